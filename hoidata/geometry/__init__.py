@@ -1,0 +1,1 @@
+"""Rotations and rigid motion as pure functions."""
