@@ -1,0 +1,113 @@
+"""Exact distances from points to a triangle mesh, signed: negative inside.
+
+Exact nearest-triangle search is libigl's. The sign is the angle-weighted pseudonormal's (Baerentzen and Aanaes 2005)
+where the surface is closed, and the winding number's (Jacobson et al. 2013) where it has holes.
+"""
+
+from dataclasses import dataclass
+
+import igl
+import numpy as np
+
+from hoidata.errors import BadInput
+
+CHUNK_POINTS = 1 << 17
+
+
+@dataclass(frozen=True)
+class ClosestPoints:
+    """distance_m: (point,) >= 0; closest_m: (point, 3) on the surface; face: (point,) index of its triangle."""
+
+    distance_m: np.ndarray
+    closest_m: np.ndarray
+    face: np.ndarray
+
+
+@dataclass(frozen=True)
+class SignedDistance:
+    """distance_m: (point,) negative inside; closest_m: (point, 3); face: (point,); normal: (point, 3) unit, outward.
+
+    ``normal`` belongs to the closest point: the triangle's there, whatever the side the query came from.
+    ``closed`` says whether the surface has no hole, so that "inside" is exact.
+    """
+
+    distance_m: np.ndarray
+    closest_m: np.ndarray
+    face: np.ndarray
+    normal: np.ndarray
+    closed: bool
+
+
+@dataclass(frozen=True)
+class _Surface:
+    """Coinciding vertices merged, collapsed triangles left out; ``kept`` maps back to the caller's face indices."""
+
+    vertices_m: np.ndarray
+    faces: np.ndarray
+    kept: np.ndarray
+
+
+def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> ClosestPoints:
+    """Nearest point of the mesh ``(vertex, 3)``, ``(face, 3)`` to each of ``points_m (point, 3)``; metres, one frame.
+
+    Raises BadInput for a mesh without triangles of positive area or with numbers that are not finite.
+    """
+    surface = _surface(vertices_m, faces)
+    parts = [
+        igl.point_mesh_squared_distance(chunk, surface.vertices_m, surface.faces)[:3] for chunk in _chunks(points_m)
+    ]
+    square, face, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return ClosestPoints(np.sqrt(square), closest.reshape(-1, 3), surface.kept[face])
+
+
+def signed_distance(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> SignedDistance:
+    """Signed distance from ``points_m (point, 3)`` to the mesh ``(vertex, 3)``, ``(face, 3)``; metres, one frame.
+
+    Vertices that coincide (a mesh split along texture seams) count as one, so seams do not open the surface.
+    Raises BadInput as :func:`closest_points` does.
+    """
+    surface = _surface(vertices_m, faces)
+    closed = _is_closed(surface.faces)
+    kinds = igl.SignedDistanceType
+    kind = kinds.SIGNED_DISTANCE_TYPE_PSEUDONORMAL if closed else kinds.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
+    parts = [igl.signed_distance(chunk, surface.vertices_m, surface.faces, kind)[:3] for chunk in _chunks(points_m)]
+    distance, face, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    normals = face_normals(surface.vertices_m, surface.faces)
+    return SignedDistance(distance, closest.reshape(-1, 3), surface.kept[face], normals[face], closed)
+
+
+def face_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """(face, 3) unit normals by the right-hand rule; zero for a triangle without area."""
+    a, b, c = (vertices_m[faces[:, corner]] for corner in range(3))
+    cross = np.cross(b - a, c - a)
+    length = np.linalg.norm(cross, axis=1, keepdims=True)
+    return cross / np.where(length > 0, length, 1.0)
+
+
+def _surface(vertices_m: np.ndarray, faces: np.ndarray) -> _Surface:
+    vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
+    if not np.isfinite(vertices).all():
+        raise BadInput("object mesh", "finite vertices", "NaN or infinity", "repair the mesh")
+    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
+    merged = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)].reshape(-1, 3)
+    a, b, c = merged.T
+    kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+    if not len(kept):
+        raise BadInput(
+            "object mesh", "at least one triangle", f"{len(merged)} faces, none with area", "repair the mesh"
+        )
+    return _Surface(unique, np.ascontiguousarray(merged[kept]), kept)
+
+
+def _is_closed(faces: np.ndarray) -> bool:
+    """Every directed edge is met by its opposite exactly as often: a closed, consistently oriented surface."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = int(faces.max()) + 1
+    forward = np.sort(edges[:, 0] * size + edges[:, 1])
+    backward = np.sort(edges[:, 1] * size + edges[:, 0])
+    return bool(np.array_equal(forward, backward))
+
+
+def _chunks(points_m: np.ndarray) -> list[np.ndarray]:
+    points = np.ascontiguousarray(points_m, dtype=np.float64).reshape(-1, 3)
+    return [points[start : start + CHUNK_POINTS] for start in range(0, max(len(points), 1), CHUNK_POINTS)]

@@ -1,0 +1,75 @@
+"""Signed distance against formulas for a sphere and a box, and on split, open and broken meshes."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from hoidata.errors import BadInput
+from hoidata.objects.distance import closest_points, signed_distance
+
+
+def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    outside = np.linalg.norm(np.maximum(np.abs(points) - half, 0), axis=1)
+    return outside + np.minimum((np.abs(points) - half).max(axis=1), 0)
+
+
+@pytest.fixture
+def queries() -> np.ndarray:
+    return np.random.default_rng(0).uniform(-0.08, 0.08, (2000, 3))
+
+
+def test_signed_distance_to_a_box_equals_the_formula(queries: np.ndarray) -> None:
+    box = trimesh.creation.box((0.06, 0.04, 0.1))
+    found = signed_distance(box.vertices, box.faces, queries)
+    np.testing.assert_allclose(found.distance_m, box_distance(queries, np.array((0.03, 0.02, 0.05))), atol=1e-12)
+    assert found.closed
+    np.testing.assert_allclose(np.linalg.norm(found.closest_m - queries, axis=1), abs(found.distance_m), atol=1e-12)
+
+
+def test_signed_distance_to_a_fine_sphere_is_radius_minus_its_sagitta(queries: np.ndarray) -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
+    found = signed_distance(sphere.vertices, sphere.faces, queries)
+    error = found.distance_m - (np.linalg.norm(queries, axis=1) - 0.05)
+    assert np.abs(error).max() < 1e-4
+    away = np.linalg.norm(queries, axis=1) > 0.01
+    outward = found.closest_m / np.linalg.norm(found.closest_m, axis=1, keepdims=True)
+    assert (found.normal * outward).sum(axis=1)[away].min() > 0.99
+
+
+def test_a_mesh_split_into_separate_triangles_gives_the_same_signs(queries: np.ndarray) -> None:
+    box = trimesh.creation.box((0.06, 0.04, 0.1))
+    soup = box.vertices[box.faces].reshape(-1, 3)
+    split = signed_distance(soup, np.arange(len(soup)).reshape(-1, 3), queries)
+    np.testing.assert_allclose(split.distance_m, signed_distance(box.vertices, box.faces, queries).distance_m)
+
+
+def test_faces_are_numbered_as_the_caller_numbers_them(queries: np.ndarray) -> None:
+    box = trimesh.creation.box((0.06, 0.04, 0.1))
+    faces = np.concatenate([[[0, 0, 1]], box.faces])
+    found = closest_points(box.vertices, faces, queries)
+    assert found.face.min() >= 1
+    corners = box.vertices[faces[found.face]]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    offset = ((found.closest_m - corners[:, 0]) * normal).sum(axis=1)
+    np.testing.assert_allclose(offset, 0, atol=1e-12)
+
+
+def test_a_box_with_a_small_hole_still_knows_its_inside() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    points = np.array([[0.0, 0, 0], [0.02, 0, 0], [0.1, 0, 0]])
+    found = signed_distance(sphere.vertices, sphere.faces[1:], points)
+    assert not found.closed
+    assert (found.distance_m < 0).tolist() == [True, True, False]
+
+
+def test_no_points_give_no_distances() -> None:
+    box = trimesh.creation.box((1, 1, 1))
+    assert len(signed_distance(box.vertices, box.faces, np.zeros((0, 3))).distance_m) == 0
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces"), [(np.zeros((3, 3)), [[0, 1, 2]]), (np.full((3, 3), np.nan), [[0, 1, 2]])]
+)
+def test_a_mesh_without_a_surface_is_refused(vertices: np.ndarray, faces: list) -> None:
+    with pytest.raises(BadInput, match="object mesh"):
+        signed_distance(vertices, np.array(faces), np.zeros((1, 3)))
