@@ -1,0 +1,148 @@
+"""What an adapter is: a named reader of one dataset's raw files that gives clips.
+
+Three short steps in one file and one class:
+locate (``sequences``: which sequences are there), load (read the files of one sequence through ``RawTree``) and
+convert (change of frame, unit and convention, into ``Clip``). Nothing outside an adapter knows a dataset's quirks.
+"""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from hoidata.errors import BadInput
+from hoidata.files import sha256_bytes, sha256_file
+from hoidata.hands import HandPair
+from hoidata.schema.clip import Clip, SourceFile
+from hoidata.schema.quarantine import Quarantined
+
+__all__ = ["Adapter", "Quarantined", "RawTree", "SequenceKey"]
+
+
+@dataclass(frozen=True, order=True)
+class SequenceKey:
+    """One raw sequence. name: its path-like name below the dataset (``s1/mug_drink_1``); subject: as in the source."""
+
+    dataset: str
+    subject: str
+    name: str
+
+    def __str__(self) -> str:
+        return f"{self.dataset}/{self.name}"
+
+
+@runtime_checkable
+class Adapter(Protocol):
+    """Reader of one dataset. Must be picklable (a frozen dataclass without open files): workers get a copy.
+
+    name: of the dataset, lower case. licence, where_to_register: shown to users who lack the data.
+    needs_mano: the raw files hold MANO parameters, meaningless without the licensed MANO files.
+    source_fps: frames per second of the raw files (a file's own figure wins).
+    frame_notes: the world frame in one sentence: handedness, up axis, gravity or why it is unknown.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def licence(self) -> str: ...
+    @property
+    def where_to_register(self) -> str: ...
+    @property
+    def needs_mano(self) -> bool: ...
+    @property
+    def source_fps(self) -> float: ...
+    @property
+    def frame_notes(self) -> str: ...
+
+    def sequences(self, root: Path) -> list[SequenceKey]:
+        """Locate: the keys of all sequences below ``root``, sorted. Looks at names only, opens no motion file."""
+        ...
+
+    def load(self, raw: "RawTree", key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
+        """Load and convert one sequence: its clips, and the stretches left out of it.
+
+        Every file is reached through ``raw``. Raises BadInput when the whole sequence cannot be used.
+        """
+        ...
+
+
+@dataclass
+class RawTree:
+    """A raw dataset folder that remembers what was read from it and checks it against a manifest.
+
+    Paths are relative to ``root`` with forward slashes. ``sources`` holds every file read so far (a folder of
+    per-frame files counts as one, see ``read_folder``). With a manifest (path -> SourceFile), a file whose digest
+    differs, or that is not listed, raises BadInput.
+    """
+
+    root: Path
+    manifest: Mapping[str, SourceFile] | None = None
+    _sources: dict[str, SourceFile] = field(default_factory=dict)
+
+    @property
+    def sources(self) -> tuple[SourceFile, ...]:
+        return tuple(self._sources[path] for path in sorted(self._sources))
+
+    def file(self, path: str) -> Path:
+        """The absolute path of one file, after recording and checking it. Raises BadInput when it is missing."""
+        place = self._inside(path)
+        self._record(SourceFile(path, place.stat().st_size, sha256_file(place)))
+        return place
+
+    def read(self, path: str) -> bytes:
+        """The bytes of one file, recorded and checked."""
+        data = self._inside(path).read_bytes()
+        self._record(SourceFile(path, len(data), sha256_bytes(data)))
+        return data
+
+    def read_folder(self, folder: str, names: Iterable[str]) -> list[bytes]:
+        """The bytes of many small files of one folder; recorded as one source.
+
+        Its digest is the SHA-256 of one ``<sha256>  <name>`` line per file, its size the sum. In a manifest either
+        the files or the folder may be listed.
+        """
+        contents, lines = [], []
+        for name in names:
+            data = self._inside(f"{folder}/{name}").read_bytes()
+            digest = sha256_bytes(data)
+            if self.manifest is not None and folder not in self.manifest:
+                self._check(SourceFile(f"{folder}/{name}", len(data), digest))
+            contents.append(data)
+            lines.append(f"{digest}  {name}\n")
+        whole = SourceFile(folder, sum(map(len, contents)), sha256_bytes("".join(lines).encode()))
+        if self.manifest is not None and folder in self.manifest:
+            self._check(whole)
+        self._sources[folder] = whole
+        return contents
+
+    def names(self, folder: str, suffix: str = "") -> list[str]:
+        """Sorted names of the plain files in a folder that end in ``suffix`` (any case); none when it is absent."""
+        place = self.root / folder
+        if not place.is_dir():
+            return []
+        return sorted(item.name for item in place.iterdir() if item.name.lower().endswith(suffix) and item.is_file())
+
+    def has(self, path: str) -> bool:
+        return (self.root / path).is_file()
+
+    def _inside(self, path: str) -> Path:
+        place = self.root / path
+        if not place.is_file():
+            raise BadInput(path, "a file", "nothing there", "check that the download is complete and unpacked here")
+        if not place.resolve().is_relative_to(self.root.resolve()):
+            raise BadInput(path, "a file inside the raw folder", "a link that leaves it", "replace the link by a copy")
+        return place
+
+    def _record(self, source: SourceFile) -> None:
+        if self.manifest is not None:
+            self._check(source)
+        self._sources[source.path] = source
+
+    def _check(self, found: SourceFile) -> None:
+        listed = (self.manifest or {}).get(found.path)
+        if listed is None:
+            raise BadInput(found.path, "a file listed in the manifest", "an unlisted one", "scan the raw folder again")
+        if listed.sha256 != found.sha256:
+            expected = f"SHA-256 {listed.sha256[:12]} ({listed.size} bytes)"
+            got = f"{found.sha256[:12]} ({found.size} bytes)"
+            raise BadInput(found.path, expected, got, "restore the file, or scan the raw folder again")

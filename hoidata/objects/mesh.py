@@ -1,0 +1,119 @@
+"""Reading triangle meshes exactly as stored, and their mass properties."""
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import trimesh
+
+from hoidata.errors import BadInput
+
+LARGEST_MESH_BYTES = 512 * 1024 * 1024
+
+
+class Mesh(NamedTuple):
+    """vertices: (vertex, 3) float64 in the file's own unit and order; faces: (face, 3) int64."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+class MassProperties(NamedTuple):
+    """A solid of 1 kg and even density.
+
+    volume_m3; centre_m (3,), in the mesh frame; inertia_kg_m2 (3, 3) about the centre of mass, mesh axes.
+    source: "solid" from the mesh itself, "convex hull" where the mesh is open or encloses nothing.
+    """
+
+    volume_m3: float
+    centre_m: np.ndarray
+    inertia_kg_m2: np.ndarray
+    source: Literal["solid", "convex hull"]
+
+
+def load_mesh(path: str | Path) -> Mesh:
+    """Vertices and triangles of an OBJ or PLY file; polygons become fans.
+
+    Vertices are neither merged, reordered nor dropped, so that per-vertex files (part ids, contacts) keep their
+    meaning. Raises BadInput on anything that is not a finite triangle mesh.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput(path, "a mesh file", "nothing there")
+    if path.stat().st_size > LARGEST_MESH_BYTES:
+        raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
+    reader = {".obj": _read_obj, ".ply": _read_ply}.get(path.suffix.lower())
+    if reader is None:
+        raise BadInput(path, "a mesh named .obj or .ply", path.suffix or "no suffix", "convert the mesh")
+    try:
+        mesh = reader(path)
+    except BadInput:
+        raise
+    except Exception as error:  # any parser failure means the same to the user: this mesh cannot be read
+        raise BadInput(path, "a readable mesh", f"{type(error).__name__}: {error}") from error
+    return _checked(path, mesh)
+
+
+def _read_obj(path: Path) -> Mesh:
+    # Own reader: trimesh splits and reorders vertices where faces carry texture or normal indices.
+    vertices: list[list[float]] = []
+    faces: list[tuple[int, int, int]] = []
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+        words = line.split()
+        if not words or words[0] not in ("v", "f"):
+            continue
+        try:
+            if words[0] == "v":
+                vertices.append([float(word) for word in words[1:4]])
+                continue
+            corners = [_obj_index(word, len(vertices)) for word in words[1:]]
+        except ValueError as error:
+            raise BadInput(f"{path}:{number}", "numbers after 'v' or 'f'", repr(line[:60])) from error
+        if len(corners) < 3 or (vertices and len(vertices[-1]) != 3):
+            raise BadInput(f"{path}:{number}", "3 coordinates per vertex and 3 or more corners per face", line[:60])
+        faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
+    return Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
+
+
+def _obj_index(word: str, n_vertices: int) -> int:
+    """OBJ counts from 1; negative indices count back from the last vertex read."""
+    index = int(word.split("/")[0])
+    return index - 1 if index > 0 else n_vertices + index
+
+
+def _read_ply(path: Path) -> Mesh:
+    with open(path, "rb") as stream:
+        fields = trimesh.exchange.ply.load_ply(stream, prefer_color="vertex", skip_materials=True)
+    faces = fields.get("faces")
+    triangles = np.zeros((0, 3)) if faces is None else trimesh.geometry.triangulate_quads(faces)
+    return Mesh(np.asarray(fields["vertices"], dtype=np.float64), np.asarray(triangles, dtype=np.int64))
+
+
+def _checked(path: Path, mesh: Mesh) -> Mesh:
+    vertices, faces = mesh
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
+        raise BadInput(path, "a mesh with vertices of 3 coordinates", f"an array of shape {vertices.shape}")
+    if not np.isfinite(vertices).all():
+        raise BadInput(path, "finite vertices", "NaN or infinity")
+    if not len(faces):
+        raise BadInput(path, "a mesh with faces", f"{len(vertices)} vertices and no face")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise BadInput(path, f"face corners from 0 to {len(vertices) - 1}", f"{faces.min()} to {faces.max()}")
+    return mesh
+
+
+def mass_properties(vertices_m: np.ndarray, faces: np.ndarray) -> MassProperties:
+    """Volume, centre of mass and inertia of the solid a mesh bounds, for 1 kg.
+
+    vertices_m: (vertex, 3); faces: (face, 3). A mesh turned inside out is turned back. An open mesh, or one that
+    encloses less than 0.1 % of its convex hull (two opposite shells), is replaced by that hull, and says so.
+    """
+    mesh = trimesh.Trimesh(vertices_m, faces, process=True)
+    hull = mesh.convex_hull
+    solid = mesh.is_watertight and abs(mesh.volume) > 1e-3 * hull.volume
+    used = mesh if solid else hull
+    if used.volume < 0:
+        used.invert()
+    volume = float(used.volume)
+    inertia = np.asarray(used.moment_inertia) / volume
+    return MassProperties(volume, np.asarray(used.center_mass), inertia, "solid" if solid else "convex hull")
