@@ -19,7 +19,7 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: array {name!r} holds Python objects, which NPZ files here never do")
     with atomic_file(path) as part, open(part, "wb") as stream:
-        np.savez(stream, allow_pickle=False, **{name: np.ascontiguousarray(a) for name, a in arrays.items()})
+        np.savez(stream, allow_pickle=False, **{name: np.asarray(a, order="C") for name, a in arrays.items()})
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:
