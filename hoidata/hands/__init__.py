@@ -1,1 +1,22 @@
+"""MANO-layout hand models: the embedded one and the user's MANO files, forward kinematics, fitting to keypoints."""
 
+from hoidata.hands.embedded import load_embedded_hands, mirrored
+from hoidata.hands.kinematics import HandKinematics
+from hoidata.hands.model import JOINT_NAMES, PARENTS, TIP_VERTICES, HandModel, HandPair
+from hoidata.hands.tracks import HandTrackLike, kinematics_of, track_joints, track_rotmats, track_vertices
+
+__all__ = [
+    "JOINT_NAMES",
+    "PARENTS",
+    "TIP_VERTICES",
+    "HandKinematics",
+    "HandModel",
+    "HandPair",
+    "HandTrackLike",
+    "kinematics_of",
+    "load_embedded_hands",
+    "mirrored",
+    "track_joints",
+    "track_rotmats",
+    "track_vertices",
+]

@@ -1,0 +1,105 @@
+"""Forward kinematics of a MANO-layout hand in torch: linear blend skinning with shape and pose blend shapes.
+
+World convention of hoidata: joint 0 lies exactly at ``wrist_m``, and the hand turns about it. A MANO file's own
+translation relates by ``wrist_m = transl + J0(betas)``. Model: Romero et al. 2017; skinning: Loper et al. 2015, eq. 2-9.
+"""
+
+import torch
+from torch import Tensor, nn
+
+from hoidata.hands.model import N_JOINTS, N_SHAPE, PARENTS, TIP_VERTICES, HandModel
+
+_LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
+
+
+class HandKinematics(nn.Module):
+    """Batched joints and vertices of one side, metres in the world frame, differentiable in every input.
+
+    dtype: torch.float32 or torch.float64, of the buffers and hence of what the inputs must be.
+    """
+
+    def __init__(self, model: HandModel, dtype: torch.dtype = torch.float32) -> None:
+        super().__init__()
+        self.side, self.digest = model.side, model.digest
+        self._buffer("template_m", model.template_m, dtype)
+        self._buffer("joint_regressor", model.joint_regressor, dtype)
+        self._buffer("rest_joints_m", model.joint_regressor @ model.template_m, dtype)
+        self._buffer("joint_directions", model.joint_directions, dtype)
+        self.mesh = _Skin(model, range(len(model.template_m)), dtype)
+        self.tips = _Skin(model, TIP_VERTICES, dtype)
+
+    def joints(self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None = None) -> Tensor:
+        """(batch, 21, 3) joints without skinning the mesh: only the five tip vertices are.
+
+        wrist_m: (batch, 3) world position of joint 0. rotmats: (batch, 16, 3, 3) local rotations, the first one
+        world-from-hand, the others relative to the parent joint; absolute, the identity is the flat hand.
+        betas: (batch or 1, 10). template_m: (778, 3) or (batch, 778, 3) personal rest mesh.
+        """
+        rotations, places, rest = self._chain(wrist_m, rotmats, betas, template_m)
+        tips = self.tips(rotmats, betas, rotations, places, rest, template_m)
+        return torch.cat((places, tips), 1)
+
+    def forward(
+        self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Vertices (batch, 778, 3) and joints (batch, 21, 3); arguments as in ``joints``."""
+        rotations, places, rest = self._chain(wrist_m, rotmats, betas, template_m)
+        vertices = self.mesh(rotmats, betas, rotations, places, rest, template_m)
+        return vertices, torch.cat((places, vertices[:, list(TIP_VERTICES)]), 1)
+
+    def _chain(
+        self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """World rotations (batch, 16, 3, 3) and positions (batch, 16, 3) of the joints, and the rest joints."""
+        base = self.rest_joints_m if template_m is None else self.joint_regressor @ template_m
+        rest = base + (betas @ self.joint_directions).reshape(-1, N_JOINTS, 3)
+        bones = (rest[:, 1:] - rest[:, list(PARENTS[1:])]).expand(len(wrist_m), -1, -1)
+        rotations, places = [rotmats[:, :1].expand(-1, 5, -1, -1)], [wrist_m[:, None].expand(-1, 5, -1)]
+        for level in _LEVELS:
+            bone = bones[:, [joint - 1 for joint in level], :, None]
+            places.append(places[-1] + (rotations[-1] @ bone)[..., 0])
+            rotations.append(rotations[-1] @ rotmats[:, list(level)])
+        fingers_rotation = torch.stack(rotations[1:], 2).flatten(1, 2)
+        fingers_place = torch.stack(places[1:], 2).flatten(1, 2)
+        return torch.cat((rotmats[:, :1], fingers_rotation), 1), torch.cat((wrist_m[:, None], fingers_place), 1), rest
+
+    def _buffer(self, name: str, value, dtype: torch.dtype) -> None:
+        self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
+
+
+class _Skin(nn.Module):
+    """Blend shapes and skinning of some vertices of a model, coordinate-major so that every sum is one matmul."""
+
+    def __init__(self, model: HandModel, vertices, dtype: torch.dtype) -> None:
+        super().__init__()
+        self.vertices = list(vertices)
+        self.is_whole = len(self.vertices) == len(model.template_m)
+        shape = model.shape_directions[self.vertices].transpose(2, 1, 0).reshape(N_SHAPE, -1)
+        pose = model.pose_directions[self.vertices].transpose(2, 1, 0).reshape(model.pose_directions.shape[2], -1)
+        arrays = {"template": model.template_m[self.vertices].T, "weights": model.skin_weights[self.vertices].T}
+        for name, value in {**arrays, "shape": shape, "pose": pose}.items():
+            self.register_buffer(name, torch.tensor(value, dtype=dtype).contiguous(), persistent=False)
+
+    def forward(
+        self, rotmats: Tensor, betas: Tensor, rotations: Tensor, places: Tensor, rest: Tensor, template_m: Tensor | None
+    ) -> Tensor:
+        """World positions (batch, vertex, 3)."""
+        n_batch = len(rotmats)
+        moves = torch.cat((rotations, (places[..., None] - rotations @ rest[..., None])), -1)
+        blended = moves.reshape(n_batch, N_JOINTS, 12).transpose(1, 2) @ self.weights
+        x, y, z, shift = blended.reshape(n_batch, 3, 4, -1).unbind(2)
+        rested = self._rested(rotmats, betas, template_m)
+        placed = x * rested[:, :1] + y * rested[:, 1:2] + z * rested[:, 2:] + shift
+        return placed.transpose(1, 2).contiguous()
+
+    def _rested(self, rotmats: Tensor, betas: Tensor, template_m: Tensor | None) -> Tensor:
+        """Rest positions with shape and pose blend shapes, (batch, 3, vertex)."""
+        identity = torch.eye(3, dtype=rotmats.dtype, device=rotmats.device)
+        features = (rotmats[:, 1:] - identity).reshape(len(rotmats), -1)
+        shaped = (betas @ self.shape).reshape(-1, 3, len(self.vertices)) + self._template(template_m)
+        return (features @ self.pose).reshape(len(rotmats), 3, -1) + shaped
+
+    def _template(self, template_m: Tensor | None) -> Tensor:
+        if template_m is None:
+            return self.template
+        return (template_m if self.is_whole else template_m[..., self.vertices, :]).transpose(-1, -2)

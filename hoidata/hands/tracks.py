@@ -1,0 +1,66 @@
+"""Joints and vertices of a recorded hand track, as NumPy arrays in the world frame."""
+
+from functools import lru_cache
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands.kinematics import HandKinematics
+from hoidata.hands.model import HandModel
+
+_CHUNK_FRAMES = 512
+
+
+class HandTrackLike(Protocol):
+    """What ``schema.HandTrack`` offers; units and shapes as there."""
+
+    @property
+    def wrist_m(self) -> np.ndarray: ...
+    @property
+    def global_orient(self) -> np.ndarray: ...
+    @property
+    def hand_pose(self) -> np.ndarray: ...
+    @property
+    def betas(self) -> np.ndarray: ...
+    @property
+    def template_m(self) -> np.ndarray | None: ...
+
+
+def track_joints(track: HandTrackLike, model: HandModel) -> np.ndarray:
+    """(frame, 21, 3) float32 world joints, metres, of every frame of the track, valid or not."""
+    return _in_chunks(track, model, 21, lambda layer, inputs: layer.joints(*inputs))
+
+
+def track_vertices(track: HandTrackLike, model: HandModel) -> np.ndarray:
+    """(frame, 778, 3) float32 world vertices, metres, of every frame of the track, valid or not."""
+    return _in_chunks(track, model, len(model.template_m), lambda layer, inputs: layer(*inputs)[0])
+
+
+@lru_cache(maxsize=8)
+def kinematics_of(model: HandModel, dtype: torch.dtype = torch.float32) -> HandKinematics:
+    """The shared HandKinematics of a model on the CPU, made once per model object and dtype."""
+    return HandKinematics(model, dtype)
+
+
+def track_rotmats(track: HandTrackLike) -> np.ndarray:
+    """(frame, 16, 3, 3) local rotations of a track, the global one first."""
+    rotvec = np.concatenate((track.global_orient, track.hand_pose), axis=1, dtype=np.float64)
+    return rotvec_to_rotmat(rotvec.reshape(len(rotvec), 16, 3))
+
+
+def _in_chunks(track: HandTrackLike, model: HandModel, n_points: int, run) -> np.ndarray:
+    # float64 inside: a world position metres from the origin keeps its last micrometre.
+    layer = kinematics_of(model, torch.float64)
+    wrist, rotmats, betas = (
+        torch.as_tensor(np.asarray(array, dtype=np.float64)) for array in (track.wrist_m, track_rotmats(track), track.betas)
+    )
+    template = None if track.template_m is None else torch.as_tensor(np.asarray(track.template_m, dtype=np.float64))
+    out = np.empty((len(wrist), n_points, 3), dtype=np.float32)
+    with torch.no_grad():
+        for start in range(0, len(wrist), _CHUNK_FRAMES):
+            part = slice(start, start + _CHUNK_FRAMES)
+            own_betas = betas if len(betas) == 1 else betas[part]
+            out[part] = run(layer, (wrist[part], rotmats[part], own_betas, template)).numpy()
+    return out
