@@ -1,0 +1,156 @@
+"""Word forms of verbs and objects: an explicit table first, rules for every other word.
+
+``grammar.csv`` holds one row per word: kind (verb or object), base, gerund, past_participle, third_singular for verbs,
+noun_phrase and number (singular, plural or mass) for objects. Rules: lemminflect on the head word of an unknown verb;
+the first spoken sound for the article; the head noun's number.
+"""
+
+import csv
+import logging
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Literal
+
+from hoidata.errors import BadInput
+
+Number = Literal["singular", "plural", "mass"]
+COLUMNS = ("kind", "base", "gerund", "past_participle", "third_singular", "noun_phrase", "number")
+DETERMINERS = frozenset(
+    ("a", "an", "the", "this", "that", "these", "those", "my", "your", "his", "her", "its", "our", "their", "some")
+)
+# Words that start with a vowel letter but a consonant sound, and the other way round.
+CONSONANT_SOUND = re.compile(r"(?:eu|ew|uni(?!n|m)|one(?:\b|-)|once|ouija|u[bcfhjkqrst][aeiou])", re.IGNORECASE)
+SILENT_H = re.compile(r"(?:hour|honest|honou?r|heir|herb)", re.IGNORECASE)
+VOWEL_NUMBER = re.compile(r"(?:8|11(?!\d)|18(?!\d))")
+SINGULAR_IN_S = re.compile(r"(?:ss|us|is|as|ics|lens|[aeiou]ss|yes)$", re.IGNORECASE)
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class VerbForms:
+    """One verb: ``take out``, ``taking out``, ``taken out``, ``takes out``."""
+
+    base: str
+    gerund: str
+    past_participle: str
+    third_singular: str
+
+
+@dataclass(frozen=True)
+class NounPhrase:
+    """One object as it stands in a sentence: ``a book``, ``scissors``, ``milk``; number rules the verb's form."""
+
+    base: str
+    words: str
+    number: Number
+
+
+@dataclass(frozen=True)
+class Grammar:
+    """Known verbs and objects by base form; unknown ones are inflected by rule."""
+
+    verbs: dict[str, VerbForms]
+    nouns: dict[str, NounPhrase]
+
+    def verb(self, base: str) -> VerbForms:
+        """Forms of ``base`` (``hand over``). Raises BadInput when it holds no word."""
+        base = _words(base, "verb")
+        known = self.verbs.get(base) or self.verbs.get(base.lower())
+        return known or inflect_verb(base)
+
+    def noun(self, base: str) -> NounPhrase:
+        """Phrase of ``base`` (``large cube``), with its article. Raises BadInput when it holds no word."""
+        base = _words(base, "object")
+        known = self.nouns.get(base) or self.nouns.get(base.lower())
+        if known:
+            return known
+        number = self._number_by_rule(base)
+        bare = number != "singular" or base.split()[0].lower() in DETERMINERS
+        return NounPhrase(base, base if bare else f"{article(base)} {base}", number)
+
+    def _number_by_rule(self, base: str) -> Number:
+        """The number of the head noun: the last word, or the last one before "of"."""
+        head = re.split(r"\s+of\s+", base)[0].split()[-1]
+        known = self.nouns.get(head) or self.nouns.get(head.lower())
+        if known:
+            return known.number
+        plural = head.lower().endswith("s") and len(head) > 3 and not SINGULAR_IN_S.search(head)
+        return "plural" if plural else "singular"
+
+
+@lru_cache(maxsize=4096)
+def inflect_verb(base: str) -> VerbForms:
+    """Forms of a verb outside the table: its first word inflected by lemminflect, the rest kept (``zip up``)."""
+    from lemminflect import getInflection
+
+    head, _, rest = base.partition(" ")
+    logger.warning("verb %r is not in the grammar table; its forms are made by rule", base)
+    forms = [_first_form(getInflection, head, tag) for tag in ("VBG", "VBN", "VBZ")]
+    return VerbForms(base, *(f"{form} {rest}".rstrip() for form in forms))
+
+
+def _first_form(inflection, head: str, tag: str) -> str:
+    return (inflection(head, tag=tag, inflect_oov=False) or inflection(head, tag=tag, inflect_oov=True))[0]
+
+
+def article(noun: str) -> Literal["a", "an"]:
+    """ "a" or "an" by the first sound of ``noun``: an hour, a unicycle, an SD card, a USB stick, an 8-sided die."""
+    first = re.split(r"[\s-]", noun.strip())[0]
+    letters = re.sub(r"[^A-Za-z]", "", first)
+    if letters and letters.isupper() and (len(letters) == 1 or len(letters) <= 4):
+        return "an" if letters[0] in "AEFHILMNORSX" else "a"
+    if VOWEL_NUMBER.match(noun) or SILENT_H.match(noun):
+        return "an"
+    return "an" if noun[0].lower() in "aeiou" and not CONSONANT_SOUND.match(noun) else "a"
+
+
+@lru_cache(maxsize=1)
+def default_grammar() -> Grammar:
+    """The table shipped with the package: every verb and object of H2O, GRAB and ARCTIC, and common others."""
+    with files("hoidata.annotation").joinpath("grammar.csv").open(encoding="utf-8", newline="") as stream:
+        return read_grammar(stream, "grammar.csv")
+
+
+def extend_grammar(grammar: Grammar, path: str | Path) -> Grammar:
+    """``grammar`` with the rows of a user's table in the same columns; they win over rows of the same base form."""
+    with open(path, encoding="utf-8", newline="") as stream:
+        added = read_grammar(stream, str(path))
+    return Grammar({**grammar.verbs, **added.verbs}, {**grammar.nouns, **added.nouns})
+
+
+def read_grammar(lines: Iterable[str], where: str) -> Grammar:
+    """A grammar from CSV lines. Raises BadInput for other columns, an unknown kind or number, or an empty form."""
+    reader = csv.DictReader(lines)
+    if tuple(reader.fieldnames or ()) != COLUMNS:
+        raise BadInput(where, f"columns {', '.join(COLUMNS)}", f"{reader.fieldnames}", "name the columns so")
+    verbs: dict[str, VerbForms] = {}
+    nouns: dict[str, NounPhrase] = {}
+    for row in reader:
+        _check_row(row, f"{where} line {reader.line_num}")
+        if row["kind"] == "verb":
+            verbs[row["base"]] = VerbForms(*(row[name] for name in COLUMNS[1:5]))
+        else:
+            nouns[row["base"]] = NounPhrase(row["base"], row["noun_phrase"], row["number"])
+    return Grammar(verbs, nouns)
+
+
+def _check_row(row: dict[str, str], where: str) -> None:
+    needed = {"verb": COLUMNS[1:5], "object": ("base", "noun_phrase", "number")}.get(row["kind"])
+    if needed is None:
+        raise BadInput(where, "kind verb or object", repr(row["kind"]), "correct the row")
+    empty = [name for name in needed if not row[name]]
+    if empty:
+        raise BadInput(where, f"a {row['kind']} with {', '.join(needed)}", f"no {', '.join(empty)}", "fill it in")
+    if row["kind"] == "object" and row["number"] not in ("singular", "plural", "mass"):
+        raise BadInput(where, "number singular, plural or mass", repr(row["number"]), "correct the row")
+
+
+def _words(text: str, kind: str) -> str:
+    words = " ".join(text.split())
+    if not re.search(r"\w", words):
+        raise BadInput(f"{kind} of a sentence", "at least one word", repr(text), "give the clip a name for it")
+    return words
