@@ -55,10 +55,15 @@ def load_mesh(path: str | Path) -> Mesh:
 
 
 def _read_obj(path: Path) -> Mesh:
+    return parse_obj(path.read_text(encoding="utf-8", errors="replace"), path)
+
+
+def parse_obj(text: str, path: str | Path) -> Mesh:
+    """Vertices and triangles of an OBJ file's text, as ``load_mesh`` reads them; ``path`` names it in errors."""
     # Own reader: trimesh splits and reorders vertices where faces carry texture or normal indices.
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+    for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words or words[0] not in ("v", "f"):
             continue
@@ -72,7 +77,7 @@ def _read_obj(path: Path) -> Mesh:
         if len(corners) < 3 or (vertices and len(vertices[-1]) != 3):
             raise BadInput(f"{path}:{number}", "3 coordinates per vertex and 3 or more corners per face", line[:60])
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
-    return Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
+    return _checked(path, Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3)))
 
 
 def _obj_index(word: str, n_vertices: int) -> int:
@@ -89,7 +94,7 @@ def _read_ply(path: Path) -> Mesh:
     return Mesh(np.asarray(fields["vertices"], dtype=np.float64), np.asarray(triangles, dtype=np.int64))
 
 
-def _checked(path: Path, mesh: Mesh) -> Mesh:
+def _checked(path: str | Path, mesh: Mesh) -> Mesh:
     vertices, faces = mesh
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
         raise BadInput(path, "a mesh with vertices of 3 coordinates", f"an array of shape {vertices.shape}")
