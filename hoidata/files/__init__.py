@@ -2,5 +2,19 @@
 
 from hoidata.files.atomic import atomic_file, atomic_folder
 from hoidata.files.digest import canonical_json, sha256_bytes, sha256_file
+from hoidata.files.numpy_files import load_npy, load_npy_object, load_npz_objects
+from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
 
-__all__ = ["atomic_file", "atomic_folder", "canonical_json", "sha256_bytes", "sha256_file"]
+__all__ = [
+    "ARRAYS",
+    "Record",
+    "atomic_file",
+    "atomic_folder",
+    "canonical_json",
+    "load_npy",
+    "load_npy_object",
+    "load_npz_objects",
+    "restricted_load",
+    "sha256_bytes",
+    "sha256_file",
+]

@@ -1,0 +1,232 @@
+"""Read pickles and NumPy files of others without executing anything in them.
+
+A pickle may only name the (module, name) pairs of an allow-list, and each is mapped to a function of ours that checks
+its arguments; everything else is refused before it is looked up. Every problem is a ``BadInput`` that names the file.
+"""
+
+import io
+import pickle
+import pickletools
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from hoidata.errors import BadInput
+
+MAX_BYTES = 2 << 30
+Allow = Mapping[tuple[str, str], Any]
+
+_REMEDY = "download it again from the dataset's own site; it is not opened otherwise, because it could run code"
+# Never written by the tools we read from, or able to reach beyond the allow-list.
+_REFUSED_OPCODES = {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"}
+_MEMO_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
+_DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}|O8?)")
+
+
+def restricted_load(
+    source: bytes | BinaryIO,
+    allow: Allow,
+    encoding: str = "ASCII",
+    where: str | Path = "pickle",
+    max_bytes: int = MAX_BYTES,
+) -> Any:
+    """Unpickle ``source`` with only the globals of ``allow``; arrays come back as plain ``numpy.ndarray``.
+
+    allow: (module, name) -> what stands for it; ``ARRAYS`` covers arrays in containers. encoding: "latin1" for files
+    written by Python 2. Raises BadInput for anything malformed, oversized or not allowed.
+    """
+    data = source if isinstance(source, bytes) else source.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
+    try:
+        _check_opcodes(data)
+        return _plain(_Unpickler(io.BytesIO(data), allow, encoding).load(), {})
+    except BadInput:
+        raise
+    except Exception as error:  # a malformed pickle can raise anything
+        text = f"{type(error).__name__}: {error}"
+        raise BadInput(where, "a pickle of arrays, containers, numbers and strings", text, _REMEDY) from None
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, stream: BinaryIO, allow: Allow, encoding: str) -> None:
+        super().__init__(stream, fix_imports=False, encoding=encoding)
+        self._allow = allow
+
+    def find_class(self, module: str, name: str) -> Any:
+        try:
+            return self._allow[module, name]
+        except KeyError:
+            raise pickle.UnpicklingError(f"it names {module}.{name}, which is not allowed") from None
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise pickle.UnpicklingError("it holds a persistent id, which is not allowed")
+
+
+def _check_opcodes(data: bytes) -> None:
+    """Refuse opcodes we never need, and memo indices beyond the file's length (they would allocate at will)."""
+    for opcode, argument, _ in pickletools.genops(data):
+        if opcode.name in _REFUSED_OPCODES:
+            raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
+        if opcode.name in _MEMO_OPCODES and isinstance(argument, int) and argument > len(data):
+            raise pickle.UnpicklingError(f"it stores memo entry {argument} in {len(data)} bytes")
+
+
+def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
+    """The same value with our array class replaced by ``numpy.ndarray``.
+
+    ``seen`` maps the id of each part to (part, result), so that shared and cyclic parts are visited once.
+    """
+    if id(value) in seen:
+        return seen[id(value)][1]
+    if isinstance(value, _Array):
+        result = value.view(np.ndarray)
+        seen[id(value)] = value, result
+        if result.dtype.hasobject:
+            for index, item in enumerate(list(result.flat)):
+                result.flat[index] = _plain(item, seen)
+        return result
+    if isinstance(value, tuple):
+        result = tuple(_plain(item, seen) for item in value)
+        seen[id(value)] = value, result
+        return result
+    if isinstance(value, dict | list | Record):
+        seen[id(value)] = value, value
+        _make_parts_plain(value, seen)
+    return value
+
+
+def _make_parts_plain(value: "dict | list | Record", seen: dict[int, tuple[Any, Any]]) -> None:
+    if isinstance(value, dict):
+        value.update({key: _plain(item, seen) for key, item in value.items()})
+    elif isinstance(value, list):
+        value[:] = [_plain(item, seen) for item in value]
+    else:
+        value.state = _plain(value.state, seen)
+
+
+class Record:
+    """Inert stand-in for a foreign class: keeps the pickled state in ``state`` and does nothing."""
+
+    state: Any = None
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+class _Array(np.ndarray):
+    """An array whose pickled state is checked before NumPy sees it."""
+
+    def __setstate__(self, state: tuple) -> None:  # type: ignore[override]
+        _, shape, dtype, is_fortran, raw = state
+        kind = _checked_dtype(dtype)
+        if kind.hasobject:
+            if not isinstance(raw, list):
+                raise pickle.UnpicklingError("an object array without a list of its items")
+        else:
+            raw = _as_bytes(raw)
+        if not all(isinstance(length, int) and length >= 0 for length in shape):
+            raise pickle.UnpicklingError(f"an array of shape {shape}")
+        super().__setstate__((1, tuple(shape), kind, bool(is_fortran), raw))
+
+
+class _DtypeRecord:
+    """A dtype built from a checked string; its state may only set the byte order."""
+
+    def __init__(self, text: str) -> None:
+        self.dtype = np.dtype(text)
+
+    def __setstate__(self, state: tuple) -> None:
+        order, structure = state[1], state[2:5]
+        if order not in ("<", ">", "|", "=") or any(part is not None for part in structure):
+            raise pickle.UnpicklingError("a structured dtype, which is not allowed")
+        self.dtype = self.dtype.newbyteorder(order)
+
+
+class _NdarrayType:
+    """Stands for ``numpy.ndarray`` where a pickle names it as the type to rebuild; cannot be called."""
+
+
+_NDARRAY = _NdarrayType()
+
+
+def _dtype(text: Any, align: Any = False, copy: Any = False) -> _DtypeRecord:
+    text = text.decode("latin1") if isinstance(text, bytes) else text
+    if not isinstance(text, str) or not _DTYPE.fullmatch(text):
+        raise pickle.UnpicklingError(f"dtype {text!r}, which is not allowed")
+    return _DtypeRecord(text)
+
+
+def _checked_dtype(value: Any) -> np.dtype:
+    if not isinstance(value, _DtypeRecord):
+        raise pickle.UnpicklingError(f"a {type(value).__name__} in the place of a dtype")
+    return value.dtype
+
+
+def _as_bytes(raw: Any) -> bytes:
+    """Array data as bytes; Python 2 strings arrive as latin1 text."""
+    if isinstance(raw, str):
+        return raw.encode("latin1")
+    if isinstance(raw, bytes | bytearray):
+        return bytes(raw)
+    raise pickle.UnpicklingError(f"a {type(raw).__name__} in the place of array data")
+
+
+def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> _Array:
+    if subtype is not _NDARRAY or tuple(shape) != (0,):
+        raise pickle.UnpicklingError("an array subclass or a preset shape, which is not allowed")
+    return np.ndarray.__new__(_Array, (0,), np.int8)
+
+
+def _scalar(dtype: Any, raw: Any = b"") -> Any:
+    kind = _checked_dtype(dtype)
+    if kind.hasobject:
+        raise pickle.UnpicklingError("a scalar of object dtype, which is not allowed")
+    data = _as_bytes(raw)
+    if len(data) != kind.itemsize:
+        raise pickle.UnpicklingError(f"a scalar of {len(data)} bytes for dtype {kind}")
+    return np.frombuffer(data, kind)[0] if data else kind.type()
+
+
+def _frombuffer(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
+    kind = _checked_dtype(dtype)
+    if kind.hasobject or order not in ("C", "F"):
+        raise pickle.UnpicklingError("a buffer of objects or unknown order, which is not allowed")
+    return np.frombuffer(bytearray(_as_bytes(raw)), kind).reshape(shape, order=order)
+
+
+def _encode(text: Any, encoding: Any = None) -> bytes:
+    if not isinstance(text, str) or encoding not in ("latin1", "latin-1"):
+        raise pickle.UnpicklingError(f"_codecs.encode to {encoding!r}, which is not allowed")
+    return text.encode("latin1")
+
+
+def _set(items: Any = ()) -> set:
+    if not isinstance(items, list | tuple):
+        raise pickle.UnpicklingError(f"a set of a {type(items).__name__}")
+    return set(items)
+
+
+def _numpy_globals() -> dict[tuple[str, str], Callable | _NdarrayType]:
+    """NumPy 1 calls its inner package ``numpy.core``, NumPy 2 ``numpy._core``; files of both are read."""
+    allowed: dict[tuple[str, str], Callable | _NdarrayType] = {
+        ("numpy", "ndarray"): _NDARRAY,
+        ("numpy", "dtype"): _dtype,
+    }
+    for core in ("numpy.core", "numpy._core"):
+        allowed[f"{core}.multiarray", "_reconstruct"] = _reconstruct
+        allowed[f"{core}.multiarray", "scalar"] = _scalar
+        allowed[f"{core}.numeric", "_frombuffer"] = _frombuffer
+    return allowed
+
+
+# Arrays, NumPy scalars, sets and Python-3 bytes, inside dicts, lists, tuples, strings and numbers.
+ARRAYS: Allow = {
+    **_numpy_globals(),
+    ("_codecs", "encode"): _encode,
+    ("__builtin__", "set"): _set,
+    ("builtins", "set"): _set,
+}
