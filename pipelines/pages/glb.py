@@ -1,0 +1,199 @@
+"""A clip as one animated GLB that any glTF 2.0 viewer plays.
+
+Hands are skinned meshes on MANO's 16 joints with the shape (mean betas of the valid frames, or the personal template)
+baked into the rest mesh. Two things are left out because glTF skins cannot say them: pose correctives, and all but the
+four strongest joint weights of a vertex (the embedded hand has no more). A hand that is never valid is not in the file;
+one that comes and goes is scaled to zero where it means nothing. The node "world" turns gravity to glTF's -y.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import pygltflib as gltf
+from scipy.spatial.transform import Rotation
+
+from hoidata.files import atomic_file
+from hoidata.hands import JOINT_NAMES, HandModel, HandPair
+from hoidata.objects.model import ObjectModel
+from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack
+from pipelines.pages.gltf import GltfBuilder, linear_from_srgb
+from pipelines.pages.surface import ContactPaint, Surface, display_surface
+
+HAND_COLOURS = {"left": (0.47, 0.62, 0.78), "right": (0.90, 0.69, 0.53)}
+OBJECT_COLOUR = (0.84, 0.83, 0.80)
+MOVING_PART_COLOUR = (0.72, 0.74, 0.74)
+OTHER_OBJECT_COLOUR = (0.90, 0.90, 0.89)
+CONTACT_COLOURS = ((0.0, OBJECT_COLOUR), (0.5, (0.95, 0.62, 0.25)), (1.0, (0.78, 0.12, 0.14)))
+
+
+def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> Path:
+    """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable."""
+    with atomic_file(path) as part:
+        part.write_bytes(glb_bytes(clip, hands, contact))
+    return Path(path)
+
+
+def glb_bytes(clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> bytes:
+    """The bytes of ``write_glb``."""
+    builder = GltfBuilder(clip.clip_id, {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS})
+    world = builder.node("world", None, rotation=upright_rotation(clip.gravity).as_quat().round(9).tolist())
+    times = builder.array((np.arange(clip.n_frames) / FPS).astype(np.float32), bounds=True)
+    _add_object(builder, world, times, "object", clip.object, contact)
+    for number, track in enumerate(clip.other_objects):
+        _add_object(builder, world, times, f"other object {number}", track, None)
+    for side in SIDES:
+        if clip.hands[side].valid.any():
+            _add_hand(builder, world, times, hands[side], clip.hands[side])
+    return builder.to_bytes()
+
+
+def upright_rotation(gravity: np.ndarray | None) -> Rotation:
+    """The smallest rotation that turns ``gravity`` to -y; none when the clip does not know where down is."""
+    if gravity is None:
+        return Rotation.identity()
+    down, target = np.asarray(gravity, dtype=np.float64), np.array((0.0, -1.0, 0.0))
+    axis, cosine = np.cross(down, target), float(down @ target)
+    if np.linalg.norm(axis) < 1e-9:
+        return Rotation.identity() if cosine > 0 else Rotation.from_rotvec((np.pi, 0.0, 0.0))
+    return Rotation.from_rotvec(axis / np.linalg.norm(axis) * np.arccos(np.clip(cosine, -1, 1)))
+
+
+def contact_colours(value: np.ndarray) -> np.ndarray:
+    """Contact values (vertex,) in [0, 1] to linear RGBA (vertex, 4) uint8: object grey, orange, red."""
+    stops = np.array([stop for stop, _ in CONTACT_COLOURS])
+    colours = np.array([colour for _, colour in CONTACT_COLOURS])
+    srgb = np.stack([np.interp(value, stops, colours[:, channel]) for channel in range(3)], axis=1)
+    rgba = np.concatenate([linear_from_srgb(srgb), np.ones((len(value), 1))], axis=1)
+    return np.round(rgba * 255).astype(np.uint8)
+
+
+def rest_hand(model: HandModel, track: HandTrack) -> tuple[np.ndarray, np.ndarray]:
+    """Shaped rest vertices (778, 3) and joints (16, 3), metres, of one hand: mean betas over its valid frames."""
+    betas = track.betas[0] if len(track.betas) == 1 else track.betas[track.valid].mean(axis=0)
+    template = model.template_m if track.template_m is None else track.template_m
+    vertices = np.asarray(template, dtype=np.float64) + model.shape_directions @ betas
+    return vertices, model.joint_regressor @ vertices
+
+
+def strongest_weights(skin_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The four strongest joints of each vertex, (vertex, 4) uint8, and their weights (vertex, 4) float32, sum 1."""
+    joints = np.argsort(-skin_weights, axis=1, kind="stable")[:, :4]
+    weights = np.take_along_axis(skin_weights, joints, axis=1)
+    weights = weights / weights.sum(axis=1, keepdims=True)
+    return np.where(weights > 0, joints, 0).astype(np.uint8), weights.astype(np.float32)
+
+
+def _add_hand(builder: GltfBuilder, world: int, times: int, model: HandModel, track: HandTrack) -> None:
+    vertices, rest_joints = rest_hand(model, track)
+    nodes = _add_skeleton(builder, world, model, rest_joints)
+    inverse_bind = np.tile(np.eye(4), (16, 1, 1))
+    inverse_bind[:, :3, 3] = -rest_joints
+    skin = builder.skin(f"{model.side} skin", nodes, inverse_bind)
+    joints, weights = strongest_weights(np.asarray(model.skin_weights))
+    faces = np.asarray(model.faces, dtype=np.int64)
+    attributes = {
+        "POSITION": builder.array(vertices.astype(np.float32), gltf.ARRAY_BUFFER, bounds=True),
+        "NORMAL": builder.array(_smooth_normals(vertices, faces).astype(np.float32), gltf.ARRAY_BUFFER),
+        "JOINTS_0": builder.array(joints, gltf.ARRAY_BUFFER),
+        "WEIGHTS_0": builder.array(weights, gltf.ARRAY_BUFFER),
+    }
+    indices = builder.array(faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
+    material = builder.material(f"{model.side} hand", HAND_COLOURS[model.side])
+    mesh = builder.mesh(f"{model.side} hand", attributes, indices, material)
+    builder.node(f"{model.side} hand", None, mesh=mesh, skin=skin)
+    _animate_hand(builder, times, nodes, track)
+
+
+def _add_skeleton(builder: GltfBuilder, world: int, model: HandModel, rest_joints: np.ndarray) -> list[int]:
+    nodes: list[int] = []
+    for joint, name in enumerate(JOINT_NAMES[:16]):
+        parent = world if joint == 0 else nodes[int(model.parents[joint])]
+        offset = rest_joints[joint] if joint == 0 else rest_joints[joint] - rest_joints[int(model.parents[joint])]
+        nodes.append(builder.node(f"{model.side} {name}", parent, translation=np.float32(offset).tolist()))
+    return nodes
+
+
+def _animate_hand(builder: GltfBuilder, times: int, nodes: list[int], track: HandTrack) -> None:
+    pose = np.concatenate([track.global_orient, track.hand_pose], axis=1).reshape(track.n_frames, 16, 3)
+    builder.animate(nodes[0], "translation", times, track.wrist_m)
+    for joint, node in enumerate(nodes):
+        builder.animate(node, "rotation", times, continuous_quaternions(pose[:, joint]))
+    if not track.valid.all():
+        scale = np.repeat(track.valid[:, None].astype(np.float32), 3, axis=1)
+        builder.animate(nodes[0], "scale", times, scale, step=True)
+
+
+def _add_object(
+    builder: GltfBuilder, world: int, times: int, name: str, track: ObjectTrack, contact: ContactPaint | None
+) -> None:
+    model, other = track.model, name != "object"
+    node = builder.node(name, world)
+    builder.animate(node, "translation", times, track.translation_m)
+    builder.animate(node, "rotation", times, continuous_quaternions(track.rotvec))
+    face_part = model.face_part
+    base_colour = OTHER_OBJECT_COLOUR if other else OBJECT_COLOUR
+    _add_part(builder, node, model, model.faces[face_part == 0], 0, base_colour, contact)
+    if model.hinge is None or track.hinge_rad is None:
+        return
+    part = builder.node(f"{name} moving part", node, translation=np.float32(model.hinge.origin_m).tolist())
+    angles = model.hinge.axis[None] * np.asarray(track.hinge_rad)[:, None]
+    builder.animate(part, "rotation", times, continuous_quaternions(angles))
+    colour = OTHER_OBJECT_COLOUR if other else MOVING_PART_COLOUR
+    _add_part(builder, part, model, model.faces[face_part == 1], 1, colour, contact)
+
+
+def _add_part(
+    builder: GltfBuilder,
+    parent: int,
+    model: ObjectModel,
+    faces: np.ndarray,
+    part: int,
+    colour: tuple[float, float, float],
+    contact: ContactPaint | None,
+) -> None:
+    """Hang one rigid part of the object on its node; the moving part's vertices are taken from the hinge origin."""
+    if len(faces) == 0:
+        return
+    used, compact = np.unique(faces, return_inverse=True)
+    surface = display_surface(model.vertices_m[used], compact.reshape(-1, 3), _paint_of_part(contact, part))
+    origin = model.hinge.origin_m if part == 1 and model.hinge is not None else np.zeros(3)
+    attributes = _surface_attributes(builder, surface, origin)
+    indices = builder.array(surface.faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
+    # A painted surface carries its colour per vertex; the material then only says how it shines.
+    material = builder.material(f"{model.name} {part}", colour if surface.value is None else (1.0, 1.0, 1.0))
+    mesh = builder.mesh(f"{model.name} {part}", attributes, indices, material)
+    builder.node(f"{model.name} {'base' if part == 0 else 'part'} mesh", parent, mesh=mesh)
+
+
+def _surface_attributes(builder: GltfBuilder, surface: Surface, origin: np.ndarray) -> dict[str, int]:
+    attributes = {
+        "POSITION": builder.array((surface.vertices_m - origin).astype(np.float32), gltf.ARRAY_BUFFER, bounds=True),
+        "NORMAL": builder.array(surface.normals.astype(np.float32), gltf.ARRAY_BUFFER),
+    }
+    if surface.value is not None:
+        attributes["COLOR_0"] = builder.array(contact_colours(surface.value), gltf.ARRAY_BUFFER, normalized=True)
+    return attributes
+
+
+def _paint_of_part(contact: ContactPaint | None, part: int) -> ContactPaint | None:
+    if contact is None:
+        return None
+    here = np.asarray(contact.part) == part
+    return ContactPaint(contact.points_m[here], contact.part[here], contact.value[here])
+
+
+def continuous_quaternions(rotvec: np.ndarray) -> np.ndarray:
+    """Axis-angle (frame, 3) to xyzw quaternions (frame, 4) whose sign never flips between frames."""
+    quaternions = Rotation.from_rotvec(np.asarray(rotvec, dtype=np.float64)).as_quat()
+    flips = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0
+    signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))
+    return quaternions * signs[:, None]
+
+
+def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    triangles = vertices[faces]
+    doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    normals = np.zeros_like(vertices)
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], doubled)
+    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)

@@ -1,0 +1,142 @@
+"""What the pages' tests share: a made-up clip (hands beside a carried box), an independent glTF reader."""
+
+from pathlib import Path
+
+import numpy as np
+import pygltflib
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.schema.clip import Clip, HandTrack, ObjectTrack
+
+FRAMES = 24
+GRAVITY = np.array((0.0, 0.0, -1.0))
+
+
+def hand_track(wrist_m: np.ndarray, orient: np.ndarray, valid: bool, curl_rad: float = 0.9) -> HandTrack:
+    frames = len(wrist_m)
+    pose = np.zeros((frames, 15, 3))
+    pose[:, :12, 2] = np.linspace(0.1, curl_rad, frames)[:, None]
+    betas = np.linspace(-1, 1, 10)[None]
+    return HandTrack(wrist_m, orient, pose.reshape(frames, 45), betas, np.full(frames, valid))
+
+
+def box_model(hinged: bool = False) -> ObjectModel:
+    box = trimesh.creation.box((0.08, 0.12, 0.06))
+    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
+    if not hinged:
+        return ObjectModel("box", vertices, faces, np.zeros(len(vertices), np.uint8))
+    lid = trimesh.creation.box((0.08, 0.12, 0.01))
+    lid.apply_translation((0, 0, 0.036))
+    hinge = Hinge(np.array((0.0, 1.0, 0.0)), np.array((-0.04, 0.0, 0.031)))
+    part = np.repeat(np.array((0, 1), np.uint8), 8)
+    both = np.concatenate([faces, np.asarray(lid.faces) + 8])
+    return ObjectModel("lidded box", np.concatenate([vertices, lid.vertices]), both, part, hinge)
+
+
+def make_page_clip(right: bool = True, left: bool = False, hinged: bool = False, frames: int = FRAMES) -> Clip:
+    """A box lifted from z = 0 by 20 cm while it turns; hands follow at its sides; gravity along -z."""
+    phase = np.linspace(0, 1, frames)
+    centre = np.stack([0.1 * phase, 0.05 * phase, 0.03 + 0.2 * phase], axis=1)
+    rotvec = np.stack([0 * phase, 0 * phase, 0.6 * phase], axis=1)
+    hinge = -1.2 * phase if hinged else None
+    tracks = {
+        "right": hand_track(centre + np.array((0.13, 0, 0.08)), np.tile((1.3, 0.2, 2.6), (frames, 1)), right),
+        "left": hand_track(centre + np.array((-0.13, 0, 0.08)), np.tile((1.3, -0.2, -2.6), (frames, 1)), left),
+    }
+    return Clip(
+        clip_id="test/box_lift",
+        dataset="test",
+        subject="s1",
+        sequence="box_lift",
+        hands=tracks,  # pyright: ignore[reportArgumentType]
+        object=ObjectTrack(box_model(hinged), rotvec, centre, hinge),
+        source_frames=np.arange(frames, dtype=np.int32),
+        gravity=GRAVITY,
+        verb="lift",
+        object_words="box",
+        synthetic=True,
+    )
+
+
+_DTYPES = {5121: np.uint8, 5125: np.uint32, 5126: np.float32}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+class GltfFile:
+    def __init__(self, path: Path) -> None:
+        self.document = pygltflib.GLTF2().load_binary(str(path))
+        self.blob = self.document.binary_blob()
+
+    def array(self, index: int) -> np.ndarray:
+        accessor = self.document.accessors[index]
+        view = self.document.bufferViews[accessor.bufferView]
+        width, dtype = _WIDTHS[accessor.type], _DTYPES[accessor.componentType]
+        flat = np.frombuffer(self.blob, dtype, accessor.count * width, view.byteOffset)
+        return flat.reshape(accessor.count, width)
+
+    def node_names(self) -> list[str]:
+        return [node.name for node in self.document.nodes]
+
+    def node(self, name: str) -> int:
+        return self.node_names().index(name)
+
+    def world_matrix(self, node: int, frame: int, world: bool = True) -> np.ndarray:
+        """4x4 of ``node`` at ``frame``; with world False the root "world" counts as the identity."""
+        parents = {child: index for index, item in enumerate(self.document.nodes) for child in item.children}
+        matrix = self._local_matrix(node, frame)
+        while node in parents:
+            node = parents[node]
+            if world or self.document.nodes[node].name != "world":
+                matrix = self._local_matrix(node, frame) @ matrix
+        return matrix
+
+    def skinned(self, name: str, frame: int) -> np.ndarray:
+        """Vertices of a skinned node at a frame, in the clip's own world frame."""
+        item = self.document.nodes[self.node(name)]
+        skin = self.document.skins[item.skin]
+        inverse_bind = self.array(skin.inverseBindMatrices).reshape(-1, 4, 4).transpose(0, 2, 1)
+        bones = np.stack([self.world_matrix(joint, frame, world=False) for joint in skin.joints]) @ inverse_bind
+        attributes = self.document.meshes[item.mesh].primitives[0].attributes
+        place = np.c_[self.array(attributes.POSITION), np.ones(self.document.accessors[attributes.POSITION].count)]
+        joints, weights = self.array(attributes.JOINTS_0), self.array(attributes.WEIGHTS_0)
+        return np.einsum("vk,vkij,vj->vi", weights, bones[joints], place)[:, :3]
+
+    def placed(self, name: str, frame: int) -> np.ndarray:
+        """Vertices of a rigid mesh node at a frame, in the clip's own world frame."""
+        node = self.node(name)
+        attributes = self.document.meshes[self.document.nodes[node].mesh].primitives[0].attributes
+        matrix = self.world_matrix(node, frame, world=False)
+        return self.array(attributes.POSITION) @ matrix[:3, :3].T + matrix[:3, 3]
+
+    def _local_matrix(self, node: int, frame: int) -> np.ndarray:
+        item = self.document.nodes[node]
+        values = {"translation": item.translation, "rotation": item.rotation, "scale": item.scale}
+        for channel in self.document.animations[0].channels:
+            if channel.target.node == node:
+                sampler = self.document.animations[0].samplers[channel.sampler]
+                values[channel.target.path] = self.array(sampler.output)[frame]
+        matrix = np.eye(4)
+        scale = np.ones(3) if values["scale"] is None else np.asarray(values["scale"])
+        rotation = (0, 0, 0, 1) if values["rotation"] is None else values["rotation"]
+        matrix[:3, :3] = Rotation.from_quat(rotation).as_matrix() * scale
+        matrix[:3, 3] = 0 if values["translation"] is None else values["translation"]
+        return matrix
+
+
+@pytest.fixture(scope="session")
+def hands():
+    return load_embedded_hands()
+
+
+@pytest.fixture
+def page_clip():
+    return make_page_clip
+
+
+@pytest.fixture
+def read_glb():
+    return GltfFile
