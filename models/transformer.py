@@ -1,0 +1,109 @@
+"""The Transformer encoder that denoiser and refiner share, over tokens of (agent, frames).
+
+Text2HOI supplement, Table S8: self-attention and GELU feed-forward blocks with residuals, post-norm in the paper.
+``norm_first`` puts the norms in front, which trains without warm-up; ``frames_per_token`` lets one token carry several
+neighbouring frames of an agent (the paper: 1), which shortens the sequence where compute is scarce.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+@dataclass(frozen=True)
+class TransformerConfig:
+    """Sizes of the encoder; the defaults are the paper's."""
+
+    width: int = 512
+    layers: int = 8
+    heads: int = 4
+    feed_forward: int = 1024
+    dropout: float = 0.1
+    norm_first: bool = False
+    frames_per_token: int = 1
+
+
+class Block(nn.Module):
+    """Self-attention, then feed-forward, each with a residual and a LayerNorm."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.heads, self.norm_first, self.dropout = config.heads, config.norm_first, config.dropout
+        self.query_key_value = nn.Linear(config.width, 3 * config.width)
+        self.attended = nn.Linear(config.width, config.width)
+        self.norm_attention, self.norm_feed_forward = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
+        self.feed_forward = nn.Sequential(
+            nn.Linear(config.width, config.feed_forward),
+            nn.GELU(),
+            nn.Dropout(config.dropout),
+            nn.Linear(config.feed_forward, config.width),
+        )
+        self.drop = nn.Dropout(config.dropout)
+
+    def forward(self, x: Tensor, seen: Tensor) -> Tensor:
+        """x: (batch, token, width). seen: (batch, token) bool, the tokens that may be attended to."""
+        if self.norm_first:
+            x = x + self.drop(self.attend(self.norm_attention(x), seen))
+            return x + self.drop(self.feed_forward(self.norm_feed_forward(x)))
+        x = self.norm_attention(x + self.drop(self.attend(x, seen)))
+        return self.norm_feed_forward(x + self.drop(self.feed_forward(x)))
+
+    def attend(self, x: Tensor, seen: Tensor) -> Tensor:
+        """Multi-head self-attention (Vaswani et al. 2017, eq. 1)."""
+        batch, tokens, width = x.shape
+        query, key, value = self.query_key_value(x).reshape(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+        dropout = self.dropout if self.training else 0.0
+        mixed = functional.scaled_dot_product_attention(query, key, value, seen[:, None, None], dropout_p=dropout)
+        return self.attended(mixed.transpose(1, 2).reshape(batch, tokens, width))
+
+
+class Encoder(nn.Module):
+    """A stack of blocks; pre-norm stacks end with a norm."""
+
+    def __init__(self, config: TransformerConfig) -> None:
+        super().__init__()
+        self.blocks = nn.ModuleList([Block(config) for _ in range(config.layers)])
+        self.last_norm = nn.LayerNorm(config.width) if config.norm_first else nn.Identity()
+
+    def forward(self, x: Tensor, seen: Tensor) -> Tensor:
+        """(batch, token, width) to the same; ``seen`` as in :class:`Block`."""
+        for block in self.blocks:
+            x = block(x, seen)
+        return self.last_norm(x)
+
+
+def sinusoid(positions: Tensor, width: int) -> Tensor:
+    """Sine and cosine codes (..., width) of positions (...,) (Vaswani et al. 2017, Sec. 3.5)."""
+    half = width // 2
+    rates = torch.exp(torch.arange(half, device=positions.device) * (-math.log(10_000.0) / half))
+    angles = positions[..., None].float() * rates
+    return torch.cat((angles.sin(), angles.cos()), -1)
+
+
+# Text2HOI gives each agent one row of the frames' own table, far apart from each other: left, right, object.
+AGENT_POSITIONS = (1, 1666, 3333)
+
+
+def agent_codes(width: int, device: torch.device) -> Tensor:
+    """(3, width) agent-wise position codes: left hand, right hand, object."""
+    return sinusoid(torch.tensor(AGENT_POSITIONS, device=device), width)
+
+
+def to_tokens(x: Tensor, frames_per_token: int) -> Tensor:
+    """Frames (..., F, D) to tokens (..., ceil(F / k), k D), padded with zeros at the end."""
+    spare = -x.shape[-2] % frames_per_token
+    padded = functional.pad(x, (0, 0, 0, spare))
+    return padded.reshape(*x.shape[:-2], -1, frames_per_token * x.shape[-1])
+
+
+def to_frames(tokens: Tensor, n_frames: int, frames_per_token: int) -> Tensor:
+    """The inverse of :func:`to_tokens`, cut to ``n_frames``."""
+    return tokens.reshape(*tokens.shape[:-2], -1, tokens.shape[-1] // frames_per_token)[..., :n_frames, :]
+
+
+def tokens_seen(frames: Tensor, frames_per_token: int) -> Tensor:
+    """(..., token) True where a token holds at least one frame of ``frames`` (..., F) bool."""
+    return to_tokens(frames[..., None].float(), frames_per_token).amax(-1) > 0
