@@ -2,6 +2,7 @@
 
 from hoidata.hands.embedded import load_embedded_hands, mirrored
 from hoidata.hands.kinematics import HandKinematics
+from hoidata.hands.mano import load_mano_hands, write_mano_pickle
 from hoidata.hands.model import JOINT_NAMES, PARENTS, TIP_VERTICES, HandModel, HandPair
 from hoidata.hands.tracks import HandTrackLike, kinematics_of, track_joints, track_rotmats, track_vertices
 
@@ -15,8 +16,10 @@ __all__ = [
     "HandTrackLike",
     "kinematics_of",
     "load_embedded_hands",
+    "load_mano_hands",
     "mirrored",
     "track_joints",
     "track_rotmats",
     "track_vertices",
+    "write_mano_pickle",
 ]

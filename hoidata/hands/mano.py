@@ -1,0 +1,166 @@
+"""Read the user's own MANO files (Romero et al. 2017) without chumpy and without executing what is in them.
+
+The released files are Python 2 pickles that hold chumpy and SciPy objects. Those are read as inert records and
+evaluated here. The widespread correction of the left hand's shape directions is not applied: H2O, GRAB and ARCTIC were
+fitted with the file as it is.
+"""
+
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files import ARRAYS, Record, atomic_file, restricted_load
+from hoidata.hands.model import N_JOINTS, N_SHAPE, PARENTS, HandModel, HandPair, Side, checked_model
+
+MANO_SITE = "https://mano.is.tue.mpg.de"
+FILE_NAMES: dict[Side, str] = {"left": "MANO_LEFT.pkl", "right": "MANO_RIGHT.pkl"}
+_MAX_BYTES = 64 << 20
+_REMEDY = f"download mano_v1_2.zip again from {MANO_SITE} and take models/MANO_LEFT.pkl and MANO_RIGHT.pkl from it"
+_ROOT_SENTINEL = 2**32 - 1
+
+
+class _Ch(Record):
+    """A chumpy array: its value is ``state["x"]``."""
+
+
+class _Select(Record):
+    """A chumpy selection: elements ``idxs`` of the flattened ``a``, shaped ``preferred_shape``."""
+
+
+class _Csc(Record):
+    """A SciPy compressed-column matrix."""
+
+
+_ALLOW = {
+    **ARRAYS,
+    ("chumpy.ch", "Ch"): _Ch,
+    ("chumpy.reordering", "Select"): _Select,
+    ("scipy.sparse.csc", "csc_matrix"): _Csc,
+    ("scipy.sparse._csc", "csc_matrix"): _Csc,
+}
+
+
+def load_mano_hands(folder: str | Path) -> HandPair:
+    """Both hands of a MANO download, named "mano".
+
+    folder: where MANO_LEFT.pkl and MANO_RIGHT.pkl lie, or the unpacked ``mano_v1_2`` above their ``models`` folder.
+    Raises MissingResource when a file is absent and BadInput when one cannot be a MANO file.
+    """
+    return HandPair(left=_load_side(Path(folder), "left"), right=_load_side(Path(folder), "right"))
+
+
+def _load_side(folder: Path, side: Side) -> HandModel:
+    path = _find(folder, FILE_NAMES[side])
+    with open(path, "rb") as stream:
+        content = restricted_load(stream, _ALLOW, encoding="latin1", where=path, max_bytes=_MAX_BYTES)
+    if not isinstance(content, dict):
+        raise BadInput(path, "a dict of arrays", type(content).__name__, _REMEDY)
+    model = checked_model(str(path), _REMEDY, side=side, name="mano", **_fields(path, content))
+    _check_side(path, model)
+    return model
+
+
+def _find(folder: Path, name: str) -> Path:
+    for place in (folder, folder / "models", folder / "mano_v1_2" / "models"):
+        if (place / name).is_file():
+            return place / name
+    raise MissingResource(
+        f"{folder}: expected {name} of the MANO hand model, found none; register at {MANO_SITE}, download "
+        f"mano_v1_2.zip, unpack it and give its 'models' folder (MANO may not be redistributed, so hoidata has no copy)"
+    )
+
+
+def _fields(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
+    names = {
+        "template_m": "v_template",
+        "shape_directions": "shapedirs",
+        "pose_directions": "posedirs",
+        "joint_regressor": "J_regressor",
+        "skin_weights": "weights",
+        "parents": "kintree_table",
+        "faces": "f",
+        "mean_pose": "hands_mean",
+        "components": "hands_components",
+    }
+    absent = sorted(key for key in names.values() if key not in content)
+    if absent:
+        raise BadInput(path, f"the keys {sorted(names.values())}", f"a dict without {absent}", _REMEDY)
+    values = {field: _dense(f"{path}: {key}", content[key]) for field, key in names.items()}
+    values["shape_directions"] = values["shape_directions"][..., :N_SHAPE]
+    values["parents"] = _parents(values["parents"])
+    return values
+
+
+def _dense(where: str, value: Any) -> np.ndarray:
+    """Evaluate a record; plain arrays pass."""
+    try:
+        if isinstance(value, _Ch):
+            return _dense(where, value.state["x"])
+        if isinstance(value, _Select):
+            flat = _dense(where, value.state["a"]).ravel()
+            return flat[np.asarray(value.state["idxs"])].reshape(value.state["preferred_shape"])
+        if isinstance(value, _Csc):
+            return _dense_csc(value.state)
+        if isinstance(value, np.ndarray):
+            return value
+    except (KeyError, IndexError, TypeError, ValueError, RecursionError) as error:
+        got = f"{type(error).__name__}: {error}"
+        raise BadInput(where, "a chumpy or SciPy object as MANO has them", got, _REMEDY) from None
+    raise BadInput(where, "an array", type(value).__name__, _REMEDY)
+
+
+def _dense_csc(state: dict[str, Any]) -> np.ndarray:
+    rows, columns = (int(length) for length in state["_shape"])
+    if not (0 < rows <= 1024 and 0 < columns <= 1024):
+        raise ValueError(f"matrix of shape {(rows, columns)}")
+    data, row, start = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
+    if start.shape != (columns + 1,) or start[0] != 0 or start[-1] != len(row) or len(row) != len(data):
+        raise ValueError("column pointers that do not fit the data")
+    if (np.diff(start) < 0).any() or (len(row) and not 0 <= row.min() <= row.max() < rows):
+        raise ValueError("row indices outside the matrix")
+    dense = np.zeros((rows, columns))
+    np.add.at(dense, (row, np.repeat(np.arange(columns), np.diff(start))), data)
+    return dense
+
+
+def _parents(table: np.ndarray) -> np.ndarray:
+    if table.ndim != 2 or table.dtype.kind not in "iu":
+        return table
+    parents = table[0].astype(np.int64)
+    return np.where(parents == _ROOT_SENTINEL, -1, parents)
+
+
+def _check_side(path: Path, model: HandModel) -> None:
+    """In MANO's rest pose the right hand's fingers point to -x, the left hand's to +x."""
+    joints = model.joint_regressor @ model.template_m
+    points_to_minus_x = joints[4, 0] < joints[0, 0]
+    if points_to_minus_x != (model.side == "right"):
+        remedy = "give the two files their original names back"
+        raise BadInput(path, f"a {model.side} hand", "fingers that point like the other hand's", remedy)
+
+
+def write_mano_pickle(model: HandModel, path: str | Path) -> None:
+    """Write a model in the layout of a MANO file, as plain arrays (pickle protocol 2, about 3.9 MB).
+
+    For tests of the user-file path and for tools that read MANO; never write a real MANO hand with it to share it.
+    """
+    content = {
+        "v_template": model.template_m,
+        "shapedirs": model.shape_directions,
+        "posedirs": model.pose_directions,
+        "J_regressor": model.joint_regressor,
+        "J": model.joint_regressor @ model.template_m,
+        "weights": model.skin_weights,
+        "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_JOINTS)], dtype=np.int64),
+        "f": model.faces.astype(np.uint32),
+        "hands_mean": model.mean_pose,
+        "hands_components": model.components,
+        "hands_coeffs": np.zeros((1, len(model.mean_pose))),
+        "bs_style": "lbs",
+        "bs_type": "lrotmin",
+    }
+    with atomic_file(path) as part:
+        part.write_bytes(pickle.dumps(content, protocol=2))
