@@ -1,0 +1,49 @@
+# `make demo` is all a newcomer needs; `make check` is what CI runs.
+PYTHON ?= python3
+VENV := .venv
+export PATH := $(CURDIR)/$(VENV)/bin:$(PATH)
+# Nothing but the package index is ever contacted.
+export DVC_NO_ANALYTICS := 1
+export DO_NOT_TRACK := 1
+export PREFECT_SERVER_ANALYTICS_ENABLED := false
+export HF_HUB_OFFLINE := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: demo install install-dev test test-fast lint types imports check clean
+
+demo: $(VENV)/.installed
+	dvc repro
+
+install: $(VENV)/.installed
+install-dev: $(VENV)/.installed-dev
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e .
+	touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[test,dev]'
+	touch $@
+
+test: install-dev
+	OMP_NUM_THREADS=1 pytest -n 2
+
+test-fast: install-dev
+	OMP_NUM_THREADS=1 pytest -n 2 -m "not slow"
+
+lint: install-dev
+	ruff check .
+	ruff format --check .
+
+types: install-dev
+	pyright
+
+imports: install-dev
+	lint-imports
+
+check: lint types imports test
+
+# Removes what the graph made and the generated raw data; your own raw files are never touched.
+clean:
+	rm -rf data checkpoints metrics report .hoidata dvc.lock

@@ -1,0 +1,40 @@
+"""What a file, a folder or a piece of code is, by content: equal digests, equal content."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from hoidata.files import canonical_json, sha256_bytes, sha256_file
+
+COMPILED = {"__pycache__"}
+
+
+def path_digest(path: Path) -> str | None:
+    """SHA-256 of a file, or of a folder's sorted ``digest  relative path`` lines; None when there is nothing.
+
+    Compiled Python and hidden files do not count.
+    """
+    if path.is_file():
+        return sha256_file(path)
+    if not path.is_dir():
+        return None
+    lines = [f"{sha256_file(item)}  {item.relative_to(path).as_posix()}\n" for item in _files_of(path)]
+    return sha256_bytes("".join(lines).encode())
+
+
+def _files_of(folder: Path) -> list[Path]:
+    files = (item for item in folder.rglob("*") if item.is_file())
+    return sorted(item for item in files if not _is_noise(item.relative_to(folder)))
+
+
+def _is_noise(path: Path) -> bool:
+    return path.suffix == ".pyc" or any(part in COMPILED or part.startswith(".") for part in path.parts)
+
+
+def paths_digests(root: Path, paths: Iterable[str]) -> dict[str, str | None]:
+    """Digest of each path below ``root``."""
+    return {path: path_digest(root / path) for path in sorted(paths)}
+
+
+def value_digest(value: object) -> str:
+    """SHA-256 of a JSON value in canonical form."""
+    return sha256_bytes(canonical_json(value).encode())

@@ -1,0 +1,38 @@
+"""The ``hoidata`` command. Every sub-command imports what it needs when it runs, so that ``--help`` is quick."""
+
+import sys
+
+import typer
+
+from hoidata.errors import HoidataError
+from pipelines.commands import generate, graph, inspect, raw, synth
+
+app = typer.Typer(
+    name="hoidata",
+    help="Data and models for text-guided 3D hand-object interaction.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+)
+app.add_typer(synth.app, name="synth", help="The embedded corpora: write them, check their physics.")
+app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
+app.command("repro")(graph.repro)
+app.command("up")(graph.up)
+app.command("doctor")(inspect.doctor)
+app.command("info")(inspect.info)
+app.command("lineage")(inspect.lineage)
+app.command("generate")(generate.generate)
+
+
+def main() -> None:
+    """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given."""
+    try:
+        app()
+    except HoidataError as error:
+        from rich.console import Console
+
+        Console(stderr=True).print(f"[bold red]hoidata:[/] {error}", markup=True, highlight=False, soft_wrap=True)
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

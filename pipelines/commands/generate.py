@@ -1,0 +1,26 @@
+"""``hoidata generate``: a sentence and a mesh become a motion."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.commands.project import current_profile, enter_project
+
+
+def generate(
+    text: Annotated[str, typer.Argument(help="E.g. 'Lift a box with the right hand.'")],
+    object: Annotated[str, typer.Option("--object", help="A mesh file in metres, or an object's name in the dataset.")],
+    out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
+    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    dataset: Annotated[str, typer.Option(help="Whose trained models to use.")] = "grab",
+    profile: Annotated[str, typer.Option(help="embedded or own; the one in params.yaml when left out.")] = "",
+) -> None:
+    """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
+    mesh = Path(object).resolve() if Path(object).is_file() else None
+    enter_project()
+    from pipelines.generation import write_generation
+
+    written = write_generation(text, mesh or object, seed, out, dataset, profile or current_profile())
+    for path in written:
+        typer.echo(path)

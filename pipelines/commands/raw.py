@@ -1,0 +1,94 @@
+"""``hoidata raw``: the user's own raw files."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.commands.project import current_profile, enter_project, remember_root, set_profile
+
+app = typer.Typer(no_args_is_help=True)
+Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
+MANO_FILES = ("MANO_RIGHT.pkl", "MANO_LEFT.pkl")
+
+
+@app.command()
+def scan(
+    dataset: Dataset,
+    root: Annotated[Path, typer.Option(help="Its raw folder.", exists=True, file_okay=False, resolve_path=True)],
+) -> None:
+    """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
+    enter_project()
+    from hoidata.lineage.manifests import write_manifest
+    from pipelines.stages.base import HAND, Place
+
+    name = HAND if dataset == "mano" else dataset
+    place = Place("own", name)
+    manifest = _scan_hand(place, root) if name == HAND else _scan_dataset(place, root)
+    write_manifest(place.manifest, manifest)
+    remember_root(name, root)
+    size = sum(entry.size for entry in manifest.files)
+    typer.echo(f"{place.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
+    if name != HAND and set_profile("own"):
+        typer.echo("params.yaml: profile set to own (set it back to embedded to return; nothing is retrained)")
+
+
+def _scan_dataset(place, root: Path):
+    from hoidata.adapters.registry import get_adapter
+    from hoidata.errors import BadInput
+    from hoidata.lineage.graph import read_params
+    from hoidata.lineage.manifests import Manifest, scan_files
+    from pipelines.stages.raw import require_hand
+
+    known = read_params(Path())["datasets"]
+    if place.dataset not in known:
+        raise BadInput("dataset", f"one of {', '.join(known)} or mano", place.dataset, "correct the name")
+    require_hand(place)
+    adapter = get_adapter(place.dataset)
+    if not adapter.sequences(root):
+        remedy = f"give the folder that {adapter.name} unpacks to ({adapter.where_to_register})"
+        raise BadInput(root, f"sequences of {adapter.name}", "none found", remedy)
+    return Manifest(adapter.name, True, "files", adapter.licence, adapter.where_to_register, files=scan_files(root))
+
+
+def _scan_hand(place, root: Path):
+    from dataclasses import replace
+
+    from hoidata.errors import BadInput
+    from hoidata.files import sha256_file
+    from hoidata.lineage.manifests import read_manifest
+    from hoidata.schema.clip import SourceFile
+
+    missing = [name for name in MANO_FILES if not (root / name).is_file()]
+    if missing:
+        raise BadInput(root, " and ".join(MANO_FILES), f"no {', '.join(missing)}", "see https://mano.is.tue.mpg.de")
+    files = [SourceFile(name, (root / name).stat().st_size, sha256_file(root / name)) for name in sorted(MANO_FILES)]
+    return replace(read_manifest(place.manifest), present=True, files=tuple(files))
+
+
+@app.command()
+def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
+    """Compare raw files with the manifests of the current profile. Exit code 1 when they differ."""
+    enter_project()
+    from hoidata.lineage.graph import read_params
+
+    results = [_verify_one(name) for name in ([dataset] if dataset else read_params(Path())["datasets"])]
+    raise typer.Exit(0 if all(results) else 1)
+
+
+def _verify_one(dataset: str) -> bool:
+    """Print how one dataset's files compare with its manifest; True when there is nothing to complain about."""
+    from hoidata.lineage.manifests import read_manifest, verify_files
+    from pipelines.stages.base import Place, raw_root
+
+    place = Place(current_profile(), dataset)
+    manifest = read_manifest(place.manifest)
+    if not manifest.present:
+        typer.echo(f"{dataset}: not present; {manifest.licence}; {manifest.where_to_register}")
+        return True
+    listed = read_manifest(place.raw_manifest) if manifest.synthetic else manifest
+    differences = verify_files(raw_root(place), listed)
+    for item in differences:
+        typer.echo(f"{dataset}: {item.path} is {item.problem}")
+    typer.echo(f"{dataset}: {len(listed.files)} entries, {len(differences)} differences")
+    return not differences

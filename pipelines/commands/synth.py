@@ -1,0 +1,36 @@
+"""``hoidata synth``: the embedded corpora."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pipelines.commands.project import enter_project
+
+app = typer.Typer(no_args_is_help=True)
+Dataset = Annotated[str, typer.Argument(help="h2o, grab or arctic; all three when left out.")]
+
+
+@app.command()
+def write(dataset: Dataset = "") -> None:
+    """Write the raw trees of the embedded corpora anew, as their committed recipes say."""
+    enter_project()
+    from hoidata.lineage.manifests import read_manifest
+    from pipelines.stages.base import Place
+    from pipelines.stages.raw import write_generated
+
+    for name in _chosen(dataset):
+        place = Place("embedded", name)
+        write_generated(place, read_manifest(place.manifest), place.generated_raw)
+        typer.echo(f"{name}: written to {place.generated_raw}")
+
+
+def _chosen(dataset: str) -> list[str]:
+    from hoidata.errors import MissingResource
+    from hoidata.lineage.manifests import read_manifest
+
+    committed = [read_manifest(path) for path in sorted(Path("manifests/embedded").glob("*.json"))]
+    generated = [item.dataset for item in committed if item.present and "size" in (item.recipe or {})]
+    if dataset and dataset not in generated:
+        raise MissingResource(f"there is no embedded corpus {dataset!r}; there are {', '.join(generated)}")
+    return [dataset] if dataset else generated

@@ -1,0 +1,114 @@
+"""What is installed and found on this machine, part by part."""
+
+import os
+import sys
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Literal
+
+from hoidata.errors import HoidataError
+from hoidata.lineage.graph import read_params
+from hoidata.lineage.manifests import read_manifest
+from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
+
+NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One part: ``ok``, ``absent`` (optional, not there) or ``broken`` (needed, not usable)."""
+
+    part: str
+    state: Literal["ok", "absent", "broken"]
+    found: str
+
+
+def examine() -> list[Finding]:
+    """Look at everything a run depends on; opens no raw file and starts nothing."""
+    params = read_params(Path())
+    findings = [_python(), *_packages(), _prefect_server(), _gpu(), Finding("profile", "ok", params["profile"])]
+    findings += [_raw("embedded", name) for name in params["datasets"]]
+    findings += [_raw("own", name) for name in params["datasets"]]
+    return [*findings, _hand("embedded"), _hand("own"), _encoder(), _clip()]
+
+
+def _python() -> Finding:
+    right = sys.version_info[:2] == (3, 11)
+    text = f"{sys.version.split()[0]}, {len(os.sched_getaffinity(0))} cores"
+    return Finding("python", "ok" if right else "broken", text if right else f"{text}; hoidata needs 3.11")
+
+
+def _packages() -> list[Finding]:
+    return [_package(name) for name in NEEDED]
+
+
+def _package(name: str) -> Finding:
+    try:
+        return Finding(name, "ok", version(name))
+    except PackageNotFoundError:
+        return Finding(name, "broken", "not installed; run `make install`")
+
+
+def _prefect_server() -> Finding:
+    """Whether Prefect's server can be imported: a FastAPI that is too new breaks it while `pip check` is content."""
+    try:
+        import prefect.server.api.server  # noqa: F401
+    except (ImportError, TypeError) as error:
+        return Finding("prefect server", "broken", f"{error}; install with the versions of constraints.txt")
+    return Finding("prefect server", "ok", "can be started with `hoidata up`")
+
+
+def _gpu() -> Finding:
+    import torch
+
+    if torch.cuda.is_available():
+        return Finding("gpu", "ok", torch.cuda.get_device_name(0))
+    return Finding("gpu", "absent", f"none; torch uses {torch.get_num_threads()} threads of the CPU")
+
+
+def _raw(profile: str, dataset: str) -> Finding:
+    part, place = f"raw {dataset} ({profile})", Place(profile, dataset)
+    try:
+        manifest = read_manifest(place.manifest)
+    except HoidataError as error:
+        return Finding(part, "broken", str(error))
+    root = place.generated_raw if profile == "embedded" else own_root(dataset)
+    if not manifest.present:
+        unscanned = f"; {root} is not scanned, run `hoidata raw scan {dataset} --root {root}`" if root else ""
+        return Finding(part, "absent", f"not present{unscanned}" if unscanned else _where_to_get(profile, manifest))
+    if root is None or not root.is_dir():
+        remedy = "written by the stage raw" if profile == "embedded" else f"set {root_variable(dataset)}"
+        return Finding(part, "absent", f"manifest is there, files are not; {remedy}")
+    return Finding(part, "ok", f"{root}{' (synthetic)' if manifest.synthetic else ''}")
+
+
+def _where_to_get(profile: str, manifest) -> str:
+    return f"register at {manifest.where_to_register}" if profile == "own" else "has no embedded corpus"
+
+
+def _hand(profile: str) -> Finding:
+    part = f"hand ({profile})"
+    try:
+        hands = load_hands(profile)
+    except HoidataError as error:
+        return Finding(part, "broken", str(error))
+    note = f"; {root_variable(HAND)} or `hoidata raw scan mano` for MANO" if profile == "own" else ""
+    return Finding(part, "ok", f"{hands.name}, sha256 {hands.digest[:12]}{note if hands.name == 'embedded' else ''}")
+
+
+def _encoder() -> Finding:
+    from hoidata.annotation import load_encoder
+
+    name = read_params(Path())["annotate"]["encoder"]
+    try:
+        return Finding("text encoder", "ok", load_encoder(name).identity)
+    except HoidataError as error:
+        return Finding("text encoder", "broken", str(error))
+
+
+def _clip() -> Finding:
+    if find_spec("open_clip") is None:
+        return Finding("CLIP", "absent", "optional; pip install -c constraints.txt -e '.[clip]'")
+    return Finding("CLIP", "ok", f"open_clip {version('open_clip_torch')}; weights are yours to provide")

@@ -1,0 +1,31 @@
+"""Prefect flows: each brings one DVC target up to date. Which stages there are, and their order, is dvc.yaml's."""
+
+from pathlib import Path
+
+from prefect import flow
+
+from hoidata.lineage.graph import read_params
+from pipelines.repro import reproduce
+
+
+class GraphFailed(RuntimeError):
+    """``dvc repro`` ended with an error; its own output says which stage and why."""
+
+
+def run_target(targets: list[str]) -> None:
+    """Preflight and ``dvc repro``. Raises GraphFailed so that the flow run counts as failed."""
+    code = reproduce(targets)
+    if code:
+        raise GraphFailed(f"dvc repro {' '.join(targets)} ended with exit code {code}")
+
+
+@flow(name="annotate-arctic")
+def annotate_arctic() -> None:
+    """Bring ARCTIC's annotation up to date, in the profile params.yaml chooses."""
+    run_target([f"annotate@{read_params(Path())['profile']}-arctic"])
+
+
+@flow(name="full-graph")
+def full_graph() -> None:
+    """Bring everything up to date."""
+    run_target([])

@@ -1,0 +1,83 @@
+"""A Prefect server, work pool, deployments and worker for this folder, all on the loopback interface."""
+
+import os
+import subprocess
+import sys
+import time
+import tomllib
+import urllib.error
+import urllib.request
+from pathlib import Path
+from urllib.parse import urlparse
+
+from hoidata.errors import MissingResource
+
+START_TIMEOUT_S = 180
+POOL = "local"
+
+
+def serve() -> int:
+    """Start the server, deploy, and work until interrupted; the server ends with it. Returns the worker's exit code."""
+    url, environment = api_url(), server_environment()
+    server = _start_server(url, environment)
+    try:
+        wait_until_healthy(url, server)
+        deploy(environment)
+        print("ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder", flush=True)
+        return subprocess.run(_prefect("worker", "start", "--pool", POOL), env=environment).returncode
+    except KeyboardInterrupt:
+        return 0
+    finally:
+        server.terminate()
+        server.wait()
+
+
+def api_url() -> str:
+    """PREFECT_API_URL, else the address in prefect.toml."""
+    configured = tomllib.loads(Path("prefect.toml").read_text())["api"]["url"]
+    return os.environ.get("PREFECT_API_URL", configured)
+
+
+def server_environment() -> dict[str, str]:
+    """Prefect's state in ``.prefect/`` of this folder unless PREFECT_HOME says otherwise; nothing is reported home."""
+    home = os.environ.get("PREFECT_HOME", str(Path(".prefect").resolve()))
+    quiet = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
+    return {**os.environ, **quiet, "PREFECT_HOME": home, "PREFECT_API_URL": api_url()}
+
+
+def deploy(environment: dict[str, str]) -> None:
+    """Make the work pool (again) and the deployments of prefect.yaml."""
+    subprocess.run(
+        _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite"), env=environment, check=True
+    )
+    subprocess.run(_prefect("--no-prompt", "deploy", "--all"), env=environment, check=True)
+
+
+def wait_until_healthy(url: str, server: subprocess.Popen) -> None:
+    """Wait for the server's health endpoint. Raises MissingResource when it ends or stays silent."""
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline:
+        if server.poll() is not None:
+            raise MissingResource(f"the Prefect server ended with exit code {server.returncode}; is {url} taken?")
+        if _answers(f"{url}/health"):
+            return
+        time.sleep(0.5)
+    raise MissingResource(f"the Prefect server did not answer at {url} within {START_TIMEOUT_S} s")
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=2) as response:
+            return response.status == 200
+    except (urllib.error.URLError, OSError):
+        return False
+
+
+def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
+    address = urlparse(url)
+    where = ("--host", address.hostname or "127.0.0.1", "--port", str(address.port or 4200))
+    return subprocess.Popen(_prefect("server", "start", *where, "--analytics-off"), env=environment)
+
+
+def _prefect(*arguments: str) -> list[str]:
+    return [sys.executable, "-m", "prefect", *arguments]

@@ -1,0 +1,64 @@
+"""``dvc repro`` after a look at whether what it is going to read is there: DVC itself looks too late."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from hoidata.lineage.graph import read_graph, read_params
+from hoidata.lineage.manifests import read_manifest
+from pipelines.stages.base import Place, raw_root
+from pipelines.stages.raw import require_hand, write_generated
+
+
+def reproduce(targets: list[str]) -> int:
+    """Preflight, then ``dvc repro`` of the targets (all when empty). Returns DVC's exit code.
+
+    Raises MissingResource before DVC starts when raw or MANO files that a stale stage needs are absent.
+    """
+    preflight()
+    return subprocess.run([sys.executable, "-m", "dvc", "repro", *targets], env=stage_environment()).returncode
+
+
+def stage_environment() -> dict[str, str]:
+    """The environment for ``dvc``: its stages run ``python``, which must be this one."""
+    path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+    return {**os.environ, "PATH": path, "DVC_NO_ANALYTICS": "1"}
+
+
+def preflight() -> None:
+    """Write again a generated corpus that a conversion is about to read; refuse when the user's files are missing."""
+    params = read_params(Path())
+    places = [Place(params["profile"], name) for name in params["datasets"]]
+    present = [place for place in places if read_manifest(place.manifest).present]
+    for place in present:
+        if place.profile == "own":
+            require_hand(place)
+    unreadable = [place for place in present if not _is_readable(place)]
+    stale = _stale_stages([f"{stage}@{place}" for place in unreadable for stage in ("raw", "convert")])
+    for place in unreadable:
+        if place.profile == "embedded" and f"raw@{place}" not in stale and f"convert@{place}" in stale:
+            write_generated(place, read_manifest(place.manifest), place.generated_raw)
+        elif place.profile == "own" and {f"raw@{place}", f"convert@{place}"} & stale:
+            raw_root(place)
+
+
+def _is_readable(place: Place) -> bool:
+    from hoidata.errors import MissingResource
+
+    try:
+        return raw_root(place).is_dir()
+    except MissingResource:
+        return False
+
+
+def _stale_stages(stages: list[str]) -> set[str]:
+    """Which of the stages DVC would run again."""
+    known = read_graph(Path())
+    wanted = [stage for stage in stages if stage in known]
+    if not wanted:
+        return set()
+    command = [sys.executable, "-m", "dvc", "status", "--json", *wanted]
+    result = subprocess.run(command, env=stage_environment(), capture_output=True, text=True, check=True)
+    return set(json.loads(result.stdout))

@@ -1,0 +1,165 @@
+"""What every stage shares: where things lie, its section of params.yaml, the hand of the profile, and being empty."""
+
+import json
+import os
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.atomic import atomic_folder
+from hoidata.files.digest import canonical_json
+
+if TYPE_CHECKING:
+    from hoidata.hands import HandPair
+
+EMPTY = "empty.json"
+HAND = "hand"
+
+
+class StageParams(BaseModel):
+    """A stage's section of params.yaml. Frozen; unknown keys fail and the known ones are listed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+Params = TypeVar("Params", bound=StageParams)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the files of one stage run lie, relative to the project folder (the current folder)."""
+
+    profile: str
+    dataset: str = ""
+    model: str = ""
+
+    def __str__(self) -> str:
+        return "-".join(filter(None, (self.profile, self.dataset, self.model)))
+
+    @property
+    def data(self) -> Path:
+        return Path("data", self.profile, self.dataset)
+
+    @property
+    def manifest(self) -> Path:
+        return Path("manifests", self.profile, f"{self.dataset}.json")
+
+    @property
+    def hand_manifest(self) -> Path:
+        return Path("manifests", self.profile, f"{HAND}.json")
+
+    @property
+    def raw_manifest(self) -> Path:
+        return self.data / "raw.json"
+
+    @property
+    def clips(self) -> Path:
+        return self.data / "clips"
+
+    @property
+    def annotation(self) -> Path:
+        return self.data / "annotation"
+
+    @property
+    def contact(self) -> Path:
+        return self.data / "contact"
+
+    @property
+    def checkpoints(self) -> Path:
+        return Path("checkpoints", self.profile, self.dataset)
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.checkpoints / self.model
+
+    @property
+    def metrics(self) -> Path:
+        return Path("metrics", self.profile, f"{self.dataset}.json")
+
+    @property
+    def report(self) -> Path:
+        return Path("report", self.profile)
+
+    @property
+    def generated_raw(self) -> Path:
+        return Path(".hoidata", "raw", self.profile, self.dataset)
+
+
+def load_params(kind: type[Params], section: str, path: Path = Path("params.yaml")) -> Params:
+    """One section of params.yaml, checked. Raises BadInput that names the wrong key and lists the known ones."""
+    values = yaml.safe_load(path.read_text()).get(section)
+    known = ", ".join(kind.model_fields) or "none"
+    try:
+        return kind.model_validate(values or {})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise BadInput(f"{path}: {section}", f"keys among: {known}", f"{key}: {first['msg']}", "correct it") from error
+
+
+def root_variable(name: str) -> str:
+    """The environment variable that names the raw folder of a dataset, or of the MANO files."""
+    return f"HOIDATA_{'MANO' if name == HAND else name.upper()}"
+
+
+def own_root(name: str) -> Path | None:
+    """The user's raw folder of ``name``: its environment variable, else hoidata.toml's [roots], else None."""
+    if value := os.environ.get(root_variable(name)):
+        return Path(value)
+    settings = Path("hoidata.toml")
+    roots = tomllib.loads(settings.read_text()).get("roots", {}) if settings.is_file() else {}
+    return Path(roots[name]) if name in roots else None
+
+
+def raw_root(place: Place) -> Path:
+    """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
+    if place.profile == "embedded":
+        root, remedy = place.generated_raw, f"write it again with `hoidata synth write {place.dataset}`"
+    else:
+        root = own_root(place.dataset)
+        remedy = f"set {root_variable(place.dataset)}, or run `hoidata raw scan {place.dataset} --root PATH`"
+    if root is None or not root.is_dir():
+        raise MissingResource(f"the raw files of {place.dataset} ({place.profile}) are not at {root}; {remedy}")
+    return root
+
+
+def load_hands(profile: str) -> "HandPair":
+    """The hand of the profile: the embedded one, or in ``own`` the user's MANO files where they are registered."""
+    from hoidata.hands import load_embedded_hands, load_mano_hands
+
+    values = json.loads(Place(profile).hand_manifest.read_text())
+    if profile == "embedded" or not values["present"]:
+        return load_embedded_hands()
+    root = own_root(HAND)
+    if root is None or not root.is_dir():
+        raise MissingResource(f"the MANO files are not at {root}; set {root_variable(HAND)} to their folder")
+    return load_mano_hands(root)
+
+
+def empty_reason(folder: Path) -> str | None:
+    """Why a stage's output folder is empty, or None when it holds something."""
+    note = folder / EMPTY
+    return json.loads(note.read_text())["reason"] if note.is_file() else None
+
+
+def write_empty(folder: Path, reason: str) -> None:
+    """An output that holds nothing but the reason."""
+    with atomic_folder(folder) as part:
+        (part / EMPTY).write_text(canonical_json({"reason": reason}) + "\n")
+    print(f"{folder}: empty, {reason}")
+
+
+def write_json(path: Path, values: Any) -> None:
+    """Readable JSON with sorted keys."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(values, indent=2, sort_keys=True, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def jobs() -> int:
+    """Worker processes to use: HOIDATA_JOBS, else the cores this process may run on. Never changes results."""
+    return int(os.environ.get("HOIDATA_JOBS", 0)) or len(os.sched_getaffinity(0))

@@ -1,0 +1,77 @@
+"""Stage raw: the file-level manifest of a dataset, after the files it lists were written or checked."""
+
+from pathlib import Path
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.atomic import atomic_file, atomic_folder
+from hoidata.lineage.digests import paths_digests, value_digest
+from hoidata.lineage.graph import read_graph
+from hoidata.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
+from pipelines.stages.base import Place, jobs, raw_root, root_variable
+
+SHOWN_DIFFERENCES = 5
+
+
+def run(place: Place) -> None:
+    """Write ``raw.json``: the committed manifest itself, or for a generated corpus the files its recipe gives."""
+    manifest = read_manifest(place.manifest)
+    if manifest.present and manifest.synthetic:
+        manifest = manifest.with_files(generated_files(place, manifest))
+    elif manifest.present:
+        require_hand(place)
+        check_own_files(place, manifest)
+    write_manifest(place.raw_manifest, manifest)
+    print(f"{place}: {len(manifest.files)} raw files" if manifest.present else f"{place}: not present")
+
+
+def generated_files(place: Place, manifest: Manifest):
+    """Write the corpus of the manifest's recipe, unless the same recipe and code already did, and list its files."""
+    root = place.generated_raw
+    stamp, wanted = root.with_suffix(".recipe"), recipe_digest(place, manifest)
+    if not (root.is_dir() and stamp.is_file() and stamp.read_text() == wanted):
+        write_generated(place, manifest, root)
+        with atomic_file(stamp) as part:
+            part.write_text(wanted)
+    return scan_files(root)
+
+
+def recipe_digest(place: Place, manifest: Manifest) -> str:
+    """Digest of the recipe and of the code that follows it."""
+    project = Path()
+    code = read_graph(project)[f"raw@{place}"].code
+    return value_digest([manifest.recipe, paths_digests(project, code)])
+
+
+def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
+    """Write the corpus of the manifest's recipe into ``root``, whole or not at all."""
+    from hoidata.synthetic import write_corpus
+
+    recipe = manifest.recipe or {}
+    if recipe.keys() != {"seed", "size"}:
+        raise BadInput(place.manifest, "a recipe of seed and size", ", ".join(recipe), "restore it with git checkout")
+    with atomic_folder(root) as part:
+        write_corpus(place.dataset, part, recipe["seed"], recipe["size"], jobs())
+
+
+def require_hand(place: Place) -> None:
+    """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
+    from hoidata.adapters.registry import get_adapter
+
+    if not get_adapter(place.dataset).needs_mano or read_manifest(place.hand_manifest).present:
+        return
+    raise MissingResource(
+        f"{place.dataset} holds MANO parameters and no MANO files are registered. Register at "
+        f"https://mano.is.tue.mpg.de, put MANO_RIGHT.pkl and MANO_LEFT.pkl into one folder, then run "
+        f"`hoidata raw scan mano --root FOLDER` (it can also be named in {root_variable('hand')})"
+    )
+
+
+def check_own_files(place: Place, manifest: Manifest) -> None:
+    """Compare the user's files with the scanned manifest. Raises BadInput that lists the first differences."""
+    root = raw_root(place)
+    differences = verify_files(root, manifest)
+    if differences:
+        shown = ", ".join(f"{item.path} ({item.problem})" for item in differences[:SHOWN_DIFFERENCES])
+        got = f"{len(differences)} differences: {shown}"
+        remedy = f"restore the files, or accept them with `hoidata raw scan {place.dataset} --root {root}`"
+        raise BadInput(root, f"the files listed in {place.manifest}", got, remedy)
