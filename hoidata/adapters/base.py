@@ -83,6 +83,10 @@ class RawTree:
     def sources(self) -> tuple[SourceFile, ...]:
         return tuple(self._sources[path] for path in sorted(self._sources))
 
+    def recorded(self, *places: str) -> tuple[SourceFile, ...]:
+        """The sources read so far that are one of these paths or lie below one of them, sorted by path."""
+        return tuple(s for s in self.sources if any(s.path == p or s.path.startswith(f"{p}/") for p in places))
+
     def file(self, path: str) -> Path:
         """The absolute path of one file, after recording and checking it. Raises BadInput when it is missing."""
         place = self._inside(path)

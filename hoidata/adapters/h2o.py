@@ -1,0 +1,241 @@
+"""H2O (Kwon et al. 2021): per-frame text files of five cameras; hands and objects in the camera's frame.
+
+Only the head camera (cam4) is read, because action labels exist only there. Its pose files are camera-to-world.
+"""
+
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hoidata.adapters import checks
+from hoidata.adapters.base import Quarantined, RawTree, SequenceKey
+from hoidata.adapters.hand_parameters import hand_track, move_points, move_rotvec, wrist_from_transl
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.hands import HandPair
+from hoidata.objects.mesh import load_mesh
+from hoidata.objects.model import ObjectModel
+from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+
+CAMERA = "cam4"
+OBJECTS = ("", "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")  # by class id
+OLD_NAMES = {"spray": "lotion_spray", "cocoa": "ovomaltine", "chips": "pringles", "cappuccino": "starbucks"}
+FRAME_FILE = re.compile(r"\d{6}\.txt")
+_SHELF = ("book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")
+ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is background
+    ("", ""),
+    *(("grab", noun) for noun in _SHELF),
+    *(("place", noun) for noun in _SHELF),
+    *(("open", noun) for noun in ("lotion", "milk", "chips")),
+    *(("close", noun) for noun in ("lotion", "milk", "chips")),
+    ("pour", "milk"),
+    *(("take out", noun) for noun in ("espresso", "cocoa", "chips", "cappuccino")),
+    *(("put in", noun) for noun in ("espresso", "cocoa", "cappuccino")),
+    *(("apply", noun) for noun in ("lotion", "spray")),
+    *(("read", noun) for noun in ("book", "espresso")),
+    ("spray", "spray"),
+    ("squeeze", "lotion"),
+)
+
+
+@dataclass(frozen=True)
+class _Frames:
+    """The numbers of one sequence, frame axis first, as in the files (camera frame, metres)."""
+
+    folder: str
+    first: int
+    camera: np.ndarray
+    hands: np.ndarray
+    object: np.ndarray
+    label: np.ndarray
+
+
+@dataclass(frozen=True)
+class H2OAdapter:
+    """Raw root: ``object/<name>/<name>.obj`` and ``subjectN/<place>/<number>/cam4/<kind>/NNNNNN.txt``.
+
+    margin_frames: frames kept before and after each labelled run. shortest_frames: runs must be this long or longer.
+    """
+
+    margin_frames: int = 0
+    shortest_frames: int = 21
+    name: str = "h2o"
+    licence: str = "research use after registration; no licence text is published with the files"
+    where_to_register: str = "https://h2odataset.ethz.ch (subjectN_pose_v1_1.tar.gz, object.zip)"
+    needs_mano: bool = True
+    source_fps: float = 30.0
+    frame_notes: str = "H2O's camera-rig world, right-handed, metres; gravity unknown: its axes are not documented"
+
+    def sequences(self, root: Path) -> list[SequenceKey]:
+        """One key per ``subjectN/<place>/<number>`` that has a cam4 folder."""
+        found = sorted(Path(root).glob(f"subject*/*/*/{CAMERA}"))
+        parts = [path.relative_to(root).parts for path in found if path.is_dir()]
+        return [SequenceKey(self.name, part[0], "/".join(part[:3])) for part in parts]
+
+    def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
+        """One clip per run of frames with one non-zero action label and the object that label names."""
+        frames = _read_frames(raw, f"{key.name}/{CAMERA}")
+        models: dict[int, ObjectModel] = {}
+        results: list[Clip | Quarantined] = []
+        for start, stop in label_runs(frames.label, self.shortest_frames):
+            class_id = _object_class(frames, start, stop)
+            if isinstance(class_id, BadInput):
+                results.append(Quarantined.from_error(_clip_id(key, frames, start, stop), class_id))
+                continue
+            mesh_path = _mesh_path(raw, OBJECTS[class_id])
+            if class_id not in models:
+                models[class_id] = _object_model(raw, OBJECTS[class_id], mesh_path)
+            sources = raw.recorded(frames.folder, mesh_path)
+            clip = self._convert(key, frames, start, stop, models[class_id], hands)
+            results.append(replace(clip, sources=sources))
+        return results
+
+    def _convert(
+        self, key: SequenceKey, frames: _Frames, start: int, stop: int, model: ObjectModel, hands: HandPair
+    ) -> Clip:
+        verb, noun = ACTIONS[int(frames.label[start])]
+        clip_id = _clip_id(key, frames, start, stop)
+        start, stop = max(0, start - self.margin_frames), min(len(frames.label), stop + self.margin_frames)
+        camera = frames.camera[start:stop]
+        world_from_object = camera @ frames.object[start:stop, 1:].reshape(-1, 4, 4)
+        return Clip(
+            clip_id=clip_id,
+            dataset=self.name,
+            subject=key.subject,
+            sequence=key.name,
+            hands={side: _hand(side, frames.hands[start:stop], camera, hands) for side in SIDES},
+            object=ObjectTrack(
+                model,
+                rotmat_to_rotvec(world_from_object[:, :3, :3]).astype(np.float32),
+                world_from_object[:, :3, 3].astype(np.float32),
+            ),
+            source_frames=np.arange(frames.first + start, frames.first + stop, dtype=np.int32),
+            gravity=None,
+            verb=verb,
+            object_words=noun,
+            source_fps=self.source_fps,
+        )
+
+
+def label_runs(label: np.ndarray, shortest: int) -> list[tuple[int, int]]:
+    """Half-open ranges of one non-zero label that are at least ``shortest`` frames long. label: (frame,) int."""
+    edges = np.flatnonzero(np.diff(label)) + 1
+    starts, stops = np.r_[0, edges], np.r_[edges, len(label)]
+    return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if label[a] != 0 and b - a >= shortest]
+
+
+def _hand(side: Side, block: np.ndarray, camera: np.ndarray, hands: HandPair) -> HandTrack:
+    """block: (frame, 124) = left then right: flag, transl 3, orient 3, fingers 45, betas 10; camera: (frame, 4, 4)."""
+    block = block[:, :62] if side == "left" else block[:, 62:]
+    valid = block[:, 0] != 0
+    block = np.where(valid[:, None], block, 0.0)
+    betas, rotation = block[:, 52:62], camera[:, :3, :3]
+    wrist = wrist_from_transl(block[:, 1:4], betas, hands[side])
+    return hand_track(
+        wrist_m=move_points(wrist, rotation, camera[:, :3, 3]),
+        global_orient=move_rotvec(block[:, 4:7], rotation),
+        hand_pose=block[:, 7:52],
+        betas=betas,
+        valid=valid,
+    )
+
+
+def _clip_id(key: SequenceKey, frames: _Frames, start: int, stop: int) -> str:
+    return f"{key}/{frames.first + start:06d}-{frames.first + stop - 1:06d}"
+
+
+def _object_class(frames: _Frames, start: int, stop: int) -> int | BadInput:
+    """The one object class of a run, or why there is none: it must be the object the action label names."""
+    label = int(frames.label[start])
+    classes = np.unique(frames.object[start:stop, 0].astype(int))
+    expected = OBJECTS.index(ACTIONS[label][1])
+    if classes.tolist() == [expected]:
+        return expected
+    wanted = f"class {expected} ({OBJECTS[expected]}) in every frame of action {label}"
+    return BadInput(f"{frames.folder}/obj_pose_rt", wanted, f"classes {classes.tolist()}", "check the annotation")
+
+
+def _mesh_path(raw: RawTree, name: str) -> str:
+    for known in (name, OLD_NAMES.get(name, name)):
+        exact = f"{known}.obj"
+        names = raw.names(f"object/{known}", ".obj")
+        if names:
+            return f"object/{known}/{exact if exact in names else names[0]}"
+    raise BadInput(f"object/{name}/{name}.obj", "the object's mesh", "nothing there", "unpack object.zip here")
+
+
+def _object_model(raw: RawTree, name: str, path: str) -> ObjectModel:
+    mesh = load_mesh(raw.file(path))
+    return ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
+
+
+def _read_frames(raw: RawTree, folder: str) -> _Frames:
+    kinds = {kind: _folder_of(raw, folder, kind) for kind in ("cam_pose", "hand_pose_mano", "obj_pose_rt")}
+    kinds["action_label"] = f"{folder}/action_label"
+    files = _common_files(raw, kinds)
+    camera = _numbers(raw, kinds["cam_pose"], files, 16)
+    hands = _numbers(raw, kinds["hand_pose_mano"], files, 124)
+    objects = _numbers(raw, kinds["obj_pose_rt"], files, 17)
+    label = _numbers(raw, kinds["action_label"], files, 1)
+    used_hands = np.where(np.repeat(hands[:, [0, 62]] != 0, 62, axis=1), hands, 0.0)
+    used_objects = np.where(objects[:, :1] != 0, objects, 0.0)
+    for kind, values in (("cam_pose", camera), ("hand_pose_mano", used_hands), ("obj_pose_rt", used_objects)):
+        _check_finite(kinds[kind], files, values)
+    _check_ids(kinds["action_label"], files, label[:, 0], len(ACTIONS))
+    _check_ids(kinds["obj_pose_rt"], files, objects[:, 0], len(OBJECTS))
+    camera = camera.reshape(-1, 4, 4)
+    checks.rotations(kinds["cam_pose"], camera[:, :3, :3])
+    tracked = used_objects[used_objects[:, 0] != 0, 1:].reshape(-1, 4, 4)
+    checks.rotations(kinds["obj_pose_rt"], tracked[:, :3, :3])
+    return _Frames(folder, int(files[0][:6]), camera, used_hands, used_objects, label[:, 0].astype(int))
+
+
+def _folder_of(raw: RawTree, folder: str, kind: str) -> str:
+    """The real name of a folder whose case differs between releases (hand_pose_mano, hand_pose_MANO)."""
+    place = raw.root / folder
+    found = sorted(item.name for item in place.iterdir() if item.name.lower() == kind)
+    return f"{folder}/{found[-1] if found else kind}"
+
+
+def _common_files(raw: RawTree, kinds: dict[str, str]) -> list[str]:
+    """Names of the frame files, the same in every folder and without a gap; else BadInput names the missing one."""
+    names = {folder: {n for n in raw.names(folder) if FRAME_FILE.fullmatch(n)} for folder in kinds.values()}
+    for folder, found in names.items():
+        if not found:
+            raise BadInput(folder, "a folder of NNNNNN.txt files", "none", "download the pose archive of this subject")
+    numbers = sorted(int(name[:6]) for name in set().union(*names.values()))
+    expected = [f"{number:06d}.txt" for number in range(numbers[0], numbers[-1] + 1)]
+    for folder, found in names.items():
+        missing = next((name for name in expected if name not in found), None)
+        if missing is not None:
+            raise BadInput(f"{folder}/{missing}", f"one file for each of {len(expected)} frames", "nothing there")
+    return expected
+
+
+def _numbers(raw: RawTree, folder: str, files: list[str], columns: int) -> np.ndarray:
+    """(frame, column) float64 from the first line of each file."""
+    rows = []
+    for name, data in zip(files, raw.read_folder(folder, files), strict=True):
+        try:
+            row = [float(word) for word in data.partition(b"\n")[0].split()]
+        except ValueError as error:
+            raise BadInput(f"{folder}/{name}", f"{columns} numbers", str(error)) from error
+        if len(row) != columns:
+            raise BadInput(f"{folder}/{name}", f"{columns} numbers", f"{len(row)}")
+        rows.append(row)
+    return np.array(rows, dtype=np.float64)
+
+
+def _check_finite(folder: str, files: list[str], values: np.ndarray) -> None:
+    good = np.isfinite(values).all(axis=1)
+    if not good.all():
+        raise BadInput(f"{folder}/{files[int(np.argmin(good))]}", "finite numbers", "NaN or infinity")
+
+
+def _check_ids(folder: str, files: list[str], values: np.ndarray, count: int) -> None:
+    known = np.isin(values, np.arange(count))
+    if not known.all():
+        at = int(np.argmin(known))
+        raise BadInput(f"{folder}/{files[at]}", f"a whole number from 0 to {count - 1}", f"{values[at]}")
