@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 from hoidata.errors import BadInput
 
@@ -111,8 +111,8 @@ def article(noun: str) -> Literal["a", "an"]:
 @lru_cache(maxsize=1)
 def default_grammar() -> Grammar:
     """The table shipped with the package: every verb and object of H2O, GRAB and ARCTIC, and common others."""
-    with files("hoidata.annotation").joinpath("grammar.csv").open(encoding="utf-8", newline="") as stream:
-        return read_grammar(stream, "grammar.csv")
+    table = files("hoidata.annotation").joinpath("grammar.csv").read_text(encoding="utf-8")
+    return read_grammar(table.splitlines(), "grammar.csv")
 
 
 def extend_grammar(grammar: Grammar, path: str | Path) -> Grammar:
@@ -134,7 +134,7 @@ def read_grammar(lines: Iterable[str], where: str) -> Grammar:
         if row["kind"] == "verb":
             verbs[row["base"]] = VerbForms(*(row[name] for name in COLUMNS[1:5]))
         else:
-            nouns[row["base"]] = NounPhrase(row["base"], row["noun_phrase"], row["number"])
+            nouns[row["base"]] = NounPhrase(row["base"], row["noun_phrase"], cast(Number, row["number"]))
     return Grammar(verbs, nouns)
 
 

@@ -1,0 +1,198 @@
+"""Hand test, contact maps and distance maps against plane geometry, brute force, world motion and hinges."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.contact import (
+    ENTRY,
+    ProximityIndex,
+    acting_hands,
+    contact_maps,
+    dense_distances,
+    distance_entries,
+    frame_contact,
+    touched_frames,
+)
+from hoidata.errors import BadInput
+from hoidata.objects.model import Hinge, ObjectModel, articulate, place
+from hoidata.objects.sampling import SampledPoints
+from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack
+
+FRAMES, POINTS = 12, 300
+Joints = dict[str, np.ndarray]
+
+
+def hand_track(frames: int) -> HandTrack:
+    zeros = np.zeros((frames, 3), np.float32)
+    return HandTrack(zeros, zeros, np.zeros((frames, 45), np.float32), np.zeros((1, 10)), np.ones(frames, bool))
+
+
+def build_clip(track: ObjectTrack) -> Clip:
+    frames = track.n_frames
+    hands = {side: hand_track(frames) for side in SIDES}
+    return Clip("toy/1", "toy", "s1", "1", hands, track, np.arange(frames, dtype=np.int32), None, "lift", "box")
+
+
+def sampled(points: np.ndarray, part: np.ndarray | None = None) -> SampledPoints:
+    count = len(points)
+    part = np.zeros(count, np.uint8) if part is None else part
+    return SampledPoints(
+        points.astype(np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.int32),
+        np.zeros((count, 3), np.float32), part, "surface-fps",
+    )  # fmt: skip
+
+
+@pytest.fixture(params=[False, True], ids=["rigid", "articulated"])
+def scene(request: pytest.FixtureRequest) -> tuple[Clip, Joints, SampledPoints]:
+    """A cloud of points that moves (and folds), and joints that wander through it."""
+    random = np.random.default_rng(5)
+    points = random.uniform(-0.08, 0.08, (POINTS, 3)).astype(np.float32)
+    part = (points[:, 0] > 0).astype(np.uint8) if request.param else np.zeros(POINTS, np.uint8)
+    hinge = Hinge(np.array([0.0, 0.6, 0.8]), np.array([0.01, -0.02, 0.03])) if request.param else None
+    model = ObjectModel("cloud", points, np.arange(POINTS).reshape(-1, 3), part, hinge)
+    angle = np.linspace(-2.0, 1.5, FRAMES) if request.param else None
+    track = ObjectTrack(model, random.normal(size=(FRAMES, 3)), random.normal(size=(FRAMES, 3)), angle)
+    clip = build_clip(track)
+    around = articulate(points, part, hinge, angle)
+    centre = place(np.broadcast_to(around, (FRAMES, POINTS, 3)), track.rotvec, track.translation_m).mean(axis=1)
+    joints = {side: centre[:, None] + random.normal(0, 0.07, (FRAMES, 21, 3)) for side in SIDES}
+    return clip, joints, sampled(points, part)
+
+
+def brute_force(clip: Clip, joints: np.ndarray, points: SampledPoints) -> np.ndarray:
+    """(frame, point, joint) distances in the world, float64."""
+    track = clip.object
+    local = articulate(points.points_m.astype(np.float64), points.part, track.model.hinge, track.hinge_rad)
+    rotation = Rotation.from_rotvec(track.rotvec).as_matrix()
+    world = np.einsum("fij,fpj->fpi", rotation, np.broadcast_to(local, (FRAMES, POINTS, 3)))
+    world = world + track.translation_m[:, None]
+    return np.linalg.norm(world[:, :, None] - joints[:, None], axis=3)
+
+
+def moved(clip: Clip, joints: Joints) -> tuple[Clip, Joints]:
+    """The same scene in another world frame."""
+    turn, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array([1.0, -2.0, 0.5])
+    rotvec = (turn * Rotation.from_rotvec(clip.object.rotvec)).as_rotvec()
+    track = replace(clip.object, rotvec=rotvec, translation_m=turn.apply(clip.object.translation_m) + shift)
+    turned = {side: turn.apply(array.reshape(-1, 3)).reshape(array.shape) + shift for side, array in joints.items()}
+    return replace(clip, object=track), turned
+
+
+def test_distance_maps_equal_brute_force(scene: tuple[Clip, Joints, SampledPoints]) -> None:
+    clip, joints, points = scene
+    entries = distance_entries(clip, joints, ProximityIndex(points))
+    for side in SIDES:
+        truth = brute_force(clip, joints[side], points)
+        assert (truth < 0.02).sum() > 100
+        np.testing.assert_array_equal(np.isfinite(dense_distances(entries[side], FRAMES, POINTS)), truth < 0.02)
+        found = entries[side]
+        np.testing.assert_allclose(
+            found["distance_m"], truth[found["frame"], found["point"], found["joint"]], atol=1e-8
+        )
+
+
+def test_contact_maps_equal_brute_force(scene: tuple[Clip, Joints, SampledPoints]) -> None:
+    clip, joints, points = scene
+    entries = distance_entries(clip, joints, ProximityIndex(points))
+    maps, tighter = contact_maps(entries, POINTS), contact_maps(entries, POINTS, threshold_m=0.01)
+    for side in SIDES:
+        near = brute_force(clip, joints[side], points).min(axis=2)
+        np.testing.assert_array_equal(maps[side], (near < 0.02).any(axis=0))
+        np.testing.assert_array_equal(tighter[side], (near < 0.01).any(axis=0))
+        np.testing.assert_array_equal(frame_contact(entries[side], FRAMES, POINTS), near < 0.02)
+        np.testing.assert_array_equal(touched_frames(entries[side], POINTS), (near < 0.02).sum(axis=0))
+
+
+def test_hand_evidence_equals_brute_force(scene: tuple[Clip, Joints, SampledPoints]) -> None:
+    clip, joints, points = scene
+    evidence = acting_hands(clip, joints, ProximityIndex(points))
+    for side in SIDES:
+        truth = brute_force(clip, joints[side], points).min(axis=(1, 2))
+        np.testing.assert_allclose(evidence.distance_m[side], truth, atol=1e-12)
+        assert evidence.closest_m(side) == pytest.approx(truth.min())
+
+
+def test_nothing_changes_when_the_world_turns_and_shifts(scene: tuple[Clip, Joints, SampledPoints]) -> None:
+    clip, joints, points = scene
+    other_clip, other_joints = moved(clip, joints)
+    index = ProximityIndex(points)
+    before, after = distance_entries(clip, joints, index), distance_entries(other_clip, other_joints, index)
+    for side in SIDES:
+        for column in ("frame", "point", "joint"):
+            np.testing.assert_array_equal(before[side][column], after[side][column])
+        np.testing.assert_allclose(before[side]["distance_m"], after[side]["distance_m"], atol=1e-8)
+
+
+def test_a_cut_clip_has_the_entries_of_its_own_frames_only(scene: tuple[Clip, Joints, SampledPoints]) -> None:
+    clip, joints, points = scene
+    index = ProximityIndex(points)
+    whole = distance_entries(clip, joints, index)["left"]
+    part = distance_entries(clip.cut(3, 7), {side: joints[side][3:7] for side in SIDES}, index)["left"]
+    expected = whole[(whole["frame"] >= 3) & (whole["frame"] < 7)]
+    np.testing.assert_array_equal(part["point"], expected["point"])
+    np.testing.assert_array_equal(part["frame"], expected["frame"] - 3)
+
+
+@pytest.fixture
+def plane() -> tuple[Clip, SampledPoints]:
+    """A flat square of points, 1/256 m apart (exact in float32), at rest in the plane z = 0."""
+    grid = np.stack(np.meshgrid(np.arange(20), np.arange(20), [0]), -1).reshape(-1, 3) / 256
+    model = ObjectModel("plate", grid, np.arange(399).reshape(-1, 3), np.zeros(400, np.uint8))
+    return build_clip(ObjectTrack(model, np.zeros((2, 3)), np.zeros((2, 3)))), sampled(grid)
+
+
+def hovering(left_m: float, right_m: float) -> Joints:
+    """One joint of each hand above the middle point of the plate, in the second frame only."""
+    joints = {side: np.full((2, 21, 3), 1.0) for side in SIDES}
+    for side, height in (("left", left_m), ("right", right_m)):
+        joints[side][1, 16] = (10 / 256, 10 / 256, height)
+    return joints
+
+
+@pytest.mark.parametrize(
+    ("left_m", "right_m", "hand_type"),
+    [(0.0199, 0.0201, "left"), (0.0201, 0.0199, "right"), (0.0199, 0.0199, "both"), (0.0201, 0.0201, None)],
+)
+def test_a_hand_acts_below_2_cm_and_not_above(plane, left_m: float, right_m: float, hand_type: str | None) -> None:
+    clip, points = plane
+    evidence = acting_hands(clip, hovering(left_m, right_m), ProximityIndex(points))
+    assert evidence.hand_type == hand_type
+    assert evidence.closest_m("left") == pytest.approx(left_m)
+
+
+def test_another_threshold_needs_no_new_distances(plane) -> None:
+    clip, points = plane
+    evidence = acting_hands(clip, hovering(0.012, 0.027), ProximityIndex(points))
+    judged = [evidence.at_threshold(threshold).hand_type for threshold in (0.01, 0.02, 0.03)]
+    assert judged == [None, "left", "both"]
+
+
+def test_an_invalid_frame_is_no_evidence(plane) -> None:
+    clip, points = plane
+    unseen = replace(clip.hands["left"], valid=np.array([True, False]))
+    clip = replace(clip, hands={**clip.hands, "left": unseen})
+    joints, index = hovering(0.01, 0.01), ProximityIndex(points)
+    assert acting_hands(clip, joints, index).hand_type == "right"
+    assert len(distance_entries(clip, joints, index)["left"]) == 0
+
+
+def test_a_joint_on_a_point_counts_with_distance_zero(plane) -> None:
+    clip, points = plane
+    entries = distance_entries(clip, hovering(0.0, 1.0), ProximityIndex(points))["left"]
+    assert entries["distance_m"].min() == 0
+    near = [(a, b) for a in range(-9, 10) for b in range(-9, 10) if (a * a + b * b) / 256**2 < 0.02**2]
+    assert len(entries) == len(near)
+
+
+def test_an_entry_takes_9_bytes() -> None:
+    assert ENTRY.itemsize == 9
+
+
+def test_a_clip_too_long_to_count_is_refused(plane) -> None:
+    clip, points = plane
+    long = replace(clip, source_frames=np.zeros(40_000, np.int32))
+    with pytest.raises(BadInput, match="at most 32767 frames"):
+        distance_entries(long, {}, ProximityIndex(points))
