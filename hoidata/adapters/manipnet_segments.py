@@ -1,0 +1,191 @@
+"""Which stretches of a ManipNet recording are unusable, which show an interaction, and what the object does in them.
+
+Pure functions on arrays. Two clocks: *source frames* (120 per second, where faults show) and *frames* (30 per second).
+All stretches are half-open, ``start`` to ``stop``.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+FROZEN_SOURCE_FRAMES = 12
+FAR_WRIST_M = 1.0
+# A step is a jump when it is large for any motion, or notable and several times what the motion around it does.
+LARGE_STEP_M, LARGE_STEP_RAD = 0.10, np.deg2rad(30)
+NOTABLE_STEP_M, NOTABLE_STEP_RAD = 0.01, np.deg2rad(8)
+JUMP_RATIO = 4.0
+JUMP_NEIGHBOURS = 5
+
+LIFTED_M = 0.015
+TOUCH_M = 0.02
+BRIDGE_FRAMES = 10
+APPROACH_FRAMES = 15
+SHORTEST_FRAMES = 45
+LONGEST_FRAMES = 150
+
+MOVED_M, TURNED_RAD = 0.03, np.deg2rad(30)
+CARRIED_M, SPUN_RAD = 0.15, np.deg2rad(60)
+
+
+class Stretch(NamedTuple):
+    start: int
+    stop: int
+
+
+class Cut(NamedTuple):
+    """Source frames ``start`` to ``stop`` that are left out, what was expected of them and what came."""
+
+    start: int
+    stop: int
+    expected: str
+    got: str
+
+
+@dataclass(frozen=True)
+class BodyMotion:
+    """One tracked body at the source's rate. position_m: (frame, 3); rotation: (frame, 3, 3); raw: (frame, channel).
+
+    raw: every number of the file, so that a frozen tracker can be told from a body at rest.
+    """
+
+    name: str
+    position_m: np.ndarray
+    rotation: np.ndarray
+    raw: np.ndarray
+
+
+def find_cuts(left: BodyMotion, right: BodyMotion, thing: BodyMotion) -> list[Cut]:
+    """Disjoint unusable stretches in order: frozen trackers, wrists far from the object, jumps of any body."""
+    used = np.zeros(len(thing.raw), dtype=bool)
+    cuts: list[Cut] = []
+    for stretch in _frozen(left, right, thing):
+        got = f"{stretch.stop - stretch.start} exactly equal frames"
+        cuts.append(Cut(*stretch, "hands and object that move", got))
+        used[slice(*stretch)] = True
+    away = [np.linalg.norm(hand.position_m - thing.position_m, axis=1) for hand in (left, right)]
+    farthest = np.maximum(*away)
+    for stretch in runs((farthest > FAR_WRIST_M) & ~used):
+        got = f"a wrist {farthest[slice(*stretch)].max():.2f} m away"
+        cuts.append(Cut(*stretch, f"both wrists within {FAR_WRIST_M:g} m of the object", got))
+        used[slice(*stretch)] = True
+    for body in (left, right, thing):
+        for cut in _jumps(body):
+            for stretch in runs(_mask(cut, len(used)) & ~used):
+                cuts.append(Cut(*stretch, cut.expected, cut.got))
+                used[slice(*stretch)] = True
+    return sorted(cuts)
+
+
+def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) -> list[Stretch]:
+    """Stretches of at most 150 frames in which a hand is at the object, each with at most one lift; booleans (frame,).
+
+    Touches with gaps of at most 10 frames count as one. Each lift forms a stretch with up to 15 frames of touch before
+    and after; what lies between two lifts forms its own. Long ones are divided evenly.
+    """
+    pieces: list[Stretch] = []
+    for touch in runs(_bridged(touched) & usable):
+        windows = _lift_windows(touch, _bridged(lifted & _mask(touch, len(lifted))))
+        edges = [touch.start, *(edge for window in windows for edge in window), touch.stop]
+        for start, stop in zip(edges[:-1], edges[1:], strict=True):
+            if stop > start:
+                pieces += _divided(Stretch(start, stop))
+    return pieces
+
+
+def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) -> str | None:
+    """What the object's motion in a clip shows, or None when it neither leaves the table nor moves.
+
+    lift_m: (frame,) height of its lowest point above the table; centre_m: (frame, 3); rotation: (frame, 3, 3).
+    Leaves the table: "lift". Comes back to it: "place". In the air throughout: "turn" from 60 degrees on, else "move"
+    from 15 cm on, else "hold". On the table throughout: "turn" from 30 degrees on, "move" from 3 cm on.
+    """
+    lifted = lift_m > LIFTED_M
+    moved_m = np.linalg.norm(centre_m - centre_m[0], axis=1).max()
+    turned_rad = rotation_angle(rotation[:1].transpose(0, 2, 1) @ rotation).max()
+    if lifted.any() and not lifted.all():
+        return "place" if lifted[0] and not lifted[-1] else "lift"
+    enough_turn, enough_way = (SPUN_RAD, CARRIED_M) if lifted.all() else (TURNED_RAD, MOVED_M)
+    if turned_rad >= enough_turn:
+        return "turn"
+    if moved_m >= enough_way:
+        return "move"
+    return "hold" if lifted.all() else None
+
+
+def height_above_table(lowest_m: np.ndarray) -> np.ndarray:
+    """(frame,) lowest object point above its 3rd percentile over the sequence, which stands for the table."""
+    return lowest_m - np.percentile(lowest_m, 3)
+
+
+def rotation_angle(rotation: np.ndarray) -> np.ndarray:
+    """Angle of rotation matrices (..., 3, 3), radians."""
+    return np.arccos(np.clip((np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+
+
+def runs(flags: np.ndarray) -> list[Stretch]:
+    """Maximal stretches of True in (frame,) booleans."""
+    change = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
+    pairs = zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True)
+    return [Stretch(int(start), int(stop)) for start, stop in pairs]
+
+
+def _frozen(*bodies: BodyMotion) -> list[Stretch]:
+    same = np.all([(body.raw[1:] == body.raw[:-1]).all(axis=1) for body in bodies], axis=0)
+    return [Stretch(a, b + 1) for a, b in runs(same) if b + 1 - a >= FROZEN_SOURCE_FRAMES]
+
+
+def _jumps(body: BodyMotion) -> list[Cut]:
+    """Four frames around each jump, merged where they overlap."""
+    step_m = np.linalg.norm(np.diff(body.position_m, axis=0), axis=1)
+    step_rad = rotation_angle(body.rotation[:-1].transpose(0, 2, 1) @ body.rotation[1:])
+    sudden = _sudden(step_m, NOTABLE_STEP_M, LARGE_STEP_M) | _sudden(step_rad, NOTABLE_STEP_RAD, LARGE_STEP_RAD)
+    bad = np.zeros(len(body.position_m), dtype=bool)
+    for step in np.flatnonzero(sudden):
+        bad[max(0, step - 1) : step + 3] = True
+    cuts = []
+    for start, stop in runs(bad):
+        steps = slice(start, stop - 1)
+        got = f"{body.name} jumps {step_m[steps].max() * 100:.1f} cm, {np.rad2deg(step_rad[steps].max()):.0f} degrees"
+        cuts.append(Cut(start, stop, "steady motion from frame to frame", got))
+    return cuts
+
+
+def _sudden(step: np.ndarray, notable: float, large: float) -> np.ndarray:
+    if not len(step):
+        return np.zeros(0, dtype=bool)
+    padded = np.pad(step, JUMP_NEIGHBOURS, mode="reflect" if len(step) > JUMP_NEIGHBOURS else "edge")
+    around = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * JUMP_NEIGHBOURS + 1), axis=1)
+    return (step > large) | ((step > notable) & (step > JUMP_RATIO * around))
+
+
+def _mask(stretch: tuple, length: int) -> np.ndarray:
+    mask = np.zeros(length, dtype=bool)
+    mask[stretch[0] : stretch[1]] = True
+    return mask
+
+
+def _bridged(flags: np.ndarray) -> np.ndarray:
+    """Flags with inner gaps of at most 10 frames filled."""
+    filled = flags.copy()
+    for start, stop in runs(~flags):
+        if start > 0 and stop < len(flags) and stop - start <= BRIDGE_FRAMES:
+            filled[start:stop] = True
+    return filled
+
+
+def _lift_windows(touch: Stretch, lifted: np.ndarray) -> list[Stretch]:
+    """One stretch per lift inside ``touch``, widened; neighbours that would overlap meet halfway."""
+    lifts = runs(lifted)
+    windows = []
+    for i, (start, stop) in enumerate(lifts):
+        before = touch.start if i == 0 else (lifts[i - 1].stop + start) // 2
+        after = touch.stop if i == len(lifts) - 1 else (stop + lifts[i + 1].start) // 2
+        windows.append(Stretch(max(before, start - APPROACH_FRAMES), min(after, stop + APPROACH_FRAMES)))
+    return windows
+
+
+def _divided(stretch: Stretch) -> list[Stretch]:
+    parts = -(-(stretch.stop - stretch.start) // LONGEST_FRAMES)
+    edges = np.linspace(stretch.start, stretch.stop, parts + 1).round().astype(int).tolist()
+    return [Stretch(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
