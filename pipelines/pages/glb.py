@@ -33,8 +33,8 @@ def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPai
     return Path(path)
 
 
-def glb_bytes(clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> bytes:
-    """The bytes of ``write_glb``."""
+def glb_bytes(clip: Clip, hands: HandPair | None, contact: ContactPaint | None = None) -> bytes:
+    """The bytes of ``write_glb``; hands None: the objects alone."""
     builder = GltfBuilder(clip.clip_id, {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS})
     world = builder.node("world", None, rotation=upright_rotation(clip.gravity).as_quat().round(9).tolist())
     times = builder.array((np.arange(clip.n_frames) / FPS).astype(np.float32), bounds=True)
@@ -42,7 +42,7 @@ def glb_bytes(clip: Clip, hands: HandPair, contact: ContactPaint | None = None) 
     for number, track in enumerate(clip.other_objects):
         _add_object(builder, world, times, f"other object {number}", track, None)
     for side in SIDES:
-        if clip.hands[side].valid.any():
+        if hands is not None and clip.hands[side].valid.any():
             _add_hand(builder, world, times, hands[side], clip.hands[side])
     return builder.to_bytes()
 

@@ -87,7 +87,7 @@ class GltfBuilder:
 
     def to_bytes(self) -> bytes:
         """The finished GLB."""
-        self.document.animations = [self._animation]
+        self.document.animations = [self._animation] if self._animation.channels else []
         data = b"".join(self._chunks)
         self.document.buffers = [gltf.Buffer(byteLength=len(data))]
         self.document.set_binary_blob(data)

@@ -6,7 +6,7 @@ them lives in this repository; a trimesh without that viewer is named as such.
 
 import base64
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from zipfile import ZipFile
@@ -18,30 +18,15 @@ from markupsafe import Markup
 
 from hoidata.errors import MissingResource
 from hoidata.files import atomic_file
-from hoidata.hands import HandPair, track_joints
-from hoidata.objects.model import articulate, place
-from hoidata.schema.clip import FPS, SIDES, Clip
-from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes, upright_rotation
+from hoidata.hands import HandPair
+from hoidata.schema.clip import SIDES, Clip
+from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
 from pipelines.pages.surface import ContactPaint
+from pipelines.pages.view import View, still_view, view_of
 
 _ROOM = Path(__file__).parent
 _VIEWER = Path(trimesh.resources.__file__ or "").parent / "templates" / "viewer.zip"
 _THREE = re.compile(r"<script>(/\*\*.*?THREE\.GLTFLoader=GLTFLoader;\}\)\(\);)", re.DOTALL)
-_POINTS_FOR_VIEW = 400
-_HAND_MARGIN_M = 0.015
-
-
-@dataclass(frozen=True)
-class View:
-    """Where the camera starts, in the GLB's upright world (y up), metres and radians; ground_m None: no ground."""
-
-    centre: tuple[float, float, float]
-    radius_m: float
-    ground_m: float | None
-    azimuth_rad: float
-    elevation_rad: float
-    frames: int
-    fps: int = FPS
 
 
 @dataclass(frozen=True)
@@ -87,23 +72,17 @@ def motion_player(
     )
 
 
-def view_of(clip: Clip, hands: HandPair) -> View:
-    """A camera that sees the whole motion, from the side and a little above, between hand and object."""
-    upright = upright_rotation(clip.gravity).as_matrix()
-    object_points = _object_points(clip) @ upright.T
-    hand_points = [point @ upright.T for point in _hand_points(clip, hands)]
-    everything = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    centre = (low + high) / 2
-    radius = float(np.linalg.norm(everything - centre, axis=1).max()) + _HAND_MARGIN_M
-    return View(
-        centre=_rounded(centre),
-        radius_m=round(radius, 4),
-        ground_m=None if clip.gravity is None else round(float(low[1]), 4),
-        azimuth_rad=round(_side_azimuth(object_points, hand_points), 3),
-        elevation_rad=0.42,
-        frames=clip.n_frames,
-    )
+def contact_player(
+    clip: Clip, paint: ContactPaint, title: str, caption: str, look_from: np.ndarray, label: str
+) -> Player:
+    """The clip's object at rest, as it lies in the first frame, with a contact map to turn and look at.
+
+    look_from: (3,) where the camera starts, see ``touched_side``. label: what the colours mean.
+    """
+    absent = {side: replace(track, valid=np.zeros_like(track.valid)) for side, track in clip.hands.items()}
+    still = replace(clip, hands=absent, other_objects=()).cut(0, 1)
+    view = still_view(still, look_from)
+    return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
 
 
 def render_page(template: str, **values: object) -> str:
@@ -172,31 +151,3 @@ def _legend(clip: Clip) -> tuple[tuple[str, str], ...]:
     if clip.object.is_articulated:
         rows.append(("its moving part", css_colour(MOVING_PART_COLOUR)))
     return tuple(rows)
-
-
-def _object_points(clip: Clip) -> np.ndarray:
-    """(frame, point, 3) world points of the object, thinned evenly."""
-    model, track = clip.object.model, clip.object
-    step = max(1, len(model.vertices_m) // _POINTS_FOR_VIEW)
-    local = articulate(model.vertices_m[::step], model.part[::step], model.hinge, track.hinge_rad)
-    return place(local, track.rotvec, track.translation_m)
-
-
-def _hand_points(clip: Clip, hands: HandPair) -> list[np.ndarray]:
-    return [track_joints(track, hands[side])[track.valid] for side, track in clip.hands.items() if track.valid.any()]
-
-
-def _side_azimuth(object_points: np.ndarray, hand_points: list[np.ndarray]) -> float:
-    """Azimuth across the line from the hands to the object, so that neither hides the other; pi/5 without hands."""
-    if not hand_points:
-        return float(np.pi / 5)
-    wrists = np.concatenate([points[:, 0] for points in hand_points]).mean(axis=0)
-    toward = object_points.reshape(-1, 3).mean(axis=0) - wrists
-    if np.hypot(toward[0], toward[2]) < 1e-3:
-        return float(np.pi / 5)
-    return float(np.arctan2(toward[0], toward[2]) + np.radians(65.0))
-
-
-def _rounded(vector: np.ndarray) -> tuple[float, float, float]:
-    x, y, z = (round(float(value), 4) for value in vector)
-    return x, y, z

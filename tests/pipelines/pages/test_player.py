@@ -5,7 +5,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from pipelines.pages.player import motion_player, three_javascript, view_of, write_motion_page
+from pipelines.pages.player import motion_player, three_javascript, write_motion_page
+from pipelines.pages.view import view_of
 
 FETCHES = re.compile(r"""(?:src|href|data)\s*=\s*["']?\s*(?:https?:)?//|url\(\s*["']?(?:https?:)?//|@import""", re.I)
 

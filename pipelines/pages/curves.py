@@ -1,0 +1,86 @@
+"""Curves as inline SVG: equal numbers give equal markup."""
+
+import csv
+import io
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+COLOURS = ("#3b6ea5", "#b5371f", "#5b8c5a", "#8a5a00", "#7a5195", "#6a6f76")
+_STYLE = {
+    "svg.fonttype": "none",
+    "font.family": "DejaVu Sans",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": "#b8b8b4",
+    "axes.labelcolor": "#6a6f76",
+    "xtick.color": "#6a6f76",
+    "ytick.color": "#6a6f76",
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One line of a chart: x and y (point,)."""
+
+    name: str
+    x: np.ndarray
+    y: np.ndarray
+
+
+def curves_svg(
+    curves: list[Curve], x_label: str, y_label: str, salt: str, log_y: bool = False, size_inches=(4.6, 2.5)
+) -> str:
+    """A small line chart as an ``<svg>`` element; ``salt`` keeps the ids of several charts on one page apart."""
+    style: dict[Any, Any] = {**_STYLE, "svg.hashsalt": salt}
+    with matplotlib.rc_context(style):
+        figure = Figure(figsize=size_inches, layout="constrained")
+        FigureCanvasSVG(figure)
+        axes = figure.add_subplot()
+        for number, curve in enumerate(curves):
+            axes.plot(curve.x, curve.y, color=COLOURS[number % len(COLOURS)], linewidth=1.4, label=curve.name)
+        if log_y:
+            axes.set_yscale("log")
+        axes.set(xlabel=x_label, ylabel=y_label)
+        axes.grid(axis="y", color="#ededea", linewidth=0.8)
+        if len(curves) > 1:
+            axes.legend(frameon=False, fontsize=8)
+        stream = io.StringIO()
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
+    svg = re.sub(r"<metadata>.*?</metadata>", "", stream.getvalue(), flags=re.DOTALL)
+    return re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg[svg.index("<svg") :])
+
+
+def read_log(path: str | Path) -> dict[str, np.ndarray]:
+    """The numeric columns of a training log, by name; an empty cell is NaN, a column of words is left out."""
+    with open(path, newline="", encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    columns = {name: [_number(row[name]) for row in rows] for name in (rows[0] if rows else {})}
+    return {name: np.array(values) for name, values in columns.items() if not all(math.isnan(v) for v in values)}
+
+
+def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Curve]:
+    """Every loss column of a log over its step; rows without that number (validation is rarer) are skipped."""
+    if x_name not in columns:
+        return []
+    curves = []
+    for name, values in columns.items():
+        here = np.isfinite(values)
+        if name != x_name and re.search("loss|train|valid", name) and here.any():
+            curves.append(Curve(name.replace("_", " "), columns[x_name][here], values[here]))
+    return curves
+
+
+def _number(text: str | None) -> float:
+    try:
+        return float(text or "nan")
+    except ValueError:
+        return math.nan

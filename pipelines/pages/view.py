@@ -1,0 +1,97 @@
+"""Where the camera of a player starts: it must see the whole motion, with hand and object beside each other."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import HandPair, track_joints
+from hoidata.objects.model import articulate, place
+from hoidata.schema.clip import FPS, Clip
+from pipelines.pages.glb import upright_rotation
+from pipelines.pages.surface import ContactPaint
+
+_POINTS_FOR_VIEW = 400
+_HAND_MARGIN_M = 0.015
+
+
+@dataclass(frozen=True)
+class View:
+    """Where the camera starts, in the GLB's upright world (y up), metres and radians; ground_m None: no ground."""
+
+    centre: tuple[float, float, float]
+    radius_m: float
+    ground_m: float | None
+    azimuth_rad: float
+    elevation_rad: float
+    frames: int
+    fps: int = FPS
+
+
+def view_of(clip: Clip, hands: HandPair) -> View:
+    """A camera that sees the whole motion, from the side and a little above, between hand and object."""
+    upright = upright_rotation(clip.gravity).as_matrix()
+    object_points = _object_points(clip) @ upright.T
+    hand_points = [point @ upright.T for point in _hand_points(clip, hands)]
+    everything = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    centre = (low + high) / 2
+    radius = float(np.linalg.norm(everything - centre, axis=1).max()) + _HAND_MARGIN_M
+    return View(
+        centre=_rounded(centre),
+        radius_m=round(radius, 4),
+        ground_m=None if clip.gravity is None else round(float(low[1]), 4),
+        azimuth_rad=round(_side_azimuth(object_points, hand_points), 3),
+        elevation_rad=0.42,
+        frames=clip.n_frames,
+    )
+
+
+def still_view(clip: Clip, look_from: np.ndarray) -> View:
+    """A camera that sees the object of a one-frame clip from ``look_from`` (3,), at least a little from above."""
+    points = _object_points(clip)[0] @ upright_rotation(clip.gravity).as_matrix().T
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    return View(
+        centre=_rounded(centre),
+        radius_m=round(float(np.linalg.norm(points - centre, axis=1).max()) * 1.08, 4),
+        ground_m=None,
+        azimuth_rad=round(float(np.arctan2(look_from[0], look_from[2])), 3),
+        elevation_rad=round(float(np.clip(np.arcsin(look_from[1]), 0.15, 1.0)), 3),
+        frames=1,
+    )
+
+
+def touched_side(clip: Clip, paint: ContactPaint) -> np.ndarray:
+    """(3,) unit direction, in the upright world of the first frame, from the object's middle to where it is touched."""
+    turn = upright_rotation(clip.gravity).as_matrix() @ rotvec_to_rotmat(clip.object.rotvec[:1])[0]
+    toward = (paint.points_m - paint.points_m.mean(axis=0)).T @ paint.value
+    direction = turn @ toward + np.array((1e-6, 0.0, 1e-6))
+    return direction / np.linalg.norm(direction)
+
+
+def _object_points(clip: Clip) -> np.ndarray:
+    """(frame, point, 3) world points of the object, thinned evenly."""
+    model, track = clip.object.model, clip.object
+    step = max(1, len(model.vertices_m) // _POINTS_FOR_VIEW)
+    local = articulate(model.vertices_m[::step], model.part[::step], model.hinge, track.hinge_rad)
+    return place(local, track.rotvec, track.translation_m)
+
+
+def _hand_points(clip: Clip, hands: HandPair) -> list[np.ndarray]:
+    return [track_joints(track, hands[side])[track.valid] for side, track in clip.hands.items() if track.valid.any()]
+
+
+def _side_azimuth(object_points: np.ndarray, hand_points: list[np.ndarray]) -> float:
+    """Azimuth across the line from the hands to the object, so that neither hides the other; pi/5 without hands."""
+    if not hand_points:
+        return float(np.pi / 5)
+    wrists = np.concatenate([points[:, 0] for points in hand_points]).mean(axis=0)
+    toward = object_points.reshape(-1, 3).mean(axis=0) - wrists
+    if np.hypot(toward[0], toward[2]) < 1e-3:
+        return float(np.pi / 5)
+    return float(np.arctan2(toward[0], toward[2]) + np.radians(65.0))
+
+
+def _rounded(vector: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (round(float(value), 4) for value in vector)
+    return x, y, z
