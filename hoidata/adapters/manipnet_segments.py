@@ -5,6 +5,7 @@ All stretches are half-open, ``start`` to ``stop``.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ APPROACH_FRAMES = 15
 SHORTEST_FRAMES = 45
 LONGEST_FRAMES = 150
 
+BRIEF_FRAMES = 5
 MOVED_M, TURNED_RAD = 0.03, np.deg2rad(30)
 CARRIED_M, SPUN_RAD = 0.15, np.deg2rad(60)
 
@@ -87,7 +89,7 @@ def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) ->
     for touch in runs(_bridged(touched) & usable):
         windows = _lift_windows(touch, _bridged(lifted & _mask(touch, len(lifted))))
         edges = [touch.start, *(edge for window in windows for edge in window), touch.stop]
-        for start, stop in zip(edges[:-1], edges[1:], strict=True):
+        for start, stop in pairwise(edges):
             if stop > start:
                 pieces += _divided(Stretch(start, stop))
     return pieces
@@ -98,9 +100,10 @@ def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) 
 
     lift_m: (frame,) height of its lowest point above the table; centre_m: (frame, 3); rotation: (frame, 3, 3).
     Leaves the table: "lift". Comes back to it: "place". In the air throughout: "turn" from 60 degrees on, else "move"
-    from 15 cm on, else "hold". On the table throughout: "turn" from 30 degrees on, "move" from 3 cm on.
+    from 15 cm on, else "hold". On the table throughout: "turn" from 30 degrees on, "move" from 3 cm on. Fewer than
+    5 frames in the air, or on the table, do not count.
     """
-    lifted = lift_m > LIFTED_M
+    lifted = _without_brief(lift_m > LIFTED_M)
     moved_m = np.linalg.norm(centre_m - centre_m[0], axis=1).max()
     turned_rad = rotation_angle(rotation[:1].transpose(0, 2, 1) @ rotation).max()
     if lifted.any() and not lifted.all():
@@ -159,6 +162,13 @@ def _sudden(step: np.ndarray, notable: float, large: float) -> np.ndarray:
     return (step > large) | ((step > notable) & (step > JUMP_RATIO * around))
 
 
+def _without_brief(lifted: np.ndarray) -> np.ndarray:
+    """All alike where fewer than 5 frames differ from the rest."""
+    if min(lifted.sum(), (~lifted).sum()) >= BRIEF_FRAMES:
+        return lifted
+    return np.full_like(lifted, lifted.mean() > 0.5)
+
+
 def _mask(stretch: tuple, length: int) -> np.ndarray:
     mask = np.zeros(length, dtype=bool)
     mask[stretch[0] : stretch[1]] = True
@@ -188,4 +198,4 @@ def _lift_windows(touch: Stretch, lifted: np.ndarray) -> list[Stretch]:
 def _divided(stretch: Stretch) -> list[Stretch]:
     parts = -(-(stretch.stop - stretch.start) // LONGEST_FRAMES)
     edges = np.linspace(stretch.start, stretch.stop, parts + 1).round().astype(int).tolist()
-    return [Stretch(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    return [Stretch(a, b) for a, b in pairwise(edges)]

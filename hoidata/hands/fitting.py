@@ -37,16 +37,19 @@ class FitSettings:
     its bone, around the model's mean pose; thumb_rad: of the thumb about either axis across its bone.
     shake_rad: standard deviation of a finger joint from its mean over three neighbouring frames.
     shape_frames: at most so many frames per hand, evenly spaced, decide the shape.
+    shape_prior: weight per frame of a standard normal prior on the shape. It grows with the frames because joint
+    definitions differ in the same way in all of them: without it, ManipNet's hands drive betas to 14.
     """
 
     weights: tuple[float, ...] = DEFAULT_WEIGHTS
     noise_m: float = 0.003
     bend_rad: float = 1.5
-    spread_rad: float = 0.3
-    twist_rad: float = 0.3
+    spread_rad: float = 0.25
+    twist_rad: float = 0.2
     thumb_rad: float = 1.0
     shake_rad: float = 0.1
     shape_frames: int = 100
+    shape_prior: float = 0.3
     shape_steps: int = 30
     pose_steps: int = 15
 
@@ -145,8 +148,10 @@ def fit_shape(
         chosen = np.unique(np.linspace(0, len(points) - 1, min(settings.shape_frames, len(points))).astype(int))
         problems.append(_problem(side, points[chosen], hands[side], settings))
         poses.append(_initial_pose(problems[-1]))
+    n_frames = sum(len(problem.keypoints) for problem in problems)
+    prior = settings.noise_m**2 * max(1.0, settings.shape_prior * n_frames)
     for _ in range(settings.shape_steps):
-        betas, poses = _shape_step(problems, poses, betas, settings.noise_m**2)
+        betas, poses = _shape_step(problems, poses, betas, prior)
     return betas[0].numpy()
 
 
