@@ -1,0 +1,160 @@
+import numpy as np
+import pytest
+import torch
+from scipy.linalg import expm
+
+from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
+from hoidata.hands import PARENTS, TIP_VERTICES, HandKinematics, load_embedded_hands, track_joints, track_vertices
+from hoidata.schema import HandTrack
+
+
+def random_track(n_frames, seed=0, betas_per_frame=False, template_m=None):
+    generator = np.random.default_rng(seed)
+    return HandTrack(
+        wrist_m=generator.normal(0, 0.5, (n_frames, 3)),
+        global_orient=generator.normal(0, 1, (n_frames, 3)),
+        hand_pose=generator.normal(0, 0.4, (n_frames, 45)),
+        betas=generator.normal(0, 1, (n_frames if betas_per_frame else 1, 10)),
+        valid=np.ones(n_frames, dtype=bool),
+        template_m=template_m,
+    )
+
+
+def torch_inputs(track, dtype=torch.float64):
+    rotvec = np.concatenate((track.global_orient, track.hand_pose), 1).reshape(-1, 16, 3)
+    arrays = (track.wrist_m, rotvec_to_rotmat(rotvec), track.betas)
+    return [torch.as_tensor(array, dtype=dtype) for array in arrays]
+
+
+def skinned_one_by_one(model, wrist_m, rotvec, betas, template_m):
+    """Linear blend skinning of one frame written as 4 x 4 matrices and loops, with the matrix exponential."""
+    template = model.template_m if template_m is None else template_m
+    local = [expm(np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])) for x, y, z in rotvec]
+    shaped = template + model.shape_directions @ betas
+    rest = model.joint_regressor @ shaped
+    features = np.concatenate([(rotation - np.eye(3)).ravel() for rotation in local[1:]])
+    posed = shaped + model.pose_directions @ features
+    world = []
+    for joint, parent in enumerate(PARENTS):
+        move = np.eye(4)
+        move[:3, :3] = local[joint]
+        move[:3, 3] = wrist_m if parent < 0 else rest[joint] - rest[parent]
+        world.append(move if parent < 0 else world[parent] @ move)
+    vertices = np.zeros((778, 3))
+    for joint in range(16):
+        moved = (posed - rest[joint]) @ world[joint][:3, :3].T + world[joint][:3, 3]
+        vertices += model.skin_weights[:, joint, None] * moved
+    return vertices, np.array([move[:3, 3] for move in world])
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+@pytest.mark.parametrize("with_template", [False, True])
+def test_track_functions_equal_skinning_written_out_with_matrices(side, with_template):
+    model = load_embedded_hands()[side]
+    template = model.template_m * 0.93 + 0.01 if with_template else None
+    track = random_track(3, betas_per_frame=True, template_m=template)
+    vertices, joints = track_vertices(track, model), track_joints(track, model)
+    for frame in range(3):
+        rotvec = np.concatenate((track.global_orient[frame], track.hand_pose[frame])).reshape(16, 3)
+        wanted = skinned_one_by_one(model, track.wrist_m[frame], rotvec, track.betas[frame], template)
+        np.testing.assert_allclose(vertices[frame], wanted[0], atol=2e-7)
+        np.testing.assert_allclose(joints[frame, :16], wanted[1], atol=2e-7)
+        np.testing.assert_allclose(joints[frame, 16:], wanted[0][list(TIP_VERTICES)], atol=2e-7)
+
+
+def test_identity_pose_is_the_template_moved_to_the_wrist():
+    model = load_embedded_hands().right
+    track = random_track(1)
+    wrist = np.array([[0.3, -0.2, 1.1]])
+    flat = HandTrack(wrist, np.zeros((1, 3)), np.zeros((1, 45)), np.zeros((1, 10)), track.valid)
+    expected = model.template_m - model.wrist_offset_m(np.zeros((1, 10))) + wrist
+    np.testing.assert_allclose(track_vertices(flat, model)[0], expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("with_template", [False, True])
+def test_joints_only_path_equals_the_full_path(with_template):
+    model = load_embedded_hands().right
+    layer = HandKinematics(model, torch.float64)
+    inputs = torch_inputs(random_track(5, betas_per_frame=True))
+    template = torch.as_tensor(model.template_m * 1.1) if with_template else None
+    torch.testing.assert_close(
+        layer.joints(*inputs, template_m=template), layer(*inputs, template_m=template)[1], atol=1e-12, rtol=0
+    )
+
+
+def test_wrist_joint_lies_exactly_where_it_was_put():
+    inputs = torch_inputs(random_track(7), torch.float32)
+    joints = HandKinematics(load_embedded_hands().left).joints(*inputs)
+    assert torch.equal(joints[:, 0], inputs[0])
+
+
+def test_hand_follows_a_rigid_motion_of_the_world():
+    layer = HandKinematics(load_embedded_hands().right, torch.float64)
+    wrist, rotmats, betas = torch_inputs(random_track(4))
+    turn = rotvec_to_rotmat(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64))
+    shift = torch.tensor([0.2, 3.0, -1.0], dtype=torch.float64)
+    moved = torch.cat((turn @ rotmats[:, :1], rotmats[:, 1:]), 1)
+    vertices, joints = layer(wrist, rotmats, betas)
+    moved_vertices, moved_joints = layer(wrist @ turn.T + shift, moved, betas)
+    torch.testing.assert_close(moved_vertices, vertices @ turn.T + shift, atol=1e-12, rtol=0)
+    torch.testing.assert_close(moved_joints, joints @ turn.T + shift, atol=1e-12, rtol=0)
+
+
+def test_left_hand_is_the_right_hand_in_a_mirror():
+    pair = load_embedded_hands()
+    right = random_track(6)
+    mirror = np.array([-1.0, 1.0, 1.0])
+    left = HandTrack(
+        wrist_m=right.wrist_m * mirror,
+        global_orient=mirror_rotvec_x(right.global_orient),
+        hand_pose=mirror_rotvec_x(right.hand_pose.reshape(-1, 15, 3)).reshape(-1, 45),
+        betas=right.betas,
+        valid=right.valid,
+    )
+    expected = track_vertices(right, pair.right) * mirror
+    np.testing.assert_allclose(track_vertices(left, pair.left), expected, atol=1e-7)
+
+
+def test_positive_turn_about_z_bends_every_finger_towards_the_palm():
+    model = load_embedded_hands().right
+    bent = np.zeros((1, 15, 3))
+    bent[:, :12, 2] = 0.8
+    still = random_track(1)
+    zero = np.zeros((1, 3))
+    flat = HandTrack(zero, zero, np.zeros((1, 45)), np.zeros((1, 10)), still.valid)
+    curled = HandTrack(zero, zero, bent.reshape(1, 45), np.zeros((1, 10)), still.valid)
+    drop_m = track_joints(flat, model)[0, 16:20, 1] - track_joints(curled, model)[0, 16:20, 1]
+    assert (drop_m > 0.02).all()  # the palm looks to -y
+
+
+def test_gradients_are_right_and_finite_at_zero_pose():
+    layer = HandKinematics(load_embedded_hands().right, torch.float64)
+    rotvec = torch.zeros(1, 16, 3, dtype=torch.float64, requires_grad=True)
+    betas = torch.zeros(1, 10, dtype=torch.float64, requires_grad=True)
+    wrist = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
+
+    def tips(wrist_m, axis_angles, shape):
+        return layer.joints(wrist_m, rotvec_to_rotmat(axis_angles), shape)[:, 16:]
+
+    assert torch.autograd.gradcheck(tips, (wrist, rotvec, betas), atol=1e-6)
+    gradients = torch.autograd.grad(layer(wrist, rotvec_to_rotmat(rotvec), betas)[0].square().sum(), (wrist, rotvec, betas))
+    assert all(torch.isfinite(gradient).all() and gradient.abs().max() > 0 for gradient in gradients)
+
+
+def test_long_tracks_come_out_the_same_in_chunks_and_frame_by_frame():
+    model = load_embedded_hands().right
+    track = random_track(1030, betas_per_frame=True)
+    joints = track_joints(track, model)
+    assert joints.shape == (1030, 21, 3)
+    assert joints.dtype == np.float32
+    for frame in (0, 511, 512, 1029):
+        one = HandTrack(*(getattr(track, name)[frame : frame + 1] for name in
+                          ("wrist_m", "global_orient", "hand_pose", "betas", "valid")))  # fmt: skip
+        np.testing.assert_allclose(track_joints(one, model)[0], joints[frame], atol=1e-7)
+
+
+def test_one_shape_for_all_frames_equals_the_same_shape_in_every_frame():
+    layer = HandKinematics(load_embedded_hands().right, torch.float64)
+    wrist, rotmats, betas = torch_inputs(random_track(4))
+    repeated = layer(wrist, rotmats, betas.expand(4, 10))[0]
+    torch.testing.assert_close(layer(wrist, rotmats, betas)[0], repeated, atol=1e-12, rtol=0)
