@@ -1,0 +1,154 @@
+"""Stage annotate: hand type, sentences, text features and split of every clip.
+
+The folder it writes is described in ``hoidata.schema.annotated``.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from hoidata.annotation.encoders import TextEncoder, load_encoder
+from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
+from hoidata.contact import CONTACT_THRESHOLD_M, HandEvidence, ProximityIndex, acting_hands
+from hoidata.contact.stage import sample_objects
+from hoidata.files import atomic_folder, canonical_json
+from hoidata.files.arrays import write_npz
+from hoidata.files.tables import write_table
+from hoidata.hands import HandPair
+from hoidata.objects.sampling import POINT_COUNT
+from hoidata.schema import SIDES, HandType, Side
+from hoidata.schema.splits import SplitRule, assign_split
+from hoidata.schema.store import Store, open_store
+
+HAND_TYPE_SOURCE = "proximity"
+_TEXT = pa.string()
+TEXT_TABLE = pa.schema([("clip_id", _TEXT), ("form", _TEXT), ("sentence", _TEXT), ("text_row", pa.int32())])
+HAND_TYPE_TABLE = pa.schema(
+    [
+        ("clip_id", _TEXT),
+        ("hand_type", _TEXT),
+        ("source", _TEXT),
+        ("min_left_m", pa.float64()),
+        ("min_right_m", pa.float64()),
+        ("labelled_hand", _TEXT),
+        ("agreement", pa.bool_()),
+        ("reason", _TEXT),
+    ]
+)
+SPLIT_TABLE = pa.schema([("clip_id", _TEXT), ("split", _TEXT)])
+
+
+@dataclass(frozen=True)
+class _Annotated:
+    """One clip's result; ``sentences`` is None when no hand acts."""
+
+    clip_id: str
+    labelled_hand: HandType | None
+    evidence: HandEvidence
+    sentences: FourSentences | None
+
+
+def annotate_store(
+    clips_folder: str | Path,
+    out_folder: str | Path,
+    *,
+    encoder: str | TextEncoder = "use",
+    split: SplitRule | None = None,
+    threshold_m: float = CONTACT_THRESHOLD_M,
+    points: int = POINT_COUNT,
+    hands: HandPair | None = None,
+) -> dict[str, int]:
+    """Annotate every clip of the store; the folder appears whole or not at all.
+
+    encoder: a name for ``load_encoder``, or the encoder itself. split: None puts every clip into train.
+    threshold_m: a hand acts when one of its joints comes closer to one of ``points`` sampled points.
+    hands: as in ``open_store``. Clips without an acting hand are listed with that reason and get no sentence.
+    Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing.
+    """
+    store = open_store(clips_folder, hands)
+    encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
+    found = _annotate_clips(store, threshold_m, points)
+    named = [item for item in found if item.sentences]
+    sentences = list(dict.fromkeys(text for item in named for text in item.sentences or ()))
+    counts = _counts(found, sentences)
+    with atomic_folder(out_folder) as part:
+        write_table(part / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
+        write_table(part / "text.parquet", _text_rows(named, sentences), TEXT_TABLE)
+        write_table(part / "split.parquet", _split_rows(store, named, split or SplitRule()), SPLIT_TABLE)
+        _write_embeddings(part / "embeddings.npz", encoder, sentences)
+        info = {"encoder": encoder.identity, "threshold_m": threshold_m, "points": points, "counts": counts}
+        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+    return counts
+
+
+def _annotate_clips(store: Store, threshold_m: float, points: int) -> list[_Annotated]:
+    indices = {name: ProximityIndex(cloud) for name, cloud in sample_objects(store, points).items()}
+    found = []
+    for clip_id in store.ids:
+        clip = store.clip(clip_id)
+        joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
+        evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
+        hand = evidence.hand_type
+        sentences = four_sentences(clip.verb, clip.object_words, hand) if hand else None
+        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, sentences))
+    return found
+
+
+def _hand_row(item: _Annotated) -> dict:
+    closest = {side: item.evidence.closest_m(side) for side in SIDES}
+    found, labelled = item.evidence.hand_type, item.labelled_hand
+    return {
+        "clip_id": item.clip_id,
+        "hand_type": found,
+        "source": HAND_TYPE_SOURCE if found else None,
+        **{f"min_{side}_m": distance if np.isfinite(distance) else None for side, distance in closest.items()},
+        "labelled_hand": labelled,
+        "agreement": None if labelled is None else labelled == found,
+        "reason": None if found else _reason(item.evidence),
+    }
+
+
+def _reason(evidence: HandEvidence) -> str:
+    nearest = min(evidence.closest_m(side) for side in SIDES)
+    if not np.isfinite(nearest):
+        return "no hand is valid in any frame"
+    return f"no joint within {evidence.threshold_m * 100:g} cm of the object; nearest {nearest * 100:.1f} cm"
+
+
+def _text_rows(named: Sequence[_Annotated], sentences: Sequence[str]) -> list[dict]:
+    row_of = {sentence: row for row, sentence in enumerate(sentences)}
+    return [
+        {"clip_id": item.clip_id, "form": form, "sentence": sentence, "text_row": row_of[sentence]}
+        for item in named
+        for form, sentence in zip(FORMS, item.sentences or (), strict=True)
+    ]
+
+
+def _split_rows(store: Store, named: Sequence[_Annotated], rule: SplitRule) -> list[dict]:
+    """Parts are counted over the clips that will be used, so that none runs empty through clips left out."""
+    used = store.sequences.loc[[item.clip_id for item in named]]
+    return [{"clip_id": clip_id, "split": str(part)} for clip_id, part in assign_split(used, rule).items()]
+
+
+def _write_embeddings(path: Path, encoder: TextEncoder, sentences: Sequence[str]) -> None:
+    identity = np.frombuffer(canonical_json(encoder.identity).encode(), np.uint8)
+    text = np.array(sentences, dtype=np.str_) if sentences else np.zeros(0, "<U1")
+    write_npz(path, {"features": encoder.encode(sentences), "sentences": text, "identity": identity})
+
+
+def _counts(found: Sequence[_Annotated], sentences: Sequence[str]) -> dict[str, int]:
+    hands = Counter(item.evidence.hand_type for item in found)
+    labelled = [item for item in found if item.labelled_hand]
+    return {
+        "clips": len(found),
+        "annotated": len(found) - hands[None],
+        "left_out": hands[None],
+        **{hand: hands[hand] for hand in ("left", "right", "both")},
+        "sentences": len(sentences),
+        "labelled": len(labelled),
+        "agreeing": sum(item.labelled_hand == item.evidence.hand_type for item in labelled),
+    }

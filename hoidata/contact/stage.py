@@ -1,0 +1,132 @@
+"""Stage contact: sampled points of every object, touched points and joint-point distances of every clip.
+
+The folder it writes is described in ``hoidata.schema.annotated``.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from hoidata.contact.maps import distance_entries, touched_frames
+from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ENTRY, ProximityIndex
+from hoidata.files import atomic_folder, canonical_json
+from hoidata.files.arrays import write_npz
+from hoidata.files.tables import write_table
+from hoidata.hands import HandPair
+from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
+from hoidata.schema import SIDES, Side
+from hoidata.schema.store import Store, open_store
+
+ENTRIES_PER_SHARD = 1 << 23
+POINT_SHAPES = {
+    "points_m": ((3,), np.float32),
+    "normals": ((3,), np.float32),
+    "face": ((), np.int32),
+    "barycentric": ((3,), np.float32),
+    "part": ((), np.uint8),
+}
+OBJECTS = pa.schema([("object", pa.string()), ("row", pa.int32()), ("method", pa.string())])
+CLIPS = pa.schema(
+    [
+        ("clip_id", pa.string()),
+        ("row", pa.int32()),
+        ("shard", pa.int32()),
+        *((f"{side}_{end}", pa.int64()) for side in SIDES for end in ("start", "stop")),
+    ]
+)
+
+
+def contact_store(
+    clips_folder: str | Path,
+    out_folder: str | Path,
+    *,
+    points: int = POINT_COUNT,
+    threshold_m: float = CONTACT_THRESHOLD_M,
+    hands: HandPair | None = None,
+) -> dict[str, int]:
+    """Write contact and distance maps of every clip of the store; the folder appears whole or not at all.
+
+    points: sampled points per object. threshold_m: larger distances are not kept. hands: as in ``open_store``.
+    Returns counts: clips, objects, entries, clips_without_contact.
+    """
+    store = open_store(clips_folder, hands)
+    sampled = sample_objects(store, points)
+    with atomic_folder(out_folder) as part:
+        _write_points(part, sampled, points)
+        writer = _Writer(part, points)
+        indices = {name: ProximityIndex(cloud) for name, cloud in sampled.items()}
+        for clip_id, entries in clip_entries(store, indices, threshold_m):
+            writer.add(clip_id, entries)
+        counts = writer.finish() | {"objects": len(sampled)}
+        info = {"threshold_m": threshold_m, "points": points, "counts": counts}
+        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+    return counts
+
+
+def sample_objects(store: Store, points: int = POINT_COUNT) -> dict[str, SampledPoints]:
+    """Sampled points of every object of a store, by name, in the store's order."""
+    return {name: sample_points(store.object_model(name), points) for name in store.objects["object"]}
+
+
+def clip_entries(
+    store: Store, indices: dict[str, ProximityIndex], threshold_m: float
+) -> Iterator[tuple[str, dict[Side, np.ndarray]]]:
+    """Every clip's id and distance entries per hand, one clip in memory at a time."""
+    for clip_id in store.ids:
+        clip = store.clip(clip_id)
+        joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
+        yield clip_id, distance_entries(clip, joints, indices[clip.object.model.name], threshold_m)
+
+
+def _write_points(folder: Path, sampled: dict[str, SampledPoints], points: int) -> None:
+    arrays = {}
+    for name, (shape, dtype) in POINT_SHAPES.items():
+        rows = [getattr(cloud, name) for cloud in sampled.values()]
+        arrays[name] = np.stack(rows).astype(dtype) if rows else np.zeros((0, points, *shape), dtype)
+    write_npz(folder / "points.npz", arrays)
+    rows = [{"object": name, "row": row, "method": cloud.method} for row, (name, cloud) in enumerate(sampled.items())]
+    write_table(folder / "objects.parquet", rows, OBJECTS)
+
+
+class _Writer:
+    """Collects clips; writes a shard of distances whenever enough of them are in memory."""
+
+    def __init__(self, folder: Path, points: int) -> None:
+        self.folder, self.points = folder, points
+        self.rows: list[dict] = []
+        self.touched: dict[Side, list[np.ndarray]] = {side: [] for side in SIDES}
+        self.pending: list[np.ndarray] = []
+        self.pending_rows = self.written_rows = self.shard = self.untouched = 0
+
+    def add(self, clip_id: str, entries: dict[Side, np.ndarray]) -> None:
+        row: dict = {"clip_id": clip_id, "row": len(self.rows), "shard": self.shard}
+        for side in SIDES:
+            self.touched[side].append(touched_frames(entries[side], self.points))
+            row[f"{side}_start"] = self.pending_rows
+            self.pending.append(entries[side])
+            self.pending_rows += len(entries[side])
+            row[f"{side}_stop"] = self.pending_rows
+        self.rows.append(row)
+        self.untouched += row["left_start"] == row["right_stop"]
+        if self.pending_rows >= ENTRIES_PER_SHARD:
+            self._write_shard()
+
+    def _write_shard(self) -> None:
+        entries = np.concatenate(self.pending) if self.pending else np.zeros(0, ENTRY)
+        columns = {name: np.ascontiguousarray(entries[name]) for name in ENTRY.names or ()}
+        write_npz(self.folder / f"distances-{self.shard:05d}.npz", columns)
+        self.written_rows += self.pending_rows
+        self.pending, self.pending_rows, self.shard = [], 0, self.shard + 1
+
+    def finish(self) -> dict[str, int]:
+        if self.pending or not self.shard:
+            self._write_shard()
+        empty = np.zeros((0, self.points), np.uint16)
+        write_npz(
+            self.folder / "contact.npz",
+            {f"{side}_frames": np.stack(maps) if maps else empty for side, maps in self.touched.items()},
+        )
+        write_table(self.folder / "clips.parquet", self.rows, CLIPS)
+        return {"clips": len(self.rows), "entries": self.written_rows, "clips_without_contact": int(self.untouched)}

@@ -1,0 +1,173 @@
+"""The annotated dataset of one profile and source: clips, words, contacts, read from the three folders stages write.
+
+    clips/        the store (see ``hoidata.schema.store``)
+    annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz)
+                  hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
+                                      reason (why a clip is left out)
+                  embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
+                  split.parquet       clip_id, split        info.json    encoder, threshold_m, counts
+    contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
+                  clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
+                  contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
+                  distances-*.npz     frame int16, point int16, joint int8, distance_m float32: one row per entry
+                  info.json           threshold_m, points, counts
+
+A clip without an acting hand has a row with a reason in hand_type.parquet and no sentence; it belongs to no split.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import pandas as pd
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.arrays import read_npz
+from hoidata.hands import HandPair
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.sampling import SampledPoints
+from hoidata.schema.clip import SIDES, Clip, HandType, Side
+from hoidata.schema.dataset import DistanceEntries
+from hoidata.schema.mapped import map_npz
+from hoidata.schema.store import Store, open_store
+
+
+def load_annotated(root: str | Path, hands: HandPair | None = None) -> "AnnotatedStore":
+    """Open ``root/clips``, ``root/annotation`` and ``root/contact`` for reading.
+
+    hands: as in ``open_store``. Raises MissingResource naming the stage whose folder is not there.
+    """
+    root = Path(root)
+    for folder, stage in (("clips", "convert"), ("annotation", "annotate"), ("contact", "contact")):
+        if not (root / folder).is_dir():
+            raise MissingResource(f"{root / folder} is not there: run the stage '{stage}' of this dataset first")
+    return AnnotatedStore(root, open_store(root / "clips", hands))
+
+
+class AnnotatedStore:
+    """Clips with their words and contacts, by clip id. ``ids()`` are the clips in which a hand acts."""
+
+    def __init__(self, root: Path, store: Store) -> None:
+        self.root = root
+        self.store = store
+        annotation, contact = root / "annotation", root / "contact"
+        self.text = pd.read_parquet(annotation / "text.parquet")
+        self.hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
+        split = pd.read_parquet(annotation / "split.parquet")
+        self.splits: dict[str, str] = dict(zip(split["clip_id"], split["split"], strict=True))
+        self.annotation_info: dict[str, Any] = orjson.loads((annotation / "info.json").read_bytes())
+        self.contact_info: dict[str, Any] = orjson.loads((contact / "info.json").read_bytes())
+        embeddings = read_npz(annotation / "embeddings.npz")
+        self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
+        self._features = embeddings["features"]
+        self._sentences = {str(key): rows for key, rows in self.text.groupby("clip_id", sort=False)}
+        self._objects = pd.read_parquet(contact / "objects.parquet").set_index("object")
+        self._clips = pd.read_parquet(contact / "clips.parquet").set_index("clip_id")
+        self._points = read_npz(contact / "points.npz")
+        self._contact = read_npz(contact / "contact.npz")
+        self._distances: dict[int, dict[str, np.ndarray]] = {}
+        self._refuse_other_clips()
+
+    def __len__(self) -> int:
+        return len(self.ids())
+
+    def ids(self, split: str | None = None) -> list[str]:
+        """Clips of one split, or of all, in the store's order; clips without an acting hand are left out."""
+        return [key for key in self._sentences if split is None or self.splits[key] == split]
+
+    def split_ids(self, split: str) -> list[str]:
+        """Clips of one split, in the store's order."""
+        return self.ids(split)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The store's ``meta/info.json``: dataset, synthetic, hand model, licence."""
+        return self.store.info
+
+    def clip(self, clip_id: str) -> Clip:
+        return self.store.clip(clip_id)
+
+    def joints(self, clip_id: str, side: Side) -> np.ndarray:
+        """(frame, 21, 3) float32 world joints of one hand, metres."""
+        return self.store.joints(clip_id, side)
+
+    def hand_type(self, clip_id: str) -> HandType:
+        """The hand the proximity test found. Raises KeyError for a clip without an acting hand."""
+        found = self.hand_types.at[clip_id, "hand_type"]
+        if found not in ("left", "right", "both"):
+            raise KeyError(f"no hand acts in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")
+        return found
+
+    def sentences(self, clip_id: str) -> tuple[str, ...]:
+        """Imperative, passive, subject and gerund form."""
+        return tuple(self._sentences[clip_id]["sentence"])
+
+    def text_features(self, clip_id: str) -> np.ndarray:
+        """(4, 512) float32 features of the four sentences, of the encoder ``encoder_identity``."""
+        return self._features[self._sentences[clip_id]["text_row"].to_numpy()]
+
+    def text_embedding(self, clip_id: str) -> np.ndarray:
+        """The same as :meth:`text_features`."""
+        return self.text_features(clip_id)
+
+    def object_key(self, clip_id: str) -> str:
+        """Name of the manipulated object within this dataset."""
+        return str(self.store.sequences.at[clip_id, "object"])
+
+    def object_model(self, object_key: str) -> ObjectModel:
+        return self.store.object_model(object_key)
+
+    def points(self, object_key: str) -> SampledPoints:
+        """The sampled points of an object, in its own frame with the hinge at zero."""
+        row = int(self._objects.at[object_key, "row"])
+        arrays = {name: array[row] for name, array in self._points.items()}
+        return SampledPoints(**arrays, method=self._objects.at[object_key, "method"])
+
+    def contact_of(self, clip_id: str, side: Side) -> np.ndarray:
+        """(1024,) uint8: points one hand touches in any frame of the clip."""
+        return (self.touched_frames(clip_id, side) > 0).astype(np.uint8)
+
+    def contact(self, clip_id: str) -> np.ndarray:
+        """(1024,) uint8: points any hand touches in any frame of the clip, Text2HOI's contact map."""
+        return np.maximum(self.contact_of(clip_id, "left"), self.contact_of(clip_id, "right"))
+
+    def touched_frames(self, clip_id: str, side: Side) -> np.ndarray:
+        """(1024,) uint16: in how many frames one hand touches each point."""
+        return self._contact[f"{side}_frames"][int(self._clips.at[clip_id, "row"])]
+
+    def distances(self, clip_id: str, side: Side | None = None) -> DistanceEntries:
+        """All joint-point distances under the threshold, of one hand or of both (left first)."""
+        sides = SIDES if side is None else (side,)
+        parts = [self._entries(clip_id, name) for name in sides]
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return DistanceEntries(*columns)
+
+    def _entries(self, clip_id: str, side: Side) -> tuple[np.ndarray, ...]:
+        row = self._clips.loc[clip_id]
+        rows = slice(int(row[f"{side}_start"]), int(row[f"{side}_stop"]))
+        shard = self._shard(int(row["shard"]))
+        frame, joint, point = (shard[name][rows].astype(np.int64) for name in ("frame", "joint", "point"))
+        number = np.full(len(frame), SIDES.index(side), np.int64)
+        return number, frame, joint, point, np.array(shard["distance_m"][rows])
+
+    def _shard(self, number: int) -> dict[str, np.ndarray]:
+        if number not in self._distances:
+            self._distances[number] = map_npz(self.root / "contact" / f"distances-{number:05d}.npz")
+        return self._distances[number]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workers map the distances anew: a pickled memory map would carry all of them."""
+        return {**self.__dict__, "_distances": {}}
+
+    def _refuse_other_clips(self) -> None:
+        """Raise BadInput when a stage's output belongs to another conversion than the clips beside it."""
+        for folder, found in (("annotation", self.hand_types.index), ("contact", self._clips.index)):
+            _same_ids(self.root / folder, self.store.ids, list(found))
+
+
+def _same_ids(folder: Path, expected: Sequence[str], found: Sequence[str]) -> None:
+    if list(expected) != list(found):
+        got = f"{len(found)}, {len(set(found) & set(expected))} of them among these"
+        raise BadInput(folder, f"the {len(expected)} clips of the store beside it", got, "run its stage again")

@@ -1,0 +1,189 @@
+"""The stages annotate and contact, and reading both back, on a small store of clips made here."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+
+from hoidata.annotation.encoders import load_encoder
+from hoidata.annotation.stage import annotate_store
+from hoidata.contact.stage import contact_store
+from hoidata.errors import BadInput, MissingResource
+from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.objects.model import Hinge, ObjectModel, articulate, place
+from hoidata.objects.sampling import sample_points
+from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.schema.annotated import AnnotatedStore, load_annotated
+from hoidata.schema.splits import SplitRule
+from hoidata.schema.store import open_store, write_store
+
+FRAMES = 6
+RULE = SplitRule(validation=("s2",), test=("s3",))
+
+
+def box_model() -> ObjectModel:
+    box = trimesh.creation.box((0.06, 0.06, 0.2))
+    return ObjectModel("box", box.vertices, box.faces, np.zeros(8, np.uint8))
+
+
+def folder_model() -> ObjectModel:
+    """Two flat boxes side by side; the second turns about the edge between them."""
+    base = trimesh.creation.box((0.1, 0.1, 0.01))
+    vertices = np.concatenate([base.vertices - np.array([0.05, 0, 0]), base.vertices + np.array([0.05, 0, 0])])
+    faces = np.concatenate([base.faces, base.faces + 8])
+    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.zeros(3))
+    return ObjectModel("notebook", vertices, faces, (np.arange(16) >= 8).astype(np.uint8), hinge)
+
+
+def hand(wrist_m: tuple[float, float, float]) -> HandTrack:
+    zeros = np.zeros((FRAMES, 3), np.float32)
+    wrist = np.tile(np.array(wrist_m, np.float32), (FRAMES, 1))
+    pose, betas = np.zeros((FRAMES, 45), np.float32), np.zeros((1, 10), np.float32)
+    return HandTrack(wrist, zeros, pose, betas, np.ones(FRAMES, bool))
+
+
+def clip(number: int, model: ObjectModel, left: bool, right: bool, **facts) -> Clip:
+    """A hand that acts has its wrist 1 cm above the object's top at the origin; another is a metre away."""
+    top = float(model.vertices_m[:, 2].max())
+    hands = {side: hand((0, 0, top + (0.01 if acts else 1.0))) for side, acts in zip(SIDES, (left, right), strict=True)}
+    hinge = np.linspace(0, 0.5, FRAMES, dtype=np.float32) if model.is_articulated else None
+    still = np.zeros((FRAMES, 3), np.float32)
+    made = Clip(
+        f"toy/s{number}/{number}", "toy", f"s{number}", f"{number}", hands, ObjectTrack(model, still, still, hinge),
+        np.arange(FRAMES, dtype=np.int32), np.array([0.0, 0, -1]), "lift", model.name, synthetic=True,
+    )  # fmt: skip
+    return replace(made, **facts)
+
+
+def clips() -> list[Clip]:
+    return [
+        clip(1, box_model(), True, False),
+        clip(2, box_model(), False, True, labelled_hand="right", verb="take out", object_words="milk"),
+        clip(3, folder_model(), True, True, labelled_hand="left", verb=None),
+        clip(4, folder_model(), False, False),
+    ]
+
+
+def write_all(root: Path, made: list[Clip]) -> Path:
+    digest = load_embedded_hands().digest
+    write_store(root / "clips", made, {"dataset": "toy", "hand_model": {"name": "embedded", "digest": digest}})
+    annotate_store(root / "clips", root / "annotation", encoder="hash", split=RULE)
+    contact_store(root / "clips", root / "contact")
+    return root
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_all(tmp_path_factory.mktemp("toy"), clips())
+
+
+@pytest.fixture(scope="module")
+def annotated(root: Path) -> AnnotatedStore:
+    return load_annotated(root)
+
+
+def test_sentences_name_the_hand_that_was_found(annotated: AnnotatedStore) -> None:
+    assert annotated.sentences("toy/s1/1")[2] == "The left hand lifts a box."
+    assert annotated.sentences("toy/s2/2")[1] == "Milk is taken out by the right hand."
+    assert annotated.sentences("toy/s3/3")[0] == "Move a notebook with both hands."
+    assert [annotated.hand_type(key) for key in annotated.ids()] == ["left", "right", "both"]
+
+
+def test_a_clip_without_an_acting_hand_is_listed_with_its_reason_and_left_out(annotated: AnnotatedStore) -> None:
+    assert "toy/s4/4" not in annotated.ids()
+    assert "no joint within 2 cm" in annotated.hand_types.at["toy/s4/4", "reason"]
+    with pytest.raises(KeyError, match="no hand acts"):
+        annotated.hand_type("toy/s4/4")
+    assert annotated.annotation_info["counts"]["left_out"] == 1
+
+
+def test_the_labelled_hand_is_kept_beside_the_found_one(annotated: AnnotatedStore) -> None:
+    agreement = annotated.hand_types["agreement"]
+    assert agreement["toy/s2/2"] is True
+    assert agreement["toy/s3/3"] is False
+    assert agreement["toy/s1/1"] is None
+    assert annotated.hand_types.at["toy/s1/1", "min_left_m"] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_every_clip_with_words_has_its_part(annotated: AnnotatedStore) -> None:
+    assert [annotated.ids(part) for part in ("train", "validation", "test")] == [
+        ["toy/s1/1"], ["toy/s2/2"], ["toy/s3/3"],
+    ]  # fmt: skip
+
+
+def test_features_are_those_of_the_sentences(annotated: AnnotatedStore) -> None:
+    encoder = load_encoder("hash")
+    for key in annotated.ids():
+        np.testing.assert_array_equal(annotated.text_features(key), encoder.encode(annotated.sentences(key)))
+    assert annotated.encoder_identity == encoder.identity
+
+
+def test_points_come_back_as_they_were_sampled(annotated: AnnotatedStore) -> None:
+    for key in ("box", "notebook"):
+        stored, made = annotated.points(key), sample_points(annotated.object_model(key))
+        assert stored.method == made.method
+        for name in ("points_m", "normals", "face", "barycentric", "part"):
+            np.testing.assert_array_equal(getattr(stored, name), getattr(made, name))
+
+
+def test_distances_and_contact_equal_brute_force_from_the_stored_clip(annotated: AnnotatedStore) -> None:
+    for key in annotated.ids():
+        track, points = annotated.clip(key).object, annotated.points(annotated.object_key(key))
+        local = articulate(points.points_m, points.part, track.model.hinge, track.hinge_rad)
+        world = place(np.broadcast_to(local, (FRAMES, 1024, 3)), track.rotvec, track.translation_m)
+        union = np.zeros(1024, bool)
+        for side in SIDES:
+            joints = track_joints(annotated.clip(key).hands[side], load_embedded_hands()[side])
+            distance = np.linalg.norm(world[:, :, None] - joints[:, None], axis=3)
+            entries = annotated.distances(key, side)
+            assert len(entries.frame) == (distance < 0.02).sum()
+            truth = distance[entries.frame, entries.point, entries.joint]
+            np.testing.assert_allclose(entries.distance_m, truth, atol=1e-6)
+            touched = (distance < 0.02).any(axis=2)
+            np.testing.assert_array_equal(annotated.touched_frames(key, side), touched.sum(axis=0))
+            np.testing.assert_array_equal(annotated.contact_of(key, side), touched.any(axis=0))
+            union |= touched.any(axis=0)
+        np.testing.assert_array_equal(annotated.contact(key), union)
+
+
+def test_both_hands_are_told_apart_in_the_distances(annotated: AnnotatedStore) -> None:
+    both = annotated.distances("toy/s3/3")
+    assert set(both.side.tolist()) == {0, 1}
+    assert len(both.frame) == sum(len(annotated.distances("toy/s3/3", side).frame) for side in SIDES)
+
+
+def test_the_same_clips_give_the_same_bytes(root: Path, tmp_path: Path) -> None:
+    again = write_all(tmp_path, clips())
+    for folder in ("annotation", "contact"):
+        names = sorted(path.name for path in (root / folder).iterdir())
+        assert names == sorted(path.name for path in (again / folder).iterdir())
+        for name in names:
+            assert (root / folder / name).read_bytes() == (again / folder / name).read_bytes(), name
+
+
+def test_an_empty_store_gives_an_empty_annotation(tmp_path: Path) -> None:
+    annotated = load_annotated(write_all(tmp_path, []))
+    assert annotated.ids() == []
+
+
+def test_the_threshold_decides_who_acts(root: Path, tmp_path: Path) -> None:
+    """Below 5 mm only the notebook's cover is left: it turns up into the hands."""
+    annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", split=RULE, threshold_m=0.005)
+    text = pd.read_parquet(tmp_path / "annotation" / "text.parquet")
+    assert set(text["clip_id"]) == {"toy/s3/3"}
+
+
+def test_a_folder_of_another_conversion_is_refused(root: Path, tmp_path: Path) -> None:
+    write_all(tmp_path, clips()[:2])
+    write_store(tmp_path / "clips", clips(), dict(open_store(root / "clips").info))
+    with pytest.raises(BadInput, match="run its stage again"):
+        load_annotated(tmp_path)
+
+
+def test_a_missing_stage_is_named(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "clips").mkdir()
+    with pytest.raises(MissingResource, match="stage 'annotate'"):
+        load_annotated(tmp_path)
