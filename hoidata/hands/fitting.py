@@ -50,7 +50,7 @@ class FitSettings:
     shake_rad: float = 0.1
     shape_frames: int = 100
     shape_prior: float = 0.3
-    shape_steps: int = 30
+    shape_steps: int = 12
     pose_steps: int = 15
 
 
@@ -151,7 +151,8 @@ def fit_shape(
     n_frames = sum(len(problem.keypoints) for problem in problems)
     prior = settings.noise_m**2 * max(1.0, settings.shape_prior * n_frames)
     for _ in range(settings.shape_steps):
-        betas, poses = _shape_step(problems, poses, betas, prior)
+        betas, moved = _shape_step(problems, poses, betas, prior)
+        poses = [_settled(*pair, betas) for pair in zip(problems, moved, poses, strict=True)]
     return betas[0].numpy()
 
 
@@ -270,6 +271,12 @@ def _pose_step(problem: _Problem, pose: _Pose, betas: Tensor) -> _Pose:
     better = _cost(problem, moved, betas, target) < _cost(problem, pose, betas, target)
     problem.damping = torch.where(better, problem.damping / 4, problem.damping * 16).clamp(1e-8, 1e4)
     return moved.where(better, pose)
+
+
+def _settled(problem: _Problem, moved: _Pose, before: _Pose, betas: Tensor) -> _Pose:
+    """After a step of the shape: per frame the better of both poses, then a damped step of its own."""
+    better = _cost(problem, moved, betas, moved.fingers) < _cost(problem, before, betas, before.fingers)
+    return _pose_step(problem, moved.where(better, before), betas)
 
 
 def _shape_step(
