@@ -22,6 +22,7 @@ class GeneratedMotion:
     text: the sentence. hand_type: "left", "right", "both"; hand_evidence: why. seed: what the noise was drawn from.
     points: the object's 1,024 points; contact: (2, point) predicted contact in [0, 1], sides ordered left, right.
     synthetic: the models behind it were trained on generated data. facts: further (name, value) rows for the page.
+    answers_to: id of the recorded clip with the same sentence and object, where there is one.
     """
 
     clip: Clip
@@ -34,6 +35,7 @@ class GeneratedMotion:
     contact: np.ndarray | None = None
     synthetic: bool = False
     facts: tuple[tuple[str, str], ...] = ()
+    answers_to: str = ""
 
 
 def write_generation(out_dir: str | Path, motion: GeneratedMotion, vertices: bool = False) -> list[Path]:
@@ -65,10 +67,11 @@ def write_generation(out_dir: str | Path, motion: GeneratedMotion, vertices: boo
 def motion_arrays(motion: GeneratedMotion, vertices: bool = False) -> dict[str, np.ndarray]:
     """The arrays of motion.npz. Metres, radians, 30 fps, the clip's world frame; side axis: left, right.
 
-    text (); fps (); gravity (3,) or (0,); valid (2, F) bool; joints_m (2, F, 21, 3);
-    vertices_m (2, F, 778, 3) if asked; wrist_m (2, F, 3), global_orient (2, F, 3), hand_pose (2, F, 45): axis-angle, absolute; betas (2, 1 or F, 10);
-    object_rotvec (F, 3), object_translation_m (F, 3), object_hinge_rad (F,) if articulated; object_vertices_m (V, 3),
-    object_faces (N, 3), object_part (V,); contact_points_m (P, 3), contact_part (P,), contact (2, P) where predicted.
+    text (); fps (); gravity (3,) or (0,); valid (2, F) bool; joints_m (2, F, 21, 3); vertices_m (2, F, 778, 3) if asked
+    wrist_m (2, F, 3), global_orient (2, F, 3), hand_pose (2, F, 45): axis-angle, absolute; betas (2, 1 or F, 10)
+    object_rotvec (F, 3), object_translation_m (F, 3), object_hinge_rad (F,) if articulated
+    object_vertices_m (V, 3), object_faces (N, 3), object_part (V,)
+    contact_points_m (P, 3), contact_part (P,), contact (2, P) where predicted
     Rows of a hand where ``valid`` is False are zero.
     """
     clip = motion.clip

@@ -44,8 +44,8 @@ def make_page_clip(right: bool = True, left: bool = False, hinged: bool = False,
     rotvec = np.stack([0 * phase, 0 * phase, 0.6 * phase], axis=1)
     hinge = -1.2 * phase if hinged else None
     tracks = {
-        "right": hand_track(centre + np.array((0.13, 0, 0.08)), np.tile((1.3, 0.2, 2.6), (frames, 1)), right),
         "left": hand_track(centre + np.array((-0.13, 0, 0.08)), np.tile((1.3, -0.2, -2.6), (frames, 1)), left),
+        "right": hand_track(centre + np.array((0.13, 0, 0.08)), np.tile((1.3, 0.2, 2.6), (frames, 1)), right),
     }
     return Clip(
         clip_id="test/box_lift",

@@ -1,0 +1,99 @@
+"""The facts of one dataset as the report shows them, read from the folders its stages wrote."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from hoidata.hands import HandPair
+from hoidata.schema.annotated import AnnotatedStore, load_annotated
+from hoidata.schema.clip import FPS
+from hoidata.schema.store import Store, open_store
+
+MOST_FREQUENT = 12
+
+
+@dataclass(frozen=True)
+class DatasetFacts:
+    """Numbers and tables of one dataset.
+
+    tiles: (number, name). counts: (title, [(name, clips)]). quarantine: rows of the store's table, as dicts.
+    annotated: None where no clip is annotated; empty: the reason, where there is no clip at all.
+    """
+
+    name: str
+    synthetic: bool
+    empty: str
+    tiles: list[tuple[str, str]]
+    counts: list[tuple[str, list[tuple[str, int]]]]
+    quarantine: list[dict[str, str]]
+    annotated: AnnotatedStore | None
+    info: dict
+
+    @property
+    def reasons(self) -> list[tuple[str, int]]:
+        """What the sequences left out should have been, most frequent first."""
+        return _frequent([row["expected"] for row in self.quarantine], "")
+
+
+def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
+    """Facts of the dataset below ``root`` (its ``clips``, ``annotation`` and ``contact`` folders)."""
+    reason = reason_for_nothing(root / "clips")
+    if not (root / "clips" / "meta" / "info.json").is_file():
+        return DatasetFacts(name, False, reason or "it was not converted", [], [], [], None, {})
+    store = open_store(root / "clips", hands)
+    quarantine = [{key: str(row[key]) for key in store.quarantine} for row in store.quarantine.to_dict("records")]
+    if not len(store):
+        return DatasetFacts(name, False, reason or "no sequence gave a clip", [], [], quarantine, None, store.info)
+    annotated = load_annotated(root, hands) if _is_annotated(root) else None
+    synthetic = bool(store.sequences["synthetic"].any())
+    tiles, counts = _tiles(store, annotated), _counts(store, annotated)
+    return DatasetFacts(name, synthetic, "", tiles, counts, quarantine, annotated, store.info)
+
+
+def reason_for_nothing(folder: Path) -> str:
+    """The reason a stage noted in ``folder/empty.json``; "" where it noted none."""
+    note = folder / "empty.json"
+    return str(json.loads(note.read_text(encoding="utf-8"))["reason"]) if note.is_file() else ""
+
+
+def _is_annotated(root: Path) -> bool:
+    return (root / "annotation" / "text.parquet").is_file() and (root / "contact" / "points.npz").is_file()
+
+
+def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, str]]:
+    rows = store.sequences
+    frames = sum(int(count) for count in rows["n_frames"])
+    tiles = [
+        (f"{len(rows):,}", "clips"),
+        (f"{frames:,}", "frames at 30 fps"),
+        (f"{frames / FPS / 60:.1f}", "minutes"),
+        (f"{rows['subject'].nunique():,}", "subjects"),
+        (f"{rows['object'].nunique():,}", "objects"),
+        (f"{rows['verb'].nunique():,}", "verbs"),
+        (f"{len(store.quarantine):,}", "left out"),
+    ]
+    if annotated is not None:
+        tiles.append((f"{len(annotated.text):,}", "sentences"))
+    return tiles
+
+
+def _counts(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, list[tuple[str, int]]]]:
+    rows = store.sequences
+    tables = []
+    if annotated is not None:
+        tables.append(("hands", _frequent(list(annotated.hand_types["hand_type"]), "none acts")))
+        tables.append(("split", _frequent([annotated.splits[clip_id] for clip_id in annotated.ids()], "none")))
+    tables.append(("verb", _frequent(list(rows["verb"]), "no label in the source")))
+    tables.append(("object", _frequent(list(rows["object_words"]), "unnamed")))
+    return tables
+
+
+def _frequent(column: list, missing: str) -> list[tuple[str, int]]:
+    names = [missing if pd.isna(value) else str(value) for value in column]
+    counted = sorted(Counter(names).items(), key=lambda item: (-item[1], item[0]))
+    rest = counted[MOST_FREQUENT:]
+    tail = [(f"{len(rest)} others", sum(count for _, count in rest))] if rest else []
+    return counted[:MOST_FREQUENT] + tail

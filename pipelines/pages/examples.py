@@ -1,0 +1,62 @@
+"""What the report shows of one dataset: which held-out clips, and their contact maps beside predicted ones."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hoidata.schema.annotated import AnnotatedStore
+from hoidata.schema.clip import SIDES, Clip
+from models.checkpoints import Checkpoint, load_checkpoint
+from models.contact import ContactModel
+from pipelines.pages.surface import ContactPaint
+
+CONTACT_DRAWS = 32
+
+
+@dataclass(frozen=True)
+class ContactExample:
+    """One test clip's contact map beside the mean of 32 predicted ones."""
+
+    clip: Clip
+    sentence: str
+    truth: ContactPaint
+    predicted: ContactPaint
+
+
+def shown_ids(annotated: AnnotatedStore, count: int) -> list[str]:
+    """Up to ``count`` test clips (validation, then training, where there are none), of different objects first."""
+    ids = next((ids for split in ("test", "validation", "train") if (ids := annotated.split_ids(split))), [])
+    first_of_object = list({annotated.object_key(clip_id): clip_id for clip_id in reversed(ids)}.values())[::-1]
+    rest = [clip_id for clip_id in ids if clip_id not in first_of_object]
+    return (first_of_object + rest)[:count]
+
+
+def true_contact(annotated: AnnotatedStore, clip_id: str) -> ContactPaint:
+    """Points any hand touches in any frame of the clip."""
+    points = annotated.points(annotated.object_key(clip_id))
+    return ContactPaint(points.points_m, points.part, annotated.contact(clip_id).astype(np.float64))
+
+
+def contact_examples(annotated: AnnotatedStore, folder: Path, ids: list[str], seed: int) -> list[ContactExample]:
+    """Truth and prediction for each clip id, from the contact checkpoint in ``folder``."""
+    checkpoint = load_checkpoint(folder, "contact")
+    return [_contact_example(annotated, checkpoint, clip_id, seed) for clip_id in ids]
+
+
+def _contact_example(annotated: AnnotatedStore, checkpoint: Checkpoint, clip_id: str, seed: int) -> ContactExample:
+    network = checkpoint.network
+    assert isinstance(network, ContactModel)
+    points = annotated.points(annotated.object_key(clip_id))
+    acts = [annotated.hand_type(clip_id) in (side, "both") for side in SIDES]
+    chances = network.sample(
+        torch.from_numpy(points.points_m)[None],
+        torch.from_numpy(annotated.text_features(clip_id)[:1]),
+        torch.tensor([acts]),
+        CONTACT_DRAWS,
+        torch.Generator().manual_seed(seed),
+    )
+    predicted = ContactPaint(points.points_m, points.part, chances[0].mean(0).double().numpy())
+    sentence = annotated.sentences(clip_id)[0]
+    return ContactExample(annotated.clip(clip_id), sentence, true_contact(annotated, clip_id), predicted)

@@ -1,0 +1,165 @@
+"""The report of one profile: one self-contained page over all its datasets."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from markupsafe import Markup
+
+from hoidata.files import atomic_file
+from hoidata.hands import HandPair
+from pipelines.pages.curves import curves_svg, log_curves, read_log
+from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
+from pipelines.pages.examples import contact_examples, shown_ids, true_contact
+from pipelines.pages.generation_page import GeneratedMotion, contact_paint
+from pipelines.pages.metrics_table import Table, metrics_tables
+from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.view import touched_side
+
+MODELS = ("contact", "length", "diffusion", "refiner")
+TITLES = {"h2o": "H2O", "grab": "GRAB", "arctic": "ARCTIC", "manipnet": "ManipNet"}
+CONTACT_EXAMPLES = 3
+LOG_RATIO = 20.0
+
+
+@dataclass(frozen=True)
+class ReportFolders:
+    """Where the stages of one profile wrote: each folder holds one entry per dataset."""
+
+    data: Path
+    checkpoints: Path
+    metrics: Path
+
+    @classmethod
+    def of(cls, profile: str, root: str | Path = ".") -> "ReportFolders":
+        root = Path(root)
+        return cls(root / "data" / profile, root / "checkpoints" / profile, root / "metrics" / profile)
+
+
+@dataclass(frozen=True)
+class Section:
+    """One dataset on the page. motions: recorded and generated, side by side; contact: sentence, (truth, predicted)."""
+
+    facts: DatasetFacts
+    title: str
+    motions: list[Player] = field(default_factory=list)
+    motion_facts: list[tuple[str, str]] = field(default_factory=list)
+    contact: list[tuple[str, list[Player]]] = field(default_factory=list)
+    tables: list[Table] = field(default_factory=list)
+    metrics_note: str = ""
+    curves: list[dict[str, str]] = field(default_factory=list)
+    missing: list[tuple[str, str]] = field(default_factory=list)
+
+
+def write_report(
+    out: str | Path,
+    profile: str,
+    datasets: Sequence[str],
+    hands: HandPair,
+    generated: Mapping[str, GeneratedMotion] | None = None,
+    folders: ReportFolders | None = None,
+    seed: int = 0,
+) -> Path:
+    """Write ``out/index.html`` from what the stages of ``profile`` left in ``folders`` (below the current folder).
+
+    generated: per dataset one motion made by its models, shown beside the recorded clip it answers to.
+    Equal inputs give equal bytes. Datasets without clips are listed with their reason.
+    """
+    folders = folders or ReportFolders.of(profile)
+    motions = generated or {}
+    sections = [_section(name, folders, hands, motions.get(name), seed) for name in datasets]
+    synthetic = any(section.facts.synthetic for section in sections)
+    has_players = any(section.motions or section.contact for section in sections)
+    page = render_page(
+        "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections, synthetic=synthetic,
+        hand_model=hands.name, has_players=has_players,
+    )  # fmt: skip
+    path = Path(out) / "index.html"
+    with atomic_file(path) as part:
+        part.write_text(page, encoding="utf-8")
+    return path
+
+
+def _section(name: str, folders: ReportFolders, hands: HandPair, motion: GeneratedMotion | None, seed: int) -> Section:
+    facts = read_dataset(folders.data / name, name, hands)
+    title = TITLES.get(name, name)
+    if facts.empty:
+        return Section(facts, title)
+    checkpoints = folders.checkpoints / name
+    tables, note = _metrics(folders.metrics / f"{name}.json")
+    return Section(
+        facts,
+        title,
+        motions=_motions(facts, hands, motion),
+        motion_facts=_motion_facts(motion),
+        contact=_contact_pairs(facts, checkpoints / "contact", seed),
+        tables=tables,
+        metrics_note=note,
+        curves=[chart for model in MODELS if (chart := _loss_chart(name, model, checkpoints / model / "log.csv"))],
+        missing=[(model, reason) for model in MODELS if (reason := reason_for_nothing(checkpoints / model))],
+    )
+
+
+def _metrics(path: Path) -> tuple[list[Table], str]:
+    if not path.is_file():
+        return [], "The models of this dataset have not been evaluated."
+    values = json.loads(path.read_text(encoding="utf-8"))
+    if "empty" in values:
+        return [], f"Not evaluated: {values['empty']}."
+    return metrics_tables(values), ""
+
+
+def _motions(facts: DatasetFacts, hands: HandPair, motion: GeneratedMotion | None) -> list[Player]:
+    """The recorded clip (named by the motion, else the first of the test split) and the generated one."""
+    annotated = facts.annotated
+    if annotated is None:
+        return []
+    ids = [motion.answers_to] if motion and motion.answers_to else shown_ids(annotated, 1)
+    players = []
+    for clip_id in ids:
+        sentence = annotated.sentences(clip_id)[0]
+        caption = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}: {sentence}"
+        paint = true_contact(annotated, clip_id)
+        players.append(motion_player(annotated.clip(clip_id), hands, sentence, caption, paint, "touched in the clip"))
+    if motion is not None:
+        paint = contact_paint(motion.points, motion.contact)
+        caption = f"Generated: {motion.text}"
+        players.append(motion_player(motion.clip, motion.hands, motion.text, caption, paint, "predicted contact"))
+    return players
+
+
+def _motion_facts(motion: GeneratedMotion | None) -> list[tuple[str, str]]:
+    if motion is None:
+        return []
+    rows = [("generated for", f"{motion.answers_to} (held out)")] if motion.answers_to else []
+    hands = ("hands", f"{motion.hand_type}: {motion.hand_evidence}")
+    return [*rows, hands, ("seed", str(motion.seed)), *motion.facts]
+
+
+def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[str, list[Player]]]:
+    annotated = facts.annotated
+    if annotated is None or not (folder / "model.safetensors").is_file():
+        return []
+    pairs = []
+    for example in contact_examples(annotated, folder, shown_ids(annotated, CONTACT_EXAMPLES), seed):
+        look = touched_side(example.clip, example.truth)
+        players = [
+            contact_player(example.clip, paint, f"{caption}: {example.sentence}", caption, look, label)
+            for caption, paint, label in (
+                ("ground truth", example.truth, "touched"),
+                ("predicted", example.predicted, "chance of contact, 0 to 1"),
+            )
+        ]
+        pairs.append((example.sentence, players))
+    return pairs
+
+
+def _loss_chart(dataset: str, model: str, log: Path) -> dict[str, str] | None:
+    """A chart of every loss in a training log; the axis is logarithmic where the values span more than 20 to 1."""
+    curves = log_curves(read_log(log)) if log.is_file() else []
+    if not curves:
+        return None
+    low, high = min(curve.y.min() for curve in curves), max(curve.y.max() for curve in curves)
+    svg = curves_svg(curves, "step", "loss", f"{dataset} {model}", log_y=low > 0 and high / low > LOG_RATIO)
+    return {"title": model, "svg": Markup(svg)}
