@@ -8,7 +8,7 @@ import io
 import pickle
 import pickletools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -130,7 +130,7 @@ class _Array(np.ndarray):
             raw = _as_bytes(raw)
         if not all(isinstance(length, int) and length >= 0 for length in shape):
             raise pickle.UnpicklingError(f"an array of shape {shape}")
-        super().__setstate__((1, tuple(shape), kind, bool(is_fortran), raw))
+        super().__setstate__((1, tuple(shape), kind, bool(is_fortran), raw))  # type: ignore[arg-type]
 
 
 class _DtypeRecord:
@@ -204,15 +204,20 @@ def _encode(text: Any, encoding: Any = None) -> bytes:
     return text.encode("latin1")
 
 
+def _empty_bytes() -> bytes:
+    """Python 3 writes empty bytes below protocol 3 as a call of ``bytes`` without arguments."""
+    return b""
+
+
 def _set(items: Any = ()) -> set:
     if not isinstance(items, list | tuple):
         raise pickle.UnpicklingError(f"a set of a {type(items).__name__}")
     return set(items)
 
 
-def _numpy_globals() -> dict[tuple[str, str], Callable | _NdarrayType]:
+def _numpy_globals() -> dict[tuple[str, str], Any]:
     """NumPy 1 calls its inner package ``numpy.core``, NumPy 2 ``numpy._core``; files of both are read."""
-    allowed: dict[tuple[str, str], Callable | _NdarrayType] = {
+    allowed: dict[tuple[str, str], Any] = {
         ("numpy", "ndarray"): _NDARRAY,
         ("numpy", "dtype"): _dtype,
     }
@@ -227,6 +232,7 @@ def _numpy_globals() -> dict[tuple[str, str], Callable | _NdarrayType]:
 ARRAYS: Allow = {
     **_numpy_globals(),
     ("_codecs", "encode"): _encode,
+    ("__builtin__", "bytes"): _empty_bytes,
     ("__builtin__", "set"): _set,
     ("builtins", "set"): _set,
 }

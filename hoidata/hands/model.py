@@ -86,7 +86,7 @@ class HandModel:
         return self.joint_regressor @ template + shift
 
     def wrist_offset_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
-        """(frame, 3) J0: where the unposed wrist lies in the model's frame. ``wrist_m = transl + J0`` for MANO files."""
+        """(frame, 3) J0: the unposed wrist in the model's frame; ``wrist_m = transl + J0`` for MANO parameters."""
         return self.rest_joints_m(betas, template_m)[..., 0, :]
 
     @cached_property
@@ -116,7 +116,7 @@ class HandPair:
 
 
 def checked_model(where: str, remedy: str, **values) -> HandModel:
-    """Build a HandModel from its field values; BadInput names the first one with a wrong shape or impossible numbers."""
+    """Build a HandModel from its field values; BadInput names the first with a wrong shape or impossible numbers."""
     arrays = {}
     for key, shape in _SHAPES.items():
         value = np.asarray(values.pop(key))

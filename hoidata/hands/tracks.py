@@ -54,7 +54,8 @@ def _in_chunks(track: HandTrackLike, model: HandModel, n_points: int, run) -> np
     # float64 inside: a world position metres from the origin keeps its last micrometre.
     layer = kinematics_of(model, torch.float64)
     wrist, rotmats, betas = (
-        torch.as_tensor(np.asarray(array, dtype=np.float64)) for array in (track.wrist_m, track_rotmats(track), track.betas)
+        torch.as_tensor(np.asarray(array, dtype=np.float64))
+        for array in (track.wrist_m, track_rotmats(track), track.betas)
     )
     template = None if track.template_m is None else torch.as_tensor(np.asarray(track.template_m, dtype=np.float64))
     out = np.empty((len(wrist), n_points, 3), dtype=np.float32)

@@ -137,7 +137,9 @@ def test_gradients_are_right_and_finite_at_zero_pose():
         return layer.joints(wrist_m, rotvec_to_rotmat(axis_angles), shape)[:, 16:]
 
     assert torch.autograd.gradcheck(tips, (wrist, rotvec, betas), atol=1e-6)
-    gradients = torch.autograd.grad(layer(wrist, rotvec_to_rotmat(rotvec), betas)[0].square().sum(), (wrist, rotvec, betas))
+    gradients = torch.autograd.grad(
+        layer(wrist, rotvec_to_rotmat(rotvec), betas)[0].square().sum(), (wrist, rotvec, betas)
+    )
     assert all(torch.isfinite(gradient).all() and gradient.abs().max() > 0 for gradient in gradients)
 
 

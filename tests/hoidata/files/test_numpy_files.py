@@ -1,0 +1,148 @@
+import io
+import pickle
+import zipfile
+
+import numpy as np
+import pytest
+
+from hoidata.errors import BadInput
+from hoidata.files import load_npy, load_npy_object, load_npz_objects
+
+
+def npy_of_numpy_1(value):
+    """The bytes numpy 1.23 writes for a 0-d object array: header 1.0, pickle protocol 3, old module names."""
+    header = b"{'descr': '|O', 'fortran_order': False, 'shape': (), }"
+    padded = header + b" " * (64 - (10 + len(header) + 1) % 64) + b"\n"
+    body = pickle.dumps(np.array(value, dtype=object), 3).replace(b"numpy._core", b"numpy.core")
+    assert b"numpy.core.multiarray" in body
+    return b"\x93NUMPY\x01\x00" + len(padded).to_bytes(2, "little") + padded + body
+
+
+ARCTIC = {"right": {"rot": np.arange(6.0).reshape(2, 3), "shape": np.zeros(10), "fitting_err": [0.1, 0.2]}}
+
+
+def test_a_dict_saved_by_numpy_1_or_2_comes_back(tmp_path):
+    (tmp_path / "old.npy").write_bytes(npy_of_numpy_1(ARCTIC))
+    np.save(tmp_path / "new.npy", np.array(ARCTIC, dtype=object), allow_pickle=True)
+    for name in ("old.npy", "new.npy"):
+        loaded = load_npy_object(tmp_path / name)
+        np.testing.assert_array_equal(loaded["right"]["rot"], ARCTIC["right"]["rot"])
+        assert loaded["right"]["fitting_err"] == [0.1, 0.2]
+
+
+def test_plain_arrays_come_back_from_both_readers(tmp_path):
+    for array in (np.eye(3), np.asfortranarray(np.arange(6).reshape(2, 3)), np.array(["a", "bc"]), np.zeros((0, 7))):
+        np.save(tmp_path / "a.npy", array)
+        np.testing.assert_array_equal(load_npy(tmp_path / "a.npy"), array)
+        np.testing.assert_array_equal(load_npy_object(tmp_path / "a.npy"), array)
+
+
+def test_the_plain_reader_refuses_objects(tmp_path):
+    (tmp_path / "a.npy").write_bytes(npy_of_numpy_1(ARCTIC))
+    with pytest.raises(BadInput, match=r"a\.npy: expected an array of numbers, got Python objects"):
+        load_npy(tmp_path / "a.npy")
+
+
+def grab(path):
+    np.savez(
+        path,
+        gender="male",
+        n_frames=np.int64(240),
+        framerate=120.0,
+        body={"params": {"transl": np.ones((2, 3))}},
+        contact={"object": np.zeros((2, 5), dtype=np.int8)},
+        plain=np.arange(3),
+    )
+
+
+def test_grab_members_come_back_as_items(tmp_path):
+    grab(tmp_path / "s.npz")
+    loaded = load_npz_objects(tmp_path / "s.npz")
+    assert (loaded["gender"], loaded["n_frames"], loaded["framerate"]) == ("male", 240, 120.0)
+    np.testing.assert_array_equal(loaded["body"]["params"]["transl"], np.ones((2, 3)))
+    np.testing.assert_array_equal(loaded["plain"], np.arange(3))
+
+
+def test_only_the_named_members_are_read_and_must_exist(tmp_path):
+    grab(tmp_path / "s.npz")
+    assert set(load_npz_objects(tmp_path / "s.npz", {"gender", "body"})) == {"gender", "body"}
+    with pytest.raises(BadInput, match="lhand"):
+        load_npz_objects(tmp_path / "s.npz", {"lhand"})
+
+
+class Malicious:
+    def __init__(self, target):
+        self.target = target
+
+    def __reduce__(self):
+        return open, (str(self.target), "w")
+
+
+@pytest.mark.parametrize("reader", [load_npy, load_npy_object])
+def test_npy_with_a_call_inside_is_refused_and_nothing_runs(tmp_path, reader):
+    trace = tmp_path / "trace"
+    np.save(tmp_path / "a.npy", np.array({"a": Malicious(trace)}, dtype=object), allow_pickle=True)
+    with pytest.raises(BadInput):
+        reader(tmp_path / "a.npy")
+    assert not trace.exists()
+
+
+def test_npz_with_a_call_inside_is_refused_by_member_and_nothing_runs(tmp_path):
+    trace = tmp_path / "trace"
+    np.savez(tmp_path / "a.npz", body=np.array({"a": Malicious(trace)}, dtype=object))
+    with pytest.raises(BadInput, match=r"a\.npz: body: .*open"):
+        load_npz_objects(tmp_path / "a.npz")
+    assert not trace.exists()
+
+
+def test_header_that_promises_more_than_the_file_holds_is_refused_before_reading(tmp_path):
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": (10**13,)})
+    (tmp_path / "a.npy").write_bytes(stream.getvalue() + b"\0" * 80)
+    with pytest.raises(BadInput, match="80 bytes"):
+        load_npy(tmp_path / "a.npy")
+
+
+def test_zip_bomb_is_refused_by_its_declared_size(tmp_path, monkeypatch):
+    monkeypatch.setattr("hoidata.files.numpy_files.MAX_BYTES", 10_000)
+    np.savez_compressed(tmp_path / "a.npz", a=np.zeros(100_000))
+    with pytest.raises(BadInput, match="at most 10000 bytes"):
+        load_npz_objects(tmp_path / "a.npz")
+
+
+def test_too_many_members_are_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for index in range(300):
+            archive.writestr(f"{index}.npy", b"")
+    with pytest.raises(BadInput, match="at most 256 members"):
+        load_npz_objects(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.5, 0.9, 0.999])
+def test_truncated_files_are_bad_input(tmp_path, share):
+    grab(tmp_path / "s.npz")
+    np.save(tmp_path / "plain.npy", np.arange(1000))
+    (tmp_path / "object.npy").write_bytes(npy_of_numpy_1(ARCTIC))
+    readers = {"s.npz": load_npz_objects, "plain.npy": load_npy, "object.npy": load_npy_object}
+    for name, reader in readers.items():
+        path = tmp_path / name
+        data = path.read_bytes()
+        path.write_bytes(data[: int(len(data) * share)])
+        with pytest.raises(BadInput, match=name):
+            reader(path)
+
+
+def test_a_spoilt_member_is_bad_input(tmp_path):
+    grab(tmp_path / "s.npz")
+    data = bytearray((tmp_path / "s.npz").read_bytes())
+    data[data.find(b"transl") + 80] ^= 0xFF
+    (tmp_path / "s.npz").write_bytes(bytes(data))
+    with pytest.raises(BadInput, match=r"s\.npz"):
+        load_npz_objects(tmp_path / "s.npz")
+
+
+@pytest.mark.parametrize("reader", [load_npy, load_npy_object, load_npz_objects])
+def test_a_missing_file_or_a_folder_is_bad_input(tmp_path, reader):
+    for path in (tmp_path / "nothing.npy", tmp_path):
+        with pytest.raises(BadInput, match=str(path)):
+            reader(path)

@@ -1,0 +1,178 @@
+import io
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from hoidata.errors import BadInput
+from hoidata.files import ARRAYS, restricted_load
+
+
+def sample():
+    return {
+        "c_order": np.arange(6.0).reshape(2, 3),
+        "fortran": np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3)),
+        "big_endian": np.arange(3, dtype=">i4"),
+        "words": np.array(["cup", "box"]),
+        "flags": np.array([True, False]),
+        "nested": [(np.ones(2), {"deep": np.zeros((0, 3))})],
+        "objects": np.array([1, "x", np.arange(2)], dtype=object),
+        "scalar": np.float32(2.5),
+        "bytes": b"\xff\x00",
+        "set": {1, 2},
+        "text": "mug",
+    }
+
+
+def assert_same(got, wanted):
+    assert type(got) is type(wanted)
+    if isinstance(wanted, dict):
+        assert got.keys() == wanted.keys()
+        for key in wanted:
+            assert_same(got[key], wanted[key])
+    elif isinstance(wanted, list | tuple) or (isinstance(wanted, np.ndarray) and wanted.dtype.hasobject):
+        assert len(got) == len(wanted)
+        for one, other in zip(got, wanted, strict=True):
+            assert_same(one, other)
+    elif isinstance(wanted, np.ndarray):
+        # NumPy turns big-endian arrays into native ones below protocol 5.
+        assert got.dtype.newbyteorder("=") == wanted.dtype.newbyteorder("=")
+        np.testing.assert_array_equal(got, wanted)
+    else:
+        assert got == wanted
+
+
+@pytest.mark.parametrize("protocol", [2, 3, 4, 5])
+@pytest.mark.parametrize("core", [b"numpy.core", b"numpy._core"])
+def test_arrays_in_containers_come_back_equal_under_both_numpy_spellings(protocol, core):
+    if protocol >= 4:
+        # Names carry their length from protocol 4 on, so only the writer's own spelling can be tested by replacement.
+        data = pickle.dumps(sample(), protocol)
+    else:
+        data = pickle.dumps(sample(), protocol).replace(b"numpy._core", core)
+        assert core + b".multiarray" in data
+    assert_same(restricted_load(data, ARRAYS), sample())
+
+
+def test_stream_and_bytes_give_the_same():
+    data = pickle.dumps(sample())
+    assert_same(restricted_load(io.BytesIO(data), ARRAYS), restricted_load(data, ARRAYS))
+
+
+def test_arrays_are_plain_and_writable():
+    array = restricted_load(pickle.dumps({"a": np.zeros(2)}), ARRAYS)["a"]
+    array[0] = 1
+    assert type(array) is np.ndarray
+
+
+def test_shared_and_cyclic_parts_are_read_once():
+    shared = [np.zeros(1)]
+    for _ in range(60):
+        shared = [shared, shared]  # 2^60 paths to one array
+    cyclic: list = []
+    cyclic.append(cyclic)
+    loaded = restricted_load(pickle.dumps({"shared": shared, "cyclic": cyclic}), ARRAYS)
+    assert loaded["cyclic"][0] is loaded["cyclic"]
+    assert loaded["shared"][0] is loaded["shared"][1]
+
+
+class Call:
+    """Pickles as a call of ``function`` with ``arguments``."""
+
+    def __init__(self, function, *arguments):
+        self.function, self.arguments = function, arguments
+
+    def __reduce__(self):
+        return self.function, self.arguments
+
+
+def nested_call(target):
+    return {"a": [np.zeros(2), Call(os.system, f"touch {target}")]}
+
+
+@pytest.mark.parametrize("protocol", [0, 1, 2, 3, 4, 5])
+def test_a_call_of_a_command_is_refused_and_does_not_run(tmp_path, protocol):
+    trace = tmp_path / "trace"
+    with pytest.raises(BadInput, match="not allowed"):
+        restricted_load(pickle.dumps(nested_call(trace), protocol), ARRAYS)
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"cos\nsystem\n(S'true'\ntR.",
+        b"(S'true'\nios\nsystem\n.",
+        b"c__builtin__\neval\n(S'1'\ntR.",
+        b"cnumpy\nload\n(S'x'\ntR.",
+        b"cnumpy.core.multiarray\nfromfile\n.",
+        b"\x80\x04\x8c\x08builtins\x8c\x04exec\x93.",
+        b"\x80\x04\x8c\x0bnumpy._core\x8c\x21multiarray._reconstruct.__class__\x93.",
+        b"P1\n.",
+        b"\x80\x02\x82\x01.",
+    ],
+    ids=[
+        "global",
+        "inst",
+        "eval",
+        "numpy.load",
+        "other numpy",
+        "stack global",
+        "dotted name",
+        "persistent",
+        "extension",
+    ],
+)
+def test_names_outside_the_list_and_strange_opcodes_are_refused(data):
+    with pytest.raises(BadInput, match="not allowed"):
+        restricted_load(data, ARRAYS)
+
+
+RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\n"
+DTYPE = b"cnumpy\ndtype\n"
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        RECONSTRUCT + b"(cnumpy\ndtype\n(I0\ntS'b'\ntR.",
+        RECONSTRUCT + b"(cnumpy\nndarray\n(I99999999999\ntS'b'\ntR.",
+        b"cnumpy\nndarray\n((I99999999999\nttR.",
+        DTYPE + b"(S'V8'\nI0\nI1\ntR.",
+        DTYPE + b"(S'f8,O'\nI0\nI1\ntR.",
+        DTYPE + b"(S'f8'\nI0\nI1\ntR(I3\nS'<'\nN(S'a'\ntN}I-1\nI-1\nI0\ntb.",
+        b"c_codecs\nencode\n(Vabc\nVrot13\ntR.",
+        b"c__builtin__\nset\n(I5\ntR.",
+        b"\x80\x02N" + b"r\xff\xff\xff\x7f" + b".",
+        RECONSTRUCT + b"(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I9\nt" + DTYPE + b"(S'f8'\nI0\nI1\ntRI00\nS'short'\ntb.",
+    ],
+    ids=["subtype", "shape", "array call", "void", "record", "fields", "rot13", "set of int", "memo", "short data"],
+)
+def test_allowed_names_refuse_harmful_arguments(data):
+    with pytest.raises(BadInput):
+        restricted_load(data, ARRAYS, encoding="latin1")
+
+
+def test_every_truncation_is_a_bad_input():
+    data = pickle.dumps(sample(), 2)
+    for length in range(0, len(data), 7):
+        with pytest.raises(BadInput, match="some file"):
+            restricted_load(data[:length], ARRAYS, where="some file")
+
+
+def test_every_flipped_byte_is_read_or_refused_but_never_runs_wild():
+    data = pickle.dumps({"a": np.arange(4.0), "b": "text"}, 2)
+    generator = np.random.default_rng(0)
+    for _ in range(500):
+        spoilt = bytearray(data)
+        spoilt[generator.integers(len(data))] = generator.integers(256)
+        try:
+            restricted_load(bytes(spoilt), ARRAYS)
+        except BadInput:
+            continue
+
+
+def test_larger_than_the_cap_is_refused():
+    with pytest.raises(BadInput, match="at most 100 bytes"):
+        restricted_load(io.BytesIO(pickle.dumps(np.zeros(100))), ARRAYS, max_bytes=100)
