@@ -176,10 +176,12 @@ def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair) -> _Motion:
     pose_path, hand_path = f"{stem}.object.npy", f"{stem}.mano.npy"
     pose = checks.table(pose_path, load_npy_object(raw.file(pose_path)), 7)
     params = load_npy_object(raw.file(hand_path))
-    tracks = {side: _hand(f"{hand_path}: {side}", checks.entry(hand_path, params, side), side, hands) for side in SIDES}
-    for side, track in tracks.items():
-        if track.n_frames != len(pose):
-            raise BadInput(f"{hand_path}: {side}", f"{len(pose)} frames as in {pose_path}", f"{track.n_frames}")
+    tracks: dict[Side, HandTrack] = {}
+    for side in SIDES:
+        tracks[side] = _hand(f"{hand_path}: {side}", checks.entry(hand_path, params, side), side, hands)
+        if tracks[side].n_frames != len(pose):
+            got = f"{tracks[side].n_frames}"
+            raise BadInput(f"{hand_path}: {side}", f"{len(pose)} frames as in {pose_path}", got)
     name = re.sub(r"\d+$", "", key.name.partition("/")[2].split("_")[0])
     model = _object_model(raw, tops[0], name)
     track = ObjectTrack(

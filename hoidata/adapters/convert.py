@@ -3,7 +3,7 @@
 import multiprocessing
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -50,7 +50,7 @@ def convert_dataset(
     hands: HandPair,
     out: str | Path,
     jobs: int = 1,
-    manifest: Iterable[SourceFile] | None = None,
+    manifest: Mapping[str, SourceFile] | Iterable[SourceFile] | None = None,
     progress: bool = True,
     synthetic: bool = False,
 ) -> ConversionSummary:
@@ -63,7 +63,8 @@ def convert_dataset(
     """
     keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
     reason = None if keys else _why_empty(adapter, root)
-    listed = None if manifest is None else {item.path: item for item in manifest}
+    files = manifest.values() if isinstance(manifest, Mapping) else manifest
+    listed = None if files is None else {item.path: item for item in files}
     convert = partial(convert_sequence, adapter, Path(root or "."), hands, listed, synthetic)
     left_out: list[Quarantined] = []
     info = _store_info(adapter, hands, synthetic, reason)

@@ -151,7 +151,7 @@ def _contact(file: _SequenceFile, n_vertices: int) -> np.ndarray:
     if labels.dtype.kind not in "fiub" or labels.shape != (file.n_frames, n_vertices):
         expected = f"numbers of shape ({file.n_frames}, {n_vertices}): frames, vertices of the contact mesh"
         raise BadInput(f"{file.path}: contact.object", expected, f"{labels.dtype} of shape {labels.shape}")
-    return (labels > 0).any(axis=1)
+    return np.asarray((labels > 0).any(axis=1))
 
 
 def _contact_range(file: _SequenceFile, contact: np.ndarray, margin: int) -> np.ndarray:

@@ -70,11 +70,12 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
         try:
             if words[0] == "v":
                 vertices.append([float(word) for word in words[1:4]])
-                continue
-            corners = [_obj_index(word, len(vertices)) for word in words[1:]]
+                corners = []
+            else:
+                corners = [_obj_index(word, len(vertices)) for word in words[1:]]
         except ValueError as error:
             raise BadInput(f"{path}:{number}", "numbers after 'v' or 'f'", repr(line[:60])) from error
-        if len(corners) < 3 or (vertices and len(vertices[-1]) != 3):
+        if len(words) < 4:
             raise BadInput(f"{path}:{number}", "3 coordinates per vertex and 3 or more corners per face", line[:60])
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
     return _checked(path, Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3)))

@@ -63,7 +63,7 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
         name: pd.read_parquet(folder / "meta" / f"{name}.parquet")
         for name in ("sequences", "objects", "files", "quarantine")
     }
-    tables["sequences"] = tables["sequences"].set_index("clip_id", drop=False)
+    tables["sequences"] = tables["sequences"].set_index("clip_id", drop=False).rename_axis(None)
     return Store(folder, info, hands=hands, **tables)
 
 

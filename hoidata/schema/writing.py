@@ -242,7 +242,7 @@ def _object_arrays(model: ObjectModel) -> tuple[dict[str, np.ndarray], str]:
 
 def _empty_arrays() -> dict[str, np.ndarray]:
     """Arrays without rows, so that every shard has every member, in one order."""
-    arrays = {"source_frames": np.zeros(0, np.int32)}
+    arrays: dict[str, np.ndarray] = {"source_frames": np.zeros(0, np.int32)}
     for side in SIDES:
         arrays |= {f"{side}_{name}": np.zeros((0, 3), np.float32) for name in ("wrist_m", "global_orient")}
         arrays[f"{side}_hand_pose"] = np.zeros((0, 45), np.float32)

@@ -1,0 +1,84 @@
+"""Which clips train, which validate, which test: by subject, or by time where there is one subject."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import pandas as pd
+
+from hoidata.errors import BadInput
+
+SPLITS = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class SplitRule:
+    """How one dataset is split.
+
+    by "subject": clips of the subjects in ``validation`` and ``test`` go there, all others train.
+    by "time": in every source sequence the last ``test_share`` of its clips test, the ``validation_share`` before
+    them validate (rounded, at least one clip each where a sequence has three or more).
+    """
+
+    by: Literal["subject", "time"] = "subject"
+    validation: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    validation_share: float = 0.15
+    test_share: float = 0.15
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "validation", tuple(self.validation))
+        object.__setattr__(self, "test", tuple(self.test))
+        if self.by not in ("subject", "time"):
+            raise BadInput("split rule: by", "subject or time", repr(self.by), "mend params.yaml")
+        shared = sorted(set(self.validation) & set(self.test))
+        if shared:
+            raise BadInput("split rule", "no subject in both validation and test", str(shared), "mend params.yaml")
+        shares = (self.validation_share, self.test_share)
+        if min(shares) < 0 or sum(shares) >= 1:
+            raise BadInput("split rule", "shares of 0 or more that sum to less than 1", str(shares), "mend params.yaml")
+
+
+def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
+    """ "train", "validation" or "test" for every row of a store's ``sequences``, under the table's own index.
+
+    Uses the columns clip_id, subject, sequence, first_source_frame and last_source_frame. Does not depend on the order
+    of the rows. Raises BadInput when a part would share a subject, or frames, with another (``check_no_leak``).
+    """
+    rows = sequences.reset_index(drop=True)
+    split = pd.Series("train", index=rows.index, name="split", dtype=object)
+    if rule.by == "subject":
+        split[rows["subject"].isin(rule.validation)] = "validation"
+        split[rows["subject"].isin(rule.test)] = "test"
+    else:
+        ordered = rows.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
+        for _, group in ordered.groupby("sequence"):
+            split.loc[group.index] = _by_time(len(group), rule)
+    check_no_leak(rows, split, rule)
+    return split.set_axis(sequences.index)
+
+
+def _by_time(n_clips: int, rule: SplitRule) -> list[str]:
+    """Parts of the clips of one sequence, in time order."""
+    least = 1 if n_clips >= 3 else 0
+    test = max(least, round(rule.test_share * n_clips)) if rule.test_share else 0
+    validation = max(least, round(rule.validation_share * n_clips)) if rule.validation_share else 0
+    return ["train"] * (n_clips - validation - test) + ["validation"] * validation + ["test"] * test
+
+
+def check_no_leak(sequences: pd.DataFrame, split: pd.Series, rule: SplitRule) -> None:
+    """Raise BadInput when parts share what the rule keeps apart: subjects, or source frames of one sequence."""
+    columns = ["clip_id", "subject", "sequence", "first_source_frame", "last_source_frame"]
+    rows = sequences[columns].assign(split=split)
+    if rule.by == "subject":
+        parts = rows.groupby("subject")["split"].nunique()
+        leaking = sorted(parts.index[parts > 1])
+        if leaking:
+            raise BadInput("split", "every subject in one part", f"{leaking} in several", "mend the split rule")
+    for _, group in rows.sort_values("first_source_frame", kind="stable").groupby(["subject", "sequence"]):
+        if group["split"].nunique() < 2:
+            continue
+        for earlier, later in pairwise(group.itertuples(index=False)):
+            if earlier.split != later.split and later.first_source_frame <= earlier.last_source_frame:
+                got = f"{earlier.clip_id} ({earlier.split}) and {later.clip_id} ({later.split}) overlap"
+                raise BadInput("split", "no frame in two parts", got, "split this dataset by subject")

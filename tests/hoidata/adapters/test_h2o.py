@@ -1,0 +1,203 @@
+"""H2O: a tree of text files written here by hand, and what its numbers must mean."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.adapters import Quarantined
+from hoidata.adapters.h2o import ACTIONS, OBJECTS, H2OAdapter
+from hoidata.errors import BadInput
+from hoidata.hands import track_joints
+
+N_FRAMES = 27
+LABELS = [0, 0, 0] + [26] * 22 + [0, 0]  # take out chips in frames 3 to 24
+LEFT = {"t": (0.05, -0.02, 0.4), "orient": (0.3, -0.8, 0.5), "betas": (0.6, -0.4, 0, 0, 0.2, 0, 0, 0, 0, 0.1)}
+RIGHT = {"t": (-0.04, 0.03, 0.5), "orient": (-0.2, 1.1, 0.1), "betas": (-0.5, 0.3, 0.1, 0, 0, 0, 0, 0, 0, 0)}
+INDEX_BEND = (0.0, 0.1, 0.7)
+
+
+def camera(frame: int) -> np.ndarray:
+    """Camera to world: a head that turns and walks."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_euler("zyx", [20 + 3 * frame, 10, -110], degrees=True).as_matrix()
+    matrix[:3, 3] = (0.1 + 0.01 * frame, -0.2, 1.5 - 0.005 * frame)
+    return matrix
+
+
+def object_in_camera(frame: int) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3] = Rotation.from_rotvec((0.2, 0.9, 0.02 * frame)).as_matrix()
+    matrix[:3, 3] = (0.02, 0.05 + 0.002 * frame, 0.45)
+    return matrix
+
+
+def hand_block(flag: int, hand: dict, fingers=(0.0,) * 45) -> list[float]:
+    return [flag, *hand["t"], *hand["orient"], *fingers, *hand["betas"]]
+
+
+def write_text(path: Path, numbers) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(" ".join(repr(float(number)) for number in np.ravel(numbers)))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """One sequence; the right index bends at its first joint; the left hand is unknown in frame 5."""
+    fingers = np.zeros(45)
+    fingers[:3] = INDEX_BEND
+    folder = tmp_path / "subject2" / "k1" / "3" / "cam4"
+    for frame in range(N_FRAMES):
+        name = f"{frame:06d}.txt"
+        left = [0.0] * 62 if frame == 5 else hand_block(1, LEFT)
+        write_text(folder / "cam_pose" / name, camera(frame))
+        write_text(folder / "hand_pose_mano" / name, left + hand_block(1, RIGHT, fingers))
+        write_text(folder / "obj_pose_rt" / name, [7, *object_in_camera(frame).ravel()])
+        write_text(folder / "action_label" / name, [LABELS[frame]])
+    mesh = tmp_path / "object" / "chips" / "chips.obj"
+    mesh.parent.mkdir(parents=True)
+    trimesh.creation.cylinder(0.04, 0.2, sections=8).export(mesh)
+    return tmp_path
+
+
+@pytest.fixture
+def clip(root, load_all):
+    (clip,) = load_all(H2OAdapter(), root)
+    return clip
+
+
+def test_a_run_of_one_label_becomes_one_clip_with_its_words_and_source_frames(clip):
+    assert (clip.clip_id, clip.subject) == ("h2o/subject2/k1/3/000003-000024", "subject2")
+    assert (clip.verb, clip.object_words, clip.object.model.name) == ("take out", "chips", "chips")
+    assert clip.source_frames.tolist() == list(range(3, 25))
+    assert clip.gravity is None
+
+
+def test_a_flat_hand_stands_in_the_world_where_its_camera_saw_it(clip, hands, formula):
+    rest = formula.rest_points(hands.left, LEFT["betas"])
+    joints = track_joints(clip.hands["left"], hands.left)
+    seen = formula.rigid(rest, LEFT["orient"], LEFT["t"])
+    for at, frame in enumerate(clip.source_frames):
+        if frame == 5:
+            continue
+        world = seen @ camera(frame)[:3, :3].T + camera(frame)[:3, 3]
+        np.testing.assert_allclose(joints[at], world, atol=1e-6)
+        without_offset = world - camera(frame)[:3, :3] @ rest[0]  # transl taken for the wrist
+        naive = formula.rigid(rest, LEFT["orient"], camera(frame)[:3, :3] @ LEFT["t"] + camera(frame)[:3, 3])
+        inverse = (seen - camera(frame)[:3, 3]) @ camera(frame)[:3, :3]
+        for wrong in (without_offset, naive, inverse):
+            assert np.linalg.norm(joints[at] - wrong, axis=1).min() > 0.01
+
+
+def test_a_bent_finger_is_absolute_and_not_relative_to_the_mean_pose(clip, hands, formula):
+    fingers = np.zeros(45)
+    fingers[:3] = INDEX_BEND
+    rest = formula.rest_points(hands.right, RIGHT["betas"])
+    seen = formula.chain(rest, RIGHT["orient"], fingers, RIGHT["t"])
+    joints = track_joints(clip.hands["right"], hands.right)
+    for at, frame in enumerate(clip.source_frames):
+        np.testing.assert_allclose(joints[at, :16], seen @ camera(frame)[:3, :3].T + camera(frame)[:3, 3], atol=1e-6)
+    relative = formula.chain(rest, RIGHT["orient"], fingers + hands.right.mean_pose, RIGHT["t"])
+    assert np.linalg.norm(relative - seen, axis=1).max() > 0.005
+
+
+def test_the_object_moves_from_its_own_frame_through_the_camera_to_the_world(clip):
+    turns = Rotation.from_rotvec(clip.object.rotvec).as_matrix()
+    for at, frame in enumerate(clip.source_frames):
+        expected = camera(frame) @ object_in_camera(frame)
+        np.testing.assert_allclose(turns[at], expected[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(clip.object.translation_m[at], expected[:3, 3], atol=1e-6)
+
+
+def test_the_flag_of_a_frame_decides_whether_the_hand_is_valid(clip):
+    assert np.flatnonzero(~clip.hands["left"].valid).tolist() == [2]
+    assert clip.hands["right"].valid.all()
+    assert len(clip.hands["left"].betas) == 1
+
+
+def test_the_folder_names_of_the_readme_are_read_too(root, clip, load_all):
+    folder = root / "subject2" / "k1" / "3" / "cam4"
+    (folder / "hand_pose_mano").rename(folder / "hand_pose_MANO")
+    (folder / "obj_pose_rt").rename(folder / "obj_pose_RT")
+    (again,) = load_all(H2OAdapter(), root)
+    np.testing.assert_array_equal(again.hands["right"].wrist_m, clip.hands["right"].wrist_m)
+
+
+def test_twenty_frames_of_a_label_are_too_short_and_twenty_one_enough(root, load_all):
+    labels = root / "subject2" / "k1" / "3" / "cam4" / "action_label"
+    for frame in (3, 4):
+        write_text(labels / f"{frame:06d}.txt", [0])
+    assert load_all(H2OAdapter(), root) == []
+    write_text(labels / "000004.txt", [26])
+    (clip,) = load_all(H2OAdapter(), root)
+    assert clip.n_frames == 21
+
+
+def test_a_margin_widens_the_clip_within_the_recording(root, load_all):
+    (clip,) = load_all(H2OAdapter(margin_frames=5), root)
+    assert clip.source_frames.tolist() == list(range(27))
+
+
+def test_another_object_class_than_the_label_names_is_left_out_with_its_reason(root, load_all):
+    write_text(root / "subject2/k1/3/cam4/obj_pose_rt/000010.txt", [5, *object_in_camera(10).ravel()])
+    (item,) = load_all(H2OAdapter(), root)
+    assert isinstance(item, Quarantined)
+    assert "7 (chips)" in item.expected
+    assert "[5, 7]" in item.got
+
+
+def test_the_old_name_of_an_object_folder_is_known(root, load_all):
+    (root / "object" / "chips" / "chips.obj").rename(root / "object" / "chips" / "pringles.obj")
+    (root / "object" / "chips").rename(root / "object" / "pringles")
+    (clip,) = load_all(H2OAdapter(), root)
+    assert clip.object.model.name == "chips"
+
+
+def test_the_label_table_has_the_36_actions_of_the_readme():
+    assert len(ACTIONS) == 37
+    assert len(OBJECTS) == 9
+    assert ACTIONS[1] == ("grab", "book")
+    assert ACTIONS[16] == ("place", "cappuccino")
+    assert ACTIONS[19] == ("open", "chips")
+    assert ACTIONS[23] == ("pour", "milk")
+    assert ACTIONS[27] == ("take out", "cappuccino")
+    assert ACTIONS[30] == ("put in", "cappuccino")
+    assert ACTIONS[34:] == (("read", "espresso"), ("spray", "spray"), ("squeeze", "lotion"))
+
+
+def _remove(path: Path) -> None:
+    path.unlink()
+
+
+def _put(text: str):
+    return lambda path: path.write_text(text)
+
+
+BAD_FILES = {
+    "a missing frame": ("hand_pose_mano/000007.txt", _remove, "nothing there"),
+    "a truncated frame": ("hand_pose_mano/000007.txt", lambda path: path.write_text(path.read_text()[:300]), "124"),
+    "too many columns": ("obj_pose_rt/000007.txt", lambda path: path.write_text(path.read_text() + " 1.0"), "17"),
+    "NaN in a pose": ("cam_pose/000007.txt", _put(" ".join(["nan"] * 16)), "finite"),
+    "no numbers": ("action_label/000007.txt", _put("milk"), "1 numbers"),
+    "an unknown label": ("action_label/000007.txt", _put("37"), "0 to 36"),
+    "a matrix that is no rotation": ("cam_pose/000007.txt", _put(" ".join(["0.5"] * 16)), "rotation"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_frame_file_is_named_with_what_was_expected(root, load_all, name):
+    file, spoil, expected = BAD_FILES[name]
+    spoil(root / "subject2/k1/3/cam4" / file)
+    with pytest.raises(BadInput) as caught:
+        load_all(H2OAdapter(), root)
+    assert file.split("/")[0] in caught.value.where
+    assert expected in f"{caught.value.expected} {caught.value.got}"
+
+
+def test_a_sequence_without_action_labels_says_so(root, load_all):
+    for path in sorted((root / "subject2/k1/3/cam4/action_label").iterdir()):
+        path.unlink()
+    with pytest.raises(BadInput, match="action_label"):
+        load_all(H2OAdapter(), root)

@@ -1,0 +1,101 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.errors import BadInput
+from hoidata.objects.mesh import load_mesh, mass_properties
+
+OBJ = """# corners shared between texture seams, out of order, one repeated
+v 1 0 0
+v 0 0 0
+v 0 1 0
+v 0 0 0
+v 0 0 1
+vt 0 0
+vt 1 1
+vn 0 0 1
+f 3/1/1 1/2/1 2/1/1
+f 5//1 4//1 1//1
+f -1 -2 -3
+"""
+
+
+def test_an_obj_keeps_vertex_order_and_repeated_vertices(tmp_path: Path):
+    (tmp_path / "a.obj").write_text(OBJ)
+    mesh = load_mesh(tmp_path / "a.obj")
+    assert mesh.vertices.tolist() == [[1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 1]]
+    assert mesh.faces.tolist() == [[2, 0, 1], [4, 3, 0], [4, 3, 2]]
+
+
+def test_a_polygon_becomes_a_fan(tmp_path: Path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    assert load_mesh(tmp_path / "a.obj").faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
+def test_a_ply_keeps_vertex_order(tmp_path: Path, encoding):
+    vertices = np.array([[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0]], dtype=float)
+    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [3, 4, 0]], process=False)
+    (tmp_path / "a.ply").write_bytes(mesh.export(file_type="ply", encoding=encoding.partition("_")[0]))
+    read = load_mesh(tmp_path / "a.ply")
+    np.testing.assert_array_equal(read.vertices, vertices)
+    assert read.faces.tolist() == [[0, 1, 2], [3, 4, 0]]
+
+
+BAD = {
+    "empty.obj": ("", "vertices"),
+    "no_faces.obj": ("v 0 0 0\nv 1 0 0\n", "faces"),
+    "words.obj": ("v 0 zero 0\nf 1 1 1\n", "numbers"),
+    "short.obj": ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 coordinates"),
+    "outside.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "0 to 2"),
+    "nan.obj": ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
+    "header.ply": ("ply\nformat ascii 1.0\nelement vertex 3\n", "readable"),
+    "text.ply": ("hello", "readable"),
+    "mesh.step": ("solid", ".obj or .ply"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_mesh_is_named_with_what_was_expected(tmp_path: Path, name):
+    text, expected = BAD[name]
+    (tmp_path / name).write_text(text)
+    with pytest.raises(BadInput) as caught:
+        load_mesh(tmp_path / name)
+    assert name in caught.value.where
+    assert expected in caught.value.expected
+
+
+def test_a_truncated_ply_is_refused(tmp_path: Path):
+    data = trimesh.creation.icosphere().export(file_type="ply")
+    (tmp_path / "a.ply").write_bytes(data[: len(data) // 2])
+    with pytest.raises(BadInput):
+        load_mesh(tmp_path / "a.ply")
+
+
+def test_a_box_has_the_inertia_of_the_textbook_wherever_it_lies():
+    a, b, c = 0.1, 0.2, 0.3
+    turn = Rotation.from_rotvec((0.3, -0.5, 0.9)).as_matrix()
+    box = trimesh.creation.box((a, b, c))
+    facts = mass_properties(box.vertices @ turn.T + (0.4, -0.2, 1.0), box.faces)
+    expected = turn @ np.diag([b * b + c * c, a * a + c * c, a * a + b * b]) @ turn.T / 12
+    assert facts.volume_m3 == pytest.approx(a * b * c)
+    np.testing.assert_allclose(facts.centre_m, (0.4, -0.2, 1.0), atol=1e-12)
+    np.testing.assert_allclose(facts.inertia_kg_m2, expected, atol=1e-12)
+    assert facts.source == "solid"
+
+
+def test_a_mesh_turned_inside_out_is_the_same_solid():
+    ball = trimesh.creation.icosphere(radius=0.05)
+    facts = mass_properties(ball.vertices, ball.faces[:, ::-1])
+    assert facts.volume_m3 == pytest.approx(ball.volume)
+    assert np.linalg.eigvalsh(facts.inertia_kg_m2).min() > 0
+
+
+def test_an_open_mesh_is_replaced_by_its_hull_and_says_so():
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    facts = mass_properties(box.vertices, box.faces[2:])
+    assert facts.source == "convex hull"
+    assert facts.volume_m3 == pytest.approx(0.001)
