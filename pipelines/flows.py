@@ -8,15 +8,15 @@ from hoidata.lineage.graph import read_params
 from pipelines.repro import reproduce
 
 
-class GraphFailed(RuntimeError):
+class GraphError(RuntimeError):
     """``dvc repro`` ended with an error; its own output says which stage and why."""
 
 
 def run_target(targets: list[str]) -> None:
-    """Preflight and ``dvc repro``. Raises GraphFailed so that the flow run counts as failed."""
+    """Preflight and ``dvc repro``. Raises GraphError so that the flow run counts as failed."""
     code = reproduce(targets)
     if code:
-        raise GraphFailed(f"dvc repro {' '.join(targets)} ended with exit code {code}")
+        raise GraphError(f"dvc repro {' '.join(targets)} ended with exit code {code}")
 
 
 @flow(name="annotate-arctic")

@@ -8,12 +8,12 @@ from prefect.plugins import register_hook
 
 
 @register_hook
-def setup_environment(ctx) -> None:
+def setup_environment(*, ctx) -> None:
     """Called once when Prefect is imported. Leaves Prefect as it is when its client is not where it used to be."""
     try:
         from prefect.client.orchestration._deployments.client import DeploymentAsyncClient
     except ImportError:
-        ctx.logger_factory("hoidata").warning("this Prefect wants deployments as FLOW/DEPLOYMENT")
+        ctx.logger_factory(__name__).warning("this Prefect wants deployments as FLOW/DEPLOYMENT")
         return
     wrap_lookup(DeploymentAsyncClient)
 
@@ -41,5 +41,7 @@ def only_one(name: str, found: list):
     if len(found) == 1:
         return found[0]
     if not found:
-        raise ValueError(f"no deployment is named {name!r}; `prefect deployment ls` lists them, `hoidata up` makes them")
+        raise ValueError(
+            f"no deployment is named {name!r}; `prefect deployment ls` lists them, `hoidata up` makes them"
+        )
     raise ValueError(f"{len(found)} flows have a deployment named {name!r}; write FLOW/{name}")

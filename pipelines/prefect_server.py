@@ -1,6 +1,7 @@
 """A Prefect server, work pool, deployments and worker for this folder, all on the loopback interface."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -17,19 +18,24 @@ POOL = "local"
 
 
 def serve() -> int:
-    """Start the server, deploy, and work until interrupted; the server ends with it. Returns the worker's exit code."""
+    """Start the server, deploy, and work until interrupted; server and worker end together. Returns the exit code."""
     url, environment = api_url(), server_environment()
-    server = _start_server(url, environment)
+    if _answers(f"{url}/health"):
+        raise MissingResource(f"another server answers at {url}; stop it, or set PREFECT_API_URL to a free port")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    running = [_start_server(url, environment)]
     try:
-        wait_until_healthy(url, server)
+        wait_until_healthy(url, running[0])
         deploy(environment)
+        running.append(subprocess.Popen(_prefect("worker", "start", "--pool", POOL), env=environment))
         print("ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder", flush=True)
-        return subprocess.run(_prefect("worker", "start", "--pool", POOL), env=environment).returncode
+        return running[1].wait()
     except KeyboardInterrupt:
         return 0
     finally:
-        server.terminate()
-        server.wait()
+        for process in reversed(running):
+            process.terminate()
+            process.wait()
 
 
 def api_url() -> str:
@@ -47,10 +53,11 @@ def server_environment() -> dict[str, str]:
 
 def deploy(environment: dict[str, str]) -> None:
     """Make the work pool (again) and the deployments of prefect.yaml."""
-    subprocess.run(
-        _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite"), env=environment, check=True
-    )
-    subprocess.run(_prefect("--no-prompt", "deploy", "--all"), env=environment, check=True)
+    pool = _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite")
+    for command in (pool, _prefect("--no-prompt", "deploy", "--all")):
+        code = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode
+        if code:
+            raise MissingResource(f"`{' '.join(command[2:])}` ended with exit code {code}; its output says why")
 
 
 def wait_until_healthy(url: str, server: subprocess.Popen) -> None:

@@ -9,7 +9,7 @@ from pipelines.commands.project import enter_project
 
 
 def doctor() -> None:
-    """Say what is installed and which raw folders, hand, encoder and GPU were found. Exit code 1 if a part is broken."""
+    """Say what is installed and which raw folders, hand, encoder and GPU were found; exit code 1 if one is broken."""
     enter_project()
     from rich.console import Console
     from rich.table import Table

@@ -147,11 +147,16 @@ def empty_reason(folder: Path) -> str | None:
     return json.loads(note.read_text())["reason"] if note.is_file() else None
 
 
+def note_empty(folder: Path, reason: str) -> None:
+    """Note in a stage's output why there is nothing in it for the stages after it."""
+    (folder / EMPTY).write_text(canonical_json({"reason": reason}) + "\n")
+    print(f"empty: {reason}")
+
+
 def write_empty(folder: Path, reason: str) -> None:
     """An output that holds nothing but the reason."""
     with atomic_folder(folder) as part:
-        (part / EMPTY).write_text(canonical_json({"reason": reason}) + "\n")
-    print(f"{folder}: empty, {reason}")
+        note_empty(part, reason)
 
 
 def write_json(path: Path, values: Any) -> None:

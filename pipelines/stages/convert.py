@@ -1,7 +1,9 @@
 """Stage convert: raw files to a store of clips; sequences that cannot be used are left out with their reason."""
 
+from hoidata.adapters.convert import convert_dataset
+from hoidata.adapters.registry import get_adapter
 from hoidata.lineage.manifests import read_manifest
-from pipelines.stages.base import Place, StageParams, empty_reason, jobs, load_hands, load_params, raw_root, write_empty
+from pipelines.stages.base import Place, StageParams, jobs, load_hands, load_params, note_empty, raw_root
 
 
 class ConvertParams(StageParams):
@@ -9,19 +11,19 @@ class ConvertParams(StageParams):
 
 
 def run(place: Place) -> None:
-    """Convert the dataset of ``place``; a dataset that is not present gives an empty output."""
+    """Convert the dataset with its adapter, each raw file checked against the manifest; none present, none read."""
     load_params(ConvertParams, "convert")
     manifest = read_manifest(place.raw_manifest)
+    summary = convert_dataset(
+        get_adapter(place.dataset),
+        raw_root(place) if manifest.present else None,
+        load_hands(place.profile),
+        place.clips,
+        jobs=jobs(),
+        manifest=manifest.files,
+        synthetic=manifest.present and manifest.synthetic,
+    )
     if not manifest.present:
-        write_empty(place.clips, f"{place.dataset} is not present in the profile {place.profile}")
-        return
-    convert(place, manifest)
-
-
-def convert(place: Place, manifest) -> None:
-    """Read every sequence of the raw folder with its adapter, each file checked against the manifest."""
-    from hoidata.adapters.convert import convert_dataset
-    from hoidata.adapters.registry import get_adapter
-
-    adapter, root = get_adapter(place.dataset), raw_root(place)
-    convert_dataset(adapter, root, load_hands(place.profile), place.clips, manifest.by_path, jobs())
+        note_empty(place.clips, f"{place.dataset} is not present in the profile {place.profile}")
+    elif not summary.clips:
+        note_empty(place.clips, f"none of {summary.sequences} sequences gave a clip")

@@ -7,6 +7,7 @@ from hoidata.files.atomic import atomic_file, atomic_folder
 from hoidata.lineage.digests import paths_digests, value_digest
 from hoidata.lineage.graph import read_graph
 from hoidata.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
+from hoidata.schema.clip import SourceFile
 from pipelines.stages.base import Place, jobs, raw_root, root_variable
 
 SHOWN_DIFFERENCES = 5
@@ -24,7 +25,7 @@ def run(place: Place) -> None:
     print(f"{place}: {len(manifest.files)} raw files" if manifest.present else f"{place}: not present")
 
 
-def generated_files(place: Place, manifest: Manifest):
+def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
     """Write the corpus of the manifest's recipe, unless the same recipe and code already did, and list its files."""
     root = place.generated_raw
     stamp, wanted = root.with_suffix(".recipe"), recipe_digest(place, manifest)
