@@ -70,7 +70,7 @@
 
     addLights() {
       const radius = this.view.radius_m;
-      this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb8b4ac, 0.75));
+      this.scene.add(new THREE.HemisphereLight(0xffffff, 0xb8b4ac, 0.62));
       const sun = new THREE.DirectionalLight(0xffffff, 0.62);
       sun.position.copy(this.target).add(new THREE.Vector3(0.5, 1.6, 0.4).multiplyScalar(radius * 2));
       sun.target.position.copy(this.target);

@@ -43,6 +43,7 @@ class Section:
 
     facts: DatasetFacts
     title: str
+    shown: str = ""
     motions: list[Player] = field(default_factory=list)
     motion_facts: list[tuple[str, str]] = field(default_factory=list)
     contact: list[tuple[str, list[Player]]] = field(default_factory=list)
@@ -68,11 +69,13 @@ def write_report(
     """
     folders = folders or ReportFolders.of(profile)
     motions = generated or {}
-    sections = [_section(name, folders, hands, motions.get(name), seed) for name in datasets]
+    all_sections = [_section(name, folders, hands, motions.get(name), seed) for name in datasets]
+    sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact for section in sections)
     page = render_page(
-        "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections, synthetic=synthetic,
+        "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
+        empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
         hand_model=hands.name, has_players=has_players,
     )  # fmt: skip
     path = Path(out) / "index.html"
@@ -91,6 +94,7 @@ def _section(name: str, folders: ReportFolders, hands: HandPair, motion: Generat
     return Section(
         facts,
         title,
+        shown=_what_is_shown(facts),
         motions=_motions(facts, hands, motion),
         motion_facts=_motion_facts(motion),
         contact=_contact_pairs(facts, checkpoints / "contact", seed),
@@ -108,6 +112,11 @@ def _metrics(path: Path) -> tuple[list[Table], str]:
     if "empty" in values:
         return [], f"Not evaluated: {values['empty']}."
     return metrics_tables(values), ""
+
+
+def _what_is_shown(facts: DatasetFacts) -> str:
+    held_out = facts.annotated is not None and bool(facts.annotated.split_ids("test"))
+    return "A clip of the test split" if held_out else "A clip (this dataset has no test split)"
 
 
 def _motions(facts: DatasetFacts, hands: HandPair, motion: GeneratedMotion | None) -> list[Player]:

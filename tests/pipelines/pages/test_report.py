@@ -37,7 +37,7 @@ def folders(hands, page_clip, tmp_path):
     log.parent.mkdir(parents=True)
     log.write_text("step,train_loss,validation_loss,note\n0,4.0,4.2,\n10,1.0,,\n20,0.1,0.3,last\n")
     folders.metrics.mkdir(parents=True)
-    figures = {"contact": {"f1": {"model": 0.61, "mean map": 0.4}, "clips": 12}}
+    figures = {"contact": {"f1": 0.61, "f1_mean_map": 0.4, "clips": 12}, "held_out_clips": 12}
     (folders.metrics / "grab.json").write_text(json.dumps(figures))
     return folders
 
@@ -54,11 +54,13 @@ def motion(hands, page_clip):
 
 def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, hands, tmp_path):
     text = write_report(tmp_path / "report", "embedded", ["grab", "arctic"], hands, folders=folders).read_text()
-    assert "Empty: arctic is not present." in text
+    assert "<td>arctic is not present</td>" in text
     assert "NaN in &lt;frame 3&gt;" in text
     assert "<b>3</b><span>clips</span>" in text
     assert "SYNTHETIC" in text
-    assert re.search(r"F1 of the contact map</td><td class=\"number\">0.61</td><td class=\"number\">0.4</td>", text)
+    assert re.search(
+        r'F1 of the contact map</td><td class="number good">0.61</td>\s*<td><b class="plain">0.4</b> mean map', text
+    )
     assert text.count("<svg") == 1
 
 
@@ -100,10 +102,35 @@ def test_charts_repeat_and_keep_their_ids_apart():
     assert not ids[0] & ids[1]
 
 
-def test_every_figure_of_a_metrics_file_reaches_a_table():
-    tables = metrics_tables({"length": {"mae_frames": {"model": 10.25, "mean length": 14}, "clips": 40}})
-    assert tables[0].columns == ["", "model", "mean length"]
-    assert tables[0].rows == [["mean absolute error of the length, frames", "10.2", "14"], ["held-out clips", "40", ""]]
-    assert number(1234567) == "1,234,567"
-    assert number(0.01234) == "0.0123"
-    assert number(None) == ""
+def test_every_figure_of_a_metrics_file_reaches_the_table_beside_its_baseline():
+    (table,) = metrics_tables(
+        {"length": {"mae_frames": 10.25, "mae_mean_length_frames": 14, "clips": 40}, "synthetic": True}
+    )
+    assert [(row.value, row.baselines, row.verdict) for row in table.rows] == [
+        ("10.2", [("mean length", "14")], "good")
+    ]
+    assert table.notes == ["clips 40"]
+    assert metrics_tables({"other": {"deep": {"figure": 0.5}}})[0].notes == ["deep figure 0.5"]
+    assert metrics_tables({"contact": {"empty": "no clips"}})[0].empty == "no clips"
+
+
+@pytest.mark.parametrize(
+    ("model", "figures", "verdict"),
+    [
+        ("contact", {"f1": 0.44, "f1_mean_map": 0.40}, "bad"),
+        ("contact", {"f1": 0.46, "f1_mean_map": 0.40}, "good"),
+        ("length", {"mae_frames": 9.0, "mae_mean_length_frames": 10.0}, "bad"),
+        (
+            "diffusion",
+            {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90, "joint_error_shuffled_prompt_mm": 40},
+            "bad",
+        ),
+        ("diffusion", {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90}, ""),
+    ],
+)
+def test_verdict_asks_for_the_margin_of_the_project(model, figures, verdict):
+    assert metrics_tables({model: figures})[0].rows[0].verdict == verdict
+
+
+def test_numbers_keep_three_digits():
+    assert [number(value) for value in (1234567, 0.01234, 2.0, None, "x")] == ["1,234,567", "0.0123", "2", "", "x"]
