@@ -62,6 +62,7 @@ class _Mesh:
                     raise RuntimeError(f"no legal collapse left at {len(self.around)} vertices")
                 limits, relaxations = limits.relaxed(), relaxations + 1
                 heap = self._all_candidates(on_boundary)
+                continue
             _, gone, kept, stamp = heapq.heappop(heap)
             if gone not in self.around or kept not in self.around or stamp != self.version[gone] + self.version[kept]:
                 continue
