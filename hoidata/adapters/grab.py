@@ -34,6 +34,7 @@ OBJECT_WORDS = {
 }
 SIZED_SHAPE = re.compile(r"(cube|cylinder|pyramid|sphere|torus)(large|medium|small)")
 ROOTS = ("", "GRAB")
+MEMBERS = ("obj_name", "motion_intent", "framerate", "n_frames", "lhand", "rhand", "object", "contact")
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ class _SequenceFile:
 def _open(raw: RawTree, key: SequenceKey) -> _SequenceFile:
     top = next((top for top in ROOTS if raw.has(_below(top, f"grab/{key.name}.npz"))), ROOTS[0])
     path = _below(top, f"grab/{key.name}.npz")
-    return _SequenceFile(top, path, load_npz_objects(raw.file(path)))
+    return _SequenceFile(top, path, load_npz_objects(raw.file(path), MEMBERS))
 
 
 def object_words(name: str) -> str:

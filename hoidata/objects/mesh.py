@@ -5,6 +5,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import trimesh
+from trimesh.exchange.ply import load_ply
 
 from hoidata.errors import BadInput
 
@@ -89,7 +90,7 @@ def _obj_index(word: str, n_vertices: int) -> int:
 
 def _read_ply(path: Path) -> Mesh:
     with open(path, "rb") as stream:
-        fields = trimesh.exchange.ply.load_ply(stream, prefer_color="vertex", skip_materials=True)
+        fields = load_ply(stream, prefer_color="vertex", skip_materials=True)
     faces = fields.get("faces")
     triangles = np.zeros((0, 3)) if faces is None else trimesh.geometry.triangulate_quads(faces)
     return Mesh(np.asarray(fields["vertices"], dtype=np.float64), np.asarray(triangles, dtype=np.int64))

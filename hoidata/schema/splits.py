@@ -1,7 +1,7 @@
 """Which clips train, which validate, which test: by subject, or by time where there is one subject."""
 
+from collections import defaultdict
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import pandas as pd
@@ -68,17 +68,26 @@ def _by_time(n_clips: int, rule: SplitRule) -> list[str]:
 
 def check_no_leak(sequences: pd.DataFrame, split: pd.Series, rule: SplitRule) -> None:
     """Raise BadInput when parts share what the rule keeps apart: subjects, or source frames of one sequence."""
-    columns = ["clip_id", "subject", "sequence", "first_source_frame", "last_source_frame"]
-    rows = sequences[columns].assign(split=split)
-    if rule.by == "subject":
-        parts = rows.groupby("subject")["split"].nunique()
-        leaking = sorted(parts.index[parts > 1])
-        if leaking:
-            raise BadInput("split", "every subject in one part", f"{leaking} in several", "mend the split rule")
-    for _, group in rows.sort_values("first_source_frame", kind="stable").groupby(["subject", "sequence"]):
-        if group["split"].nunique() < 2:
-            continue
-        for earlier, later in pairwise(group.itertuples(index=False)):
-            if earlier.split != later.split and later.first_source_frame <= earlier.last_source_frame:
-                got = f"{earlier.clip_id} ({earlier.split}) and {later.clip_id} ({later.split}) overlap"
+    rows = sequences.reset_index(drop=True).to_dict("records")
+    parts_of: dict[str, set[str]] = defaultdict(set)
+    clips_of: dict[tuple[str, str], list[tuple[int, int, str, str]]] = defaultdict(list)
+    for row, part in zip(rows, split, strict=True):
+        parts_of[row["subject"]].add(part)
+        span = (row["first_source_frame"], row["last_source_frame"], part, row["clip_id"])
+        clips_of[row["subject"], row["sequence"]].append(span)
+    leaking = sorted(subject for subject, parts in parts_of.items() if len(parts) > 1)
+    if rule.by == "subject" and leaking:
+        raise BadInput("split", "every subject in one part", f"{leaking} in several", "mend the split rule")
+    for spans in clips_of.values():
+        _check_apart(sorted(spans))
+
+
+def _check_apart(spans: list[tuple[int, int, str, str]]) -> None:
+    """spans: (first frame, last frame, part, clip id) of one sequence, sorted."""
+    last_of: dict[str, tuple[int, str]] = {}
+    for first, last, part, clip_id in spans:
+        for other, (other_last, other_id) in last_of.items():
+            if other != part and first <= other_last:
+                got = f"{other_id} ({other}) and {clip_id} ({part}) overlap"
                 raise BadInput("split", "no frame in two parts", got, "split this dataset by subject")
+        last_of[part] = max(last_of.get(part, (last, clip_id)), (last, clip_id))

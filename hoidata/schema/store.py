@@ -59,12 +59,11 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     if hands is not None and written is not None and hands.digest != written:
         remedy = "open it with the hands it was converted with"
         raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
-    tables = {
-        name: pd.read_parquet(folder / "meta" / f"{name}.parquet")
-        for name in ("sequences", "objects", "files", "quarantine")
-    }
-    tables["sequences"] = tables["sequences"].set_index("clip_id", drop=False).rename_axis(None)
-    return Store(folder, info, hands=hands, **tables)
+    sequences, objects, files, quarantine = (
+        pd.read_parquet(folder / "meta" / f"{name}.parquet") for name in ("sequences", "objects", "files", "quarantine")
+    )
+    sequences = sequences.set_index("clip_id", drop=False).rename_axis(None)
+    return Store(folder, info, sequences, objects, files, quarantine, hands)
 
 
 @dataclass
