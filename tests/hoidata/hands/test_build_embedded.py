@@ -85,7 +85,7 @@ def test_flat_hand_has_straight_fingers_in_the_plane_with_their_lengths_kept():
 def test_flat_hand_does_not_depend_on_where_the_body_stands():
     body = made_up_body()
     turn = Rotation.from_rotvec([0.4, 2.0, -1.0])
-    moved = flat_hand(body, turn.apply(body.vertices_m) + [1.0, 2.0, 3.0])
+    moved = flat_hand(body, turn.apply(body.vertices_m) + np.array([1.0, 2.0, 3.0]))
     still = flat_hand(body, body.vertices_m)
     np.testing.assert_allclose(moved.vertices_m, still.vertices_m, atol=1e-12)
     np.testing.assert_allclose(moved.joints_m, still.joints_m, atol=1e-12)
