@@ -20,10 +20,10 @@ class Comparison:
 
     def is_met(self, figures: dict) -> bool | None:
         """Whether the figure beats its baselines as required; None where one of them is missing."""
-        value, baselines = figures.get(self.key), [figures.get(key) for key in self.required]
-        if value is None or None in baselines:
+        if not {self.key, *self.required} <= figures.keys():
             return None
-        bounds = [baseline * self.factor + self.margin for baseline in baselines]
+        value = figures[self.key]
+        bounds = [figures[key] * self.factor + self.margin for key in self.required]
         return all(value >= bound if self.higher_is_better else value <= bound for bound in bounds)
 
 

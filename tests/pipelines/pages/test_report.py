@@ -18,6 +18,8 @@ from pipelines.pages.metrics_table import metrics_tables, number
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
 
+DIFFUSION = {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90}
+
 
 @pytest.fixture
 def folders(hands, page_clip, tmp_path):
@@ -59,7 +61,7 @@ def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, han
     assert "<b>3</b><span>clips</span>" in text
     assert "SYNTHETIC" in text
     assert re.search(
-        r'F1 of the contact map</td><td class="number good">0.61</td>\s*<td><b class="plain">0.4</b> mean map', text
+        r'F1 of the contact map</td><td class="number good">0.61</td>\s*<td><b class="plain">0.4</b>', text
     )
     assert text.count("<svg") == 1
 
@@ -103,12 +105,10 @@ def test_charts_repeat_and_keep_their_ids_apart():
 
 
 def test_every_figure_of_a_metrics_file_reaches_the_table_beside_its_baseline():
-    (table,) = metrics_tables(
-        {"length": {"mae_frames": 10.25, "mae_mean_length_frames": 14, "clips": 40}, "synthetic": True}
-    )
-    assert [(row.value, row.baselines, row.verdict) for row in table.rows] == [
-        ("10.2", [("mean length", "14")], "good")
-    ]
+    figures = {"mae_frames": 10.25, "mae_mean_length_frames": 14, "clips": 40}
+    (table,) = metrics_tables({"length": figures, "synthetic": True})
+    (row,) = table.rows
+    assert (row.value, row.baselines, row.verdict) == ("10.2", [("mean length", "14")], "good")
     assert table.notes == ["clips 40"]
     assert metrics_tables({"other": {"deep": {"figure": 0.5}}})[0].notes == ["deep figure 0.5"]
     assert metrics_tables({"contact": {"empty": "no clips"}})[0].empty == "no clips"
@@ -125,7 +125,9 @@ def test_every_figure_of_a_metrics_file_reaches_the_table_beside_its_baseline():
             {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90, "joint_error_shuffled_prompt_mm": 40},
             "bad",
         ),
-        ("diffusion", {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90}, ""),
+        ("diffusion", DIFFUSION | {"joint_error_shuffled_prompt_mm": 40}, "bad"),
+        ("diffusion", DIFFUSION | {"joint_error_shuffled_prompt_mm": 60}, "good"),
+        ("diffusion", DIFFUSION, ""),
     ],
 )
 def test_verdict_asks_for_the_margin_of_the_project(model, figures, verdict):
