@@ -5,6 +5,8 @@ locate (``sequences``: which sequences are there), load (read the files of one s
 convert (change of frame, unit and convention, into ``Clip``). Nothing outside an adapter knows a dataset's quirks.
 """
 
+import contextlib
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -78,6 +80,7 @@ class RawTree:
     root: Path
     manifest: Mapping[str, SourceFile] | None = None
     _sources: dict[str, SourceFile] = field(default_factory=dict)
+    _inside_of_root: dict[str, bool] = field(default_factory=dict)
 
     @property
     def sources(self) -> tuple[SourceFile, ...]:
@@ -106,10 +109,11 @@ class RawTree:
         the files or the folder may be listed.
         """
         contents, lines = [], []
+        listed = self.manifest is not None and folder not in self.manifest
         for name in names:
-            data = self._inside(f"{folder}/{name}").read_bytes()
+            data = self._read_small(folder, name)
             digest = sha256_bytes(data)
-            if self.manifest is not None and folder not in self.manifest:
+            if listed:
                 self._check(SourceFile(f"{folder}/{name}", len(data), digest))
             contents.append(data)
             lines.append(f"{digest}  {name}\n")
@@ -129,11 +133,24 @@ class RawTree:
     def has(self, path: str) -> bool:
         return (self.root / path).is_file()
 
+    def _read_small(self, folder: str, name: str) -> bytes:
+        """As ``_inside(...).read_bytes()``, without resolving the path of every plain file of a checked folder."""
+        plain = os.path.join(self.root, folder, name)
+        if self._is_inside(folder) and not os.path.islink(plain):
+            with contextlib.suppress(OSError), open(plain, "rb") as stream:
+                return stream.read()
+        return self._inside(f"{folder}/{name}").read_bytes()
+
+    def _is_inside(self, path: str) -> bool:
+        if path not in self._inside_of_root:
+            self._inside_of_root[path] = (self.root / path).resolve().is_relative_to(self.root.resolve())
+        return self._inside_of_root[path]
+
     def _inside(self, path: str) -> Path:
         place = self.root / path
         if not place.is_file():
             raise BadInput(path, "a file", "nothing there", "check that the download is complete and unpacked here")
-        if not place.resolve().is_relative_to(self.root.resolve()):
+        if not self._is_inside(path):
             raise BadInput(path, "a file inside the raw folder", "a link that leaves it", "replace the link by a copy")
         return place
 

@@ -174,3 +174,17 @@ def test_an_unknown_adapter_is_answered_with_the_known_ones():
 
 def test_a_key_reads_as_its_dataset_and_name():
     assert str(SequenceKey("grab", "s1", "s1/mug_lift")) == "grab/s1/mug_lift"
+
+
+def test_a_frame_file_that_is_a_link_out_of_the_raw_folder_is_refused(tmp_path):
+    (tmp_path / "secret.txt").write_text("1")
+    folder = tmp_path / "raw" / "frames"
+    folder.mkdir(parents=True)
+    (folder / "000000.txt").symlink_to(tmp_path / "secret.txt")
+    with pytest.raises(BadInput, match="leaves"):
+        RawTree(tmp_path / "raw").read_folder("frames", ["000000.txt"])
+    (tmp_path / "raw" / "linked").symlink_to(tmp_path)
+    with pytest.raises(BadInput, match="leaves"):
+        RawTree(tmp_path / "raw").read_folder("linked", ["secret.txt"])
+    with pytest.raises(BadInput, match="nothing there"):
+        RawTree(tmp_path / "raw").read_folder("frames", ["000001.txt"])
