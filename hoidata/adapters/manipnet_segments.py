@@ -82,8 +82,9 @@ def find_cuts(left: BodyMotion, right: BodyMotion, thing: BodyMotion) -> list[Cu
 def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) -> list[Stretch]:
     """Stretches of at most 150 frames in which a hand is at the object, each with at most one lift; booleans (frame,).
 
-    Touches with gaps of at most 10 frames count as one. Each lift forms a stretch with up to 15 frames of touch before
-    and after; what lies between two lifts forms its own. Long ones are divided evenly.
+    Touches with gaps of at most 10 frames count as one. Each lift forms a stretch with 15 frames of touch before and
+    after, where there are any; what is left of the touch forms its own, or joins the lift when it is shorter than 45
+    frames. Long stretches are divided evenly.
     """
     pieces: list[Stretch] = []
     for touch in runs(_bridged(touched) & usable):
@@ -185,13 +186,20 @@ def _bridged(flags: np.ndarray) -> np.ndarray:
 
 
 def _lift_windows(touch: Stretch, lifted: np.ndarray) -> list[Stretch]:
-    """One stretch per lift inside ``touch``, widened; neighbours that would overlap meet halfway."""
+    """One stretch per lift inside ``touch``, widened, with the rests of touch too short for a clip of their own."""
     lifts = runs(lifted)
-    windows = []
-    for i, (start, stop) in enumerate(lifts):
-        before = touch.start if i == 0 else (lifts[i - 1].stop + start) // 2
-        after = touch.stop if i == len(lifts) - 1 else (stop + lifts[i + 1].start) // 2
-        windows.append(Stretch(max(before, start - APPROACH_FRAMES), min(after, stop + APPROACH_FRAMES)))
+    bounds = [touch.start]
+    for before, after in pairwise(lifts):
+        if after.start - before.stop - 2 * APPROACH_FRAMES < SHORTEST_FRAMES:
+            bounds += [(before.stop + after.start) // 2] * 2
+        else:
+            bounds += [before.stop + APPROACH_FRAMES, after.start - APPROACH_FRAMES]
+    bounds.append(touch.stop)
+    windows = [Stretch(bounds[2 * i], bounds[2 * i + 1]) for i in range(len(lifts))]
+    if lifts and lifts[0].start - APPROACH_FRAMES - touch.start >= SHORTEST_FRAMES:
+        windows[0] = Stretch(lifts[0].start - APPROACH_FRAMES, windows[0].stop)
+    if lifts and touch.stop - lifts[-1].stop - APPROACH_FRAMES >= SHORTEST_FRAMES:
+        windows[-1] = Stretch(windows[-1].start, lifts[-1].stop + APPROACH_FRAMES)
     return windows
 
 

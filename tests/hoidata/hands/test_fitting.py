@@ -76,10 +76,11 @@ def test_mirrored_keypoints_give_the_mirrored_hand(keypoints: dict, betas: np.nd
 def test_the_pose_is_unchanged_when_the_world_turns(keypoints: dict, betas: np.ndarray) -> None:
     turn = Rotation.from_rotvec([0.3, -1.2, 2.0])
     still = fit_hands({"right": keypoints["right"]}, HANDS, betas)["right"]
-    points = turn.apply(keypoints["right"].reshape(-1, 3)).reshape(-1, 21, 3) + [1.0, 2.0, 3.0]
+    shift = np.array([1.0, 2.0, 3.0])
+    points = turn.apply(keypoints["right"].reshape(-1, 3)).reshape(-1, 21, 3) + shift
     moved = fit_hands({"right": points}, HANDS, betas)["right"]
     np.testing.assert_allclose(moved.hand_pose, still.hand_pose, atol=1e-5)
-    np.testing.assert_allclose(moved.wrist_m, turn.apply(still.wrist_m) + [1.0, 2.0, 3.0], atol=1e-6)
+    np.testing.assert_allclose(moved.wrist_m, turn.apply(still.wrist_m) + shift, atol=1e-6)
 
 
 def test_unknown_keypoints_are_left_out_and_the_others_still_fit(keypoints: dict, betas: np.ndarray) -> None:
