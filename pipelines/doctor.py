@@ -103,9 +103,13 @@ def _encoder() -> Finding:
 
     name = read_params(Path())["annotate"]["encoder"]
     try:
-        return Finding("text encoder", "ok", load_encoder(name).identity)
+        return Finding("text encoder", "ok", _named(load_encoder(name).identity))
     except HoidataError as error:
         return Finding("text encoder", "broken", str(error))
+
+
+def _named(identity: dict) -> str:
+    return ", ".join(f"{key} {str(value)[:16]}" for key, value in identity.items())
 
 
 def _clip() -> Finding:

@@ -40,8 +40,8 @@ def serve() -> int:
 
 def api_url() -> str:
     """PREFECT_API_URL, else the address in prefect.toml."""
-    configured = tomllib.loads(Path("prefect.toml").read_text())["api"]["url"]
-    return os.environ.get("PREFECT_API_URL", configured)
+    configured = str(tomllib.loads(Path("prefect.toml").read_text())["api"]["url"])
+    return os.environ.get("PREFECT_API_URL") or configured
 
 
 def server_environment() -> dict[str, str]:

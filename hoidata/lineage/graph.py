@@ -11,7 +11,7 @@ import yaml
 from hoidata.errors import BadInput
 
 PLACEHOLDER = re.compile(r"\$\{([^}]+)\}")
-CODE_ROOTS = ("hoidata/", "models/", "pipelines/")
+CODE_ROOTS = ("hoidata", "models", "pipelines")
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,12 @@ class Stage:
     @property
     def code(self) -> tuple[str, ...]:
         """The code this stage depends on."""
-        return tuple(path for path in self.deps if path.startswith(CODE_ROOTS))
+        return tuple(path for path in self.deps if path.split("/")[0] in CODE_ROOTS)
 
     @property
     def data(self) -> tuple[str, ...]:
         """The files and folders this stage depends on: manifests and outputs of other stages."""
-        return tuple(path for path in self.deps if not path.startswith(CODE_ROOTS))
+        return tuple(path for path in self.deps if path.split("/")[0] not in CODE_ROOTS)
 
 
 def read_params(root: Path) -> dict[str, Any]:

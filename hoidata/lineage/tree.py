@@ -68,7 +68,7 @@ def overall_status(tree: Node) -> Status:
 
 def tree_as_json(tree: Node) -> dict[str, Any]:
     """The tree as JSON values."""
-    values = {"kind": tree.kind, "name": tree.name, "status": tree.status, "detail": tree.detail}
+    values: dict[str, Any] = {"kind": tree.kind, "name": tree.name, "status": tree.status, "detail": tree.detail}
     if tree.repeated:
         values["repeated"] = True
     return {**values, "children": [tree_as_json(child) for child in tree.children]}
@@ -120,9 +120,12 @@ def _code_node(comparison: _Comparison, recorded: dict[str, str | None]) -> Node
     children = tuple(
         Node("code", path, comparison.path_status(path, digest), _short(digest)) for path, digest in recorded.items()
     )
-    worst: Status = next((child.status for child in children if child.status != "same"), "same")
-    changed = ", ".join(child.name for child in children if child.status != "same")
+    worst, changed = overall_status(Node("code", "code", "same", children=children)), _changed_names(children)
     return Node("code", "code", worst, changed or f"{len(children)} paths", children)
+
+
+def _changed_names(nodes: tuple[Node, ...]) -> str:
+    return ", ".join(node.name for node in nodes if node.status != "same")
 
 
 def _input_node(comparison: _Comparison, path: str, recorded: str | None) -> Node:

@@ -1,13 +1,9 @@
 """Stage report: one page over all datasets of a profile, with a motion generated for a held-out sentence of each."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from hoidata.lineage.graph import read_params
 from pipelines.stages.base import Place, StageParams, load_hands, load_params
-
-if TYPE_CHECKING:
-    from hoidata.hands import HandPair
 
 
 class ReportParams(StageParams):
