@@ -1,40 +1,53 @@
 """Which points of an object the hands will touch, from a sentence: PointNet and a conditional VAE.
 
-Text2HOI Sec. 3.1 and supplement, Tables S4-S6. Deviations, each for a reason: the hand type is an explicit input (a sentence
-embedding hardly encodes left and right); layers that see per-clip features compute them once per clip instead of once
-per point (the same function); sizes come from the config.
+Text2HOI Sec. 3.1 and supplement, Tables S4-S6. Deviations, each for a reason: the hand type is an explicit input (a
+sentence embedding hardly encodes left and right); layers that see per-clip features compute them once per clip
+instead of once per point (the same function); sizes come from the config.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.schema.dataset import ClipBatch
 
 HAND_FLAGS = 2
 
 
 @dataclass(frozen=True)
-class ContactConfig:
-    """Sizes; the defaults are the paper's. point_widths: PointNet's three per-point layers, the last is F_obj."""
+class PointNetConfig:
+    """Sizes; the defaults are the paper's. widths: the three per-point layers, the last is the length of F_obj.
 
-    point_widths: tuple[int, int, int] = (64, 128, 1024)
-    head_widths: tuple[int, int] = (512, 256)
-    decoder_widths: tuple[int, int, int] = (512, 256, 128)
-    latent: int = 64
-    text: int = 512
-    dropout: float = 0.0
+    heads: layers behind the maximum (of the alignment, and of the encoder of z). align: learn a matrix per cloud.
+    """
+
+    widths: tuple[int, int, int] = (64, 128, 1024)
+    heads: tuple[int, int] = (512, 256)
     align: bool = True
 
 
 @dataclass(frozen=True)
+class ContactConfig:
+    """Sizes; the defaults are the paper's."""
+
+    point_net: PointNetConfig = field(default_factory=PointNetConfig)
+    decoder_widths: tuple[int, int, int] = (512, 256, 128)
+    latent: int = 64
+    text: int = 512
+    dropout: float = 0.0
+
+
+@dataclass(frozen=True)
 class ContactLossConfig:
-    """Weights of the KL divergence and of the Dice term beside the mean cross-entropy; share of points per step."""
+    """Weights of KL divergence and Dice term beside the mean cross-entropy; augment: turn and scale objects."""
 
     kl_weight: float = 0.01
     dice_weight: float = 1.0
+    augment: bool = True
 
 
 def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -47,9 +60,10 @@ def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
 class PointNet(nn.Module):
     """Global feature (B, G) and per-point features (B, N, L) of points (B, N, C) (Qi et al. 2017; Tables S4, S5)."""
 
-    def __init__(self, channels: int, widths: tuple[int, int, int], heads: tuple[int, int], align: bool) -> None:
+    def __init__(self, channels: int, config: PointNetConfig) -> None:
         super().__init__()
-        self.align = _Alignment(channels, widths, heads) if align else None
+        widths = config.widths
+        self.align = _Alignment(channels, config) if config.align else None
         self.first = _PointLayer(channels, widths[0])
         self.second = _PointLayer(widths[0], widths[1])
         self.third = _PointLayer(widths[1], widths[2], activate=False)
@@ -76,12 +90,12 @@ class _PointLayer(nn.Module):
 class _Alignment(nn.Module):
     """The spatial transformer: a (C, C) matrix per clip that starts as the identity."""
 
-    def __init__(self, channels: int, widths: tuple[int, int, int], heads: tuple[int, int]) -> None:
+    def __init__(self, channels: int, config: PointNetConfig) -> None:
         super().__init__()
         self.channels = channels
-        sizes = (channels, *widths)
-        self.points = nn.Sequential(*[_PointLayer(a, b) for a, b in zip(sizes[:-1], sizes[1:], strict=True)])
-        self.hidden = nn.Sequential(_PointLayer(widths[-1], heads[0]), _PointLayer(heads[0], heads[1]))
+        sizes, heads = (channels, *config.widths), config.heads
+        self.points = nn.Sequential(*[_PointLayer(a, b) for a, b in pairwise(sizes)])
+        self.hidden = nn.Sequential(_PointLayer(sizes[-1], heads[0]), _PointLayer(heads[0], heads[1]))
         self.matrix = nn.Linear(heads[1], channels * channels)
         nn.init.zeros_(self.matrix.weight)
         nn.init.zeros_(self.matrix.bias)
@@ -97,13 +111,12 @@ class ContactModel(nn.Module):
     def __init__(self, config: ContactConfig) -> None:
         super().__init__()
         self.config = config
-        local, _, overall = config.point_widths
-        self.object_net = PointNet(3, config.point_widths, config.head_widths, config.align)
-        self.contact_net = PointNet(4, config.point_widths, config.head_widths, config.align)
+        local, _, overall = config.point_net.widths
+        heads = config.point_net.heads
+        self.object_net = PointNet(3, config.point_net)
+        self.contact_net = PointNet(4, config.point_net)
         self.to_latent = nn.Sequential(
-            _PointLayer(overall, config.head_widths[0]),
-            _PointLayer(config.head_widths[0], config.head_widths[1]),
-            nn.Linear(config.head_widths[1], 2 * config.latent),
+            _PointLayer(overall, heads[0]), _PointLayer(heads[0], heads[1]), nn.Linear(heads[1], 2 * config.latent)
         )
         first, second, third = config.decoder_widths
         self.from_point = nn.Linear(local + 3, first)
@@ -117,15 +130,6 @@ class ContactModel(nn.Module):
             nn.LeakyReLU(0.2),
             nn.Linear(third, 1),
         )
-
-    @property
-    def object_size(self) -> int:
-        """Length of the object feature F_obj."""
-        return self.config.point_widths[-1]
-
-    def object_feature(self, points_m: Tensor) -> Tensor:
-        """F_obj (B, object_size) of points (B, N, 3), metres."""
-        return self.object_net(normalised_points(points_m)[0])[0]
 
     def encode(self, points: Tensor, touched: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log-variance (B, latent) of z from normalised points (B, N, 3) and the true map (B, N)."""
@@ -173,8 +177,6 @@ def turned_and_scaled(batch: ClipBatch, generator: torch.Generator) -> Tensor:
 
     Augmentation of Text2HOI's released training.
     """
-    from hoidata.geometry.rotations import rotvec_to_rotmat
-
     device = batch.points_m.device
     drawn = torch.rand(len(batch), 4, generator=generator).to(device)
     turn = rotvec_to_rotmat((drawn[:, :3] * 2 - 1) * torch.pi / 12)

@@ -2,8 +2,8 @@
 
 Text2HOI Sec. 3.2 and supplement, Tables S7-S9: tokens [condition] + (left, right, object) x frames, frame-wise and
 agent-wise position codes, x0-prediction, masks by hand type and length. Deviations, switchable in the config: tokens of
-several frames, codes that count the frames left to the end, and contact given by its moments instead of the raw map, whose
-order of points means something different on every object. Hand flags are explicit inputs beside the masks.
+several frames, codes that count the frames left to the end, and contact given by its moments instead of the raw map,
+whose order of points means something different on every object. Hand flags are explicit inputs beside the masks.
 """
 
 from dataclasses import dataclass, field
@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.schema.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES, ClipBatch
-from models.contact import normalised_points
-from models.sampling import Denoise, Motion, SamplerConfig, sample_motion
+from models.contact import PointNet, PointNetConfig, normalised_points
+from models.features import Normaliser, proper_hands, proper_object
+from models.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_bar, sample_motion
 from models.transformer import (
     Encoder,
     TransformerConfig,
@@ -30,10 +31,10 @@ CONTACT_MOMENTS = 13
 
 @dataclass(frozen=True)
 class DiffusionConfig:
-    """transformer: its sizes. object_size: length of F_obj of the contact model. The defaults are the paper's."""
+    """transformer: its sizes. point_net: as in the contact model it comes from. The defaults are the paper's."""
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
-    object_size: int = 1024
+    point_net: PointNetConfig = field(default_factory=PointNetConfig)
     points: int = 1024
     text: int = 512
     contact_input: Literal["map", "moments"] = "map"
@@ -43,7 +44,7 @@ class DiffusionConfig:
 
 @dataclass(frozen=True)
 class Condition:
-    """What a motion is generated for. text (B, 512); object (B, object_size): F_obj; points_m, normals (B, N, 3);
+    """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3);
     touched (B, N) contact map; acts (B, 2) hand flags; frames (B, F) True up to each length."""
 
     text: Tensor
@@ -68,8 +69,8 @@ class Condition:
 def contact_moments(points_m: Tensor, normals: Tensor, touched: Tensor) -> Tensor:
     """(B, 13) summary of a contact map (B, N) that does not depend on the order of the points.
 
-    Mean and spread of the touched points about the object's centre, in units of its size and in metres (mean), their mean
-    normal, and the share of points touched.
+    Mean and spread of the touched points about the object's centre, in units of its size and in metres (mean), their
+    mean normal, and the share of points touched.
     """
     points, scale = normalised_points(points_m)
     weight = touched / touched.sum(1, keepdim=True).clamp_min(1.0)
@@ -86,17 +87,25 @@ class DiffusionModel(nn.Module):
         super().__init__()
         self.config = config
         width, per_token = config.transformer.width, config.transformer.frames_per_token
+        # Trained with the contact model and frozen here; kept so that a checkpoint of this model is enough to sample.
+        self.object_net = PointNet(3, config.point_net).requires_grad_(False)
         self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * per_token, width) for _ in range(2)])
         self.object_in = nn.Linear(OBJECT_FEATURES * per_token, width)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.text_in = nn.Linear(config.text, width)
         contact = config.points if config.contact_input == "map" else CONTACT_MOMENTS
-        self.object_condition_in = nn.Linear(config.object_size + contact + 1, width)
+        self.object_condition_in = nn.Linear(config.point_net.widths[-1] + contact + 1, width)
         self.extent_in = nn.Linear(3, width)
         self.to_go_in = nn.Linear(width, width) if config.frames_to_go else None
         self.encoder = Encoder(config.transformer)
         self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * per_token) for _ in range(2)])
         self.object_out = nn.Linear(width, OBJECT_FEATURES * per_token)
+
+    @torch.no_grad()
+    def object_feature(self, points_m: Tensor) -> Tensor:
+        """F_obj (B, G) of object points (B, N, 3), metres."""
+        self.object_net.eval()
+        return self.object_net(normalised_points(points_m)[0])[0]
 
     def forward(
         self, hands: Tensor, objects: Tensor, steps: Tensor, condition: Condition, keep: Tensor | None = None
@@ -165,11 +174,33 @@ def guided(model: DiffusionModel, condition: Condition, guidance: float) -> Deno
     return denoise if guidance == 1 else denoise_guided
 
 
-def generate_features(
-    model: DiffusionModel, condition: Condition, sampler: SamplerConfig, generator: torch.Generator
-) -> Motion:
-    """Normalised hands (B, 2, F, 99) and object (B, F, 10) sampled for a condition. Use in evaluation mode."""
-    n_clips, n_frames = condition.frames.shape
-    denoise = guided(model, condition, sampler.guidance)
-    shapes = (n_clips, 2, n_frames, HAND_FEATURES), (n_clips, n_frames, OBJECT_FEATURES)
-    return sample_motion(denoise, *shapes, sampler, generator)
+@dataclass(frozen=True)
+class MotionGenerator:
+    """A trained denoiser with the normalisation it belongs to: conditions in, motions in metres out."""
+
+    network: DiffusionModel
+    normaliser: Normaliser
+
+    @torch.no_grad()
+    def sample(self, condition: Condition, sampler: SamplerConfig, generator: torch.Generator) -> Motion:
+        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise of ``generator``."""
+        n_clips, n_frames = condition.frames.shape
+        denoise = guided(self.network, condition, sampler.guidance)
+        shapes = (n_clips, 2, n_frames, HAND_FEATURES), (n_clips, n_frames, OBJECT_FEATURES)
+        return self._features(sample_motion(denoise, *shapes, sampler, generator))
+
+    @torch.no_grad()
+    def denoise_once(
+        self, hands: Tensor, objects: Tensor, steps: Tensor, condition: Condition, generator: torch.Generator
+    ) -> Motion:
+        """Given motions, noised to ``steps`` (B,) and denoised by a single call."""
+        signal = alphas_bar(steps.device)
+        noised = []
+        for clean in self.normaliser.encode(hands, objects):
+            noise = torch.randn(clean.shape, generator=generator, device=generator.device)
+            noised.append(add_noise(clean, noise.to(clean.device), steps, signal))
+        return self._features(self.network(noised[0], noised[1], steps, condition))
+
+    def _features(self, motion: Motion) -> Motion:
+        hands, objects = self.normaliser.decode(*motion)
+        return proper_hands(hands), proper_object(objects)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.geometry.rotations import rot6d_to_rotmat, rotvec_to_rotmat
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandPair
 from hoidata.schema.clip import SIDES
 from hoidata.schema.dataset import HAND_FEATURES, N_ROTATIONS, OBJECT_FEATURES, ClipBatch, ClipSample
@@ -44,6 +44,16 @@ def object_hinge_rad(objects: Tensor) -> Tensor:
     return objects[..., 9]
 
 
+def proper_hands(hands: Tensor) -> Tensor:
+    """Hand features (..., 99) with every 6D part made the first two columns of a rotation."""
+    return torch.cat((hands[..., :3], rotmat_to_rot6d(hand_rotmats(hands)).flatten(-2)), -1)
+
+
+def proper_object(objects: Tensor) -> Tensor:
+    """Object features (..., 10) with the 6D part made the first two columns of a rotation."""
+    return torch.cat((objects[..., :3], rotmat_to_rot6d(object_rotmat(objects)), objects[..., 9:]), -1)
+
+
 def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:
     """World points (..., point, 3) in the frame of the object (..., 10): ``R^T (p - t)``."""
     return (points_m - object_position_m(objects)[..., None, :]) @ object_rotmat(objects)
@@ -69,7 +79,7 @@ class Hands(nn.Module):
         self.kinematics = nn.ModuleList([HandKinematics(pair[side]) for side in SIDES])
 
     def joints(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> Tensor:
-        """(B, 2, F, 21, 3) joints, metres, of hand features (B, 2, F, 99); betas (B, 2, 10), template (B, 2, 778, 3)."""
+        """(B, 2, F, 21, 3) joints, metres, of features (B, 2, F, 99); betas (B, 2, 10), template (B, 2, 778, 3)."""
         sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
         joints = [layer.joints(*given) for layer, given in zip(self._layers(), sides, strict=True)]
         return torch.stack([side.reshape(len(hands), hands.shape[2], 21, 3) for side in joints], 1)

@@ -1,8 +1,8 @@
 """Signed distance and nearest surface point of articulated objects, looked up in grids made once per object.
 
 Losses need both for thousands of points per step; dense point-to-point distances would cost seconds there. Each part of
-an object gets a grid of exact values (libigl) in its rest frame; a query moves into that frame and reads all four numbers
-by trilinear interpolation. Gradients flow to the query points and never into the grid.
+an object gets a grid of exact values (libigl) in its rest frame; a query moves into that frame and reads all four
+numbers by trilinear interpolation. Gradients flow to the query points and never into the grid.
 """
 
 from collections.abc import Iterable, Sequence

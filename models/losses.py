@@ -1,7 +1,7 @@
 """Losses of generator and refiner: Text2HOI eq. 5-7 and 9-11, as means over what is present.
 
-All geometry is in metres in the model frame. Distances to surfaces come from ``models.fields``, whose gradient reaches the
-query points only. Masks are 0/1 tensors; an empty mask gives zero.
+All geometry is in metres in the model frame. Distances to surfaces come from ``models.fields``, whose gradient
+reaches the query points only. Masks are 0/1 tensors; an empty mask gives zero.
 """
 
 import torch
@@ -57,9 +57,7 @@ def penetration_loss(signed_distance_m: Tensor, mask: Tensor, scale_m: float = 0
     return masked_mean(depth.square().sum(-1), mask)
 
 
-def contact_loss(
-    joint_distance_m: Tensor, coarse_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01
-) -> Tensor:
+def contact_loss(joint_distance_m: Tensor, coarse_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
     """Eq. 11: squared distance to the surface of the joints that come within 2 cm of it in the coarse motion.
 
     Distances (B, 2, F, 21), unsigned or signed; mask (B, 2, F).
@@ -74,7 +72,7 @@ def touching_joints(distance_m: Tensor) -> Tensor:
 
 
 def pick_frames(frames: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(B, count) frame indices drawn evenly among each clip's frames (B, F), one from each of ``count`` equal stretches."""
+    """(B, count) frames drawn among each clip's own (B, F), one from each of ``count`` equal stretches."""
     place = torch.rand(len(frames), count, generator=generator)
     lengths = frames.sum(1).cpu()
     chosen = ((torch.arange(count) + place) / count * lengths[:, None]).long()
@@ -90,7 +88,7 @@ def take_frames(x: Tensor, chosen: Tensor, axis: int) -> Tensor:
 def entries_of_frames(
     entries: Tensor, distance_m: Tensor, chosen: Tensor, n_frames: int, at_most: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
-    """The entries that lie in chosen frames (B, K), with the frame replaced by its place 0..K-1; ``at_most`` of them."""
+    """The entries in chosen frames (B, K), with the frame replaced by its place 0..K-1; ``at_most`` of them."""
     slot = torch.full((len(chosen), n_frames), -1, device=chosen.device)
     slot.scatter_(1, chosen, torch.arange(chosen.shape[1], device=chosen.device).expand_as(chosen))
     place = slot[entries[:, 0], entries[:, 2]]

@@ -1,7 +1,7 @@
 """Noise schedule and samplers: diffusers' schedulers around any denoiser that predicts the clean motion.
 
-Text2HOI: 1,000 steps, cosine schedule (Nichol and Dhariwal 2021), x0-prediction. DDPM walks every step (Ho et al. 2020);
-DDIM strides over them (Song et al. 2021). A denoiser here is ``x0 = denoise(x_t, t)`` on a pair (hands, object).
+Text2HOI: 1,000 steps, cosine schedule (Nichol and Dhariwal 2021), x0-prediction. DDPM walks every step (Ho et al.
+2020); DDIM strides over them (Song et al. 2021). A denoiser here is ``x0 = denoise(x_t, t)`` on a pair (hands, object).
 """
 
 from collections.abc import Callable

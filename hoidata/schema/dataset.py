@@ -4,14 +4,13 @@ A sample lives in the *model frame*: the clip's world turned so that things fall
 is known) and moved so that the object's origin lies at zero in the first frame. The stored clips are never changed;
 ``world_from_model`` takes every sample back.
 
-Features follow Text2HOI (Cha et al. 2024, Sec. 3.2.1). One hand, 99 numbers per frame: wrist position (3, metres), then 16
-local rotations in 6D, the global one first, absolute. One object, 10 numbers: position (3), rotation in 6D, hinge angle
-(radians, 0 for rigid objects). Sides are ordered left, right.
+Features follow Text2HOI (Cha et al. 2024, Sec. 3.2.1). One hand, 99 numbers per frame: wrist position (3, metres), then
+16 local rotations in 6D, the global one first, absolute. One object, 10 numbers: position (3), rotation in 6D, hinge
+angle (radians, 0 for rigid objects). Sides are ordered left, right.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import lru_cache
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -23,7 +22,7 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import track_rotmats
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 
 HAND_FEATURES, OBJECT_FEATURES, N_ROTATIONS = 99, 10, 16
 MAX_FRAMES = 150
@@ -46,7 +45,7 @@ class DistanceEntries:
 
     def select(self, keep: np.ndarray) -> "DistanceEntries":
         """The entries where ``keep`` (entry,) is True."""
-        return DistanceEntries(*(getattr(self, field.name)[keep] for field in fields(self)))
+        return DistanceEntries(**{field.name: getattr(self, field.name)[keep] for field in fields(self)})
 
     def window(self, start: int, stop: int) -> "DistanceEntries":
         """The entries of frames ``start`` to ``stop`` (exclusive), frames counted from ``start``."""
@@ -104,7 +103,7 @@ class ClipSample:
     @property
     def touched(self) -> np.ndarray:
         """(1024,) bool contact map of Text2HOI: the points touched by any acting hand."""
-        return self.contact.any(axis=0)
+        return np.logical_or(self.contact[0], self.contact[1])
 
     def crop(self, start: int, length: int) -> "ClipSample":
         """``length`` frames from ``start``; contact map and distances are restricted to them. The frame stays."""
@@ -143,7 +142,7 @@ class Annotated(Protocol):
 
     def split_ids(self, split: str) -> list[str]: ...
     def clip(self, clip_id: str) -> Clip: ...
-    def joints(self, clip_id: str, side: str) -> np.ndarray: ...
+    def joints(self, clip_id: str, side: Side) -> np.ndarray: ...
     def hand_type(self, clip_id: str) -> str: ...
     def sentences(self, clip_id: str) -> Sequence[str]: ...
     def text_embedding(self, clip_id: str) -> np.ndarray: ...
@@ -281,21 +280,16 @@ def _templates(tracks: list[HandTrack]) -> np.ndarray | None:
     return None if left is None or right is None else np.stack((left, right)).astype(np.float32)
 
 
-@lru_cache(maxsize=512)
-def _points_cached(annotated: Annotated, object_key: str) -> ObjectPoints:
+def _points(annotated: Annotated, object_key: str) -> ObjectPoints:
     stored = annotated.points(object_key)
     return ObjectPoints(
         np.asarray(stored.points_m, np.float32), np.asarray(stored.normals, np.float32), np.asarray(stored.part)
     )
 
 
-def _points(annotated: Annotated, object_key: str) -> ObjectPoints:
-    return _points_cached(annotated, object_key)
-
-
 def _acting_entries(stored: Any, acts: np.ndarray) -> DistanceEntries:
-    index = [np.asarray(getattr(stored, name), np.int64) for name in ("side", "frame", "joint", "point")]
-    entries = DistanceEntries(*index, np.asarray(stored.distance_m, np.float32))
+    index = {name: np.asarray(getattr(stored, name), np.int64) for name in ("side", "frame", "joint", "point")}
+    entries = DistanceEntries(**index, distance_m=np.asarray(stored.distance_m, np.float32))
     return entries.select(acts[entries.side])
 
 
@@ -339,12 +333,12 @@ class ClipBatch:
 
     def to(self, device: torch.device | str) -> "ClipBatch":
         """The batch with every tensor on ``device``."""
-        moved = {field.name: getattr(self, field.name) for field in fields(self)}
-        return ClipBatch(**{k: v.to(device) if isinstance(v, Tensor) else v for k, v in moved.items()})
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)})
 
 
-def collate(samples: Sequence[ClipSample]) -> ClipBatch:
-    """Samples to one padded batch."""
+def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
+    """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
     n_frames = max(sample.length for sample in samples)
     frames = np.zeros((len(samples), n_frames), dtype=bool)
     for row, sample in enumerate(samples):
@@ -352,7 +346,7 @@ def collate(samples: Sequence[ClipSample]) -> ClipBatch:
     valid = np.stack([_padded(sample.valid, 1, n_frames) for sample in samples])
     acts = np.stack([sample.acts for sample in samples])
     hinges = [sample.object_model.hinge for sample in samples]
-    rows, distance = _entry_rows(samples)
+    rows, distance = _entry_rows(samples if with_entries else ())
     arrays = {
         "hands": np.stack([_padded(sample.hands, 1, n_frames) for sample in samples]),
         "object": np.stack([_padded(sample.object, 0, n_frames) for sample in samples]),

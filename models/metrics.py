@@ -1,0 +1,87 @@
+"""Measures of evaluation, as plain functions of arrays: the same for every system whose motions are clips."""
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from hoidata.objects.distance import signed_distance
+from hoidata.objects.model import ObjectModel, articulate
+
+TOUCH_M = 0.02
+THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
+
+
+def f1_score(predicted: np.ndarray, true: np.ndarray) -> float:
+    """F1 of boolean maps (point,): 2 TP / (2 TP + FP + FN); 1 where both are empty."""
+    hits = int((predicted & true).sum())
+    total = int(predicted.sum()) + int(true.sum())
+    return 2 * hits / total if total else 1.0
+
+
+def mean_f1(chances: np.ndarray, true: np.ndarray, threshold: float) -> float:
+    """Mean over clips of the F1 of maps (clip, point) of chances at a threshold."""
+    return float(np.mean([f1_score(chance >= threshold, truth) for chance, truth in zip(chances, true, strict=True)]))
+
+
+def best_threshold(chances: np.ndarray, true: np.ndarray) -> float:
+    """The threshold among 0.05, 0.10, ... 0.95 with the best mean F1; the lowest of equals."""
+    scores = [mean_f1(chances, true, threshold) for threshold in THRESHOLDS]
+    return THRESHOLDS[int(np.argmax(scores))]
+
+
+def spatial_mean_map(
+    points: np.ndarray, training_points: np.ndarray, training_maps: np.ndarray, neighbours: int = 1
+) -> np.ndarray:
+    """(point,) chance of contact at each place, averaged over training objects.
+
+    points (point, 3) and training_points (clip, point, 3) are normalised to the size of their object; each training map
+    (clip, point) is read at its nearest point.
+    """
+    chances = np.zeros(len(points))
+    for cloud, contact in zip(training_points, training_maps, strict=True):
+        _, nearest = KDTree(cloud).query(points, k=neighbours)
+        chances += contact[nearest].reshape(len(points), -1).mean(axis=1)
+    return chances / max(len(training_maps), 1)
+
+
+def joint_error_mm(predicted_m: np.ndarray, true_m: np.ndarray, present: np.ndarray) -> float:
+    """Mean distance in millimetres between joints (side, frame, joint, 3) over the (side, frame) that are present."""
+    apart = np.linalg.norm(predicted_m - true_m, axis=-1)
+    return float(apart[present].mean() * 1000)
+
+
+def points_in_object_frame(points_m: np.ndarray, rotmat: np.ndarray, position_m: np.ndarray) -> np.ndarray:
+    """World points (frame, point, 3) at object poses (frame, 3, 3), (frame, 3): ``R^T (p - t)``."""
+    return (points_m - position_m[:, None]) @ rotmat
+
+
+def depths_m(model: ObjectModel, points_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
+    """(frame, point) depth below the surface, metres, of points (frame, point, 3) of the object frame; 0 outside."""
+    depth = np.zeros(points_m.shape[:2])
+    low, high = _bounds(model, hinge_rad)
+    close = np.logical_and(points_m >= low, points_m <= high).min(axis=-1)
+    if model.hinge is None or hinge_rad is None:
+        if close.any():
+            depth[close] = -signed_distance(model.vertices_m, model.faces, points_m[close]).distance_m
+        return depth.clip(min=0)
+    for frame in np.flatnonzero(close.max(axis=1)):
+        mesh = articulate(model.vertices_m, model.part, model.hinge, hinge_rad[frame : frame + 1])[0]
+        inside = close[frame]
+        depth[frame, inside] = -signed_distance(mesh, model.faces, points_m[frame, inside]).distance_m
+    return depth.clip(min=0)
+
+
+def surface_distances_m(model: ObjectModel, points_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
+    """(frame, point) unsigned distance to the mesh surface, metres, of points (frame, point, 3) of the object frame."""
+    if model.hinge is None or hinge_rad is None:
+        flat = signed_distance(model.vertices_m, model.faces, points_m.reshape(-1, 3)).distance_m
+        return np.abs(flat).reshape(points_m.shape[:2])
+    rows = []
+    for frame, points in enumerate(points_m):
+        mesh = articulate(model.vertices_m, model.part, model.hinge, hinge_rad[frame : frame + 1])[0]
+        rows.append(np.abs(signed_distance(mesh, model.faces, points).distance_m))
+    return np.stack(rows)
+
+
+def _bounds(model: ObjectModel, hinge_rad: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    vertices = articulate(model.vertices_m, model.part, model.hinge, hinge_rad).reshape(-1, 3)
+    return vertices.min(axis=0), vertices.max(axis=0)
