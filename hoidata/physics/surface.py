@@ -1,0 +1,154 @@
+"""Hands against an object's surface: signed distances per frame, contacts, penetration.
+
+Everything happens in the object frame, where the surface of a rigid object does not change from frame to frame; the
+moving part of a hinged object is met in its own rest frame.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands.model import HandModel
+from hoidata.objects.distance import signed_distance
+from hoidata.objects.mesh import MassProperties, mass_properties
+from hoidata.objects.model import ObjectModel
+from hoidata.physics.contact_forces import BodyMotion
+
+REACH_M = 0.03
+CONTACT_TOLERANCE_M = 0.002
+N_PATCHES = 21
+
+
+class SurfaceDistances(NamedTuple):
+    """Of points (frame, point): distance_m, negative inside, ``inf`` beyond the reach; closest_m, normal (..., 3).
+
+    ``closest_m`` and ``normal`` are in the object frame and zero beyond the reach.
+    """
+
+    distance_m: np.ndarray
+    closest_m: np.ndarray
+    normal: np.ndarray
+
+
+class Contacts(NamedTuple):
+    """points_m, normals: (contact, 3), object frame; normals point out of the object."""
+
+    points_m: np.ndarray
+    normals: np.ndarray
+
+
+def to_object_frame(points_m: np.ndarray, rotmats: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
+    """World points (frame, point, 3) in the object frame, given world-from-object (frame, 3, 3), (frame, 3)."""
+    return (points_m - translation_m[:, None]) @ rotmats
+
+
+def surface_distances(
+    model: ObjectModel, hinge_rad: np.ndarray | None, points_m: np.ndarray, reach_m: float = REACH_M
+) -> SurfaceDistances:
+    """Signed distances of ``points_m (frame, point, 3)``, object frame, to the object at each frame's hinge angle."""
+    shape = points_m.shape[:2]
+    best = SurfaceDistances(np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros((*shape, 3)))
+    for part in np.unique(model.face_part) if model.is_articulated else [None]:
+        faces = model.faces if part is None else model.faces[model.face_part == part]
+        turn = _part_rotation(model, hinge_rad) if part == 1 else None
+        _merge_nearer(best, _part_distances(model, faces, turn, points_m, reach_m))
+    return best
+
+
+def _part_rotation(model: ObjectModel, hinge_rad: np.ndarray | None) -> np.ndarray:
+    if model.hinge is None or hinge_rad is None:
+        raise ValueError(f"{model.name}: hinge angles are needed to place the moving part")
+    return rotvec_to_rotmat(model.hinge.axis[None] * np.asarray(hinge_rad, dtype=np.float64)[:, None])
+
+
+def _part_distances(
+    model: ObjectModel, faces: np.ndarray, turn: np.ndarray | None, points_m: np.ndarray, reach_m: float
+) -> SurfaceDistances:
+    origin = model.hinge.origin_m if model.hinge is not None else np.zeros(3)
+    local = points_m if turn is None else (points_m - origin) @ turn + origin
+    used = model.vertices_m[np.unique(faces)]
+    near = ((local > used.min(0) - reach_m) & (local < used.max(0) + reach_m)).all(-1)
+    distance = np.full(points_m.shape[:2], np.inf)
+    closest, normal = np.zeros(points_m.shape), np.zeros(points_m.shape)
+    if near.any():
+        found = signed_distance(model.vertices_m, faces, local[near])
+        distance[near], closest[near], normal[near] = found.distance_m, found.closest_m, found.normal
+        distance[distance > reach_m] = np.inf
+    if turn is not None:
+        closest = (closest - origin) @ turn.transpose(0, 2, 1) + origin
+        normal = normal @ turn.transpose(0, 2, 1)
+    return SurfaceDistances(distance, closest, normal)
+
+
+def _merge_nearer(best: SurfaceDistances, other: SurfaceDistances) -> None:
+    nearer = other.distance_m < best.distance_m
+    for mine, new in zip(best, other, strict=True):
+        mine[nearer] = new[nearer]
+
+
+def penetration_depth_m(distances: SurfaceDistances) -> np.ndarray:
+    """(frame,) depth of the deepest point inside the object, metres; 0 where none is inside."""
+    return np.maximum(-distances.distance_m.min(axis=1), 0.0)
+
+
+def hand_patches(model: HandModel) -> np.ndarray:
+    """(778,) which of 21 patches a hand vertex belongs to: 15 finger segments, then 6 regions of the palm.
+
+    As ManipNet's capsules (Appendix A): 4 palm regions towards the fingers, the thumb's ball and the heel.
+    """
+    joint = model.skin_weights.argmax(axis=1)
+    rest = model.joint_regressor @ model.template_m
+    knuckles = rest[[1, 4, 10, 7]]
+    anchors = np.concatenate(
+        [rest[0] + 0.7 * (knuckles - rest[0]), [0.5 * (rest[0] + rest[13])], [rest[0] + 0.25 * (rest[7] - rest[0])]]
+    )
+    region = np.linalg.norm(model.template_m[:, None] - anchors, axis=2).argmin(axis=1)
+    return np.where(joint == 0, 15 + region, joint - 1)
+
+
+def patch_contacts(
+    distances: SurfaceDistances, patches: np.ndarray, frame: int, tolerance_m: float = CONTACT_TOLERANCE_M
+) -> Contacts:
+    """At most one contact per patch: its deepest vertex, where that is nearer than the tolerance.
+
+    The contact point is the closest surface point. patches: (point,) as from :func:`hand_patches`, any numbering.
+    """
+    order = np.argsort(distances.distance_m[frame], kind="stable")
+    order = order[distances.distance_m[frame][order] < tolerance_m]
+    first = np.unique(patches[order], return_index=True)[1]
+    chosen = order[first]
+    return Contacts(distances.closest_m[frame][chosen], distances.normal[frame][chosen])
+
+
+def part_mass_properties(model: ObjectModel) -> list[tuple[float, MassProperties]]:
+    """(share of the mass, properties for 1 kg) of each part, even density over the whole object."""
+    parts = [mass_properties(model.vertices_m, model.faces[model.face_part == part]) for part in _parts(model)]
+    total = sum(part.volume_m3 for part in parts)
+    return [(part.volume_m3 / total, part) for part in parts]
+
+
+def _parts(model: ObjectModel) -> np.ndarray:
+    return np.unique(model.face_part) if model.is_articulated else np.zeros(1, dtype=np.uint8)
+
+
+def body_motion(
+    model: ObjectModel, rotmats: np.ndarray, translation_m: np.ndarray, hinge_rad: np.ndarray | None
+) -> BodyMotion:
+    """Centre of mass and inertia of 1 kg in the world at each frame; a hinged object is one body at its angle."""
+    n_frames = len(rotmats)
+    shares = part_mass_properties(model)
+    centres, inertias = [], []
+    for index, (_, part) in enumerate(shares):
+        turn = _part_rotation(model, hinge_rad) if index == 1 else np.broadcast_to(np.eye(3), (n_frames, 3, 3))
+        origin = model.hinge.origin_m if index == 1 and model.hinge is not None else np.zeros(3)
+        centres.append(turn @ (part.centre_m - origin) + origin)
+        inertias.append(turn @ part.inertia_kg_m2 @ turn.transpose(0, 2, 1))
+    centre = sum(share * c for (share, _), c in zip(shares, centres, strict=True))
+    inertia = np.zeros((n_frames, 3, 3))
+    for (share, _), part_centre, part_inertia in zip(shares, centres, inertias, strict=True):
+        away = part_centre - centre
+        square = (away**2).sum(-1)[:, None, None] * np.eye(3)
+        inertia += share * (part_inertia + square - away[:, :, None] * away[:, None, :])
+    world_centre = np.einsum("fij,fj->fi", rotmats, np.asarray(centre)) + translation_m
+    return BodyMotion(world_centre, rotmats @ inertia @ rotmats.transpose(0, 2, 1), rotmats)

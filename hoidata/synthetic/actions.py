@@ -1,0 +1,155 @@
+"""What happens in the embedded corpora: which verb with which object, held how, and how long it takes.
+
+Only pairs that the real label tables have. Each pair has one hand type and one grasped region, so that the sentence
+tells both; verbs and objects are crossed, so that the object alone does not.
+"""
+
+from dataclasses import dataclass
+
+from hoidata.synthetic.grasps import Hold, Reach
+from hoidata.synthetic.paths import MOTIONS, Motion
+
+
+@dataclass(frozen=True)
+class Action:
+    """verb: in words. intent: as in the source's files. object_name: as in the source. motion: key of MOTIONS."""
+
+    verb: str
+    object_name: str
+    hold: Hold
+    motion_name: str = ""
+    intent: str = ""
+
+    @property
+    def motion(self) -> Motion:
+        return MOTIONS[self.motion_name or self.verb]
+
+
+RIGHT = Hold((("right", Reach((0.75, -0.35, 0.45))),))
+LEFT = Hold((("left", Reach((-0.75, -0.35, 0.45))),))
+SIDES = Hold(
+    (("left", Reach((-1, -0.1, 0.1), 0.22, blend=(0, 0.6))), ("right", Reach((1, -0.1, 0.1), 0.22, blend=(0, 0.6))))
+)
+
+
+def _body_and_lid(body_m: tuple[float, float, float], lid_m: tuple[float, float, float]) -> Hold:
+    """Left hand round the body, right hand on the lid of a rigid container."""
+    left = Reach((-1, -0.2, 0.1), 0.3, body_m, (0, 0.6))
+    return Hold((("left", left), ("right", Reach((0.7, -0.2, 0.7), 0.35, lid_m, (0, 0.8)))))
+
+
+def _base_and_lid(angles_rad: tuple[float, ...]) -> Hold:
+    """Left hand on the base, right hand on the part the hinge moves; the first angle is where they arrive."""
+    base = Reach((-1, -0.3, 0.0), 0.45, blend=(0, 0.8), part=0)
+    return Hold((("left", base), ("right", Reach((1, -0.4, 0.4), 0.45, blend=(0, 0.8), part=1))), angles_rad[0], angles_rad)
+
+
+OPENING = _base_and_lid((0.35, 0.65, 0.95))
+CLOSING = _base_and_lid((0.95, 0.65, 0.35))
+MUG_HANDLE = Hold((("right", Reach((1, -0.25, 0.3), 0.25, (0.055, 0, 0.048), (0.2, 0.9))),))
+TEAPOT_HANDLE = Hold((("right", Reach((0.5, -0.4, 0.9), 0.3, (0.125, 0, 0.08), (0, 0.8))),))
+HAMMER_HANDLE = Hold((("right", Reach((0.3, -0.4, 0.9), 0.3, (0.05, 0, 0.02), (0, 0.8))),))
+STEM_LEFT = Hold((("left", Reach((-1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
+STEM_RIGHT = Hold((("right", Reach((1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
+
+H2O_ACTIONS = (
+    Action("grab", "espresso", RIGHT),
+    Action("put in", "cappuccino", LEFT),
+    Action("read", "book", SIDES),
+    Action("pour", "milk", RIGHT),
+    Action("grab", "milk", LEFT),
+    Action("place", "cappuccino", RIGHT),
+    Action("place", "cocoa", LEFT),
+    Action("take out", "espresso", LEFT),
+    Action("take out", "chips", RIGHT),
+    Action("put in", "cocoa", RIGHT),
+    Action("open", "lotion", _body_and_lid((0, 0, 0.07), (0, 0, 0.165)), "open rigid"),
+    Action("open", "milk", _body_and_lid((0, 0, 0.08), (0, 0, 0.17)), "open rigid"),
+    Action("close", "chips", _body_and_lid((0, 0, 0.07), (0, 0, 0.18)), "close rigid"),
+    Action("grab", "book", SIDES),
+    Action("spray", "spray", RIGHT),
+    Action("squeeze", "lotion", RIGHT),
+    Action("apply", "lotion", LEFT),
+    Action("read", "espresso", RIGHT),
+)
+
+GRAB_ACTIONS = (
+    Action("lift", "cubelarge", RIGHT, intent="lift"),
+    Action("eat", "apple", LEFT, intent="eat"),
+    Action("hand over", "cylinderlarge", SIDES, intent="offhand"),
+    Action("drink", "mug", MUG_HANDLE, intent="drink"),
+    Action("lift", "spheremedium", LEFT, intent="lift"),
+    Action("lift", "toruslarge", RIGHT, intent="lift"),
+    Action("pass", "cylindermedium", LEFT, intent="pass"),
+    Action("pass", "waterbottle", RIGHT, intent="pass"),
+    Action("pass", "cubemedium", RIGHT, intent="pass"),
+    Action("hand over", "spherelarge", SIDES, intent="offhand"),
+    Action("inspect", "cubelarge", SIDES, intent="inspect"),
+    Action("inspect", "cylinderlarge", LEFT, intent="inspect"),
+    Action("inspect", "spheremedium", RIGHT, intent="inspect"),
+    Action("drink", "wineglass", STEM_LEFT, intent="drink"),
+    Action("toast", "wineglass", STEM_RIGHT, intent="toast"),
+    Action("pour", "teapot", TEAPOT_HANDLE, intent="pour"),
+    Action("pour", "waterbottle", LEFT, intent="pour"),
+    Action("shake", "waterbottle", SIDES, intent="shake"),
+    Action("use", "hammer", HAMMER_HANDLE, intent="use"),
+)
+
+ARCTIC_ACTIONS = (
+    Action("open", "laptop", OPENING),
+    Action("shake", "ketchup", RIGHT),
+    Action("grasp", "ketchup", LEFT),
+    Action("close", "box", CLOSING),
+    Action("lift", "laptop", SIDES),
+    Action("grasp", "box", SIDES),
+    Action("lift", "mixer", RIGHT),
+    Action("lift", "waffleiron", SIDES),
+    Action("place", "notebook", SIDES),
+    Action("place", "phone", LEFT),
+    Action("place", "ketchup", RIGHT),
+    Action("open", "box", OPENING),
+    Action("open", "microwave", OPENING),
+    Action("close", "laptop", CLOSING),
+    Action("close", "waffleiron", CLOSING),
+    Action("sprinkle", "ketchup", LEFT),
+    Action("type", "phone", RIGHT),
+    Action("operate", "microwave", _base_and_lid((0.35, 0.6, 0.85))),
+)
+
+ACTIONS = {"h2o": H2O_ACTIONS, "grab": GRAB_ACTIONS, "arctic": ARCTIC_ACTIONS}
+
+# Mean length of a clip in 30 fps frames; lengths vary about it with LENGTH_DEVIATION.
+MEAN_LENGTH = {
+    "h2o": {
+        "grab": 46, "place": 56, "put in": 66, "take out": 76, "close": 84, "open": 92, "spray": 100, "apply": 108,
+        "squeeze": 116, "pour": 124, "read": 134,
+    },
+    "grab": {
+        "lift": 46, "pass": 58, "toast": 70, "shake": 80, "hand over": 90, "eat": 98, "use": 104, "pour": 112,
+        "drink": 122, "inspect": 134,
+    },
+    "arctic": {
+        "grasp": 45, "place": 56, "lift": 66, "shake": 78, "close": 88, "open": 100, "sprinkle": 112, "type": 122,
+        "operate": 134,
+    },
+}  # fmt: skip
+LENGTH_DEVIATION = 14.0
+SHORTEST_CLIP, LONGEST_CLIP = 34, 150
+
+H2O_VERB_IDS = {
+    "grab": 1, "place": 2, "open": 3, "close": 4, "pour": 5, "take out": 6, "put in": 7, "apply": 8, "read": 9,
+    "spray": 10, "squeeze": 11,
+}  # fmt: skip
+H2O_OBJECT_IDS = {
+    "book": 1, "espresso": 2, "lotion": 3, "spray": 4, "milk": 5, "cocoa": 6, "chips": 7, "cappuccino": 8,
+}  # fmt: skip
+_H2O_PAIRS = (
+    *(("grab", name) for name in H2O_OBJECT_IDS),
+    *(("place", name) for name in H2O_OBJECT_IDS),
+    ("open", "lotion"), ("open", "milk"), ("open", "chips"), ("close", "lotion"), ("close", "milk"), ("close", "chips"),
+    ("pour", "milk"), ("take out", "espresso"), ("take out", "cocoa"), ("take out", "chips"),
+    ("take out", "cappuccino"), ("put in", "espresso"), ("put in", "cocoa"), ("put in", "cappuccino"),
+    ("apply", "lotion"), ("apply", "spray"), ("read", "book"), ("read", "espresso"), ("spray", "spray"),
+    ("squeeze", "lotion"),
+)  # fmt: skip
+H2O_ACTION_IDS = {pair: index for index, pair in enumerate(_H2O_PAIRS, 1)}

@@ -1,0 +1,144 @@
+"""Placing an open hand over a surface and closing its fingers until they touch, many candidates at once.
+
+Everything is written for the right hand; for a left hand the caller mirrors the field in x and mirrors the result.
+"""
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from hoidata.synthetic.field import Field, gradient
+from hoidata.synthetic.hand_capsules import (
+    CURL_RATIO,
+    LIMITS_RAD,
+    N_FINGERS,
+    OPEN_RAD,
+    THUMB,
+    CapsuleHands,
+    capsule_points,
+)
+
+PRESS_M = 0.0008
+_LARGEST_STEPS = 70
+_MARCH_START_M = 0.25
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where candidate hands approach an object; one row per candidate, upright object frame, metres and radians.
+
+    rotmats: (row, 3, 3) object-from-hand, its y axis the approach normal. target_m: (row, 3) surface point.
+    blend: (row,) 0 puts the palm over the target, 1 the fingers. gap_m: (row,) clearance at which the hand stops.
+    spread_rad: (row, 5) swing of the fingers. hand: (row,) which hand shape.
+    """
+
+    rotmats: np.ndarray
+    target_m: np.ndarray
+    blend: np.ndarray
+    gap_m: np.ndarray
+    spread_rad: np.ndarray
+    hand: np.ndarray
+
+    def take(self, rows: np.ndarray) -> "Placement":
+        return Placement(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def for_hands(self, n_hands: int) -> "Placement":
+        """Every placement with every hand shape: rows placement-major."""
+        rows = np.repeat(np.arange(len(self.hand)), n_hands)
+        return replace(self.take(rows), hand=np.tile(np.arange(n_hands), len(self.hand)))
+
+
+@dataclass(frozen=True)
+class ClosedHands:
+    """Candidate grasps: wrist_m (row, 3), rotmats (row, 3, 3), flexion_rad (row, 5, 3), spread_rad (row, 5)."""
+
+    wrist_m: np.ndarray
+    rotmats: np.ndarray
+    flexion_rad: np.ndarray
+    spread_rad: np.ndarray
+
+
+def march_to_surface(field: Field, direction: np.ndarray, through_m: np.ndarray) -> np.ndarray:
+    """(row, 3) first surface points met when coming along ``-direction (row, 3)`` towards ``through_m (row, 3)``."""
+    points = through_m + _MARCH_START_M * direction
+    for _ in range(40):
+        points = points - np.maximum(field(points), 0)[:, None] * direction
+    return points
+
+
+def draw_placements(
+    field: Field,
+    direction: np.ndarray,
+    through_m: np.ndarray,
+    blend: tuple[float, float],
+    rng: np.random.Generator,
+    normal_noise: float,
+) -> Placement:
+    """Random placements coming from each ``direction (row, 3)``; rows that miss the object are left out."""
+    surface = march_to_surface(field, direction, through_m)
+    direction, surface = (array[field(surface) < 0.003] for array in (direction, surface))
+    count = len(surface)
+    normal = gradient(field, surface) + normal_noise * rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    share = rng.uniform(*blend, size=count)
+    power = share < 0.5
+    gap = np.where(power, rng.uniform(-0.001, 0.0005, count), rng.uniform(0, 0.035, count))
+    spread = rng.uniform(-0.05, 0.05, (count, N_FINGERS))
+    spread[:, THUMB] = rng.uniform(-0.25, 0.25, count)
+    rotmats = _rolled(normal, rng.uniform(-np.pi, np.pi, count))
+    return Placement(rotmats, surface, share, gap, spread, np.zeros(count, dtype=int))
+
+
+def _rolled(normal: np.ndarray, roll: np.ndarray) -> np.ndarray:
+    """Rotations (row, 3, 3) whose y axis is ``normal``, turned about it by ``roll``."""
+    helper = np.where(np.abs(normal[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    first = np.cross(normal, helper)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(normal, first)
+    x = np.cos(roll)[:, None] * first + np.sin(roll)[:, None] * second
+    return np.stack([x, normal, np.cross(x, normal)], axis=2)
+
+
+def put_over(field: Field, hands: CapsuleHands, placement: Placement) -> np.ndarray:
+    """(row, 3) wrist positions where the open hand, slid along its normal, first leaves only the gap."""
+    middle, index = hands.joints[:, 4], hands.joints[:, 1]
+    palm = 0.75 * middle + 0.1 * index
+    fingers = middle + np.array([-0.035, 0.0, 0.012])
+    anchor = palm + placement.blend[:, None] * (fingers - palm)
+    normal = placement.rotmats[:, :, 1]
+    wrist = placement.target_m - (placement.rotmats @ anchor[:, :, None])[..., 0] + 0.12 * normal
+    opened = np.broadcast_to(OPEN_RAD, (len(wrist), N_FINGERS, 3))
+    points = capsule_points(hands, placement.rotmats, wrist, opened, placement.spread_rad)
+    slid = np.zeros(len(wrist))
+    for _ in range(14):
+        moved = points - (slid[:, None] * normal)[:, None, None]
+        clearance = (field(moved).min(-1) - hands.radii).min(-1)
+        slid += clearance - placement.gap_m
+    return wrist - slid[:, None] * normal
+
+
+def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> ClosedHands:
+    """Curl all fingers step by step; a segment that presses the surface stops itself and the joints before it."""
+    wrist = put_over(field, hands, placement)
+    flexion = np.broadcast_to(OPEN_RAD, (len(wrist), N_FINGERS, 3)).copy()
+    stopped = np.zeros(flexion.shape, dtype=bool)
+    for _ in range(_LARGEST_STEPS):
+        clearance = _finger_clearance(field, hands, placement, wrist, flexion)
+        stopped |= clearance <= -PRESS_M
+        # A stopped segment holds every joint between itself and the palm.
+        free = ~np.logical_or.accumulate(stopped[..., ::-1], axis=-1)[..., ::-1] & (flexion < LIMITS_RAD - 1e-9)
+        if not free.any():
+            break
+        # Segments beyond the first free joint are the ones that move.
+        moves = np.logical_or.accumulate(free, axis=-1)
+        nearest = np.where(moves, clearance + PRESS_M, np.inf).min(-1, keepdims=True)
+        step = np.clip(0.9 * nearest / 0.10, 0.006, 0.10)
+        flexion = np.minimum(np.where(free, flexion + step * CURL_RATIO, flexion), LIMITS_RAD)
+    return ClosedHands(wrist, placement.rotmats, flexion, placement.spread_rad)
+
+
+def _finger_clearance(
+    field: Field, hands: CapsuleHands, placement: Placement, wrist: np.ndarray, flexion: np.ndarray
+) -> np.ndarray:
+    points = capsule_points(hands, placement.rotmats, wrist, flexion, placement.spread_rad)[:, :15]
+    return (field(points).min(-1) - hands.radii[:, :15]).reshape(-1, N_FINGERS, 3)

@@ -1,0 +1,180 @@
+"""From a grasp and a path to a whole action: approach, close, carry, open, retreat."""
+
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands import HandPair
+from hoidata.objects.model import ObjectModel, articulate
+from hoidata.schema.clip import FPS, SIDES, HandTrack, HandType, ObjectTrack, Side
+from hoidata.synthetic.actions import LENGTH_DEVIATION, LONGEST_CLIP, MEAN_LENGTH, SHORTEST_CLIP, Action
+from hoidata.synthetic.catalogue import ObjectSpec
+from hoidata.synthetic.grasps import Grip
+from hoidata.synthetic.paths import ObjectPath, follow_path, minimum_jerk
+from hoidata.synthetic.truth import TruthSequence
+
+# In 30 fps frames: the hand travels, closes, opens, travels away.
+APPROACH, CLOSE, OPEN, RETREAT = 10, 4, 3, 8
+LED_IN, LED_OUT = 6, 4
+_AWAY_M = 0.22
+HELD_ABOVE_M = 0.015
+SOURCE_FPS = {"h2o": 30, "grab": 120, "arctic": 30}
+_IDLE_RIGHT_M = np.array([0.6, -0.35, 0.05])
+# Idle right hand, palm down, fingers forward: hand x to -y, back of the hand up, thumb to -x.
+_IDLE_RIGHT = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class Timing:
+    """In 30 fps frames, possibly fractions: first firm contact, start and length of the action proper, last contact."""
+
+    contact_start: float
+    start: float
+    length: float
+    contact_stop: float
+    end: float
+
+
+@dataclass(frozen=True)
+class Person:
+    """subject: name. betas: (10,). template_m: (778, 3) personal rest mesh per side, or None where betas say it all."""
+
+    subject: str
+    betas: np.ndarray
+    template_m: dict[Side, np.ndarray] | None
+
+
+def draw_length(dataset: str, verb: str, rng: np.random.Generator) -> int:
+    """Length of a clip in 30 fps frames: about the verb's mean."""
+    length = MEAN_LENGTH[dataset][verb] + LENGTH_DEVIATION * rng.normal()
+    return int(np.clip(round(length), SHORTEST_CLIP, LONGEST_CLIP))
+
+
+def plan_timing(dataset: str, action: Action, length: int, rng: np.random.Generator) -> Timing:
+    """When what happens, so that the labelled clip has the given length (GRAB: firm contact alone is the clip)."""
+    motion = action.motion
+    fine = SOURCE_FPS[dataset] // FPS
+    contact_start = APPROACH + CLOSE + (int(rng.integers(fine)) / fine if fine > 1 else 0.0)
+    before, after = (0, 0) if dataset == "grab" else (motion.lifted_before, motion.lowered_after)
+    led = 0 if dataset == "grab" else LED_IN * (before == 0) + LED_OUT * (after == 0)
+    proper = length - led
+    start = contact_start + before
+    contact_stop = start + proper + after
+    return Timing(contact_start, start, proper, contact_stop, contact_stop + OPEN + RETREAT)
+
+
+def make_sequence(
+    dataset: str,
+    action: Action,
+    spec: ObjectSpec,
+    model: ObjectModel,
+    grips: tuple[Grip, ...],
+    person: Person,
+    source_key: str,
+    length: int,
+    rng: np.random.Generator,
+) -> TruthSequence:
+    """One action at the source's frame rate; everything random comes from ``rng``."""
+    timing = plan_timing(dataset, action, length, rng)
+    fps = SOURCE_FPS[dataset]
+    times = np.arange(int(np.floor(timing.end * fps / FPS)) + 1) * (FPS / fps)
+    hand = action.hold.hand
+    size, turn_size = rng.uniform(0.9, 1.1, 2)
+    path = follow_path(action.motion, times, timing.start, timing.length, hand == "left", float(size), float(turn_size))
+    rotmats, translation = _object_pose(spec, model, path, rng)
+    hinge = path.hinge_rad if model.is_articulated else None
+    idle_absent = dataset == "h2o" and bool(rng.random() < 0.5)
+    hands = {side: _idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
+    for grip in grips:
+        hands[grip.side] = _acting_hand(grip, person, model, rotmats, translation, hinge, times, timing)
+    track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
+    contact = (round(timing.contact_start * fps / FPS), round(timing.contact_stop * fps / FPS) + 1)
+    return TruthSequence(
+        dataset=dataset, subject=person.subject, source_key=source_key, raw_start=0, source_fps=fps, verb=action.verb,
+        object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=_hand_type(hand), hands=hands,
+        object=track, clip=_clip_span(dataset, action, timing, contact), contact=contact,
+        held=_lowest_point(track) > spec.stand_m + HELD_ABOVE_M, stand_m=spec.stand_m,
+    )  # fmt: skip
+
+
+def _hand_type(hand: str) -> HandType:
+    return next(kind for kind in get_args(HandType) if kind == hand)
+
+
+def _clip_span(dataset: str, action: Action, timing: Timing, contact: tuple[int, int]) -> tuple[int, int]:
+    if dataset == "grab":
+        return contact
+    start = timing.start if action.motion.lifted_before else timing.contact_start - LED_IN
+    proper_stop = timing.start + timing.length
+    return round(start), round(proper_stop if action.motion.lowered_after else proper_stop + LED_OUT)
+
+
+def _object_pose(
+    spec: ObjectSpec, model: ObjectModel, path: ObjectPath, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """World-from-object rotations (frame, 3, 3) and translations (frame, 3), from a start near the world's origin."""
+    base = model.vertices_m[model.part == 0]
+    middle = (base.min(0) + base.max(0)) / 2
+    upright = spec.upright_from_object
+    standing = articulate(model.vertices_m, model.part, model.hinge, path.hinge_rad[:1])[0] @ upright.T
+    start = np.array([*np.clip(0.025 * rng.normal(size=2), -0.06, 0.06), spec.stand_m - standing[:, 2].min()])
+    start[2] += (upright @ middle)[2]
+    yaw = np.deg2rad(np.clip(10 * rng.normal(), -25, 25))
+    at_rest = rotvec_to_rotmat(np.array([0.0, 0.0, yaw])) @ upright
+    rotmats = rotvec_to_rotmat(path.turn_rad) @ at_rest
+    return rotmats, start + path.shift_m - rotmats @ middle
+
+
+def _acting_hand(
+    grip: Grip, person: Person, model: ObjectModel, rotmats, translation, hinge, times: np.ndarray, timing: Timing
+) -> HandTrack:
+    """The hand fixed to its part of the object while it holds, straight away from it along its back before and after."""
+    follow = rotmats
+    if grip.part == 1 and model.hinge is not None and hinge is not None:
+        follow = rotmats @ rotvec_to_rotmat(model.hinge.axis * hinge[:, None])
+    world = follow @ grip.rotmat
+    arriving = 1 - minimum_jerk((times - (timing.contact_start - CLOSE - APPROACH)) / APPROACH)
+    leaving = minimum_jerk((times - timing.contact_stop - OPEN) / RETREAT)
+    wrist = follow @ grip.wrist_m + translation + _AWAY_M * (arriving + leaving)[:, None] * world[:, :, 1]
+    closed = minimum_jerk((times - timing.contact_start + CLOSE) / CLOSE) - minimum_jerk((times - timing.contact_stop) / OPEN)
+    pose = grip.open_pose + closed[:, None] * (grip.hand_pose - grip.open_pose)
+    return _track(person, grip.side, wrist, rotmat_to_rotvec(world), pose, True)
+
+
+def _idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generator, present: bool) -> HandTrack:
+    """A relaxed hand that drifts a little, far to its own side of the object."""
+    share = np.linspace(0, 1, n_frames)[:, None]
+    drift = 0.03 * rng.normal(size=3) + 0.02 * share * rng.normal(size=3)
+    wrist, orient = _IDLE_RIGHT_M + drift, np.tile(rotmat_to_rotvec(_IDLE_RIGHT), (n_frames, 1))
+    curl = np.tile([0.0, 0.0, 0.25], 15) * np.repeat([1.0, 1.0, 1.0, 1.0, 0.3], 9)
+    pose = np.tile(curl + 0.03 * rng.normal(size=45), (n_frames, 1))
+    if side == "left":
+        wrist = wrist * np.array([-1.0, 1.0, 1.0])
+        orient = mirror_rotvec_x(orient)
+        pose = mirror_rotvec_x(pose.reshape(-1, 15, 3)).reshape(-1, 45)
+    return _track(person, side, wrist, orient, pose, present)
+
+
+def _track(person: Person, side: Side, wrist, orient, pose, present: bool) -> HandTrack:
+    betas = person.betas if person.template_m is None else np.zeros(10)
+    template = None if person.template_m is None else person.template_m[side]
+    return HandTrack(wrist, orient, pose, betas[None], np.full(len(wrist), present), template)
+
+
+def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Generator) -> Person:
+    """A subject with hands of its own; GRAB files a personal mesh instead of betas, in float32."""
+    betas = np.round(np.clip(0.6 * rng.normal(size=10), -1.5, 1.5), 6).astype(np.float32).astype(np.float64)
+    if dataset != "grab":
+        return Person(subject, betas, None)
+    meshes = {side: (pair[side].template_m + pair[side].shape_directions @ betas).astype(np.float32) for side in SIDES}
+    return Person(subject, betas, {side: mesh.astype(np.float64) for side, mesh in meshes.items()})
+
+
+def _lowest_point(track: ObjectTrack) -> np.ndarray:
+    """(frame,) height of the object's lowest vertex."""
+    model = track.model
+    points = articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad)
+    up = rotvec_to_rotmat(track.rotvec)[:, 2]
+    return np.einsum("fpi,fi->fp", np.broadcast_to(points, (len(up), *points.shape[1:])), up).min(1) + track.translation_m[:, 2]
