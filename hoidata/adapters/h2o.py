@@ -57,6 +57,7 @@ class H2OAdapter:
     """Raw root: ``object/<name>/<name>.obj`` and ``subjectN/<place>/<number>/cam4/<kind>/NNNNNN.txt``.
 
     margin_frames: frames kept before and after each labelled run. shortest_frames: runs must be this long or longer.
+    A run is split where the tracked object is not the one its label names.
     """
 
     margin_frames: int = 0
@@ -77,19 +78,20 @@ class H2OAdapter:
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """One clip per run of frames with one non-zero action label and the object that label names."""
         frames = _read_frames(raw, f"{key.name}/{CAMERA}")
-        models: dict[int, ObjectModel] = {}
+        models: dict[str, ObjectModel] = {}
         results: list[Clip | Quarantined] = []
         for start, stop in label_runs(frames.label, self.shortest_frames):
-            class_id = _object_class(frames, start, stop)
-            if isinstance(class_id, BadInput):
-                results.append(Quarantined.from_error(_clip_id(key, frames, start, stop), class_id))
-                continue
-            mesh_path = _mesh_path(raw, OBJECTS[class_id])
-            if class_id not in models:
-                models[class_id] = _object_model(raw, OBJECTS[class_id], mesh_path)
-            sources = raw.recorded(frames.folder, mesh_path)
-            clip = self._convert(key, frames, start, stop, models[class_id], hands)
-            results.append(replace(clip, sources=sources))
+            pieces = _tracked_pieces(frames, start, stop, self.shortest_frames)
+            if not pieces:
+                problem = _untracked(frames, start, stop)
+                results.append(Quarantined.from_error(_clip_id(key, frames, start, stop), problem))
+            for piece in pieces:
+                name = ACTIONS[int(frames.label[start])][1]
+                mesh_path = _mesh_path(raw, name)
+                if name not in models:
+                    models[name] = _object_model(raw, name, mesh_path)
+                clip = self._convert(key, frames, *piece, models[name], hands)
+                results.append(replace(clip, sources=raw.recorded(frames.folder, mesh_path)))
         return results
 
     def _convert(
@@ -97,7 +99,7 @@ class H2OAdapter:
     ) -> Clip:
         verb, noun = ACTIONS[int(frames.label[start])]
         clip_id = _clip_id(key, frames, start, stop)
-        start, stop = max(0, start - self.margin_frames), min(len(frames.label), stop + self.margin_frames)
+        start, stop = _with_margin(frames, start, stop, self.margin_frames)
         camera = frames.camera[start:stop]
         world_from_object = camera @ frames.object[start:stop, 1:].reshape(-1, 4, 4)
         return Clip(
@@ -146,15 +148,28 @@ def _clip_id(key: SequenceKey, frames: _Frames, start: int, stop: int) -> str:
     return f"{key}/{frames.first + start:06d}-{frames.first + stop - 1:06d}"
 
 
-def _object_class(frames: _Frames, start: int, stop: int) -> int | BadInput:
-    """The one object class of a run, or why there is none: it must be the object the action label names."""
+def _tracked_pieces(frames: _Frames, start: int, stop: int, shortest: int) -> list[tuple[int, int]]:
+    """The parts of a run, ``shortest`` frames or longer, in which the tracked object is the one the label names."""
+    expected = OBJECTS.index(ACTIONS[int(frames.label[start])][1])
+    tracked = (frames.object[start:stop, 0] == expected).astype(int)
+    return [(start + first, start + last) for first, last in label_runs(tracked, shortest)]
+
+
+def _untracked(frames: _Frames, start: int, stop: int) -> BadInput:
     label = int(frames.label[start])
-    classes = np.unique(frames.object[start:stop, 0].astype(int))
-    expected = OBJECTS.index(ACTIONS[label][1])
-    if classes.tolist() == [expected]:
-        return expected
-    wanted = f"class {expected} ({OBJECTS[expected]}) in every frame of action {label}"
-    return BadInput(f"{frames.folder}/obj_pose_rt", wanted, f"classes {classes.tolist()}", "check the annotation")
+    classes = np.unique(frames.object[start:stop, 0].astype(int)).tolist()
+    noun = ACTIONS[label][1]
+    wanted = f"class {OBJECTS.index(noun)} ({noun}), the object of action {label}, for more than 20 frames"
+    return BadInput(f"{frames.folder}/obj_pose_rt", wanted, f"classes {classes}", "check the annotation")
+
+
+def _with_margin(frames: _Frames, start: int, stop: int, margin: int) -> tuple[int, int]:
+    """The piece and up to ``margin`` frames on both sides, as far as the same object is tracked."""
+    same = frames.object[:, 0] == frames.object[start, 0]
+    first, last = max(0, start - margin), min(len(same), stop + margin)
+    others = np.flatnonzero(~same)
+    before, after = others[others < start], others[others >= stop]
+    return max(first, before[-1] + 1 if len(before) else 0), min(last, after[0] if len(after) else len(same))
 
 
 def _mesh_path(raw: RawTree, name: str) -> str:

@@ -148,6 +148,13 @@ def test_another_object_class_than_the_label_names_is_left_out_with_its_reason(r
     assert "[5, 7]" in item.got
 
 
+def test_a_run_is_cut_to_the_frames_in_which_its_object_is_tracked(root, load_all):
+    write_text(root / "subject2/k1/3/cam4/obj_pose_rt/000003.txt", [0, *np.zeros(16)])
+    (clip,) = load_all(H2OAdapter(margin_frames=2), root)
+    assert clip.clip_id.endswith("000004-000024")
+    assert clip.source_frames[[0, -1]].tolist() == [4, 26]
+
+
 def test_the_old_name_of_an_object_folder_is_known(root, load_all):
     (root / "object" / "chips" / "chips.obj").rename(root / "object" / "chips" / "pringles.obj")
     (root / "object" / "chips").rename(root / "object" / "pringles")
