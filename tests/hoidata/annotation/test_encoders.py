@@ -1,0 +1,74 @@
+"""Text encoders: identity, determinism, independence of a sentence from its neighbours, and clear refusals."""
+
+import time
+
+import numpy as np
+import pytest
+
+from hoidata.annotation import load_encoder, refuse_other_encoder
+from hoidata.annotation.encoders import CachedEncoder, HashEncoder
+from hoidata.errors import BadInput, MissingResource
+
+SENTENCES = ["Lift a box with the left hand.", "Pour milk with both hands.", "A mug is grabbed by the right hand."]
+
+
+@pytest.fixture(scope="module", params=["use", "hash"])
+def encoder(request: pytest.FixtureRequest):
+    return load_encoder(request.param)
+
+
+def test_features_are_512_float32_and_say_whose_they_are(encoder) -> None:
+    features = encoder.encode(SENTENCES)
+    assert (features.shape, features.dtype) == ((3, 512), np.float32)
+    assert set(encoder.identity) == {"name", "version", "dims", "sha256"}
+    assert len(str(encoder.identity["sha256"])) == 64
+    assert encoder.encode([]).shape == (0, 512)
+
+
+def test_a_feature_does_not_depend_on_its_neighbours_or_the_process_history(encoder) -> None:
+    together = encoder.encode(SENTENCES)
+    fresh = load_encoder(str(encoder.identity["name"]))
+    for sentence, feature in zip(SENTENCES, together, strict=True):
+        assert fresh.encode([sentence])[0].tobytes() == feature.tobytes()
+
+
+def test_the_default_encoder_hears_a_synonym() -> None:
+    lift, raise_, type_ = load_encoder("use").encode(
+        ["Lift a cup with both hands.", "Raise a mug with both hands.", "Type on a laptop with both hands."]
+    )
+    assert lift @ raise_ > lift @ type_
+
+
+def test_a_sentence_is_encoded_once() -> None:
+    class Counting(HashEncoder):
+        seen = 0
+
+        def encode(self, sentences):
+            self.seen += len(sentences)
+            return super().encode(sentences)
+
+    inner = Counting()
+    cached = CachedEncoder(inner)
+    first = cached.encode([SENTENCES[0], SENTENCES[1], SENTENCES[0]])
+    np.testing.assert_array_equal(cached.encode(SENTENCES)[:2], first[:2])
+    assert inner.seen == 3
+
+
+def test_features_of_two_encoders_are_never_mixed() -> None:
+    use, hashed = load_encoder("use").identity, load_encoder("hash").identity
+    refuse_other_encoder("prompt", use, dict(use))
+    with pytest.raises(BadInput, match="use one encoder for data and prompt"):
+        refuse_other_encoder("prompt", use, hashed)
+
+
+def test_missing_clip_weights_are_named_at_once_with_the_way_out() -> None:
+    start = time.perf_counter()
+    with pytest.raises(MissingResource, match=r"(?s)/nowhere/clip\.safetensors.*text\.encoder=use"):
+        load_encoder("clip:/nowhere/clip.safetensors")
+    assert time.perf_counter() - start < 2
+
+
+@pytest.mark.parametrize("name", ["bert", "clip:weights.safetensors?gelu"])
+def test_an_unknown_encoder_is_refused(name: str) -> None:
+    with pytest.raises(BadInput, match="text encoder"):
+        load_encoder(name)

@@ -1,0 +1,154 @@
+"""Which hand a prompt asks for: every template, hard sentences of many kinds, and never an invented hand."""
+
+import numpy as np
+import pytest
+
+from hoidata.annotation.encoders import HashEncoder
+from hoidata.annotation.grammar import default_grammar
+from hoidata.annotation.hand_choice import HAND_TYPES, hand_prior, most_similar_hand, select_hand
+from hoidata.annotation.prompts import read_prompt
+from hoidata.annotation.sentences import four_sentences
+
+LEFT = """
+lefty grabs the mug | LH grasp | lift the box with the left hadn | southpaw pours the milk | use your lefthand
+Take the mug right now with the left hand | With one hand, the left, lift the pan. | open it (left hand)
+a left-handed person lifts the cup | only the left, please: lift the box | with your left, lift the bowl
+left hand only: shake the bottle | Never use both hands, just your left | the left index finger pushes the button
+both mugs are lifted by the left hand | what's left of the milk is poured with the left hand | lift it using L hand
+Open the box, left-handed | open the right-hand drawer with your left hand
+The box on the right is lifted by the left hand
+My left hand is holding the bowl | open it with your left-hand thumb | can you grab the spray, left hand please
+The right-hand side of the box is touched by the left hand | The left hand grips a book
+Lift a hand with the left hand.
+"""
+RIGHT = """
+use your right | RH lifts the mug | R hand on the mug handle, lift | Not the left hand but the right
+use the right hand, not the left | Use your right instead of your left.
+Pick up the cup on the left with the right hand.
+She left the box with her right hand | one-handed, not with the left | she hands over the cup with her right hand
+slide the book from left to right with the right hand | Raise the pan using just the right.
+grip the cup with the right palm
+Hold the phone in your right and tap it | Right-handed pour of the milk | Grip the scissors right-handedly and cut
+grasp the box without your left hand, i.e. with the right | drink from the cup held in your right hand
+use your right hadn
+lift with right hand not left hand | lift the left box with the right arm | lift a model hand with the right hand
+open the notebook using the fingers of your right hand | Fly a plane with the right hand, right over the table
+"""
+BOTH = """
+hold the box two-handed | pass it from the left hand to the right | grasp it with your hands | lift with both arms
+hold the jar in your left and twist the lid in your right | use a pair of hands | grab it with boht hands
+With one hand, open the bottle; hold it with the other. | left and right hands lift the box
+Two hands open the laptop
+Lift the box with left and right hand | bimanually rotate the cube | Both hands, mostly the left, lift the box
+The right grabs the mug while the left opens the lid | Grab the left mug handle with both hands | hands lift the crate
+Someone is opening a laptop with both of their hands | pass the apple from one hand to the other
+cradle it in her arms
+Steady the box with your left hand while lifting the lid with your right
+play the flute with all fingers of both hands
+Use both, left and right, to rotate the cube
+put the ring onto your left hand with your right hand, then both hands up
+both the left hand and the right hand lift the pot | A hand is lifted by both hands. | Both hands shake a mixer.
+"""
+UNKNOWN = """
+pick up the cup | cup on the left | right of the laptop
+open the right-hand drawer | do it right away | he left the cup
+do not use the left hand | do it one-handed | Use one hand | Use either hand to lift the cup | Lift a hand.
+lift with the left or right hand | hand over the cup | on the other hand, lift the cup | use the hand soap | turn left
+cut paper with left-handed scissors | rotate the knob to the right | put it in your left pocket | the leftmost cup
+wear the watch on the left hand | don't lift it with both hands
+Lift it without using your right hand | Grab the left mug
+move from left to right | all right, lift the mug | lift the cup by hand
+Use the wrong hand | Take the two mugs | no hands
+put both books down | Use the box's right side | with the right tool, open the box | Which way is right? | use hand
+Move the mug two inches left | With your dominant hand, lift the cup | the mug is to the left of his right hand
+The mug's handle points left; lift it | Just one hand, your choice: lift the mug
+She hands him the cup | two left shoes
+Lift it with the hand that is not the left | Squeeze the lotion single-handed
+move the book from the left to the right
+"""
+
+
+def listed(block: str, hand: str | None) -> list[tuple[str, str | None]]:
+    return [(text.strip(), hand) for line in block.strip().splitlines() for text in line.split(" | ")]
+
+
+CASES = listed(LEFT, "left") + listed(RIGHT, "right") + listed(BOTH, "both") + listed(UNKNOWN, None)
+
+
+@pytest.mark.parametrize(("text", "hand"), CASES)
+def test_the_rules_read_hard_sentences(text: str, hand: str | None) -> None:
+    choice = select_hand(text)
+    assert choice.hand == hand, choice
+    assert choice.source == ("rule" if hand else "unknown")
+
+
+def test_the_rules_read_every_verb_and_every_object_of_the_table_in_all_forms_and_hands() -> None:
+    grammar = default_grammar()
+    pairs = [(verb, "box") for verb in grammar.verbs] + [("lift", noun) for noun in grammar.nouns]
+    for verb, noun in pairs:
+        for hand in HAND_TYPES:
+            for sentence in four_sentences(verb, noun, hand):
+                assert select_hand(sentence).hand == hand, sentence
+
+
+def test_a_sentence_without_a_hand_gets_none_from_any_encoder() -> None:
+    for noun in default_grammar().nouns.values():
+        choice = select_hand(f"Lift {noun.words}.", HashEncoder())
+        assert (choice.hand, choice.source) == (None, "unknown")
+
+
+def test_similarity_decides_only_by_a_margin_and_says_so() -> None:
+    text = "the hand that is left with the left one"
+    assert select_hand(text).hand is None
+    choice = select_hand(text, HashEncoder())
+    assert (choice.hand, choice.source) == ("left", "embedding")
+    assert choice.confidence >= 0.05
+
+
+def test_a_prior_answers_last_and_is_named() -> None:
+    prior = hand_prior(["right", "right", "both", "left"])
+    choice = select_hand("pick up the cup", prior=prior)
+    assert (choice.hand, choice.source, choice.confidence) == ("right", "prior", 0.5)
+    assert select_hand("lift it with the left hand", prior=prior).source == "rule"
+
+
+def test_a_prior_never_answers_with_a_hand_the_sentence_rules_out() -> None:
+    prior = hand_prior(["right", "right", "both", "left"])
+    assert select_hand("lift it without using your right hand", prior=prior).hand == "left"
+    assert select_hand("one hand only", prior=hand_prior(["both", "both", "left"])).hand == "left"
+
+
+def test_the_papers_choice_is_the_most_similar_template() -> None:
+    for hand in HAND_TYPES:
+        phrase = "both hands" if hand == "both" else f"{hand} hand"
+        found, margin = most_similar_hand(f"A photo of {phrase}", HashEncoder())
+        assert found == hand
+        assert margin > 0
+
+
+@pytest.mark.parametrize(
+    ("text", "verb", "noun"),
+    [
+        ("Take out milk with both hands.", "take out", "milk"),
+        ("A camera is used to take a picture by the right hand.", "take a picture with", "camera"),
+        ("The left hand stamps a stamp.", "stamp", "stamp"),
+        ("A Stanford bunny is handed over by both hands.", "hand over", "Stanford bunny"),
+        ("Lift a hand with the left hand.", "lift", "hand"),
+        ("Spraying spray with the right hand.", "spray", "spray"),
+        ("Lift a water bottle with your left hand.", "lift", "water bottle"),
+        ("Frobnicate the gizmo with both hands.", None, None),
+    ],
+)
+def test_a_prompt_gives_back_its_verb_and_object(text: str, verb: str | None, noun: str | None) -> None:
+    reading = read_prompt(text)
+    assert (reading.verb, reading.object_words) == (verb, noun)
+
+
+def test_prompts_of_all_table_words_give_back_hand_verb_and_object() -> None:
+    grammar, random = default_grammar(), np.random.default_rng(0)
+    verbs, nouns = list(grammar.verbs), list(grammar.nouns)
+    for _ in range(100):
+        verb, noun, hand = random.choice(verbs), random.choice(nouns), HAND_TYPES[random.integers(3)]
+        for sentence in four_sentences(str(verb), str(noun), hand):
+            reading = read_prompt(sentence)
+            assert (reading.hand.hand, reading.verb, reading.object_words) == (hand, verb, noun), sentence
