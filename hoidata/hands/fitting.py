@@ -1,27 +1,25 @@
 """Fit a MANO-layout hand to 3D keypoints: one shape, and wrist, orientation and finger pose per frame.
 
-Least squares by Levenberg-Marquardt with analytic derivatives, all frames at once. A keypoint of one finger depends on
-that finger and the palm only, so each step eliminates five 9 x 9 finger blocks, then the 6 x 6 palm, then the shape
-(Schur complements); 10,000 hands take seconds on one core. Deterministic: no random numbers.
+Least squares by Levenberg-Marquardt (Marquardt 1963) from a start that turns each rest bone onto the observed one;
+10,000 hands take about 15 s on one core. Deterministic: no random numbers.
 
 Units metres and radians; keypoints in the order of the 21 joints (``hoidata.hands.JOINT_NAMES``).
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat, skew
-from hoidata.hands.kinematics import HandKinematics
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands.model import N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
+from hoidata.hands.solver import FINGER_POINTS, Pose, Problem, pose_step, predict, settled, shape_step
 from hoidata.hands.tracks import kinematics_of
 
 KNUCKLES = [1, 4, 7, 10, 13]
-FINGER_POINTS = [[3 * finger + 1, 3 * finger + 2, 3 * finger + 3, 16 + finger] for finger in range(5)]
 N_KEYPOINTS = 21
 THUMB = 4
 # Fingertips touch things, so they count most; knuckles and wrist are where datasets disagree about what a joint is.
@@ -68,53 +66,6 @@ class HandFit:
     error_m: np.ndarray
 
 
-@dataclass(frozen=True)
-class _Pose:
-    """wrist (frame, 3); orient (frame, 3, 3) world-from-hand; fingers (frame, 5, 3, 3): finger, joint, axis-angle."""
-
-    wrist: Tensor
-    orient: Tensor
-    fingers: Tensor
-
-    def where(self, chosen: Tensor, other: "_Pose") -> "_Pose":
-        return _Pose(
-            torch.where(chosen[:, None], self.wrist, other.wrist),
-            torch.where(chosen[:, None, None], self.orient, other.orient),
-            torch.where(chosen[:, None, None, None], self.fingers, other.fingers),
-        )
-
-
-@dataclass(frozen=True)
-class _Step:
-    """Normal equations of all frames after the fingers are eliminated, and how to get the fingers' step back.
-
-    matrix (frame, n, n), vector (frame, n) of the outer unknowns: palm 6, then shape if it is fitted.
-    finger_of_outer (frame, 5, 9, n), finger_free (frame, 5, 9): finger step = free - of_outer @ outer step.
-    """
-
-    matrix: Tensor
-    vector: Tensor
-    finger_of_outer: Tensor
-    finger_free: Tensor
-
-
-@dataclass
-class _Problem:
-    """The keypoints of one hand, (frame, 21, 3), finite everywhere, with weights (frame, 21), zero where unknown."""
-
-    layer: HandKinematics
-    keypoints: Tensor
-    weights: Tensor
-    rest: Tensor
-    prior_mean: Tensor
-    prior: Tensor
-    smooth: float
-    damping: Tensor = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.damping = self.keypoints.new_full((len(self.keypoints),), 1e-6)
-
-
 def fit_hands(
     keypoints_m: Mapping[Side, np.ndarray],
     hands: HandPair,
@@ -151,8 +102,8 @@ def fit_shape(
     n_frames = sum(len(problem.keypoints) for problem in problems)
     prior = settings.noise_m**2 * max(1.0, settings.shape_prior * n_frames)
     for _ in range(settings.shape_steps):
-        betas, moved = _shape_step(problems, poses, betas, prior)
-        poses = [_settled(*pair, betas) for pair in zip(problems, moved, poses, strict=True)]
+        betas, moved = shape_step(problems, poses, betas, prior)
+        poses = [settled(*pair, betas) for pair in zip(problems, moved, poses, strict=True)]
     return betas[0].numpy()
 
 
@@ -160,8 +111,8 @@ def _fit_side(side: Side, points: np.ndarray, model: HandModel, betas: Tensor, s
     problem = _problem(side, points, model, settings)
     pose = _initial_pose(problem)
     for _ in range(settings.pose_steps):
-        pose = _pose_step(problem, pose, betas)
-    error = (_predict(problem.layer, pose, betas) - problem.keypoints).norm(dim=-1)
+        pose = pose_step(problem, pose, betas)
+    error = (predict(problem.layer, pose, betas) - problem.keypoints).norm(dim=-1)
     error[problem.weights == 0] = torch.nan
     return HandFit(
         wrist_m=pose.wrist.numpy(),
@@ -172,7 +123,7 @@ def _fit_side(side: Side, points: np.ndarray, model: HandModel, betas: Tensor, s
     )
 
 
-def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSettings) -> _Problem:
+def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSettings) -> Problem:
     points = np.asarray(points, dtype=np.float64)
     if points.ndim != 3 or points.shape[1:] != (N_KEYPOINTS, 3) or not len(points):
         raise BadInput(f"{side} hand keypoints", "an array (frame, 21, 3)", f"shape {points.shape}", "check the caller")
@@ -182,7 +133,7 @@ def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSett
         got = f"{palm.min()} in frame {palm.argmin()}"
         raise BadInput(f"{side} hand keypoints", "3 known ones on the palm", got, "leave such frames out")
     rest = np.concatenate((model.rest_joints_m(np.zeros((1, N_SHAPE)))[0], model.template_m[list(TIP_VERTICES)]))
-    return _Problem(
+    return Problem(
         layer=kinematics_of(model, torch.float64),
         keypoints=torch.from_numpy(np.where(known[..., None], points, 0.0)),
         weights=torch.from_numpy(known * np.asarray(settings.weights)),
@@ -215,7 +166,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-def _initial_pose(problem: _Problem) -> _Pose:
+def _initial_pose(problem: Problem) -> Pose:
     """Palm by the best rigid fit of wrist and knuckles, fingers by turning each rest bone onto the observed one."""
     wrist, orient = _rigid_fit(problem)
     fingers = torch.zeros(len(wrist), 5, 3, 3, dtype=wrist.dtype)
@@ -229,10 +180,10 @@ def _initial_pose(problem: _Problem) -> _Pose:
         turn = _shortest_turn(problem.rest[end] - problem.rest[start], local)
         fingers[:, :, joint] = torch.where(known[..., None], turn, 0.0)
         parent = parent @ rotvec_to_rotmat(fingers[:, :, joint])
-    return _Pose(wrist, orient, fingers)
+    return Pose(wrist, orient, fingers)
 
 
-def _rigid_fit(problem: _Problem) -> tuple[Tensor, Tensor]:
+def _rigid_fit(problem: Problem) -> tuple[Tensor, Tensor]:
     """Wrist (frame, 3) and world-from-hand (frame, 3, 3) that lay the rest palm on the keypoints (Kabsch 1976)."""
     palm = [0, *KNUCKLES]
     weight = (problem.weights[:, palm] > 0).to(problem.keypoints.dtype)[..., None]
@@ -256,138 +207,3 @@ def _shortest_turn(bone: Tensor, target: Tensor) -> Tensor:
     axis = torch.linalg.cross(bone, target, dim=-1)
     angle = torch.atan2(axis.norm(dim=-1), (bone * target).sum(-1))
     return axis / axis.norm(dim=-1, keepdim=True).clamp_min(1e-12) * angle[..., None]
-
-
-def _predict(layer: HandKinematics, pose: _Pose, betas: Tensor) -> Tensor:
-    local = rotvec_to_rotmat(pose.fingers).reshape(-1, 15, 3, 3)
-    return layer.joints(pose.wrist, torch.cat((pose.orient[:, None], local), 1), betas)
-
-
-def _pose_step(problem: _Problem, pose: _Pose, betas: Tensor) -> _Pose:
-    """One damped step of every frame; a frame that would get worse stays and is damped more."""
-    target = _mean_in_time(pose.fingers)
-    step = _normal_equations(problem, pose, betas, target, None)
-    moved = _moved(pose, step, torch.linalg.solve(step.matrix, step.vector))
-    better = _cost(problem, moved, betas, target) < _cost(problem, pose, betas, target)
-    problem.damping = torch.where(better, problem.damping / 4, problem.damping * 16).clamp(1e-8, 1e4)
-    return moved.where(better, pose)
-
-
-def _settled(problem: _Problem, moved: _Pose, before: _Pose, betas: Tensor) -> _Pose:
-    """After a step of the shape: per frame the better of both poses, then a damped step of its own."""
-    better = _cost(problem, moved, betas, moved.fingers) < _cost(problem, before, betas, before.fingers)
-    return _pose_step(problem, moved.where(better, before), betas)
-
-
-def _shape_step(
-    problems: list[_Problem], poses: list[_Pose], betas: Tensor, prior: float
-) -> tuple[Tensor, list[_Pose]]:
-    """One Gauss-Newton step of the shape and all poses together."""
-    matrix, vector = prior * torch.eye(N_SHAPE, dtype=betas.dtype), -prior * betas[0]
-    steps = []
-    for problem, pose in zip(problems, poses, strict=True):
-        step = _normal_equations(problem, pose, betas, pose.fingers, _shape_derivative(problem.layer, pose))
-        steps.append(step)
-        palm, mixed, shape = step.matrix[:, :6, :6], step.matrix[:, :6, 6:], step.matrix[:, 6:, 6:]
-        solved = torch.linalg.solve(palm, torch.cat((mixed, step.vector[:, :6, None]), -1))
-        matrix = matrix + (shape - mixed.transpose(1, 2) @ solved[..., :-1]).sum(0)
-        vector = vector + (step.vector[:, 6:, None] - mixed.transpose(1, 2) @ solved[..., -1:]).sum(0)[:, 0]
-    change = torch.linalg.solve(matrix, vector)
-    moved = [_moved_with_shape(pose, step, change) for pose, step in zip(poses, steps, strict=True)]
-    return betas + change, moved
-
-
-def _shape_derivative(layer: HandKinematics, pose: _Pose) -> Tensor:
-    """(frame, 21, 3, 10) metres per unit of beta: keypoints are linear in the shape at a fixed pose."""
-    zero = torch.zeros(1, N_SHAPE, dtype=pose.wrist.dtype)
-    base = _predict(layer, pose, zero)
-    units = torch.eye(N_SHAPE, dtype=zero.dtype)
-    return torch.stack([_predict(layer, pose, unit[None]) - base for unit in units], -1)
-
-
-def _moved_with_shape(pose: _Pose, step: _Step, shape_change: Tensor) -> _Pose:
-    rest = step.vector[:, :6] - step.matrix[:, :6, 6:] @ shape_change
-    palm = torch.linalg.solve(step.matrix[:, :6, :6], rest)
-    return _moved(pose, step, torch.cat((palm, shape_change.expand(len(palm), -1)), 1))
-
-
-def _moved(pose: _Pose, step: _Step, outer: Tensor) -> _Pose:
-    fingers = step.finger_free - (step.finger_of_outer @ outer[:, None, :, None])[..., 0]
-    return _Pose(
-        pose.wrist + outer[:, :3],
-        rotvec_to_rotmat(outer[:, 3:6]) @ pose.orient,
-        pose.fingers + fingers.reshape(pose.fingers.shape),
-    )
-
-
-def _mean_in_time(fingers: Tensor) -> Tensor:
-    """Mean of each frame and its two neighbours; the first and last frame stay."""
-    smooth = fingers.clone()
-    smooth[1:-1] = (fingers[:-2] + fingers[1:-1] + fingers[2:]) / 3
-    return smooth
-
-
-def _cost(problem: _Problem, pose: _Pose, betas: Tensor, target: Tensor) -> Tensor:
-    """(frame,) weighted squared error plus priors, in squared metres."""
-    miss = (_predict(problem.layer, pose, betas) - problem.keypoints).square().sum(-1)
-    off = pose.fingers.flatten(2) - problem.prior_mean
-    shake = (pose.fingers - target).flatten(1).square().sum(1)
-    prior = (off[..., None, :] @ problem.prior @ off[..., None]).sum((1, 2, 3))
-    return (problem.weights * miss).sum(1) + prior + problem.smooth * shake
-
-
-def _normal_equations(
-    problem: _Problem, pose: _Pose, betas: Tensor, target: Tensor, shape_derivative: Tensor | None
-) -> _Step:
-    predicted = _predict(problem.layer, pose, betas)
-    miss = problem.keypoints - predicted
-    n_frames = len(miss)
-    finger = _finger_derivative(pose, predicted)
-    outer = _palm_derivative(predicted)
-    if shape_derivative is not None:
-        outer = torch.cat((outer, shape_derivative), -1)
-    on_fingers = outer[:, FINGER_POINTS].reshape(n_frames, 5, 12, -1)
-    weights = problem.weights[:, FINGER_POINTS].repeat_interleave(3, -1)[..., None]
-    weighted = (weights * finger).transpose(-1, -2)
-    off = (problem.prior_mean - pose.fingers.flatten(2))[..., None]
-    inner = weighted @ finger + problem.prior + problem.smooth * torch.eye(9, dtype=miss.dtype)
-    inner = inner + problem.damping[:, None, None, None] * torch.diag_embed(inner.diagonal(dim1=-2, dim2=-1))
-    gradient = weighted @ miss[:, FINGER_POINTS].reshape(n_frames, 5, 12, 1) + problem.prior @ off
-    gradient = gradient + problem.smooth * (target - pose.fingers).flatten(2)[..., None]
-    mixed = weighted @ on_fingers
-    solved = torch.linalg.solve(inner, torch.cat((mixed, gradient), -1))
-    of_outer, free = solved[..., :-1], solved[..., -1:]
-    outer_all = outer.flatten(1, 2)
-    weighted_all = (problem.weights.repeat_interleave(3, -1)[..., None] * outer_all).transpose(1, 2)
-    matrix = weighted_all @ outer_all - (mixed.transpose(-1, -2) @ of_outer).sum(1)
-    vector = weighted_all @ miss.flatten(1)[..., None] - (mixed.transpose(-1, -2) @ free).sum(1)
-    return _Step(matrix, vector[..., 0], of_outer, free[..., 0])
-
-
-def _palm_derivative(predicted: Tensor) -> Tensor:
-    """(frame, 21, 3, 6) of every keypoint by the wrist's place and a small turn of the hand about it, world axes."""
-    identity = torch.eye(3, dtype=predicted.dtype).expand(*predicted.shape, 3)
-    return torch.cat((identity, -skew(predicted - predicted[:, :1])), -1)
-
-
-def _finger_derivative(pose: _Pose, predicted: Tensor) -> Tensor:
-    """(frame, 5, 12, 9) of a finger's four keypoints by its three axis-angles; the tip as if fixed to its last bone."""
-    local = rotvec_to_rotmat(pose.fingers)
-    first = pose.orient[:, None].expand(-1, 5, -1, -1)
-    second = first @ local[:, :, 0]
-    parents = torch.stack((first, second, second @ local[:, :, 1]), 2)
-    axes = parents @ _left_jacobian(pose.fingers)
-    points = predicted[:, FINGER_POINTS]
-    lever = points[:, :, :, None] - points[:, :, None, :3]
-    beyond = torch.ones(4, 3, dtype=predicted.dtype).tril(-1)[..., None, None]
-    turned = -skew(lever) @ axes[:, :, None] * beyond
-    return turned.transpose(3, 4).reshape(len(predicted), 5, 12, 9)
-
-
-def _left_jacobian(rotvec: Tensor) -> Tensor:
-    """(..., 3, 3): ``R(v + dv) = R(J dv) R(v)`` to first order (Barfoot 2017, eq. 7.77)."""
-    angle = rotvec.norm(dim=-1)[..., None, None].clamp_min(1e-4)
-    cross = skew(rotvec)
-    versine = (1 - torch.cos(angle)) / angle**2
-    sine = (angle - torch.sin(angle)) / angle**3
-    return torch.eye(3, dtype=rotvec.dtype) + versine * cross + sine * (cross @ cross)
