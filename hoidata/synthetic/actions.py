@@ -134,7 +134,7 @@ MEAN_LENGTH = {
     },
 }  # fmt: skip
 LENGTH_DEVIATION = 14.0
-SHORTEST_CLIP, LONGEST_CLIP = 34, 150
+SHORTEST_CLIP, LONGEST_CLIP = 34, 148
 
 H2O_VERB_IDS = {
     "grab": 1, "place": 2, "open": 3, "close": 4, "pour": 5, "take out": 6, "put in": 7, "apply": 8, "read": 9,

@@ -1,0 +1,65 @@
+"""Small helpers the writers of the three formats share: text, meshes, and NumPy's object files as NumPy 1 wrote them."""
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# What real files name: they were pickled by NumPy 1, before numpy.core became numpy._core.
+_NEW_SPELLING, _OLD_SPELLING = b"cnumpy._core.", b"cnumpy.core."
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+
+
+def write_text(path: Path, text: str) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text, encoding="ascii")
+
+
+def obj_text(vertices: np.ndarray, faces: np.ndarray) -> str:
+    """A Wavefront OBJ of vertices (vertex, 3) in whatever unit, and triangles."""
+    lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+    lines += [f"f {a} {b} {c}" for a, b, c in (faces + 1).tolist()]
+    return "\n".join(lines) + "\n"
+
+
+def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
+    """Binary little-endian PLY, float32 vertices."""
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(vertices)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.zeros(len(faces), dtype=[("count", "u1"), ("corner", "<i4", 3)])
+    rows["count"], rows["corner"] = 3, faces
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(header.encode("ascii") + vertices.astype("<f4").tobytes() + rows.tobytes())
+
+
+def npy_bytes(value: Any) -> bytes:
+    """An .npy file: plain arrays and scalars plainly, a dict as the 0-d object array NumPy 1 made of it."""
+    if not isinstance(value, dict):
+        stream = io.BytesIO()
+        np.lib.format.write_array(stream, np.asanyarray(value), allow_pickle=False)
+        return stream.getvalue()
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "|O", "fortran_order": False, "shape": ()})
+    boxed = np.empty((), dtype=object)
+    boxed[()] = value
+    pickled = pickle.dumps(boxed, protocol=3)
+    return stream.getvalue() + pickled.replace(_NEW_SPELLING, _OLD_SPELLING)
+
+
+def write_npy(path: Path, value: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(npy_bytes(value))
+
+
+def write_npz(path: Path, members: dict[str, Any]) -> None:
+    """An .npz of 0-d members; equal members give equal bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, value in members.items():
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy", _ZIP_TIME), npy_bytes(value), zipfile.ZIP_DEFLATED, 1)

@@ -1,0 +1,146 @@
+"""Truth sequences as GRAB's own files: one npz per sequence at 120 Hz, every member a 0-d array.
+
+Formats: raw-formats.md section 2. Objects and the table follow the row-vector convention (``x_world = x R + t``), so
+the filed axis-angle is that of the transpose. Hands: personal rest mesh, betas 0, MANO translation of the "add" kind.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import HandPair, track_vertices
+from hoidata.physics.surface import to_object_frame
+from hoidata.schema.clip import SIDES, HandTrack, Side
+from hoidata.synthetic.catalogue import GRAB_OBJECTS, object_model
+from hoidata.synthetic.object_files import write_npz, write_ply
+from hoidata.synthetic.shapes import sharp_box
+from hoidata.synthetic.truth import TruthSequence
+
+_COMPONENTS, _BODY_VERTICES = 24, 10475
+_TOUCH_M = 0.004
+# Ids of GRAB's contact labels: the palm, then the finger segments in MANO's order.
+_HAND_ID = {"left": 21, "right": 22}
+_FINGER_ID = {"left": 26, "right": 41}
+_BODY_PARAMETERS = {
+    "transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3,
+    "left_hand_pose": 24, "right_hand_pose": 24, "fullpose": 165, "expression": 10,
+}  # fmt: skip
+_MESHES = "tools/object_meshes/contact_meshes"
+_TABLE_M = (0.9, 0.8, 0.03)
+
+
+def write_grab_meshes(root: Path, sequences: list[TruthSequence]) -> None:
+    """Object meshes, the table, and each subject's personal hands, metres."""
+    for spec in GRAB_OBJECTS:
+        model = object_model("grab", spec.name)
+        write_ply(root / _MESHES / f"{spec.name}.ply", model.vertices_m, model.faces)
+    table = sharp_box(_TABLE_M).moved((0, 0, -_TABLE_M[2] / 2))
+    write_ply(root / _MESHES / "table.ply", table.vertices_m, table.faces)
+    people = {truth.subject: truth for truth in sequences}
+    for truth in people.values():
+        for side in SIDES:
+            write_ply(root / _template_path(truth.subject, side), _template(truth.hands[side]), _hand_faces(side))
+
+
+def _hand_faces(side: Side) -> np.ndarray:
+    from hoidata.hands import load_embedded_hands
+
+    return load_embedded_hands()[side].faces
+
+
+def _template(track: HandTrack) -> np.ndarray:
+    if track.template_m is None:
+        raise ValueError("a GRAB hand needs its personal rest mesh")
+    return track.template_m
+
+
+def _gender(subject: str) -> str:
+    return "male" if int(subject[1:]) % 2 else "female"
+
+
+def _template_path(subject: str, side: Side) -> str:
+    return f"tools/subject_meshes/{_gender(subject)}/{subject}_{side[0]}hand.ply"
+
+
+def write_grab_sequence(root: Path, truth: TruthSequence, pair: HandPair) -> None:
+    """grab/<subject>/<object>_<intent>_<n>.npz."""
+    body = {"params": _body(truth.n_frames), "vtemp": f"tools/subject_meshes/{_gender(truth.subject)}/{truth.subject}.ply"}
+    members: dict[str, Any] = {
+        "gender": _gender(truth.subject),
+        "sbj_id": truth.subject,
+        "obj_name": truth.object_name,
+        "motion_intent": truth.intent,
+        "framerate": 120.0,
+        "n_frames": truth.n_frames,
+        "n_comps": _COMPONENTS,
+        "body": body,
+    }
+    for side in SIDES:
+        members[f"{side[0]}hand"] = {
+            "params": _hand_parameters(truth.hands[side], pair, side),
+            "vtemp": _template_path(truth.subject, side),
+        }
+    members["object"] = {"params": _object_parameters(truth), "object_mesh": f"{_MESHES}/{truth.object_name}.ply"}
+    members["table"] = {"params": _table_parameters(truth), "table_mesh": f"{_MESHES}/table.ply"}
+    members["contact"] = {
+        "object": _object_contact(truth, pair),
+        "body": np.zeros((truth.n_frames, _BODY_VERTICES), dtype=np.int8),
+    }
+    write_npz(root / "grab" / f"{truth.source_key}.npz", members)
+
+
+def _body(n_frames: int) -> dict[str, np.ndarray]:
+    """A standing SMPL-X body that nobody looks at."""
+    return {name: np.zeros((n_frames, width), dtype=np.float32) for name, width in _BODY_PARAMETERS.items()}
+
+
+def _hand_parameters(track: HandTrack, pair: HandPair, side: Side) -> dict[str, np.ndarray]:
+    rest_wrist = pair[side].rest_joints_m(np.zeros((1, 10)), track.template_m)[0, 0]
+    # The components are orthonormal, so the projection is the nearest pose 24 of them can express.
+    projected = track.hand_pose @ pair[side].components[:_COMPONENTS].T
+    parameters = {
+        "global_orient": track.global_orient,
+        "hand_pose": projected,
+        "transl": track.wrist_m - rest_wrist,
+        "fullpose": track.hand_pose,
+    }
+    return {name: value.astype(np.float32) for name, value in parameters.items()}
+
+
+def _object_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
+    track = truth.object
+    return {"transl": track.translation_m.astype(np.float32), "global_orient": (-track.rotvec).astype(np.float32)}
+
+
+def _table_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
+    """The table top lies at height 0; objects that need room below stand on a slim stand, which GRAB does not file."""
+    zeros = np.zeros((truth.n_frames, 3), dtype=np.float32)
+    return {"transl": zeros, "global_orient": zeros.copy()}
+
+
+def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
+    """(frame, object vertex) int8 ids of the hand segments that touch; 0 but for the frames of firm contact.
+
+    While the grasp is firm, hand and object do not move against each other, so one frame says it for all.
+    """
+    start, stop = truth.contact
+    labels = np.zeros(len(truth.object.model.vertices_m), dtype=np.int8)
+    nearest = np.full(len(labels), np.inf)
+    track = truth.object.model.vertices_m
+    one = truth.picked(np.array([(start + stop) // 2]))
+    for side in truth.acting_sides:
+        vertices = track_vertices(one.hands[side], pair[side]).astype(np.float64)
+        local = to_object_frame(vertices, rotvec_to_rotmat(one.object.rotvec), one.object.translation_m)[0]
+        distance, index = cKDTree(local).query(track)
+        joint = pair[side].skin_weights.argmax(1)[index]
+        ids = np.where(joint == 0, _HAND_ID[side], _FINGER_ID[side] + joint - 1)
+        # A coarse mesh may have no vertex under the fingers: its nearest one is marked all the same.
+        touching = distance <= max(_TOUCH_M, distance.min())
+        nearer = touching & (distance < nearest)
+        labels[nearer], nearest[nearer] = ids[nearer], distance[nearer]
+    contact = np.zeros((truth.n_frames, len(labels)), dtype=np.int8)
+    contact[start:stop] = labels
+    return contact
