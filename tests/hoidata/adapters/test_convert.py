@@ -1,6 +1,7 @@
 """A whole dataset: order, workers, bad sequences, manifests, absent data."""
 
 import hashlib
+import pickle
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -155,14 +156,17 @@ def test_a_folder_of_small_files_is_one_source_whose_digest_depends_on_each(tmp_
     assert tree.sources[0].sha256 == hashlib.sha256(lines.encode()).hexdigest()
 
 
-@pytest.mark.parametrize("name", ["h2o", "grab", "arctic"])
+@pytest.mark.parametrize("name", adapter_names())
 def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     adapter = get_adapter(name)
     assert isinstance(adapter, Adapter)
     assert adapter.name == name
-    assert adapter.needs_mano
+    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic"))
     assert adapter.licence
-    assert adapter.where_to_register.startswith("https://")
+    assert adapter.where_to_register
+    assert "gravity" in adapter.frame_notes
+    assert adapter.source_fps >= 30
+    assert pickle.loads(pickle.dumps(adapter)) == adapter
     assert adapter.sequences(tmp_path) == []
 
 

@@ -1,0 +1,93 @@
+"""Each adapter gives back, for every clip, the truth the embedded corpus was written from."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.adapters import get_adapter
+from hoidata.adapters.convert import convert_dataset
+from hoidata.contact import ProximityIndex, acting_hands
+from hoidata.hands import load_embedded_hands
+from hoidata.objects.sampling import sample_points
+from hoidata.schema.store import open_store
+from hoidata.synthetic.corpus import write_corpus
+
+TOLERANCE = 1e-4  # metres, radians
+DATASETS = ("h2o", "grab", "arctic")
+
+
+@pytest.fixture(scope="module", params=DATASETS)
+def corpus(request, tmp_path_factory):
+    """(truths by sequence and first source frame, store) of one dataset's small corpus."""
+    dataset, folder = request.param, tmp_path_factory.mktemp(request.param)
+    sequences = write_corpus(dataset, folder / "raw", seed=0, size="small", jobs=1)
+    hands = load_embedded_hands()
+    summary = convert_dataset(
+        get_adapter(dataset), folder / "raw", hands, folder / "clips", progress=False, synthetic=True
+    )
+    assert summary.left_out == ()
+    truths = {(truth.source_key, int(truth.source_frames[0])): truth for truth in sequences}
+    return truths, open_store(folder / "clips")
+
+
+@pytest.fixture
+def pairs(corpus):
+    truths, store = corpus
+    clips = [store.clip(clip_id) for clip_id in store.ids]
+    assert {(clip.sequence, int(clip.source_frames[0])) for clip in clips} == set(truths)
+    return [(clip, truths[clip.sequence, int(clip.source_frames[0])].clip_truth()) for clip in clips]
+
+
+@pytest.mark.slow
+def test_frames_words_and_hand_are_those_of_the_truth(corpus, pairs):
+    truths, store = corpus
+    assert len(pairs) == len(truths) >= 8
+    for clip, truth in pairs:
+        whole = truths[clip.sequence, int(clip.source_frames[0])]
+        assert clip.source_frames.tolist() == whole.source_frames.tolist()
+        assert (clip.verb, clip.object_words, clip.subject) == (truth.verb, truth.object_words, truth.subject)
+        index = ProximityIndex(sample_points(clip.object.model))
+        joints = {side: store.joints(clip.clip_id, side) for side in ("left", "right")}
+        assert acting_hands(clip, joints, index).hand_type == truth.hand_type
+        assert clip.labelled_hand in (None, truth.hand_type)
+
+
+@pytest.mark.slow
+def test_joints_are_those_of_the_truth(corpus, pairs):
+    _, store = corpus
+    for clip, truth in pairs:
+        expected = truth.joints(load_embedded_hands())
+        for side in ("left", "right"):
+            np.testing.assert_array_equal(clip.hands[side].valid, truth.hands[side].valid)
+            valid = clip.hands[side].valid
+            np.testing.assert_allclose(
+                store.joints(clip.clip_id, side)[valid], expected[side][valid], atol=TOLERANCE, rtol=0
+            )
+
+
+@pytest.mark.slow
+def test_object_pose_and_hinge_are_those_of_the_truth(pairs):
+    for clip, truth in pairs:
+        close = partial(np.testing.assert_allclose, atol=TOLERANCE, rtol=0)
+        close(clip.object.translation_m, truth.object.translation_m)
+        between = Rotation.from_rotvec(clip.object.rotvec) * Rotation.from_rotvec(truth.object.rotvec).inv()
+        assert between.magnitude().max() < TOLERANCE
+        assert clip.object.is_articulated == truth.object.is_articulated
+        if truth.object.hinge_rad is not None:
+            close(clip.object.hinge_rad, truth.object.hinge_rad)
+
+
+@pytest.mark.slow
+def test_meshes_parts_and_hinges_are_those_of_the_truth(pairs):
+    for clip, truth in pairs:
+        found, expected = clip.object.model, truth.object.model
+        assert found.name == truth.object_name
+        np.testing.assert_allclose(found.vertices_m, expected.vertices_m, atol=1e-6, rtol=0)
+        np.testing.assert_array_equal(found.faces, expected.faces)
+        np.testing.assert_array_equal(found.part, expected.part)
+        if expected.hinge is not None:
+            assert found.hinge is not None
+            np.testing.assert_allclose(found.hinge.axis, expected.hinge.axis, atol=1e-9)
+            np.testing.assert_allclose(found.hinge.origin_m, expected.hinge.origin_m, atol=1e-9)
