@@ -38,7 +38,7 @@ class ClipEncoder:
                 "open_clip ViT-B-32 state dict) or use the built-in offline encoder: text.encoder=use. "
                 "Features of different encoders cannot be mixed."
             )
-        open_clip = _import_open_clip()
+        open_clip = import_open_clip()
         self._tower = _load_tower(open_clip, weights, quick_gelu)
         self._tokenizer = open_clip.get_tokenizer(ARCHITECTURE)
         self.identity: Identity = {
@@ -56,7 +56,7 @@ class ClipEncoder:
         return np.concatenate(features) if features else np.zeros((0, DIMENSIONS), np.float32)
 
 
-def _import_open_clip():
+def import_open_clip():
     """open_clip, imported with PyPI's CUDA build of torchvision beside CPU torch as well.
 
     That torchvision fails at import because two of its compiled operators are absent; CLIP's text tower uses neither,
