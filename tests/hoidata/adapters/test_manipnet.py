@@ -222,10 +222,17 @@ def load(raw: RawTree) -> tuple[list[Clip], list[Quarantined]]:
     return [x for x in results if isinstance(x, Clip)], [x for x in results if isinstance(x, Quarantined)]
 
 
-def test_a_carried_object_becomes_one_clip_that_says_what_was_seen(tmp_path: Path) -> None:
-    clips, left_out = load(write_tree(tmp_path, *lift_rows()))
-    (clip,) = clips
+@pytest.fixture(scope="module")
+def carried(tmp_path_factory: pytest.TempPathFactory) -> tuple[RawTree, Clip]:
+    """The raw tree of one lift and the single clip it gives."""
+    raw = write_tree(tmp_path_factory.mktemp("carried"), *lift_rows())
+    (clip,), left_out = load(raw)
     assert not left_out
+    return raw, clip
+
+
+def test_a_carried_object_becomes_one_clip_that_says_what_was_seen(carried: tuple[RawTree, Clip]) -> None:
+    _, clip = carried
     assert (clip.verb, clip.object_words, clip.labelled_hand) == ("lift", "large tetrahedron", None)
     assert clip.clip_id == "manipnet/tetra_large7/000000-000596"
     assert np.array_equal(clip.source_frames, np.arange(0, 600, 4))
@@ -238,9 +245,8 @@ def test_a_carried_object_becomes_one_clip_that_says_what_was_seen(tmp_path: Pat
     }
 
 
-def test_the_fitted_hands_follow_the_recorded_joints(tmp_path: Path) -> None:
-    raw = write_tree(tmp_path, *lift_rows())
-    (clip,), _ = load(raw)
+def test_the_fitted_hands_follow_the_recorded_joints(carried: tuple[RawTree, Clip]) -> None:
+    raw, clip = carried
     recording = read_recording(raw, KEY.name)
     for side, keypoints_m in recording.keypoints_m.items():
         error_m = np.linalg.norm(track_joints(clip.hands[side], HANDS[side]) - keypoints_m, axis=-1)
@@ -249,8 +255,8 @@ def test_the_fitted_hands_follow_the_recorded_joints(tmp_path: Path) -> None:
         assert clip.hands[side].valid.all()
 
 
-def test_the_way_back_leads_to_the_files_own_numbers(tmp_path: Path) -> None:
-    (clip,), _ = load(write_tree(tmp_path, *lift_rows()))
+def test_the_way_back_leads_to_the_files_own_numbers(carried: tuple[RawTree, Clip]) -> None:
+    _, clip = carried
     world = np.append(clip.object.translation_m[-1], 1.0)
     sway = 0.002 * np.sin(596 / 9)
     np.testing.assert_allclose((clip.source_from_world @ world)[:3], [-0.9 + sway, 4.0, -0.4], atol=1e-5)
