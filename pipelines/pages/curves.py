@@ -10,10 +10,12 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
 COLOURS = ("#3b6ea5", "#b5371f", "#5b8c5a", "#8a5a00", "#7a5195", "#6a6f76")
+LOG_RATIO = 20.0
 _STYLE = {
     "svg.fonttype": "none",
     "font.family": "DejaVu Sans",
@@ -36,27 +38,47 @@ class Curve:
     y: np.ndarray
 
 
-def curves_svg(
-    curves: list[Curve], x_label: str, y_label: str, salt: str, log_y: bool = False, size_inches=(4.6, 2.5)
-) -> str:
-    """A small line chart as an ``<svg>`` element; ``salt`` keeps the ids of several charts on one page apart."""
+@dataclass(frozen=True)
+class Panel:
+    """One chart: curves over a shared x."""
+
+    title: str
+    curves: list[Curve]
+
+    @property
+    def is_logarithmic(self) -> bool:
+        """Positive values that span more than 20 to 1 are drawn on a logarithmic axis."""
+        values = np.concatenate([curve.y for curve in self.curves])
+        return bool(values.min() > 0 and values.max() / values.min() > LOG_RATIO)
+
+
+def panels_svg(panels: list[Panel], x_label: str, salt: str, panel_inches: tuple[float, float] = (2.9, 2.4)) -> str:
+    """Charts side by side as one ``<svg>`` element; ``salt`` keeps the ids of several drawings on one page apart."""
     style: dict[Any, Any] = {**_STYLE, "svg.hashsalt": salt}
     with matplotlib.rc_context(style):
-        figure = Figure(figsize=size_inches, layout="constrained")
+        figure = Figure(figsize=(panel_inches[0] * len(panels), panel_inches[1]), layout="constrained")
         FigureCanvasSVG(figure)
-        axes = figure.add_subplot()
-        for number, curve in enumerate(curves):
-            axes.plot(curve.x, curve.y, color=COLOURS[number % len(COLOURS)], linewidth=1.4, label=curve.name)
-        if log_y:
-            axes.set_yscale("log")
-        axes.set(xlabel=x_label, ylabel=y_label)
-        axes.grid(axis="y", color="#ededea", linewidth=0.8)
-        if len(curves) > 1:
-            axes.legend(frameon=False, fontsize=8)
+        for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+            _draw_panel(axes, panel, x_label)
         stream = io.StringIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     svg = re.sub(r"<metadata>.*?</metadata>", "", stream.getvalue(), flags=re.DOTALL)
     return re.sub(r' xmlns(:xlink)?="[^"]*"', "", svg[svg.index("<svg") :])
+
+
+def _draw_panel(axes: Axes, panel: Panel, x_label: str) -> None:
+    for number, curve in enumerate(panel.curves):
+        main = number == 0
+        axes.plot(
+            curve.x, curve.y, color=COLOURS[number % len(COLOURS)], linewidth=1.7 if main else 1.0, label=curve.name
+        )
+    if panel.is_logarithmic:
+        axes.set_yscale("log")
+    axes.set_xlabel(x_label)
+    axes.set_title(panel.title, loc="left", fontsize=9, color="#6a6f76")
+    axes.grid(axis="y", color="#ededea", linewidth=0.8)
+    if len(panel.curves) > 1:
+        axes.legend(frameon=False, fontsize=7.5)
 
 
 def read_log(path: str | Path) -> dict[str, np.ndarray]:
@@ -75,7 +97,7 @@ def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Cur
     for name, values in columns.items():
         here = np.isfinite(values)
         if name != x_name and re.search("loss|train|valid", name) and here.any():
-            curves.append(Curve(name.replace("_", " "), columns[x_name][here], values[here]))
+            curves.append(Curve(name.removeprefix("train_").replace("_", " "), columns[x_name][here], values[here]))
     return curves
 
 

@@ -1,15 +1,18 @@
-"""What the report shows of one dataset: which held-out clips, and their contact maps beside predicted ones."""
+"""What the report shows of one dataset: which held-out clips, and what the models make of their sentences."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from hoidata.hands import HandPair
 from hoidata.schema.annotated import AnnotatedStore
 from hoidata.schema.clip import SIDES, Clip
-from models.checkpoints import Checkpoint, load_checkpoint
+from models.checkpoints import FILE_NAME, Checkpoint, load_checkpoint
 from models.contact import ContactModel
+from models.generation import MODELS, GeneratedMotion, generate
 from pipelines.pages.surface import ContactPaint
 
 CONTACT_DRAWS = 32
@@ -43,6 +46,38 @@ def contact_examples(annotated: AnnotatedStore, folder: Path, ids: list[str], se
     """Truth and prediction for each clip id, from the contact checkpoint in ``folder``."""
     checkpoint = load_checkpoint(folder, "contact")
     return [_contact_example(annotated, checkpoint, clip_id, seed) for clip_id in ids]
+
+
+@dataclass(frozen=True)
+class StoredEncoder:
+    """The features an annotated dataset already holds, as an encoder: no other sentence can be asked for."""
+
+    annotated: AnnotatedStore
+    clip_id: str
+
+    @property
+    def identity(self) -> dict:
+        return self.annotated.encoder_identity
+
+    def encode(self, sentences: Sequence[str]) -> np.ndarray:
+        """(sentence, 512) float32. Raises ValueError for a sentence that is not one of the clip's four."""
+        forms = list(self.annotated.sentences(self.clip_id))
+        return self.annotated.text_features(self.clip_id)[[forms.index(sentence) for sentence in sentences]]
+
+
+def generated_example(
+    annotated: AnnotatedStore, checkpoints: Path, hands: HandPair, clip_id: str, seed: int
+) -> GeneratedMotion:
+    """A motion for the first sentence and the object of a clip, by the four models in ``checkpoints``."""
+    key = annotated.object_key(clip_id)
+    sentence, words = annotated.sentences(clip_id)[0], annotated.clip(clip_id).object_words
+    encoder = StoredEncoder(annotated, clip_id)
+    return generate(sentence, annotated.object_model(key), checkpoints, hands, encoder, seed, object_words=words)
+
+
+def is_trained(checkpoints: Path) -> bool:
+    """Whether all four models are there."""
+    return all((checkpoints / model / FILE_NAME).is_file() for model in MODELS)
 
 
 def _contact_example(annotated: AnnotatedStore, checkpoint: Checkpoint, clip_id: str, seed: int) -> ContactExample:

@@ -1,7 +1,7 @@
 """The report of one profile: one self-contained page over all its datasets."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -9,10 +9,10 @@ from markupsafe import Markup
 
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
-from pipelines.pages.curves import curves_svg, log_curves, read_log
+from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
-from pipelines.pages.examples import contact_examples, shown_ids, true_contact
-from pipelines.pages.generation_page import GeneratedMotion, contact_paint
+from pipelines.pages.examples import contact_examples, generated_example, is_trained, shown_ids, true_contact
+from pipelines.pages.generation_page import generated_contact, generation_facts
 from pipelines.pages.metrics_table import Table, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.view import touched_side
@@ -20,7 +20,6 @@ from pipelines.pages.view import touched_side
 MODELS = ("contact", "length", "diffusion", "refiner")
 TITLES = {"h2o": "H2O", "grab": "GRAB", "arctic": "ARCTIC", "manipnet": "ManipNet"}
 CONTACT_EXAMPLES = 3
-LOG_RATIO = 20.0
 
 
 @dataclass(frozen=True)
@@ -58,18 +57,16 @@ def write_report(
     profile: str,
     datasets: Sequence[str],
     hands: HandPair,
-    generated: Mapping[str, GeneratedMotion] | None = None,
     folders: ReportFolders | None = None,
     seed: int = 0,
 ) -> Path:
     """Write ``out/index.html`` from what the stages of ``profile`` left in ``folders`` (below the current folder).
 
-    generated: per dataset one motion made by its models, shown beside the recorded clip it answers to.
-    Equal inputs give equal bytes. Datasets without clips are listed with their reason.
+    Where all four models of a dataset are trained, a motion is generated for a held-out clip and shown beside it; seed:
+    of what they draw. Equal inputs give equal bytes. Datasets without clips are listed with their reason.
     """
     folders = folders or ReportFolders.of(profile)
-    motions = generated or {}
-    all_sections = [_section(name, folders, hands, motions.get(name), seed) for name in datasets]
+    all_sections = [_section(name, folders, hands, seed) for name in datasets]
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact for section in sections)
@@ -84,19 +81,20 @@ def write_report(
     return path
 
 
-def _section(name: str, folders: ReportFolders, hands: HandPair, motion: GeneratedMotion | None, seed: int) -> Section:
+def _section(name: str, folders: ReportFolders, hands: HandPair, seed: int) -> Section:
     facts = read_dataset(folders.data / name, name, hands)
     title = TITLES.get(name, name)
     if facts.empty:
         return Section(facts, title)
     checkpoints = folders.checkpoints / name
     tables, note = _metrics(folders.metrics / f"{name}.json")
+    motions, motion_facts = _motions(facts, hands, checkpoints, seed)
     return Section(
         facts,
         title,
         shown=_what_is_shown(facts),
-        motions=_motions(facts, hands, motion),
-        motion_facts=_motion_facts(motion),
+        motions=motions,
+        motion_facts=motion_facts,
         contact=_contact_pairs(facts, checkpoints / "contact", seed),
         tables=tables,
         metrics_note=note,
@@ -119,31 +117,23 @@ def _what_is_shown(facts: DatasetFacts) -> str:
     return "A clip of the test split" if held_out else "A clip (this dataset has no test split)"
 
 
-def _motions(facts: DatasetFacts, hands: HandPair, motion: GeneratedMotion | None) -> list[Player]:
-    """The recorded clip (named by the motion, else the first of the test split) and the generated one."""
+def _motions(
+    facts: DatasetFacts, hands: HandPair, checkpoints: Path, seed: int
+) -> tuple[list[Player], list[tuple[str, str]]]:
+    """A recorded clip, beside it a motion generated for its sentence and object, and how that one came about."""
     annotated = facts.annotated
-    if annotated is None:
-        return []
-    ids = [motion.answers_to] if motion and motion.answers_to else shown_ids(annotated, 1)
-    players = []
-    for clip_id in ids:
-        sentence = annotated.sentences(clip_id)[0]
-        caption = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}: {sentence}"
-        paint = true_contact(annotated, clip_id)
-        players.append(motion_player(annotated.clip(clip_id), hands, sentence, caption, paint, "touched in the clip"))
-    if motion is not None:
-        paint = contact_paint(motion.points, motion.contact)
-        caption = f"Generated: {motion.text}"
-        players.append(motion_player(motion.clip, motion.hands, motion.text, caption, paint, "predicted contact"))
-    return players
-
-
-def _motion_facts(motion: GeneratedMotion | None) -> list[tuple[str, str]]:
-    if motion is None:
-        return []
-    rows = [("generated for", f"{motion.answers_to} (held out)")] if motion.answers_to else []
-    hands = ("hands", f"{motion.hand_type}: {motion.hand_evidence}")
-    return [*rows, hands, ("seed", str(motion.seed)), *motion.facts]
+    if annotated is None or not (ids := shown_ids(annotated, 1)):
+        return [], []
+    sentence = annotated.sentences(ids[0])[0]
+    caption = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}: {sentence}"
+    paint = true_contact(annotated, ids[0])
+    recorded = motion_player(annotated.clip(ids[0]), hands, sentence, caption, paint, "touched in the clip")
+    if not is_trained(checkpoints):
+        return [recorded], [("clip", ids[0])]
+    motion = generated_example(annotated, checkpoints, hands, ids[0], seed)
+    paint, caption = generated_contact(motion), f"Generated: {sentence}"
+    generated = motion_player(motion.clip, hands, sentence, caption, paint, "contact it was made for")
+    return [recorded, generated], [("clip", ids[0]), *generation_facts(motion)]
 
 
 def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[str, list[Player]]]:
@@ -165,10 +155,11 @@ def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[s
 
 
 def _loss_chart(dataset: str, model: str, log: Path) -> dict[str, str] | None:
-    """A chart of every loss in a training log; the axis is logarithmic where the values span more than 20 to 1."""
+    """The losses of a training log: what was minimised and its parts, and the validation loss in a panel of its own."""
     curves = log_curves(read_log(log)) if log.is_file() else []
     if not curves:
         return None
-    low, high = min(curve.y.min() for curve in curves), max(curve.y.max() for curve in curves)
-    svg = curves_svg(curves, "step", "loss", f"{dataset} {model}", log_y=low > 0 and high / low > LOG_RATIO)
-    return {"title": model, "svg": Markup(svg)}
+    validation = [curve for curve in curves if "valid" in curve.name]
+    training = [curve for curve in curves if curve not in validation]
+    panels = [Panel(title, part) for title, part in (("training", training), ("validation", validation)) if part]
+    return {"title": model, "svg": Markup(panels_svg(panels, "step", f"{dataset} {model}"))}

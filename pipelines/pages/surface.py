@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 CREASE_RAD = np.radians(40.0)
 PAINT_EDGE_M = 0.006
 PAINT_EDGE_PER_EXTENT = 1 / 40
-PAINT_NEIGHBOURS = 8
+PAINT_NEIGHBOURS = 12
 
 
 @dataclass(frozen=True)

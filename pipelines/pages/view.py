@@ -53,7 +53,7 @@ def still_view(clip: Clip, look_from: np.ndarray) -> View:
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     return View(
         centre=_rounded(centre),
-        radius_m=round(float(np.linalg.norm(points - centre, axis=1).max()) * 1.08, 4),
+        radius_m=round(float(np.linalg.norm(points - centre, axis=1).max()) * 1.2, 4),
         ground_m=None,
         azimuth_rad=round(float(np.arctan2(look_from[0], look_from[2])), 3),
         elevation_rad=round(float(np.clip(np.arcsin(look_from[1]), 0.15, 1.0)), 3),

@@ -7,13 +7,12 @@ import pytest
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.contact.stage import contact_store
-from hoidata.objects.sampling import sample_points
 from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import write_store
-from pipelines.pages.curves import Curve, curves_svg, log_curves, read_log
+from models.training import UPSTREAM, train_model
+from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
-from pipelines.pages.generation_page import GeneratedMotion
 from pipelines.pages.metrics_table import metrics_tables, number
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
@@ -44,41 +43,51 @@ def folders(hands, page_clip, tmp_path):
     return folders
 
 
+TINY = {
+    "contact": {"network": {"point_net": {"widths": [8, 8, 16], "heads": [8, 8], "align": False}, "latent": 4}},
+    "length": {"network": {"width": 16}},
+    "diffusion": {"network": {"transformer": {"width": 32, "heads": 2, "layers": 1, "feed_forward": 32}}},
+    "refiner": {"network": {"transformer": {"width": 32, "heads": 2, "layers": 1, "feed_forward": 32}}},
+}
+
+
 @pytest.fixture
-def motion(hands, page_clip):
-    clip = page_clip()
-    points = sample_points(clip.object.model)
-    text, contact = "Lift a box with the right hand.", np.ones((2, 1024))
-    return GeneratedMotion(
-        clip, hands, text, "right", "named in the sentence", 5, points, contact, True, answers_to="test/s2/box"
-    )
+def trained(folders):
+    """The same with four models that were trained for two steps."""
+    checkpoints = folders.checkpoints / "grab"
+    for model, upstream in UPSTREAM.items():
+        above = {upstream: checkpoints / upstream} if upstream else None
+        plan = TINY[model] | {"training": {"steps": 2, "batch": 2, "validate_every": 1}}
+        train_model(model, folders.data / "grab", checkpoints / model, plan, upstream=above, threads=1)
+    return folders
 
 
 def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, hands, tmp_path):
-    text = write_report(tmp_path / "report", "embedded", ["grab", "arctic"], hands, folders=folders).read_text()
+    text = write_report(tmp_path / "report", "embedded", ["grab", "arctic"], hands, folders).read_text()
     assert "<td>arctic is not present</td>" in text
     assert "NaN in &lt;frame 3&gt;" in text
     assert "<b>3</b><span>clips</span>" in text
     assert "SYNTHETIC" in text
-    assert re.search(
-        r'F1 of the contact map</td><td class="number good">0.61</td>\s*<td><b class="plain">0.4</b>', text
-    )
+    assert re.search(r'F1 of the contact map</td><td class="number good">0.61</td>\s*<td><b class="plain">0.4<', text)
     assert text.count("<svg") == 1
 
 
-def test_recorded_and_generated_motion_stand_side_by_side(folders, hands, motion, tmp_path):
-    page = write_report(tmp_path / "report", "embedded", ["grab"], hands, {"grab": motion}, folders)
-    text = page.read_text()
-    assert text.count('<script type="application/octet-stream" class="glb">') == 2
+@pytest.mark.slow
+def test_recorded_and_generated_motion_and_contact_maps_stand_side_by_side(trained, hands, tmp_path):
+    first, second = (write_report(tmp_path / name, "embedded", ["grab"], hands, trained).read_bytes() for name in "ab")
+    text = first.decode()
+    assert first == second
+    assert text.count('<script type="application/octet-stream" class="glb">') == 4
     assert "Synthetic ground truth: Lift a box" in text
-    assert "test/s2/box (held out)" in text
+    assert "Generated: Lift a box" in text
+    assert "2 SYNTHETIC test clips" in text
+    assert text.count("<svg") == 4
 
 
-def test_report_repeats_byte_for_byte_and_fetches_nothing(folders, hands, motion, tmp_path):
-    pages = [
-        write_report(tmp_path / name, "embedded", ["grab", "arctic"], hands, {"grab": motion}, folders) for name in "ab"
-    ]
-    first, second = (page.read_bytes() for page in pages)
+def test_report_repeats_byte_for_byte_and_fetches_nothing(folders, hands, tmp_path):
+    first, second = (
+        write_report(tmp_path / name, "embedded", ["grab", "arctic"], hands, folders).read_bytes() for name in "ab"
+    )
     assert first == second
     assert not re.search(r"https?://", first.decode().replace(three_javascript(), ""))
 
@@ -91,17 +100,24 @@ def test_shown_clips_are_held_out_ones(folders, hands):
 
 def test_log_columns_become_curves_without_their_gaps(folders):
     curves = log_curves(read_log(folders.checkpoints / "grab" / "contact" / "log.csv"))
-    assert [curve.name for curve in curves] == ["train loss", "validation loss"]
+    assert [curve.name for curve in curves] == ["loss", "validation loss"]
     assert curves[1].x.tolist() == [0, 20]
     assert curves[1].y.tolist() == [4.2, 0.3]
 
 
 def test_charts_repeat_and_keep_their_ids_apart():
-    curve = Curve("train loss", np.arange(5.0), np.arange(5.0) ** 2)
-    assert curves_svg([curve], "step", "loss", "a") == curves_svg([curve], "step", "loss", "a")
-    ids = [set(re.findall(r'id="([mp][0-9a-f]{10})"', curves_svg([curve], "step", "loss", salt))) for salt in "ab"]
+    panels = [Panel("training", [Curve("loss", np.arange(5.0), np.arange(5.0) ** 2)])]
+    assert panels_svg(panels, "step", "a") == panels_svg(panels, "step", "a")
+    ids = [set(re.findall(r'id="([mp][0-9a-f]{10})"', panels_svg(panels, "step", salt))) for salt in "ab"]
     assert ids[0]
     assert not ids[0] & ids[1]
+
+
+def test_wide_positive_ranges_are_drawn_logarithmically():
+    x = np.arange(3.0)
+    assert Panel("", [Curve("", x, np.array([1.0, 10, 30]))]).is_logarithmic
+    assert not Panel("", [Curve("", x, np.array([-1.0, 10, 30]))]).is_logarithmic
+    assert not Panel("", [Curve("", x, np.array([10.0, 20, 30]))]).is_logarithmic
 
 
 def test_every_figure_of_a_metrics_file_reaches_the_table_beside_its_baseline():
