@@ -68,10 +68,8 @@ def panels_svg(panels: list[Panel], x_label: str, salt: str, panel_inches: tuple
 
 def _draw_panel(axes: Axes, panel: Panel, x_label: str) -> None:
     for number, curve in enumerate(panel.curves):
-        main = number == 0
-        axes.plot(
-            curve.x, curve.y, color=COLOURS[number % len(COLOURS)], linewidth=1.7 if main else 1.0, label=curve.name
-        )
+        colour, width = COLOURS[number % len(COLOURS)], 1.7 if number == 0 else 1.0
+        axes.plot(curve.x, curve.y, color=colour, linewidth=width, label=curve.name)
     if panel.is_logarithmic:
         axes.set_yscale("log")
     axes.set_xlabel(x_label)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hoidata.annotation.encoders import Identity
 from hoidata.hands import HandPair
 from hoidata.schema.annotated import AnnotatedStore
 from hoidata.schema.clip import SIDES, Clip
@@ -48,31 +49,27 @@ def contact_examples(annotated: AnnotatedStore, folder: Path, ids: list[str], se
     return [_contact_example(annotated, checkpoint, clip_id, seed) for clip_id in ids]
 
 
-@dataclass(frozen=True)
+@dataclass
 class StoredEncoder:
-    """The features an annotated dataset already holds, as an encoder: no other sentence can be asked for."""
+    """Features (sentence, 512) an annotated dataset already holds, as an encoder: it knows no other sentence."""
 
-    annotated: AnnotatedStore
-    clip_id: str
-
-    @property
-    def identity(self) -> dict:
-        return self.annotated.encoder_identity
+    identity: Identity
+    sentences: tuple[str, ...]
+    features: np.ndarray
 
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
-        """(sentence, 512) float32. Raises ValueError for a sentence that is not one of the clip's four."""
-        forms = list(self.annotated.sentences(self.clip_id))
-        return self.annotated.text_features(self.clip_id)[[forms.index(sentence) for sentence in sentences]]
+        """(sentence, 512) float32. Raises ValueError for a sentence it does not hold."""
+        return self.features[[self.sentences.index(sentence) for sentence in sentences]]
 
 
 def generated_example(
     annotated: AnnotatedStore, checkpoints: Path, hands: HandPair, clip_id: str, seed: int
 ) -> GeneratedMotion:
     """A motion for the first sentence and the object of a clip, by the four models in ``checkpoints``."""
-    key = annotated.object_key(clip_id)
-    sentence, words = annotated.sentences(clip_id)[0], annotated.clip(clip_id).object_words
-    encoder = StoredEncoder(annotated, clip_id)
-    return generate(sentence, annotated.object_model(key), checkpoints, hands, encoder, seed, object_words=words)
+    sentences, words = annotated.sentences(clip_id), annotated.clip(clip_id).object_words
+    encoder = StoredEncoder(annotated.encoder_identity, sentences, annotated.text_features(clip_id))
+    model = annotated.object_model(annotated.object_key(clip_id))
+    return generate(sentences[0], model, checkpoints, hands, encoder, seed, object_words=words)
 
 
 def is_trained(checkpoints: Path) -> bool:

@@ -30,7 +30,7 @@ def write_generation(
         folder / "index.html",
         motion_player(motion.clip, hands, text, contact=paint, contact_label="contact it was made for"),
         text,
-        generation_facts(motion) + [("hand model", hands.name)],
+        [*generation_facts(motion), ("hand model", hands.name)],
         motion.clip.synthetic,
         subtitle="Generated motion",
         files=[
@@ -74,16 +74,18 @@ def motion_arrays(motion: GeneratedMotion, hands: HandPair, vertices: bool = Fal
     """
     clip = motion.clip
     valid = np.stack([clip.hands[side].valid for side in SIDES])
+    joints, coarse = (
+        _where_valid([track_joints(shown.hands[side], hands[side]) for side in SIDES], valid)
+        for shown in (clip, motion.coarse)
+    )
     arrays = {
         "text": np.array(str(motion.evidence["text"])),
         "fps": np.array(FPS),
         "seed": np.array(motion.evidence["seed"]),
         "gravity": np.zeros(0) if clip.gravity is None else np.asarray(clip.gravity),
         "valid": valid,
-        "joints_m": _where_valid([track_joints(clip.hands[side], hands[side]) for side in SIDES], valid),
-        "coarse_joints_m": _where_valid(
-            [track_joints(motion.coarse.hands[side], hands[side]) for side in SIDES], valid
-        ),
+        "joints_m": joints,
+        "coarse_joints_m": coarse,
     }
     if vertices:
         meshes = [track_vertices(clip.hands[side], hands[side]) for side in SIDES]
