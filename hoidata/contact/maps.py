@@ -32,8 +32,8 @@ def touched_frames(entries: np.ndarray, point_count: int, threshold_m: float | N
     None takes every entry, that is the threshold they were found with.
     """
     near = entries if threshold_m is None else entries[entries["distance_m"].astype(np.float64) < threshold_m]
-    pairs = np.unique(near["frame"].astype(np.int64) * point_count + near["point"])
-    return np.bincount(pairs % point_count, minlength=point_count).astype(np.uint16)
+    frame_count = int(near["frame"].max(initial=-1)) + 1
+    return frame_contact(near, frame_count, point_count).sum(axis=0, dtype=np.uint16)
 
 
 def contact_map(entries: np.ndarray, point_count: int, threshold_m: float | None = None) -> np.ndarray:
