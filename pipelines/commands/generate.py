@@ -19,8 +19,9 @@ def generate(
     """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
     mesh = Path(object).resolve() if Path(object).is_file() else None
     enter_project()
-    from pipelines.generation import write_generation
+    from pipelines.generation import generate_files
+    from pipelines.stages.base import Place
 
-    written = write_generation(text, mesh or object, seed, out, dataset, profile or current_profile())
-    for path in written:
+    place = Place(profile or current_profile(), dataset)
+    for path in generate_files(text, mesh or object, seed, out, place):
         typer.echo(path)

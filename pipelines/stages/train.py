@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.files.atomic import atomic_folder
-from hoidata.lineage.graph import producers, read_graph
+from hoidata.lineage.graph import look_up, producers, read_graph
 from hoidata.lineage.provenance import build_provenance
 from pipelines.stages.base import Place, StageParams, empty_reason, load_hands, load_params, write_empty
 
@@ -18,6 +18,11 @@ class TrainParams(StageParams):
     seed: int
     demo: dict[str, dict[str, Any]]
     paper: dict[str, dict[str, Any]]
+
+    def of(self, model: str) -> dict[str, Any]:
+        """The model's section in the chosen size, with the seed."""
+        sections = getattr(self, self.size)
+        return {**look_up(sections, model), "seed": self.seed}
 
 
 def run(place: Place) -> None:
@@ -41,7 +46,7 @@ def train(place: Place, params: TrainParams, upstream: dict[str, Path]) -> None:
             place.model,
             place.data,
             part,
-            params.model_dump(),
+            params.of(place.model),
             hands=load_hands(place.profile),
             provenance=lambda facts: build_provenance(Path(), stage, facts),
             upstream=upstream,

@@ -1,0 +1,82 @@
+"""A copy of the project in a temporary folder, with the small corpora and budgets of a few steps."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+PROJECT = Path(__file__).parents[2]
+PARTS = (
+    "hoidata",
+    "models",
+    "pipelines",
+    "manifests",
+    "dvc.yaml",
+    "params.yaml",
+    ".dvcignore",
+    ".gitignore",
+    "prefect.toml",
+    "prefect.yaml",
+    ".dvc/config",
+    ".dvc/.gitignore",
+)
+TINY = {"training": {"steps": 2, "batch": 4, "validate_every": 1}}
+TINY_EVALUATION = {"contact_samples": 2, "samples": 2, "refined": 1, "sampler_steps": 2, "frame_stride": 30}
+
+
+def copy_project(folder: Path) -> Path:
+    """The project's code and settings in ``folder``, as a repository of its own, without any data."""
+    for part in PARTS:
+        source, target = PROJECT / part, folder / part
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target)
+    subprocess.run(["git", "init", "--quiet", str(folder)], check=True)
+    make_small(folder)
+    return folder
+
+
+def make_small(folder: Path) -> None:
+    """Small corpora, the encoder that needs no weights, and a few steps per model."""
+    for path in (folder / "manifests" / "embedded").glob("*.json"):
+        path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
+    params = yaml.safe_load((folder / "params.yaml").read_text())
+    params["annotate"]["encoder"] = "hash"
+    params["train"]["demo"] = {name: {**values, **TINY} for name, values in params["train"]["demo"].items()}
+    params["evaluate"] |= TINY_EVALUATION
+    write_params(folder, params)
+
+
+def write_params(folder: Path, params: dict) -> None:
+    (folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
+
+
+def set_present(folder: Path, present: set[str]) -> None:
+    """Make only the named embedded corpora present."""
+    for name in ("h2o", "grab", "arctic"):
+        path = folder / "manifests" / "embedded" / f"{name}.json"
+        text = path.read_text().replace('"present": true', '"present": false')
+        path.write_text(text.replace('"present": false', '"present": true') if name in present else text)
+
+
+def environment(**more: str) -> dict[str, str]:
+    """This environment without the user's raw folders, and with this Python first on the path."""
+    kept = {key: value for key, value in os.environ.items() if not key.startswith(("HOIDATA_", "PREFECT_"))}
+    path = f"{Path(sys.executable).parent}{os.pathsep}{kept.get('PATH', '')}"
+    return {**kept, "PATH": path, "OMP_NUM_THREADS": "1", "DVC_NO_ANALYTICS": "1", "DO_NOT_TRACK": "1", **more}
+
+
+def run(folder: Path, *command: str, **more: str) -> subprocess.CompletedProcess:
+    """Run a command as a user would type it, in the project folder."""
+    return subprocess.run(command, cwd=folder, env=environment(**more), capture_output=True, text=True)
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    return copy_project(tmp_path / "project")
