@@ -194,17 +194,13 @@ def _read_frames(raw: RawTree, folder: str) -> _Frames:
     hands = _numbers(raw, kinds["hand_pose_mano"], files, 124)
     objects = _numbers(raw, kinds["obj_pose_rt"], files, 17)
     label = _numbers(raw, kinds["action_label"], files, 1)
-    used_hands = np.where(np.repeat(hands[:, [0, 62]] != 0, 62, axis=1), hands, 0.0)
-    used_objects = np.where(objects[:, :1] != 0, objects, 0.0)
-    for kind, values in (("cam_pose", camera), ("hand_pose_mano", used_hands), ("obj_pose_rt", used_objects)):
-        _check_finite(kinds[kind], files, values)
     _check_ids(kinds["action_label"], files, label[:, 0], len(ACTIONS))
     _check_ids(kinds["obj_pose_rt"], files, objects[:, 0], len(OBJECTS))
     camera = camera.reshape(-1, 4, 4)
     checks.rotations(kinds["cam_pose"], camera[:, :3, :3])
-    tracked = used_objects[used_objects[:, 0] != 0, 1:].reshape(-1, 4, 4)
+    tracked = objects[objects[:, 0] != 0, 1:].reshape(-1, 4, 4)
     checks.rotations(kinds["obj_pose_rt"], tracked[:, :3, :3])
-    return _Frames(folder, int(files[0][:6]), camera, used_hands, used_objects, label[:, 0].astype(int))
+    return _Frames(folder, int(files[0][:6]), camera, hands, objects, label[:, 0].astype(int))
 
 
 def _folder_of(raw: RawTree, folder: str, kind: str) -> str:
@@ -240,13 +236,11 @@ def _numbers(raw: RawTree, folder: str, files: list[str], columns: int) -> np.nd
         if len(row) != columns:
             raise BadInput(f"{folder}/{name}", f"{columns} numbers", f"{len(row)}")
         rows.append(row)
-    return np.array(rows, dtype=np.float64)
-
-
-def _check_finite(folder: str, files: list[str], values: np.ndarray) -> None:
+    values = np.array(rows, dtype=np.float64)
     good = np.isfinite(values).all(axis=1)
     if not good.all():
         raise BadInput(f"{folder}/{files[int(np.argmin(good))]}", "finite numbers", "NaN or infinity")
+    return values
 
 
 def _check_ids(folder: str, files: list[str], values: np.ndarray, count: int) -> None:
