@@ -11,8 +11,10 @@ from hoidata.schema.clip import FPS, Clip
 from pipelines.pages.glb import upright_rotation
 from pipelines.pages.surface import ContactPaint
 
+ASIDE_RAD = np.radians(40.0)  # looking past the touched side shows where the contact ends
 _POINTS_FOR_VIEW = 400
 _HAND_MARGIN_M = 0.015
+_NEAR_M = 0.10
 
 
 @dataclass(frozen=True)
@@ -29,18 +31,22 @@ class View:
 
 
 def view_of(clip: Clip, hands: HandPair) -> View:
-    """A camera that sees the whole motion, from the side and a little above, between hand and object."""
+    """A camera that sees the whole motion of the object and of the hands that come near it, from the side.
+
+    The ground lies under the lowest point of the object and of all hands.
+    """
     upright = upright_rotation(clip.gravity).as_matrix()
     object_points = _object_points(clip) @ upright.T
-    hand_points = [point @ upright.T for point in _hand_points(clip, hands)]
-    everything = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    centre = (low + high) / 2
-    radius = float(np.linalg.norm(everything - centre, axis=1).max()) + _HAND_MARGIN_M
+    everyone = [(valid, joints @ upright.T) for valid, joints in _hand_joints(clip, hands)]
+    hand_points = [joints[valid] for valid, joints in everyone if _comes_near(joints, valid, object_points)]
+    shown = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
+    centre = (shown.min(axis=0) + shown.max(axis=0)) / 2
+    radius = float(np.linalg.norm(shown - centre, axis=1).max()) + _HAND_MARGIN_M
+    lowest = min(object_points[..., 1].min(), *(joints[valid, :, 1].min() for valid, joints in everyone), np.inf)
     return View(
         centre=_rounded(centre),
         radius_m=round(radius, 4),
-        ground_m=None if clip.gravity is None else round(float(low[1]), 4),
+        ground_m=None if clip.gravity is None else round(float(lowest), 4),
         azimuth_rad=round(_side_azimuth(object_points, hand_points), 3),
         elevation_rad=0.42,
         frames=clip.n_frames,
@@ -55,7 +61,7 @@ def still_view(clip: Clip, look_from: np.ndarray) -> View:
         centre=_rounded(centre),
         radius_m=round(float(np.linalg.norm(points - centre, axis=1).max()) * 1.2, 4),
         ground_m=None,
-        azimuth_rad=round(float(np.arctan2(look_from[0], look_from[2])), 3),
+        azimuth_rad=round(float(np.arctan2(look_from[0], look_from[2]) + ASIDE_RAD), 3),
         elevation_rad=round(float(np.clip(np.arcsin(look_from[1]), 0.15, 1.0)), 3),
         frames=1,
     )
@@ -77,8 +83,18 @@ def _object_points(clip: Clip) -> np.ndarray:
     return place(local, track.rotvec, track.translation_m)
 
 
-def _hand_points(clip: Clip, hands: HandPair) -> list[np.ndarray]:
-    return [track_joints(track, hands[side])[track.valid] for side, track in clip.hands.items() if track.valid.any()]
+def _hand_joints(clip: Clip, hands: HandPair) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Valid frames (frame,) and joints (frame, 21, 3) of each hand that is ever valid."""
+    tracks = [(track, hands[side]) for side, track in clip.hands.items() if track.valid.any()]
+    return [(track.valid, track_joints(track, model)) for track, model in tracks]
+
+
+def _comes_near(joints: np.ndarray, valid: np.ndarray, object_points: np.ndarray) -> bool:
+    """Whether a joint ever comes within 10 cm of the ball around the object: an idle hand must not widen the view."""
+    moving = np.broadcast_to(object_points, (len(joints), *object_points.shape[1:]))
+    centre = moving.mean(axis=1, keepdims=True)
+    reach = np.linalg.norm(moving - centre, axis=2).max(axis=1, keepdims=True)
+    return bool(((np.linalg.norm(joints - centre, axis=2) - reach)[valid] < _NEAR_M).any())
 
 
 def _side_azimuth(object_points: np.ndarray, hand_points: list[np.ndarray]) -> float:

@@ -1,6 +1,7 @@
 import re
 import shutil
 import subprocess
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -55,6 +56,13 @@ def test_camera_sees_every_joint_and_stands_on_the_lowest_point(hands, page_clip
     assert view.ground_m is not None
     assert view.ground_m <= 1e-4
     assert view_of(page_clip(), hands).frames == clip.n_frames
+
+
+def test_idle_hand_far_away_does_not_widen_the_view(hands, page_clip):
+    clip = page_clip(left=True)
+    far = replace(clip.hands["left"], wrist_m=clip.hands["left"].wrist_m - (3.0, 0.0, 0.0))
+    idle = replace(clip, hands={"left": far, "right": clip.hands["right"]})
+    assert view_of(idle, hands).radius_m == view_of(page_clip(), hands).radius_m
 
 
 @pytest.mark.slow
