@@ -19,7 +19,7 @@ from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import write_store
 
 torch.set_num_threads(1)
-GRASP_HEIGHT_M = 0.02
+GRASP_HEIGHT_M = 0.01
 
 
 def box_model() -> ObjectModel:

@@ -1,0 +1,109 @@
+"""Losses vanish at the truth, grow away from it, and read distances as exact geometry gives them."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from hoidata.geometry.rotations import rot6d_to_rotmat
+from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import ObjectModel
+from hoidata.schema.dataset import ClipBatch
+from models import losses
+from models.features import Hands, object_rotmat, place_points
+from models.fields import DistanceFields
+from models.surface import Surface
+
+
+@pytest.fixture(scope="module")
+def hands() -> Hands:
+    return Hands(load_embedded_hands())
+
+
+def test_joints_of_the_features_are_the_stored_joints(batch: ClipBatch, hands: Hands) -> None:
+    joints = hands.joints(batch.hands, batch.betas, batch.template_m)
+    torch.testing.assert_close(joints[batch.present], batch.joints_m[batch.present], atol=1e-5, rtol=0)
+    _, same = hands.vertices(batch.hands, batch.betas, batch.template_m)
+    torch.testing.assert_close(same, joints, atol=1e-5, rtol=0)
+
+
+def test_the_distance_map_loss_is_zero_at_the_truth_and_grows_with_a_shift(batch: ClipBatch) -> None:
+    points = place_points(batch, batch.object)
+    found = [
+        float(losses.distance_map_loss(batch.joints_m + shift, points, batch.entries, batch.entry_distance_m))
+        for shift in (0.0, 0.01, 0.02)
+    ]
+    assert found[0] < 1e-6
+    assert found[0] < found[1] < found[2]
+
+
+def test_distances_of_chosen_frames_are_those_of_all_frames(batch: ClipBatch) -> None:
+    generator = torch.Generator().manual_seed(0)
+    chosen = losses.pick_frames(batch.frames, 5, generator)
+    assert (chosen < batch.lengths[:, None]).all()
+    rows, distance = losses.entries_of_frames(
+        batch.entries, batch.entry_distance_m, chosen, batch.frames.shape[1], 10_000, generator
+    )
+    joints, objects = losses.take_frames(batch.joints_m, chosen, 2), losses.take_frames(batch.object, chosen, 1)
+    assert len(rows) > 0
+    assert float(losses.distance_map_loss(joints, place_points(batch, objects), rows, distance)) < 1e-6
+
+
+def test_relative_orientation_ignores_the_world_and_sees_the_hand(batch: ClipBatch) -> None:
+    hand, body = rot6d_to_rotmat(batch.hands[..., 3:9]), object_rotmat(batch.object)
+    turn = rot6d_to_rotmat(torch.tensor([0.0, 1, 1, 0, 0, 0]))
+    zero = losses.relative_orientation_loss(turn @ hand, turn @ body, hand, body, batch.present)
+    more = losses.relative_orientation_loss(turn @ hand, body, hand, body, batch.present)
+    assert float(zero) < 1e-9
+    assert float(more) > 0.1
+
+
+def test_penetration_counts_only_what_is_inside() -> None:
+    distance = torch.tensor([0.02, -0.01, -0.02, 0.0]).reshape(1, 1, 1, 4)
+    # (1 cm)^2 + (2 cm)^2 in units of 1 cm.
+    assert float(losses.penetration_loss(distance, torch.ones(1, 1, 1))) == pytest.approx(5.0)
+    assert float(losses.penetration_loss(distance.abs(), torch.ones(1, 1, 1))) == 0
+    assert float(losses.penetration_loss(distance, torch.zeros(1, 1, 1))) == 0
+
+
+def test_contact_pulls_only_joints_that_were_near() -> None:
+    before = torch.tensor([0.019, 0.021, -0.01]).reshape(1, 1, 1, 3)
+    now = torch.tensor([0.01, 5.0, 0.03]).reshape(1, 1, 1, 3)
+    # Joints one and three count: (1 cm)^2 and (3 cm)^2.
+    assert float(losses.contact_loss(now, before, torch.ones(1, 1, 1))) == pytest.approx(5.0)
+
+
+def test_masked_mean_of_nothing_is_zero() -> None:
+    assert float(losses.simple_loss(torch.ones(2, 3, 4), torch.zeros(2, 3, 4), torch.zeros(2, 3))) == 0
+    assert float(losses.simple_loss(torch.ones(2, 3, 4), torch.zeros(2, 3, 4), torch.ones(2, 3))) == 1
+
+
+def test_a_field_reads_the_distance_of_a_sphere() -> None:
+    ball = trimesh.creation.icosphere(4, 0.05)
+    model = ObjectModel("ball", ball.vertices, ball.faces, np.zeros(len(ball.vertices), np.uint8))
+    fields = DistanceFields([("ball", model)], 40)
+    generator = torch.Generator().manual_seed(0)
+    points = (torch.rand(1, 1, 500, 3, generator=generator) - 0.5) * 0.3
+    points.requires_grad_()
+    distance, offset = fields.query(torch.zeros(1, dtype=torch.long), points, torch.zeros(1, 1))
+    radius = points.detach().norm(dim=-1)
+    away = radius > 0.02
+    inside_box = points.detach().abs().amax(-1) < 0.08
+    assert (distance.detach() - (radius - 0.05))[away & inside_box].abs().max() < 1.5e-3
+    # Beyond the box the distance to it is added: never nearer than the truth.
+    assert (distance.detach() - (radius - 0.05))[~inside_box].min() > -1.5e-3
+    reached = (points.detach() + offset.detach()).norm(dim=-1)
+    assert (reached - 0.05)[away & inside_box].abs().max() < 2e-3
+    (gradient,) = torch.autograd.grad(distance.sum(), points)
+    outward = torch.nn.functional.cosine_similarity(gradient, points.detach(), dim=-1)
+    assert outward[away & inside_box].min() > 0.95
+
+
+def test_a_field_turns_the_moving_part_with_the_hinge(batch: ClipBatch, hands: Hands) -> None:
+    surface = Surface.of(hands, batch.samples, 40, torch.device("cpu"))
+    points = place_points(batch, batch.object)
+    both = points[:, None].expand(-1, 2, -1, -1, -1)
+    _, distance, _ = surface.measure(batch, both, batch.object)
+    # Sampled points lie on the surface; a hinge line where parts meet may be inside the other part.
+    assert distance.transpose(1, 2)[batch.frames].abs().median() < 1e-3
+    assert distance.transpose(1, 2)[batch.frames].max() < 3e-3

@@ -1,0 +1,242 @@
+"""What the networks promise: masks shut things out, everything learns, the sampler does what its equations say."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from hoidata.hands import load_embedded_hands
+from hoidata.schema.annotated import AnnotatedStore
+from hoidata.schema.dataset import ClipBatch, HoiDataset, collate
+from models.contact import ContactConfig, ContactLossConfig, ContactModel, PointNetConfig, contact_loss
+from models.diffusion import Condition, DiffusionConfig, DiffusionModel
+from models.features import Hands, Normaliser
+from models.length import LengthConfig, LengthModel, length_loss
+from models.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
+from models.sampling import SamplerConfig, add_noise, alphas_bar, noise_schedule, sample_motion
+from models.surface import Surface
+from models.transformer import TransformerConfig
+
+SMALL = TransformerConfig(
+    width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2
+)
+POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16))
+
+
+def diffusion_model(**changes) -> DiffusionModel:
+    torch.manual_seed(0)
+    config = DiffusionConfig(SMALL, POINT_NET, contact_input="moments", frames_to_go=True)
+    return DiffusionModel(replace(config, **changes)).eval()
+
+
+def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
+    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0])
+
+
+def coarse_of(batch: ClipBatch) -> CoarseMotion:
+    surface = Surface.of(Hands(load_embedded_hands()), batch.samples, 24, torch.device("cpu"))
+    return surface.coarse(batch, batch.hands, batch.object, batch.touched)
+
+
+@pytest.mark.parametrize("frames_per_token", [1, 2, 5])
+def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, frames_per_token: int) -> None:
+    model = diffusion_model(transformer=replace(SMALL, frames_per_token=frames_per_token))
+    condition, steps = condition_of(batch, model), torch.tensor([10, 500, 900])
+    hands, objects = batch.hands.clone(), batch.object.clone()
+    with torch.no_grad():
+        before = model(hands, objects, steps, condition)
+        hands[~batch.acts] = 100.0
+        hands.transpose(1, 2)[~batch.frames] = -50.0
+        objects[~batch.frames] = 50.0
+        after = model(hands, objects, steps, condition)
+    assert torch.equal(before[0][batch.present], after[0][batch.present])
+    assert torch.equal(before[1][batch.frames], after[1][batch.frames])
+
+
+def test_a_clip_gives_the_same_alone_as_padded_in_a_batch(annotated: AnnotatedStore, batch: ClipBatch) -> None:
+    model = diffusion_model()
+    alone = collate([batch.samples[0]])
+    with torch.no_grad():
+        many = model(batch.hands, batch.object, torch.full((3,), 300), condition_of(batch, model))
+        one = model(alone.hands, alone.object, torch.full((1,), 300), condition_of(alone, model))
+    length, side = batch.samples[0].length, int(batch.acts[0].float().argmax())
+    torch.testing.assert_close(many[0][0, side, :length], one[0][0, side], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(many[1][0, :length], one[1][0], atol=1e-5, rtol=1e-4)
+
+
+def test_hand_flags_length_text_and_contact_are_seen(batch: ClipBatch) -> None:
+    model, steps = diffusion_model(), torch.full((3,), 300)
+    condition = condition_of(batch, model)
+    changes = {
+        "text": condition.text + 1,
+        "touched": 1 - condition.touched,
+        "acts": torch.ones_like(condition.acts),
+    }
+    with torch.no_grad():
+        before = model(batch.hands, batch.object, steps, condition)[1]
+        for name, value in changes.items():
+            after = model(batch.hands, batch.object, steps, replace(condition, **{name: value}))[1]
+            assert (before - after)[batch.frames].abs().max() > 1e-4, name
+
+
+def test_the_raw_contact_map_of_the_paper_is_an_option(batch: ClipBatch) -> None:
+    model = diffusion_model(contact_input="map", frames_to_go=False)
+    hands, objects = model(batch.hands, batch.object, torch.zeros(3, dtype=torch.long), condition_of(batch, model))
+    assert hands.shape == batch.hands.shape
+    assert objects.shape == batch.object.shape
+
+
+def test_the_papers_generator_has_the_papers_size() -> None:
+    model = DiffusionModel(DiffusionConfig())
+    trained = sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
+    # Tables S7-S9 by hand: encoder 8 x (4 (512^2 + 512) + 2 (2 x 512) + 512 x 1024 + 1024 + 1024 x 512 + 512), and the
+    # layers around it, with the three inputs that are ours (two hand flags and the length).
+    encoder = 8 * (4 * (512**2 + 512) + 4 * 512 + 2 * 512 * 1024 + 1024 + 512)
+    inputs = 2 * (99 * 512 + 512) + 10 * 512 + 512 + 2 * (512**2 + 512) + 512**2 + 512 + 2049 * 512 + 512
+    outputs = 2 * (512 * 99 + 99) + 512 * 10 + 10
+    assert trained == encoder + inputs + outputs + 3 * 512 + 512
+
+
+def test_a_refiner_starts_as_the_identity_and_every_parameter_learns(batch: ClipBatch) -> None:
+    torch.manual_seed(0)
+    model = RefinerModel(RefinerConfig(SMALL, contact_map=True))
+    coarse = coarse_of(batch)
+    torch.testing.assert_close(model(coarse)[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
+    optimiser = torch.optim.SGD(model.parameters(), lr=0.1)
+    for _ in range(2):
+        optimiser.zero_grad()
+        (model(coarse)[batch.present] - batch.hands[batch.present] - 0.1).square().sum().backward()
+        optimiser.step()
+    without = [name for name, p in model.named_parameters() if p.grad is None or not p.grad.abs().max() > 0]
+    # A key bias shifts all scores of a query alike, so a softmax gives it no gradient; it lives inside a larger tensor.
+    assert without == []
+
+
+def test_refined_hands_do_not_depend_on_padding_or_absent_hands(batch: ClipBatch) -> None:
+    torch.manual_seed(0)
+    model = RefinerModel(RefinerConfig(SMALL, contact_map=False)).eval()
+    torch.nn.init.normal_(model.hands_out[0].weight, std=0.1)
+    torch.nn.init.normal_(model.hands_out[1].weight, std=0.1)
+    coarse = coarse_of(batch)
+    noise = torch.randn(coarse.hands.shape, generator=torch.Generator().manual_seed(0))
+    other = replace(coarse, hands=torch.where(coarse.present[..., None], coarse.hands, noise))
+    with torch.no_grad():
+        assert torch.equal(model(coarse)[batch.present], model(other)[batch.present])
+
+
+def test_hands_in_the_object_frame_come_back(batch: ClipBatch) -> None:
+    there = hands_in_object_frame(batch.hands, batch.object)
+    back = hands_in_world(there, batch.object)
+    torch.testing.assert_close(back[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
+    wrist = batch.object[:, None, :, :3].expand_as(batch.hands[..., :3])
+    at_origin = torch.cat((wrist, batch.hands[..., 3:]), -1)
+    assert hands_in_object_frame(at_origin, batch.object)[..., :3].abs().max() == 0
+
+
+def test_a_perfect_denoiser_gives_the_clean_motion_back() -> None:
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.randn(3, 2, 7, 99, generator=generator), torch.randn(3, 7, 10, generator=generator)
+    for kind, steps in (("ddim", 1), ("ddim", 20), ("ddpm", 50)):
+        config = SamplerConfig(kind, steps)  # pyright: ignore[reportArgumentType]
+        hands, objects = sample_motion(lambda *_: truth, truth[0].shape, truth[1].shape, config, generator)
+        torch.testing.assert_close(hands, truth[0], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
+        torch.testing.assert_close(objects, truth[1], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
+
+
+def test_the_schedule_is_nichol_and_dhariwals_cosine() -> None:
+    time = torch.arange(1001, dtype=torch.float64) / 1000
+    curve = torch.cos((time + 0.008) / 1.008 * torch.pi / 2) ** 2
+    betas = (1 - curve[1:] / curve[:-1]).clamp_max(0.999)
+    torch.testing.assert_close(alphas_bar().double(), (1 - betas).cumprod(0), atol=1e-5, rtol=1e-4)
+
+
+def test_one_ddim_step_is_the_closed_form() -> None:
+    """Song et al. 2021, eq. 12 with sigma 0: x' = sqrt(a') x0 + sqrt(1 - a') (x - sqrt(a) x0) / sqrt(1 - a)."""
+    scheduler, signal = noise_schedule(), alphas_bar()
+    scheduler.set_timesteps(10)
+    x, clean = torch.tensor([1.3]), torch.tensor([0.4])
+    now, then = (signal[int(step)] for step in scheduler.timesteps[4:6])
+    expected = then.sqrt() * clean + (1 - then).sqrt() * (x - now.sqrt() * clean) / (1 - now).sqrt()
+    found = scheduler.step(clean, int(scheduler.timesteps[4]), x, return_dict=False)[0]
+    torch.testing.assert_close(found, expected)
+
+
+def test_noise_is_mixed_as_in_the_papers_first_equation() -> None:
+    signal = torch.tensor([0.81, 0.36])
+    noised = add_noise(torch.ones(2, 3), torch.full((2, 3), 2.0), torch.tensor([0, 1]), signal)
+    torch.testing.assert_close(noised[:, 0], torch.tensor([0.9 + 2 * 0.19**0.5, 0.6 + 2 * 0.8]))
+
+
+def fitted(parameters, loss, steps: int = 150, rate: float = 3e-3) -> float:
+    optimiser = torch.optim.Adam(parameters, lr=rate)
+    found = torch.zeros(())
+    for _ in range(steps):
+        optimiser.zero_grad()
+        found = loss()
+        found.backward()
+        optimiser.step()
+    return float(found.detach())
+
+
+def two_clips(batch: ClipBatch) -> ClipBatch:
+    return collate(list(batch.samples[:2]))
+
+
+def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
+    torch.manual_seed(0)
+    two = two_clips(batch)
+    model = ContactModel(ContactConfig(POINT_NET, (32, 32, 16), 4))
+    noise = torch.randn(2, 4, generator=torch.Generator().manual_seed(0))
+
+    def loss() -> Tensor:
+        logits, mean, spread = model(two.points_m, two.text[:, 0], two.acts, two.touched, noise)
+        return contact_loss(logits, two.touched, mean, spread, ContactLossConfig())["total"]
+
+    fitted(model.parameters(), loss, 60, 1e-2)
+    model.eval()
+    chance = model.sample(two.points_m, two.text[:, 0], two.acts, 8, torch.Generator().manual_seed(1)).mean(1)
+    assert ((chance > 0.5) == (two.touched > 0.5)).float().mean() > 0.95
+
+
+def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatch) -> None:
+    torch.manual_seed(0)
+    two = two_clips(batch)
+    model = LengthModel(LengthConfig(width=64, dropout=0.0))
+    lengths = torch.tensor([40, 120])
+    fitted(model.parameters(), lambda: length_loss(*model(two.text[:, 0], two.acts), lengths)["total"])
+    torch.testing.assert_close(model.expected_frames(two.text[:, 0], two.acts), lengths.float(), atol=2.0, rtol=0)
+    drawn = model.sample(
+        two.text[:1, 0].expand(200, -1), two.acts[:1].expand(200, -1), torch.Generator().manual_seed(0)
+    )
+    assert drawn.float().std() > 0.5
+    assert drawn.min() >= 8
+
+
+def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
+    two = two_clips(batch)
+    model = diffusion_model().train()
+    normaliser = Normaliser.of(list(two.samples))
+    hands, objects = normaliser.encode(two.hands, two.object)
+    signal, generator = alphas_bar(), torch.Generator().manual_seed(0)
+    condition = condition_of(two, model)
+
+    def loss() -> Tensor:
+        steps = torch.randint(1000, (2,), generator=generator)
+        noised = [add_noise(x, torch.randn(x.shape, generator=generator), steps, signal) for x in (hands, objects)]
+        clean = model(noised[0], noised[1], steps, condition)
+        return (clean[0] - hands)[two.present].square().mean() + (clean[1] - objects)[two.frames].square().mean()
+
+    first = float(loss().detach())
+    assert fitted(model.parameters(), loss, 200) < 0.1 * first
+
+
+def test_normalisation_leaves_out_hands_that_do_not_act_and_comes_back(annotated: AnnotatedStore) -> None:
+    train = list(HoiDataset(annotated, "train"))
+    normaliser = Normaliser.of(train)
+    left = torch.cat([torch.from_numpy(s.hands[0]) for s in train if s.acts[0]])
+    torch.testing.assert_close(normaliser.hand_mean[0], left.mean(0), atol=1e-5, rtol=1e-4)
+    both = collate(train)
+    hands, objects = normaliser.decode(*normaliser.encode(both.hands, both.object))
+    torch.testing.assert_close(hands, both.hands, atol=1e-5, rtol=0)
+    torch.testing.assert_close(objects, both.object, atol=1e-5, rtol=0)
