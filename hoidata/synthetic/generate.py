@@ -15,12 +15,12 @@ from hoidata.synthetic.actions import ACTIONS
 from hoidata.synthetic.catalogue import object_model, object_spec
 from hoidata.synthetic.grasps import Scene
 from hoidata.synthetic.plan import DATASET_IDS, Entry, Size, plan, subjects
-from hoidata.synthetic.pools import GraspPool, search_pool
+from hoidata.synthetic.pools import GRASPS_PER_PAIR, GraspPool, search_pool
 from hoidata.synthetic.sequences import Person, draw_length, make_person, make_sequence
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
 
-_ATTEMPTS = 12
+_ATTEMPTS = 18
 _PERSON_STREAM, _POOL_STREAM = 1_000_001, 1_000_002
 
 
@@ -80,14 +80,16 @@ def _pool(task: _Task, people: list[Person], pair: HandPair) -> GraspPool:
 
 
 def _sound_sequence(task: _Task, entry: Entry, person: Person, grips, pair: HandPair) -> TruthSequence:
-    """Draw until the whole action is sound: start, size of the path and, where there are two, the grasp."""
+    """Draw until the whole action is sound: start, size of the path, the grasp (the usual ones first, then reserves)."""
     dataset, action = task.dataset, ACTIONS[task.dataset][task.action]
     spec, model = object_spec(dataset, action.object_name), object_model(dataset, action.object_name)
     number = int("".join(filter(str.isdigit, entry.subject)))
     rng = np.random.default_rng([task.seed, DATASET_IDS[dataset], entry.action, number, entry.number])
     length = draw_length(dataset, action.verb, rng)
+    usual = grips[:GRASPS_PER_PAIR]
+    order = [*(usual[(entry.number + turn) % len(usual)] for turn in range(len(usual))), *grips[GRASPS_PER_PAIR:]]
     for attempt in range(_ATTEMPTS):
-        grip = grips[(entry.number + attempt) % len(grips)]
+        grip = order[attempt % len(order)]
         truth = make_sequence(dataset, action, spec, model, grip, person, _key(task, entry), length, rng)
         if measure(truth, pair).is_sound:
             return truth

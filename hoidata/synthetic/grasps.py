@@ -32,6 +32,7 @@ STAND_RADIUS_M = 0.02
 _TORQUE_SCALE_M = 0.05
 _CLOSURE_RESIDUAL = 1e-6
 _CAPSULE_CONTACT_M = 0.002
+_NEAR_M = 0.004
 # Where the elbow may be, seen from the right wrist: towards the person and outwards, not in front.
 _ELBOW = np.array([0.5, -0.8, 0.2]) / np.linalg.norm([0.5, -0.8, 0.2])
 
@@ -295,8 +296,8 @@ def _verify_at(scene: Scene, hold: Hold, hands, meshes, pair: HandPair, angle: f
     near, touch, patches = [], [], []
     for (side, reach), (vertices, joints) in zip(hold.reaches, meshes, strict=True):
         turn = scene.upright.T @ (follow if reach.part == 1 else np.eye(3))
-        near.append(surface_distances(scene.model, hinge, vertices @ turn.T))
-        touch.append(surface_distances(scene.model, hinge, joints @ turn.T).distance_m.min(1))
+        near.append(surface_distances(scene.model, hinge, vertices @ turn.T, _NEAR_M))
+        touch.append(surface_distances(scene.model, hinge, joints @ turn.T, LARGEST_JOINT_DISTANCE_M).distance_m.min(1))
         patches.append(hand_patches(pair[side]))
     centre = body_motion(scene.model, np.eye(3)[None].repeat(n_rows, 0), np.zeros((n_rows, 3)), hinge).centre_m
     score = np.zeros(n_rows)

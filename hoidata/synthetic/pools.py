@@ -6,6 +6,7 @@ import numpy as np
 
 from hoidata.errors import HoidataError
 from hoidata.hands import HandPair
+from hoidata.physics.surface import body_motion
 from hoidata.synthetic.closing import Placement
 from hoidata.synthetic.grasps import (
     SMALLEST_HAND_GAP_M,
@@ -26,13 +27,16 @@ from hoidata.synthetic.grasps import (
 from hoidata.synthetic.hand_capsules import CapsuleHands, capsule_hands
 
 GRASPS_PER_PAIR = 2
-_ROUND = 256
-_MOST_ROUNDS = 14
-_WANTED = 6
+_KEPT = 8
+_RESERVES = 3
+_ROUND = 96
+_MOST_ROUNDS = 40
+_ENOUGH_ROUNDS = 6
+_TRIED_PER_ROUND = 6
 
 
 class GraspPool(NamedTuple):
-    """grips[subject][choice]: tuple of grips (one per hand), best choices first; at most GRASPS_PER_PAIR each."""
+    """grips[subject][choice]: tuple of grips (one per hand); the first GRASPS_PER_PAIR are used, the rest are reserves."""
 
     grips: list[list[tuple[Grip, ...]]]
 
@@ -43,22 +47,28 @@ def search_pool(scene: Scene, hold: Hold, pair: HandPair, betas: np.ndarray, rng
     own = capsule_hands(pair.right, betas)
     table: list[list[tuple[Grip, ...]]] = [[] for _ in betas]
     ranked: list[tuple[np.ndarray, list[list[tuple[Grip, ...] | None]]]] = []
-    for _ in range(_MOST_ROUNDS):
+    for round_number in range(_MOST_ROUNDS):
         placements = _promising(scene, hold, average, rng)
         if placements is None:
             continue
         ranked += _for_subjects(scene, hold, placements, own, betas, pair)
-        if sum((scores > 0).all() for scores, _ in ranked) >= _WANTED:
+        if _enough(np.array([scores > 0 for scores, _ in ranked]), round_number):
             break
     ranked.sort(key=lambda entry: (-(entry[0] > 0).sum(), -entry[0].mean()))
     for _, grips in ranked:
         for subject, grip in enumerate(grips):
-            if grip is not None and len(table[subject]) < GRASPS_PER_PAIR:
+            if grip is not None and len(table[subject]) < _KEPT:
                 table[subject].append(grip)
     missing = [index for index, grips in enumerate(table) if not grips]
     if missing:
         raise HoidataError(f"{scene.spec.name}: no {hold.hand} grasp found for subjects {missing} of {len(table)}")
     return GraspPool(table)
+
+
+def _enough(works: np.ndarray, round_number: int) -> bool:
+    """works: (placement, subject) bool. Best is a placement that all subjects can use; later, any for each will do."""
+    shared = int(works.all(axis=1).sum())
+    return shared >= GRASPS_PER_PAIR or (round_number >= _ENOUGH_ROUNDS and int(works.sum(axis=0).min()) >= _RESERVES)
 
 
 def _promising(scene: Scene, hold: Hold, hands: CapsuleHands, rng: np.random.Generator) -> list[Placement] | None:
@@ -73,7 +83,7 @@ def _promising(scene: Scene, hold: Hold, hands: CapsuleHands, rng: np.random.Gen
     if count == 0:
         return None
     sides = [side.take(np.arange(count)) for side in sides]
-    good = np.flatnonzero(_holds(scene, sides))
+    good = np.flatnonzero(_holds(scene, sides))[:_TRIED_PER_ROUND]
     return [side.placement.take(good) for side in sides] if len(good) else None
 
 
@@ -90,8 +100,6 @@ def _holds(scene: Scene, sides: list[Candidates]) -> np.ndarray:
 
 
 def _centre(scene: Scene) -> np.ndarray:
-    from hoidata.physics.surface import body_motion
-
     hinge = np.full(1, scene.hinge_rad) if scene.model.is_articulated else None
     return body_motion(scene.model, np.eye(3)[None], np.zeros((1, 3)), hinge).centre_m[0]
 

@@ -26,6 +26,8 @@ LARGEST_DISTANCE_M = 0.02
 _JOINT_TOUCH_M = 0.014
 _IDLE_M = 0.2
 _SAME_M = 1e-5
+# Vertices farther away than this are not looked at; a hand that has none nearer counts as away (infinite distance).
+_REACH_M = 0.008
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.nda
     changed = np.concatenate([[True], (np.abs(np.diff(keys, axis=0)) > 1).any(1)])
     first = np.flatnonzero(changed)
     back = np.cumsum(changed) - 1
-    found = surface_distances(truth.object.model, None if hinge is None else hinge[first], points[first])
+    found = surface_distances(truth.object.model, None if hinge is None else hinge[first], points[first], _REACH_M)
     return SurfaceDistances(*(array[back] for array in found))
 
 

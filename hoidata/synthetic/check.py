@@ -1,0 +1,113 @@
+"""The figures of an embedded corpus: are its held frames physically possible, and would wrong ones be noticed?"""
+
+import argparse
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from rich.console import Console
+from rich.table import Table
+
+from hoidata.hands import load_embedded_hands
+from hoidata.physics.contact_forces import RESIDUAL_LIMIT
+from hoidata.synthetic.generate import generate_sequences, worker_pool
+from hoidata.synthetic.plan import DATASET_IDS, Size
+from hoidata.synthetic.soundness import measure, residuals_without_contact
+from hoidata.synthetic.truth import TruthSequence
+
+SHIFT_M = 0.010
+_DIRECTIONS_SEED = 7
+
+
+class SequenceFigures(NamedTuple):
+    """Counts over the held frames of one sequence; distances in metres over its frames."""
+
+    dataset: str
+    held: int
+    feasible: int
+    feasible_shifted: int
+    feasible_without_contact: int
+    largest_distance_m: float
+    largest_penetration_m: float
+    clip_frames: int
+    verb: str
+
+
+def sequence_figures(truth: TruthSequence) -> SequenceFigures:
+    """Figures of one sequence and of its two controls: hands moved by 10 mm, and no hands."""
+    pair = load_embedded_hands()
+    sound = measure(truth, pair)
+    shifted = measure(truth, pair, _shift(truth))
+    without = residuals_without_contact(truth)
+    return SequenceFigures(
+        truth.dataset, len(sound.residual), int((sound.residual < RESIDUAL_LIMIT).sum()),
+        int((shifted.residual < RESIDUAL_LIMIT).sum()), int((without < RESIDUAL_LIMIT).sum()),
+        float(sound.distance_m.max(initial=0)), float(sound.penetration_m.max()), len(truth.clip_frames), truth.verb,
+    )  # fmt: skip
+
+
+def _shift(truth: TruthSequence) -> np.ndarray:
+    """10 mm in a direction that differs from sequence to sequence but not from run to run."""
+    seed = [_DIRECTIONS_SEED, *truth.source_key.encode(), truth.raw_start]
+    direction = np.random.default_rng(seed).normal(size=3)
+    return SHIFT_M * direction / np.linalg.norm(direction)
+
+
+def explained_by_verb(verbs: list[str], lengths: np.ndarray) -> float:
+    """Share of the variance of clip lengths that the verb's mean explains."""
+    frame = pd.DataFrame({"verb": verbs, "length": np.asarray(lengths, dtype=np.float64)})
+    residual = frame["length"] - frame.groupby("verb")["length"].transform("mean")
+    return 1.0 - float((residual**2).sum() / ((frame["length"] - frame["length"].mean()) ** 2).sum())
+
+
+def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
+    """One row per dataset: shares of held frames that pass, extremes in mm, controls, and what the verb explains."""
+    with worker_pool(jobs) as run:
+        figures = pd.DataFrame(list(run(sequence_figures, sequences)), columns=list(SequenceFigures._fields))
+    rows = []
+    for dataset, own in figures.groupby("dataset", sort=False):
+        held = own["held"].sum()
+        rows.append(
+            {
+                "dataset": dataset,
+                "sequences": len(own),
+                "held frames": int(held),
+                "pass %": 100 * own["feasible"].sum() / held,
+                "pass % shifted 10 mm": 100 * own["feasible_shifted"].sum() / held,
+                "pass % without contact": 100 * own["feasible_without_contact"].sum() / held,
+                "largest hand-object distance mm": 1000 * own["largest_distance_m"].max(),
+                "largest penetration mm": 1000 * own["largest_penetration_m"].max(),
+                "clip length explained by verb %": 100 * explained_by_verb(list(own["verb"]), own["clip_frames"].to_numpy()),
+                "longest clip": int(own["clip_frames"].max()),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def check_corpus(
+    size: Size = "full", seed: int = 0, jobs: int = 2, datasets: tuple[str, ...] = tuple(DATASET_IDS)
+) -> pd.DataFrame:
+    """Make the corpora again and measure them; the table of acceptance A2."""
+    made = [truth for dataset in datasets for truth in generate_sequences(dataset, seed, size, jobs)]
+    return check_sequences(made, jobs)
+
+
+def as_text(figures: pd.DataFrame) -> Table:
+    """The figures for the terminal, one dataset per column."""
+    table = Table("", *figures["dataset"])
+    for name in figures.columns[1:]:
+        table.add_row(name, *(f"{value:.4g}" if isinstance(value, float) else str(value) for value in figures[name]))
+    return table
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--size", choices=["full", "small"], default="full")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2)
+    chosen = parser.parse_args(arguments)
+    Console().print(as_text(check_corpus(chosen.size, chosen.seed, chosen.jobs)))
+
+
+if __name__ == "__main__":
+    main()
