@@ -15,12 +15,13 @@ from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
 from hoidata.contact import CONTACT_THRESHOLD_M, HandEvidence, ProximityIndex, acting_hands
 from hoidata.contact.stage import sample_objects
+from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import POINT_COUNT
-from hoidata.schema import SIDES, HandType, Side
+from hoidata.schema import SIDES, Clip, HandType, Side
 from hoidata.schema.splits import SplitRule, assign_split
 from hoidata.schema.store import Store, open_store
 
@@ -44,12 +45,13 @@ SPLIT_TABLE = pa.schema([("clip_id", _TEXT), ("split", _TEXT)])
 
 @dataclass(frozen=True)
 class _Annotated:
-    """One clip's result; ``sentences`` is None when no hand acts."""
+    """One clip's result; without sentences, ``reason`` says why the clip is left out."""
 
     clip_id: str
     labelled_hand: HandType | None
     evidence: HandEvidence
     sentences: FourSentences | None
+    reason: str | None
 
 
 def annotate_store(
@@ -66,7 +68,8 @@ def annotate_store(
 
     encoder: a name for ``load_encoder``, or the encoder itself. split: None puts every clip into train.
     threshold_m: a hand acts when one of its joints comes closer to one of ``points`` sampled points.
-    hands: as in ``open_store``. Clips without an acting hand are listed with that reason and get no sentence.
+    hands: as in ``open_store``. Clips without an acting hand, or without a word for their object, are listed with that
+    reason and get no sentence.
     Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing.
     """
     store = open_store(clips_folder, hands)
@@ -92,10 +95,18 @@ def _annotate_clips(store: Store, threshold_m: float, points: int) -> list[_Anno
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        hand = evidence.hand_type
-        sentences = four_sentences(clip.verb, clip.object_words, hand) if hand else None
-        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, sentences))
+        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *_sentences(clip, evidence)))
     return found
+
+
+def _sentences(clip: Clip, evidence: HandEvidence) -> tuple[FourSentences | None, str | None]:
+    """The clip's sentences, or None and the reason."""
+    if evidence.hand_type is None:
+        return None, _no_hand(evidence)
+    try:
+        return four_sentences(clip.verb, clip.object_words, evidence.hand_type), None
+    except BadInput as error:
+        return None, str(error)
 
 
 def _hand_row(item: _Annotated) -> dict:
@@ -108,11 +119,11 @@ def _hand_row(item: _Annotated) -> dict:
         **{f"min_{side}_m": distance if np.isfinite(distance) else None for side, distance in closest.items()},
         "labelled_hand": labelled,
         "agreement": None if labelled is None else labelled == found,
-        "reason": None if found else _reason(item.evidence),
+        "reason": item.reason,
     }
 
 
-def _reason(evidence: HandEvidence) -> str:
+def _no_hand(evidence: HandEvidence) -> str:
     nearest = min(evidence.closest_m(side) for side in SIDES)
     if not np.isfinite(nearest):
         return "no hand is valid in any frame"
@@ -145,8 +156,8 @@ def _counts(found: Sequence[_Annotated], sentences: Sequence[str]) -> dict[str, 
     labelled = [item for item in found if item.labelled_hand]
     return {
         "clips": len(found),
-        "annotated": len(found) - hands[None],
-        "left_out": hands[None],
+        "annotated": sum(item.sentences is not None for item in found),
+        "left_out": sum(item.sentences is None for item in found),
         **{hand: hands[hand] for hand in ("left", "right", "both")},
         "sentences": len(sentences),
         "labelled": len(labelled),

@@ -106,6 +106,9 @@ def _checked(path: str | Path, mesh: Mesh) -> Mesh:
         raise BadInput(path, "a mesh with faces", f"{len(vertices)} vertices and no face")
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise BadInput(path, f"face corners from 0 to {len(vertices) - 1}", f"{faces.min()} to {faces.max()}")
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    if not np.cross(b - a, c - a).any():
+        raise BadInput(path, "faces with area", f"{len(faces)} faces without", "repair the mesh")
     return mesh
 
 

@@ -12,7 +12,8 @@
                   distances-*.npz     frame int16, point int16, joint int8, distance_m float32: one row per entry
                   info.json           threshold_m, points, counts
 
-A clip without an acting hand has a row with a reason in hand_type.parquet and no sentence; it belongs to no split.
+A clip without an acting hand, or without words, has a row with the reason in hand_type.parquet and no sentence; it
+belongs to no split.
 """
 
 from collections.abc import Sequence
@@ -47,7 +48,7 @@ def load_annotated(root: str | Path, hands: HandPair | None = None) -> "Annotate
 
 
 class AnnotatedStore:
-    """Clips with their words and contacts, by clip id. ``ids()`` are the clips in which a hand acts."""
+    """Clips with their words and contacts, by clip id. ``ids()`` are the clips that have sentences."""
 
     def __init__(self, root: Path, store: Store) -> None:
         self.root = root
@@ -74,7 +75,7 @@ class AnnotatedStore:
         return len(self.ids())
 
     def ids(self, split: str | None = None) -> list[str]:
-        """Clips of one split, or of all, in the store's order; clips without an acting hand are left out."""
+        """Clips of one split, or of all, in the store's order; clips without sentences are left out."""
         return [key for key in self._sentences if split is None or self.splits[key] == split]
 
     def split_ids(self, split: str) -> list[str]:
@@ -94,7 +95,7 @@ class AnnotatedStore:
         return self.store.joints(clip_id, side)
 
     def hand_type(self, clip_id: str) -> HandType:
-        """The hand the proximity test found. Raises KeyError for a clip without an acting hand."""
+        """The hand the proximity test found. Raises KeyError with the reason for a clip in which none acts."""
         found = self.hand_types.at[clip_id, "hand_type"]
         if found not in ("left", "right", "both"):
             raise KeyError(f"no hand acts in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")

@@ -100,6 +100,12 @@ def test_a_clip_without_an_acting_hand_is_listed_with_its_reason_and_left_out(an
     assert annotated.annotation_info["counts"]["left_out"] == 1
 
 
+def test_a_clip_without_a_word_for_its_object_does_not_stop_the_others(tmp_path: Path) -> None:
+    annotated = load_annotated(write_all(tmp_path, [*clips()[:2], clip(5, box_model(), True, False, object_words="")]))
+    assert annotated.ids() == ["toy/s1/1", "toy/s2/2"]
+    assert "object of a sentence" in annotated.hand_types.at["toy/s5/5", "reason"]
+
+
 def test_the_labelled_hand_is_kept_beside_the_found_one(annotated: AnnotatedStore) -> None:
     agreement = annotated.hand_types["agreement"]
     assert agreement["toy/s2/2"] is True
