@@ -1,0 +1,204 @@
+"""The whole of training, evaluation and generation on the toy dataset, and what its files promise."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from safetensors import safe_open
+
+from hoidata.annotation import load_encoder
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.objects.model import ObjectModel
+from models.checkpoints import load_checkpoint, save_checkpoint
+from models.evaluation import evaluate_dataset
+from models.generation import GeneratedMotion, generate
+from models.training import TrainingConfig, learning_rate_factor, train_model
+
+POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
+TRANSFORMER = {
+    "width": 32, "layers": 1, "heads": 2, "feed_forward": 64, "dropout": 0.1, "norm_first": True, "frames_per_token": 5,
+}  # fmt: skip
+BUDGET = {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "average": 0.5}
+PARAMS = {
+    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
+    "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
+    "diffusion": {"network": {"transformer": TRANSFORMER, "contact_input": "moments"}, "training": BUDGET},
+    "refiner": {
+        "network": {"transformer": TRANSFORMER, "contact_map": False},
+        "training": BUDGET,
+        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
+    },
+}
+UPSTREAM = {"diffusion": "contact", "refiner": "diffusion"}
+EVALUATION = {"samples": 2, "refined": 1, "sampler_steps": 2, "frame_stride": 10, "contact_samples": 4}
+
+
+def train(name: str, root: Path, out: Path) -> Path:
+    upstream = {UPSTREAM[name]: out / UPSTREAM[name]} if name in UPSTREAM else {}
+    return train_model(
+        name, root, out / name, PARAMS[name], provenance=lambda facts: {"model": facts["model"]}, upstream=upstream,
+        threads=1,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("checkpoints")
+    for name in PARAMS:
+        train(name, annotated_root, out)
+    return out
+
+
+def test_training_twice_gives_the_same_bytes(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
+    for name in PARAMS:
+        again = train(name, annotated_root, tmp_path)
+        assert again.read_bytes() == (trained / name / "model.safetensors").read_bytes(), name
+        assert (tmp_path / name / "log.csv").read_bytes() == (trained / name / "log.csv").read_bytes()
+
+
+def test_a_checkpoint_has_one_metadata_key_and_says_what_it_was_trained_on(trained: Path) -> None:
+    for name in PARAMS:
+        with safe_open(trained / name / "model.safetensors", framework="pt") as stored:
+            assert list(stored.metadata()) == ["hoidata"]
+            info = json.loads(stored.metadata()["hoidata"])
+        facts = info["facts"]
+        assert facts["clips"] == {"train": ["toy/s1/0", "toy/s1/1", "toy/s1/2"], "validation": ["toy/s2/3", "toy/s2/4"]}
+        assert facts["datasets"] == {"toy": 3}
+        assert facts["synthetic"] is True
+        assert facts["hand_digest"] == load_embedded_hands().digest
+        assert facts["encoder"] == load_encoder("hash").identity
+        assert info["provenance"] == {"model": name}
+
+
+def test_saving_what_was_loaded_gives_the_same_bytes_every_time(trained: Path, tmp_path: Path) -> None:
+    original = (trained / "diffusion" / "model.safetensors").read_bytes()
+    for number in range(3):
+        loaded = load_checkpoint(trained / "diffusion", "diffusion")
+        info = {key: value for key, value in loaded.info.items() if key not in ("format", "model", "config")}
+        again = save_checkpoint(tmp_path / str(number), "diffusion", loaded.network, loaded.normaliser, info)
+        assert again.read_bytes() == original
+
+
+def test_the_log_has_training_and_validation_losses(trained: Path) -> None:
+    header, *rows = (trained / "diffusion" / "log.csv").read_text().splitlines()
+    expected = "step,validation,train_total,train_simple,train_distance_map,train_relative_orientation"
+    assert header == expected
+    assert [row.split(",")[0] for row in rows] == ["2", "4"]
+
+
+def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="no file"):
+        load_checkpoint(tmp_path, "contact")
+    with pytest.raises(BadInput, match="one of length"):
+        load_checkpoint(trained / "length", "contact")
+    broken = tmp_path / "model.safetensors"
+    broken.write_bytes(b"not a checkpoint")
+    with pytest.raises(BadInput, match="a checkpoint of hoidata"):
+        load_checkpoint(tmp_path, "contact")
+
+
+def test_unknown_settings_are_refused_with_the_known_ones(annotated_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="learning_rate"):
+        train_model("length", annotated_root, tmp_path, {"training": {"stepz": 3}})
+    with pytest.raises(BadInput, match="network"):
+        train_model("length", annotated_root, tmp_path, {"optimizer": {}})
+    with pytest.raises(BadInput, match="contact"):
+        train_model("ponytail", annotated_root, tmp_path, {})
+    with pytest.raises(BadInput, match="checkpoint folder of contact"):
+        train_model("diffusion", annotated_root, tmp_path, {})
+
+
+def test_nothing_to_train_on_gives_a_note_with_the_reason(trained: Path, tmp_path: Path) -> None:
+    root, out = tmp_path / "data", tmp_path / "out"
+    (root / "clips").mkdir(parents=True)
+    (root / "clips" / "empty.json").write_text('{"reason":"grab is not present"}')
+    written = train_model("contact", root, out / "contact", PARAMS["contact"])
+    assert json.loads(written.read_text()) == {"reason": "grab is not present"}
+    after = train_model(
+        "diffusion", trained, out / "diffusion", PARAMS["diffusion"], upstream={"contact": out / "contact"}
+    )
+    assert json.loads(after.read_text()) == {"reason": "grab is not present"}
+    figures = evaluate_dataset(root, out, tmp_path / "metrics.json", EVALUATION)
+    assert figures == {"empty": "grab is not present", "held_out_clips": 0}
+
+
+def test_evaluation_puts_every_figure_beside_its_baseline(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
+    figures = evaluate_dataset(annotated_root, trained, tmp_path / "metrics.json", EVALUATION, threads=1)
+    assert json.loads((tmp_path / "metrics.json").read_text()) == figures
+    assert figures["held_out_clips"] == 2
+    assert figures["synthetic"] is True
+    assert {"f1", "f1_mean_map", "f1_mean_map_by_index", "f1_mean_map_by_place"} <= set(figures["contact"])
+    # Training lengths 24, 32, 28 with mean 28; test lengths 24 and 33.
+    assert figures["length"]["mae_mean_length_frames"] == pytest.approx(4.5)
+    assert {"joint_error_mean_pose_mm", "joint_error_shuffled_prompt_mm"} <= set(figures["diffusion"])
+    assert {"penetration_before_mm", "contact_distance_after_mm"} <= set(figures["refiner"])
+    assert all(np.isfinite(value) for part in figures.values() if isinstance(part, dict) for value in part.values())
+
+
+def user_box() -> ObjectModel:
+    made = trimesh.creation.box((0.05, 0.08, 0.1))
+    return ObjectModel("my box", made.vertices, made.faces, np.zeros(8, np.uint8))
+
+
+def motion(trained: Path, text: str, seed: int) -> GeneratedMotion:
+    return generate(text, user_box(), trained, load_embedded_hands(), load_encoder("hash"), seed, threads=1)
+
+
+def bytes_of(made: GeneratedMotion) -> bytes:
+    arrays = [made.contact, made.clip.object.rotvec, made.clip.object.translation_m]
+    for track in made.clip.hands.values():
+        arrays += [track.wrist_m, track.global_orient, track.hand_pose, track.betas, track.valid]
+    return b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
+
+
+def test_generation_repeats_its_bytes_and_uses_only_the_hands_asked_for(trained: Path) -> None:
+    made = motion(trained, "Lift a box with the right hand.", 3)
+    assert bytes_of(made) == bytes_of(motion(trained, "Lift a box with the right hand.", 3))
+    assert bytes_of(made) != bytes_of(motion(trained, "Lift a box with the right hand.", 4))
+    assert made.clip.hands["right"].valid.all()
+    assert not made.clip.hands["left"].valid.any()
+    assert made.clip.dataset == "generated"
+    assert made.clip.synthetic
+    assert made.evidence["hand"]["source"] == "rule"
+
+
+def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(trained: Path) -> None:
+    made = motion(trained, "Pass a box with both hands.", 0)
+    np.testing.assert_array_equal(made.clip.object.translation_m[0], 0)
+    np.testing.assert_array_equal(made.clip.gravity, [0, 0, -1])
+    for side, track in made.clip.hands.items():
+        assert track.valid.all()
+        assert np.isfinite(track_joints(track, load_embedded_hands()[side])).all()
+    assert made.contact.shape == (1024,)
+    assert len(made.clip.source_frames) == made.evidence["frames"] >= 8
+
+
+def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
+    pair, encoder = load_embedded_hands(), load_encoder("hash")
+    other = replace(pair, left=replace(pair.left, template_m=pair.left.template_m * 1.1))
+    with pytest.raises(BadInput, match="hand"):
+        generate("Lift a box.", user_box(), trained, other, encoder)
+    encoder.identity = {"name": "another"}
+    with pytest.raises(BadInput, match="text features"):
+        generate("Lift a box.", user_box(), trained, pair, encoder)
+
+
+def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:
+    config = TrainingConfig(steps=110, warmup=10, schedule="cosine")
+    found = [learning_rate_factor(step, config) for step in (1, 10, 60, 110)]
+    assert found == pytest.approx([0.1, 1.0, 0.5, 0.0])
+    assert learning_rate_factor(50, TrainingConfig(steps=100)) == 1
+
+
+def test_matrix_products_stay_accurate_at_the_chosen_precision() -> None:
+    """ "medium" may mean bfloat16 products on CPUs with AMX, so it is checked where it runs."""
+    torch.set_float32_matmul_precision("medium")
+    generator = torch.Generator().manual_seed(0)
+    a, b = torch.randn(256, 256, generator=generator), torch.randn(256, 256, generator=generator)
+    exact = (a.double() @ b.double()).float()
+    assert float((a @ b - exact).norm() / exact.norm()) < 1e-2
