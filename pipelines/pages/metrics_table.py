@@ -126,9 +126,9 @@ def number(value: object) -> str:
     """A figure as text: whole numbers as they are, others with three significant digits or more."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "" if value is None else str(value)
-    if isinstance(value, int) or float(value).is_integer():
+    if isinstance(value, int):
         return f"{int(value):,}"
-    return f"{value:,.1f}" if abs(value) >= 100 else f"{value:.3g}"
+    return f"{value:,.1f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
 def _flat(figures: dict, before: str = "") -> dict[str, object]:

@@ -40,9 +40,30 @@
       this.zoom = 1;
       this.seconds = 0;
       this.playing = false;
-      this.visible = true;
+      this.visible = false;
       this.dirty = true;
       this.painted = [];
+    }
+
+    // A report holds dozens of motions: the ones in view are read first, the others one after another behind them.
+    wait() {
+      new IntersectionObserver((entries) => {
+        this.visible = entries[entries.length - 1].isIntersecting;
+        this.dirty = true;
+        if (this.visible) this.ready();
+      }, { rootMargin: "150px" }).observe(this.canvas);
+    }
+
+    ready() {
+      this.loading = this.loading || this.load().catch((error) => tell(this.figure, error));
+      return this.loading;
+    }
+
+    start() {
+      const part = startAt();
+      this.show(part === null ? 0 : part * this.duration);
+      this.play(part === null && !window.matchMedia("(prefers-reduced-motion: reduce)").matches);
+      this.draw();
     }
 
     async load() {
@@ -56,6 +77,9 @@
       this.addLights();
       this.addGround();
       this.listen();
+      this.start();
+      const drawn = document.documentElement.dataset;
+      drawn.players = String(Number(drawn.players || 0) + 1);
     }
 
     prepare(node) {
@@ -112,7 +136,6 @@
       this.canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
       this.canvas.addEventListener("keydown", (event) => this.key(event));
       new ResizeObserver(() => this.draw()).observe(this.canvas);
-      new IntersectionObserver((entries) => { this.visible = entries[0].isIntersecting; this.dirty = true; }).observe(this.canvas);
     }
 
     drag(event) {
@@ -182,6 +205,7 @@
     }
 
     draw() {
+      if (!this.mixer) return;
       const ratio = Math.min(window.devicePixelRatio || 1, 2);
       const width = Math.round(this.canvas.clientWidth * ratio), height = Math.round(this.canvas.clientHeight * ratio);
       if (!width || !height) return;
@@ -210,24 +234,11 @@
     return match ? Math.min(1, Number(match[1])) : null;
   }
 
-  function applyHash() {
-    const fraction = startAt();
-    if (fraction === null) return;
-    for (const player of players) { player.play(false); player.show(fraction * player.duration); }
-  }
-
   async function main() {
     renderer = makeRenderer();
-    const still = window.matchMedia("(prefers-reduced-motion: reduce)").matches;
-    for (const figure of document.querySelectorAll("figure.player")) {
-      const player = new Player(figure);
-      await player.load();
-      player.show(0);
-      player.play(!still);
-      players.push(player);
-    }
-    applyHash();
-    window.addEventListener("hashchange", applyHash);
+    for (const figure of document.querySelectorAll("figure.player")) players.push(new Player(figure));
+    for (const player of players) player.wait();
+    window.addEventListener("hashchange", () => { for (const player of players) if (player.mixer) player.start(); });
     let before = performance.now();
     const loop = (now) => {
       const elapsed = Math.min(0.1, (now - before) / 1000);
@@ -238,16 +249,15 @@
       }
       requestAnimationFrame(loop);
     };
-    for (const player of players) player.draw();
-    document.documentElement.dataset.players = String(players.length);
     requestAnimationFrame(loop);
+    for (const player of players) await player.ready();
   }
 
-  main().catch((error) => {
-    document.documentElement.dataset.error = String(error);
-    for (const note of document.querySelectorAll(".player .fallback")) {
-      note.hidden = false;
-      note.textContent = `This browser could not draw the motion (${error}). The GLB file beside this page plays in any glTF viewer.`;
-    }
-  });
+  function tell(figure, error) {
+    const note = figure.querySelector(".fallback");
+    note.hidden = false;
+    note.textContent = `This browser could not draw the motion (${error}).`;
+  }
+
+  main().catch((error) => { for (const figure of document.querySelectorAll("figure.player")) tell(figure, error); });
 })();

