@@ -11,6 +11,7 @@ app = typer.Typer(
     name="hoidata",
     help="Data and models for text-guided 3D hand-object interaction.",
     no_args_is_help=True,
+    add_completion=False,
     pretty_exceptions_enable=False,
 )
 app.add_typer(synth.app, name="synth", help="The embedded corpora: write them, check their physics.")

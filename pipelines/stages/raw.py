@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files.atomic import atomic_file, atomic_folder
+from hoidata.files.atomic import atomic_file
 from hoidata.lineage.digests import paths_digests, value_digest
 from hoidata.lineage.graph import read_graph
 from hoidata.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
@@ -45,13 +45,12 @@ def recipe_digest(place: Place, manifest: Manifest) -> str:
 
 def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
     """Write the corpus of the manifest's recipe into ``root``, whole or not at all."""
-    from hoidata.synthetic import write_corpus
+    from hoidata.synthetic.corpus import write_corpus
 
     recipe = manifest.recipe or {}
     if recipe.keys() != {"seed", "size"}:
         raise BadInput(place.manifest, "a recipe of seed and size", ", ".join(recipe), "restore it with git checkout")
-    with atomic_folder(root) as part:
-        write_corpus(place.dataset, part, recipe["seed"], recipe["size"], jobs())
+    write_corpus(place.dataset, root, recipe["seed"], recipe["size"], jobs())
 
 
 def require_hand(place: Place) -> None:
