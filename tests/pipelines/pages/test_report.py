@@ -84,6 +84,16 @@ def test_recorded_and_generated_motion_and_contact_maps_stand_side_by_side(train
     assert text.count("<svg") == 4
 
 
+def test_dataset_of_which_nothing_could_be_used_still_lists_why(folders, hands, tmp_path):
+    left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN", "download it again")
+    info = {"dataset": "h2o", "synthetic": True, "hand_model": {"name": hands.name, "digest": hands.digest}}
+    write_store(folders.data / "h2o" / "clips", [left_out], info)
+    text = write_report(tmp_path / "report", "embedded", ["h2o"], hands, folders).read_text()
+    assert "Empty: no sequence gave a clip." in text
+    assert "<td>finite numbers</td>" in text
+    assert "Held-out figures" not in text
+
+
 def test_report_repeats_byte_for_byte_and_fetches_nothing(folders, hands, tmp_path):
     first, second = (
         write_report(tmp_path / name, "embedded", ["grab", "arctic"], hands, folders).read_bytes() for name in "ab"
