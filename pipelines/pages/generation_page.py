@@ -12,6 +12,31 @@ from pipelines.pages.glb import write_glb
 from pipelines.pages.player import motion_player, write_motion_page
 from pipelines.pages.surface import ContactPaint
 
+# Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
+ARRAYS = {
+    "text": "the sentence",
+    "fps": "frames per second",
+    "seed": "what the motion was drawn from",
+    "gravity": "(3,) direction things fall; empty where unknown",
+    "valid": "(S, F) whether the hand takes part",
+    "joints_m": "(S, F, 21, 3) MANO's 16 joints, then the tips of index, middle, pinky, ring, thumb",
+    "coarse_joints_m": "(S, F, 21, 3) the same before refinement",
+    "vertices_m": "(S, F, 778, 3) hand meshes",
+    "wrist_m": "(S, F, 3) world position of the wrist joint",
+    "global_orient": "(S, F, 3) axis-angle about the wrist joint",
+    "hand_pose": "(S, F, 45) axis-angle of the 15 finger joints; zero is the flat hand",
+    "betas": "(S, 1 or F, 10) hand shape",
+    "object_rotvec": "(F, 3) axis-angle of world from object",
+    "object_translation_m": "(F, 3) world position of the object's origin",
+    "object_hinge_rad": "(F,) hinge angle of an articulated object",
+    "object_vertices_m": "(vertex, 3) mesh in the object's own frame",
+    "object_faces": "(face, 3) vertex numbers",
+    "object_part": "(vertex,) 1 where the hinge moves it",
+    "contact_points_m": "(P, 3) points of the object, in its own frame",
+    "contact_part": "(P,) 1 where the hinge moves the point",
+    "contact": "(P,) the contact map the motion was made for",
+}
+
 
 def write_generation(
     out_dir: str | Path, motion: GeneratedMotion, hands: HandPair, vertices: bool = False
@@ -24,7 +49,8 @@ def write_generation(
     folder.mkdir(parents=True, exist_ok=True)
     text = str(motion.evidence["text"])
     paint = generated_contact(motion)
-    write_npz(folder / "motion.npz", motion_arrays(motion, hands, vertices))
+    arrays = motion_arrays(motion, hands, vertices)
+    write_npz(folder / "motion.npz", arrays)
     write_glb(folder / "motion.glb", motion.clip, hands, paint)
     write_motion_page(
         folder / "index.html",
@@ -34,9 +60,10 @@ def write_generation(
         motion.clip.synthetic,
         subtitle="Generated motion",
         files=[
-            ("motion.npz", "joints, hand parameters, object pose and contact as plain arrays"),
             ("motion.glb", "the same motion as an animated model for any glTF 2.0 viewer"),
+            ("motion.npz", "plain arrays, metres and radians: numpy.load('motion.npz')"),
         ],
+        arrays=[(name, ARRAYS[name]) for name in arrays],
     )
     return [folder / name for name in ("motion.npz", "motion.glb", "index.html")]
 
@@ -62,15 +89,9 @@ def generation_facts(motion: GeneratedMotion) -> list[tuple[str, str]]:
 
 
 def motion_arrays(motion: GeneratedMotion, hands: HandPair, vertices: bool = False) -> dict[str, np.ndarray]:
-    """The arrays of motion.npz. Metres, radians, 30 fps, the clip's world frame; side axis: left, right.
+    """The arrays of motion.npz, as ``ARRAYS`` explains them; ``vertices_m`` only if asked.
 
-    text (); fps (); seed (); gravity (3,) or (0,); valid (2, F) bool; joints_m (2, F, 21, 3); coarse_joints_m: the same
-    before refinement; vertices_m (2, F, 778, 3) if asked
-    wrist_m (2, F, 3), global_orient (2, F, 3), hand_pose (2, F, 45): axis-angle, absolute; betas (2, 1 or F, 10)
-    object_rotvec (F, 3), object_translation_m (F, 3), object_hinge_rad (F,) if articulated
-    object_vertices_m (V, 3), object_faces (N, 3), object_part (V,)
-    contact_points_m (P, 3), contact_part (P,), contact (P,) bool: the map the motion was made for
-    Rows of a hand where ``valid`` is False are zero.
+    Metres, radians, 30 fps, the clip's world frame. Rows of a hand where ``valid`` is False are zero.
     """
     clip = motion.clip
     valid = np.stack([clip.hands[side].valid for side in SIDES])

@@ -108,11 +108,15 @@ def write_motion_page(
     subtitle: str = "",
     files: list[tuple[str, str]] | None = None,
     figures: list[dict[str, str]] | None = None,
+    arrays: list[tuple[str, str]] | None = None,
 ) -> Path:
-    """Write one self-contained page that plays ``player``; figures: ``title`` and ``svg`` (trusted)."""
+    """Write one self-contained page that plays ``player``.
+
+    facts, files, arrays: (name, text) rows. figures: dicts of ``title`` and ``svg`` (trusted markup).
+    """
     page = render_page(
         "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
-        files=files or [], figures=trusted_figures(figures or []), has_players=True,
+        files=files or [], arrays=arrays or [], figures=trusted_figures(figures or []), has_players=True,
     )  # fmt: skip
     with atomic_file(path) as part:
         part.write_text(page, encoding="utf-8")

@@ -4,7 +4,7 @@ import pytest
 from hoidata.hands import track_joints
 from hoidata.objects.sampling import sample_points
 from models.generation import GeneratedMotion
-from pipelines.pages.generation_page import write_generation
+from pipelines.pages.generation_page import ARRAYS, write_generation
 
 
 @pytest.fixture
@@ -47,3 +47,11 @@ def test_page_names_seed_hands_length_and_that_it_is_synthetic(motion, hands, tm
     assert "24 frames, 0.80 s" in page
     assert "<dd>7</dd>" in page
     assert "SYNTHETIC" in page
+
+
+def test_every_array_is_explained_on_the_page(motion, hands, tmp_path):
+    paths = write_generation(tmp_path, motion, hands, vertices=True)
+    page = paths[2].read_text()
+    with np.load(paths[0], allow_pickle=False) as archive:
+        assert set(archive.files) <= set(ARRAYS)
+        assert all(f"<dt>{name}</dt>" in page for name in archive.files)
