@@ -27,10 +27,10 @@ $(VENV)/.installed-dev: $(VENV)/.installed
 	touch $@
 
 test: install-dev
-	OMP_NUM_THREADS=1 pytest -n 2
+	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope
 
 test-fast: install-dev
-	OMP_NUM_THREADS=1 pytest -n 2 -m "not slow"
+	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow"
 
 lint: install-dev
 	ruff check .

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -24,8 +25,27 @@ PARTS = (
     ".dvc/config",
     ".dvc/.gitignore",
 )
-TINY = {"training": {"steps": 2, "batch": 4, "validate_every": 1}}
-TINY_EVALUATION = {"contact_samples": 2, "samples": 2, "refined": 1, "sampler_steps": 2, "frame_stride": 30}
+BUDGET = {"steps": 2, "batch": 4, "validate_every": 1}
+TRANSFORMER = {"width": 32, "layers": 1, "heads": 2, "feed_forward": 64, "frames_per_token": 5}
+POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
+TINY = {
+    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
+    "length": {"network": {"width": 16}, "training": BUDGET},
+    "diffusion": {"network": {"transformer": TRANSFORMER}, "training": BUDGET},
+    "refiner": {
+        "network": {"transformer": TRANSFORMER},
+        "training": BUDGET,
+        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
+    },
+}
+TINY_EVALUATION = {
+    "contact_samples": 2,
+    "samples": 2,
+    "refined": 1,
+    "sampler_steps": 2,
+    "frame_stride": 30,
+    "field_resolution": 16,
+}
 
 
 def copy_project(folder: Path) -> Path:
@@ -48,7 +68,7 @@ def make_small(folder: Path) -> None:
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
     params = yaml.safe_load((folder / "params.yaml").read_text())
     params["annotate"]["encoder"] = "hash"
-    params["train"]["demo"] = {name: {**values, **TINY} for name, values in params["train"]["demo"].items()}
+    params["train"]["demo"] = TINY
     params["evaluate"] |= TINY_EVALUATION
     write_params(folder, params)
 
@@ -80,3 +100,10 @@ def run(folder: Path, *command: str, **more: str) -> subprocess.CompletedProcess
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     return copy_project(tmp_path / "project")
+
+
+@pytest.fixture(scope="session")
+def project_tools() -> SimpleNamespace:
+    """The functions above, for tests: test modules cannot import a conftest."""
+    tools = (copy_project, set_present, write_params, environment, run)
+    return SimpleNamespace(**{tool.__name__: tool for tool in tools})

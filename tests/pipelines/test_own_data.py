@@ -1,0 +1,102 @@
+"""The profile ``own``: the user's files are registered, or refused with instructions; never synthetic ones instead."""
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+import yaml
+
+from pipelines.stages.base import Place, load_params
+from pipelines.stages.train import TrainParams
+
+
+def manifest(folder: Path, name: str) -> dict:
+    return json.loads((folder / "manifests/own" / f"{name}.json").read_text())
+
+
+def test_a_dataset_of_mano_parameters_is_refused_without_mano_with_instructions(project, tmp_path, project_tools):
+    (tmp_path / "grab").mkdir()
+    result = project_tools.run(project, "hoidata", "raw", "scan", "grab", "--root", str(tmp_path / "grab"))
+    assert result.returncode == 1
+    for part in ("mano.is.tue.mpg.de", "MANO_RIGHT.pkl", "hoidata raw scan mano", "HOIDATA_MANO"):
+        assert part in " ".join(result.stderr.split())
+    assert not manifest(project, "grab")["present"]
+
+
+def test_repro_refuses_before_dvc_starts(project, project_tools):
+    path = project / "manifests/own/grab.json"
+    path.write_text(path.read_text().replace('"present": false', '"present": true'))
+    (project / "params.yaml").write_text(
+        (project / "params.yaml").read_text().replace("profile: embedded", "profile: own")
+    )
+    result = project_tools.run(project, "hoidata", "repro")
+    assert result.returncode == 1
+    assert "no MANO files are registered" in result.stderr
+    assert "Running stage" not in result.stdout
+
+
+def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, project_tools):
+    mano = tmp_path / "mano"
+    mano.mkdir()
+    missing = project_tools.run(project, "hoidata", "raw", "scan", "mano", "--root", str(mano))
+    assert missing.returncode == 1
+    assert "no MANO_RIGHT.pkl, MANO_LEFT.pkl" in missing.stderr
+    for name in ("MANO_RIGHT.pkl", "MANO_LEFT.pkl"):
+        (mano / name).write_bytes(name.encode())
+    assert project_tools.run(project, "hoidata", "raw", "scan", "mano", "--root", str(mano)).returncode == 0
+    assert manifest(project, "hand")["present"]
+    assert str(mano) in (project / "hoidata.toml").read_text()
+    assert "profile: embedded" in (project / "params.yaml").read_text()
+
+
+def test_a_folder_without_sequences_is_not_registered(project, tmp_path, project_tools):
+    (tmp_path / "empty").mkdir()
+    result = project_tools.run(project, "hoidata", "raw", "scan", "manipnet", "--root", str(tmp_path / "empty"))
+    assert result.returncode == 1
+    assert not manifest(project, "manipnet")["present"]
+
+
+def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
+    from hoidata.errors import BadInput
+
+    path = project / "params.yaml"
+    values = yaml.safe_load(path.read_text())
+    values["train"]["sizes"] = 3
+    path.write_text(yaml.safe_dump(values))
+    with pytest.raises(BadInput, match="size, seed, demo, paper"):
+        load_params(TrainParams, "train", path)
+
+
+def test_places_of_two_profiles_never_meet():
+    embedded, own = Place("embedded", "grab", "contact"), Place("own", "grab", "contact")
+    for name in ("clips", "annotation", "contact", "checkpoint", "metrics", "report", "manifest", "hand_manifest"):
+        assert getattr(embedded, name) != getattr(own, name)
+
+
+def test_outside_of_a_project_the_command_says_so(tmp_path, project_tools):
+    result = project_tools.run(tmp_path, "hoidata", "doctor")
+    assert result.returncode == 1
+    assert "no hoidata project" in result.stderr
+
+
+@pytest.mark.slow
+def test_doctor_names_every_part(project, project_tools):
+    result = project_tools.run(project, "hoidata", "doctor", COLUMNS="200")
+    assert result.returncode == 0, result.stdout
+    for part in ("torch", "prefect server", "gpu", "hand (embedded)", "text encoder", "raw grab (own)", "CLIP"):
+        assert part in result.stdout
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("HOIDATA_MANIPNET" not in os.environ, reason="HOIDATA_MANIPNET is not set")
+def test_real_motion_capture_is_scanned_checked_and_converted(project, project_tools):
+    root = os.environ["HOIDATA_MANIPNET"]
+    scanned = project_tools.run(project, "hoidata", "raw", "scan", "manipnet", "--root", root)
+    assert scanned.returncode == 0, scanned.stderr
+    assert "profile: own" in (project / "params.yaml").read_text()
+    assert project_tools.run(project, "hoidata", "raw", "verify", "manipnet").returncode == 0
+    built = project_tools.run(project, "dvc", "repro", "raw@own-manipnet", "annotate@own-grab", HOIDATA_MANIPNET=root)
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert (project / "data/own/grab/annotation/empty.json").is_file()
+    assert len(json.loads((project / "data/own/manipnet/raw.json").read_text())["files"]) > 50

@@ -1,0 +1,149 @@
+"""The whole graph as a user runs it, with GRAB alone present, small corpora and a few steps per model."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import trimesh
+import yaml
+
+from hoidata.lineage.provenance import read_checkpoint_metadata
+
+pytestmark = pytest.mark.slow
+MODELS = ("contact", "length", "diffusion", "refiner")
+NOTHING_TO_DO = "Data and pipelines are up to date."
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory, project_tools) -> Path:
+    """A project after ``dvc repro`` with no dataset but GRAB."""
+    folder = project_tools.copy_project(tmp_path_factory.mktemp("repro") / "project")
+    project_tools.set_present(folder, {"grab"})
+    result = project_tools.run(folder, "dvc", "repro")
+    assert result.returncode == 0, result.stdout + result.stderr
+    return folder
+
+
+def test_all_models_of_the_present_dataset_are_trained_and_those_of_the_others_are_empty(built):
+    for model in MODELS:
+        assert (built / "checkpoints/embedded/grab" / model / "model.safetensors").is_file()
+        for absent in ("h2o", "arctic", "manipnet"):
+            reason = json.loads((built / "checkpoints/embedded" / absent / model / "empty.json").read_text())["reason"]
+            assert reason == f"{absent} is not present in the profile embedded"
+
+
+def test_each_checkpoint_records_what_it_was_trained_on(built):
+    for model in MODELS:
+        metadata = read_checkpoint_metadata(built / "checkpoints/embedded/grab" / model / "model.safetensors")
+        provenance = metadata["provenance"]
+        assert provenance["synthetic"] is True
+        assert provenance["datasets"] == {"grab": 4}
+        assert len(provenance["clips"]["train"]) == 4
+        assert all(clip.startswith(("grab/s1/", "grab/s2/")) for clip in provenance["clips"]["train"])
+
+
+def test_metrics_and_report_are_there_and_say_synthetic(built, project_tools):
+    shown = project_tools.run(built, "dvc", "metrics", "show", "--json").stdout
+    assert "f1_mean_map" in shown
+    assert "synthetic" in (built / "report/embedded/index.html").read_text().lower()
+
+
+def test_lineage_names_everything_behind_each_checkpoint(built, project_tools):
+    for model in MODELS:
+        result = project_tools.run(built, "hoidata", "lineage", f"checkpoints/embedded/grab/{model}", "--json")
+        assert result.returncode == 0, result.stdout + result.stderr
+        for name in (
+            "manifests/embedded/grab.json",
+            "raw@embedded-grab",
+            "convert@embedded-grab",
+            f"train.demo.{model}",
+        ):
+            assert f'"name": "{name}"' in result.stdout
+
+
+def test_lineage_says_what_has_changed_since(built, project_tools):
+    params = (built / "params.yaml").read_text()
+    values = yaml.safe_load(params)
+    values["annotate"]["threshold_m"] = 0.03
+    project_tools.write_params(built, values)
+    try:
+        result = project_tools.run(built, "hoidata", "lineage", "checkpoints/embedded/grab/contact")
+        assert result.returncode == 1
+        assert "annotate.threshold_m changed value: 0.02 -> 0.03" in result.stdout
+    finally:
+        (built / "params.yaml").write_text(params)
+
+
+def test_removing_the_raw_data_afterwards_neither_deletes_nor_retrains_anything(built, project_tools):
+    raw = built / ".hoidata/raw/embedded/grab"
+    shutil.move(raw, built / "moved")
+    try:
+        result = project_tools.run(built, "dvc", "repro")
+        assert result.returncode == 0, result.stderr
+        assert NOTHING_TO_DO in result.stdout
+        assert "Running stage" not in result.stdout
+    finally:
+        shutil.move(built / "moved", raw)
+
+
+def test_a_failing_conversion_leaves_the_clips_in_place(built, project_tools):
+    code = built / "pipelines/stages/convert.py"
+    text = code.read_text()
+    shutil.move(built / ".hoidata/raw/embedded/grab", built / "moved")
+    code.write_text(text + "\n# edited\n")
+    try:
+        result = project_tools.run(built, "dvc", "repro", "convert@embedded-grab")
+        assert result.returncode != 0
+        assert "hoidata synth write grab" in result.stdout + result.stderr
+        assert (built / "data/embedded/grab/clips/meta/sequences.parquet").is_file()
+    finally:
+        code.write_text(text)
+        shutil.move(built / "moved", built / ".hoidata/raw/embedded/grab")
+
+
+def test_going_to_the_other_profile_and_back_runs_nothing_again(built, project_tools):
+    params = (built / "params.yaml").read_text()
+    values = yaml.safe_load(params)
+    project_tools.write_params(built, {**values, "profile": "own"})
+    other = project_tools.run(built, "dvc", "repro", "train@own-grab-contact")
+    (built / "params.yaml").write_text(params)
+    assert other.returncode == 0, other.stderr
+    assert (built / "checkpoints/own/grab/contact/empty.json").is_file()
+    assert NOTHING_TO_DO in project_tools.run(built, "dvc", "repro").stdout
+
+
+def test_a_dataset_that_becomes_present_runs_its_own_stages_only(built, project_tools):
+    manifest = built / "manifests/embedded/arctic.json"
+    text = manifest.read_text()
+    project_tools.set_present(built, {"grab", "arctic"})
+    try:
+        status = json.loads(project_tools.run(built, "dvc", "status", "--json").stdout)
+        assert "raw@embedded-arctic" in status
+        assert not [stage for stage in status if "grab" in stage]
+    finally:
+        manifest.write_text(text)
+
+
+def test_the_same_seed_generates_the_same_bytes_on_a_mesh_of_the_users(built, project_tools, tmp_path):
+    trimesh.creation.box((0.06, 0.08, 0.1)).export(tmp_path / "box.obj")
+    for out in ("first", "second"):
+        result = project_tools.run(
+            built, "hoidata", "generate", "Lift a box with the right hand.", "--object", str(tmp_path / "box.obj"),
+            "--seed", "3", "--out", str(tmp_path / out),
+        )  # fmt: skip
+        assert result.returncode == 0, result.stdout + result.stderr
+    for name in ("motion.npz", "motion.glb", "index.html"):
+        first, second = (tmp_path / out / name for out in ("first", "second"))
+        assert first.read_bytes() == second.read_bytes()
+
+
+def test_generation_says_which_objects_there_are_and_which_meshes_cannot_be_meant(built, project_tools, tmp_path):
+    trimesh.creation.box((60, 80, 100)).export(tmp_path / "millimetres.obj")
+    for object_name, message in ((str(tmp_path / "millimetres.obj"), "scale the mesh to metres"), ("ufo", "one of:")):
+        result = project_tools.run(
+            built, "hoidata", "generate", "Lift it.", "--object", object_name, "--out", str(tmp_path / "out")
+        )
+        assert result.returncode == 1
+        assert message in result.stderr
+        assert "Traceback" not in result.stderr
