@@ -83,8 +83,15 @@ class _PointLayer(nn.Module):
         self.linear, self.norm, self.activate = nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), activate
 
     def forward(self, x: Tensor) -> Tensor:
-        x = self.norm(self.linear(x).flatten(0, -2)).reshape(*x.shape[:-1], -1)
+        rows = self.linear(x).flatten(0, -2)
+        # One row has no spread of its own: a dataset of one clip is normalised with the running statistics.
+        rows = self.norm(rows) if len(rows) > 1 else self._with_running_statistics(rows)
+        x = rows.reshape(*x.shape[:-1], -1)
         return x.relu() if self.activate else x
+
+    def _with_running_statistics(self, rows: Tensor) -> Tensor:
+        norm = self.norm
+        return functional.batch_norm(rows, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
 
 
 class _Alignment(nn.Module):

@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from itertools import pairwise
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from hoidata.schema.annotated import AnnotatedStore
 from hoidata.schema.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
 
 BUCKET_BATCHES = 4
+Item = TypeVar("Item")
 HAND_TYPES = ("left", "right", "both")
 
 
@@ -55,19 +57,27 @@ class Corpus:
 
 
 def batches(dataset: HoiDataset, size: int, generator: torch.Generator, with_entries: bool) -> Iterator[ClipBatch]:
-    """Endless batches; every epoch has a new order, and clips of like length share a batch to save padding."""
-    size = min(size, len(dataset))
+    """Endless batches of about ``size`` clips; every epoch has a new order and meets every clip once.
+
+    Clips of like length share a batch, which saves padding: within each stretch of a few batches they are sorted.
+    """
     epoch = 0
     while True:
         dataset.set_epoch(epoch)
         order = torch.randperm(len(dataset), generator=generator).tolist()
-        for start in range(0, len(order) - size + 1, size * BUCKET_BATCHES):
-            window = [dataset[index] for index in order[start : start + size * BUCKET_BATCHES]]
-            window.sort(key=lambda sample: (sample.length, sample.clip_id))
-            groups = [window[at : at + size] for at in range(0, len(window) - size + 1, size)]
+        for window in _split(order, size * BUCKET_BATCHES):
+            clips = sorted((dataset[index] for index in window), key=lambda sample: (sample.length, sample.clip_id))
+            groups = _split(clips, size)
             for index in torch.randperm(len(groups), generator=generator).tolist():
                 yield collate(groups[index], with_entries)
         epoch += 1
+
+
+def _split(items: list[Item], size: int) -> list[list[Item]]:
+    """The items in order, in nearly equal parts of ``size`` or a little more (fewer only where there are fewer)."""
+    parts = max(1, len(items) // size)
+    edges = [len(items) * part // parts for part in range(parts + 1)]
+    return [items[start:stop] for start, stop in pairwise(edges)]
 
 
 def any_form(batch: ClipBatch, generator: torch.Generator) -> Tensor:

@@ -18,7 +18,7 @@ from hoidata.hands import HandPair
 from hoidata.schema.annotated import AnnotatedStore, load_annotated
 from hoidata.schema.dataset import ClipBatch, ClipSample, HoiDataset, collate
 from models import metrics
-from models.checkpoints import Checkpoint, empty_reason, load_checkpoint, motion_generator
+from models.checkpoints import FILE_NAME, Checkpoint, empty_reason, load_checkpoint, motion_generator
 from models.config import build_config
 from models.contact import ContactModel, normalised_points
 from models.diffusion import Condition
@@ -30,6 +30,7 @@ from models.surface import Surface
 
 AT_ONCE = 32
 TIME_BINS = 50
+NEEDED_TO_MEASURE = {"diffusion": {"contact"}, "refiner": {"contact", "diffusion"}}
 
 
 @dataclass(frozen=True)
@@ -80,18 +81,15 @@ def _figures(root: Path, checkpoints: Path, config: EvaluationConfig, hands: Han
     if not test:
         return {"empty": "no test clips", "held_out_clips": 0}
     found: dict[str, Any] = {"held_out_clips": len(test), "synthetic": any(sample.synthetic for sample in test)}
-    available = {
-        name: folder for name in ("contact", "length", "diffusion", "refiner") if (folder := checkpoints / name)
-    }
     loaded: dict[str, Checkpoint] = {}
-    for name, folder in available.items():
-        if reason := empty_reason(folder):
+    for name in ("contact", "length", "diffusion", "refiner"):
+        if reason := empty_reason(checkpoints / name):
             found[name] = {"empty": reason}
-        else:
-            loaded[name] = load_checkpoint(folder, name)
+        elif (checkpoints / name / FILE_NAME).is_file():
+            loaded[name] = load_checkpoint(checkpoints / name, name)
     rounds = Evaluation(annotated, test, config, loaded)
     for name in loaded:
-        if name != "diffusion" or "contact" in loaded:
+        if NEEDED_TO_MEASURE.get(name, set()) <= set(loaded):
             found[name] = {key: round(value, 6) for key, value in getattr(rounds, name)().items()}
     return found
 

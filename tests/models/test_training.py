@@ -14,7 +14,10 @@ from hoidata.annotation import load_encoder
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import ObjectModel
+from hoidata.schema.annotated import AnnotatedStore
+from hoidata.schema.dataset import HoiDataset
 from models.checkpoints import load_checkpoint, save_checkpoint
+from models.corpus import batches
 from models.evaluation import evaluate_dataset
 from models.generation import GeneratedMotion, generate
 from models.training import TrainingConfig, learning_rate_factor, train_model
@@ -202,3 +205,14 @@ def test_matrix_products_stay_accurate_at_the_chosen_precision() -> None:
     a, b = torch.randn(256, 256, generator=generator), torch.randn(256, 256, generator=generator)
     exact = (a.double() @ b.double()).float()
     assert float((a @ b - exact).norm() / exact.norm()) < 1e-2
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 100])
+def test_every_epoch_meets_every_clip_once(annotated: AnnotatedStore, size: int) -> None:
+    dataset = HoiDataset(annotated, "train")
+    stream = batches(dataset, size, torch.Generator().manual_seed(0), with_entries=False)
+    for _ in range(3):
+        met: list[str] = []
+        while len(met) < len(dataset):
+            met += [sample.clip_id for sample in next(stream).samples]
+        assert sorted(met) == sorted(dataset.ids)
