@@ -41,12 +41,14 @@ def _body_and_lid(body_m: tuple[float, float, float], lid_m: tuple[float, float,
 def _base_and_lid(angles_rad: tuple[float, ...]) -> Hold:
     """Left hand on the base, right hand on the part the hinge moves; the first angle is where they arrive."""
     base = Reach((-1, -0.3, 0.0), 0.45, blend=(0, 0.8), part=0)
-    return Hold((("left", base), ("right", Reach((1, -0.4, 0.4), 0.45, blend=(0, 0.8), part=1))), angles_rad[0], angles_rad)
+    return Hold(
+        (("left", base), ("right", Reach((1, -0.4, 0.4), 0.45, blend=(0, 0.8), part=1))), angles_rad[0], angles_rad
+    )
 
 
 OPENING = _base_and_lid((0.35, 0.65, 0.95))
 CLOSING = _base_and_lid((0.95, 0.65, 0.35))
-MUG_HANDLE = Hold((("right", Reach((1, -0.25, 0.3), 0.25, (0.055, 0, 0.048), (0.2, 0.9))),))
+MUG_HANDLE = Hold((("right", Reach((1, -0.35, 0.2), 0.35, (0.079, 0, 0.045), (0.0, 0.9))),))
 TEAPOT_HANDLE = Hold((("right", Reach((0.5, -0.4, 0.9), 0.3, (0.125, 0, 0.08), (0, 0.8))),))
 HAMMER_HANDLE = Hold((("right", Reach((0.3, -0.4, 0.9), 0.3, (0.05, 0, 0.02), (0, 0.8))),))
 STEM_LEFT = Hold((("left", Reach((-1, -0.35, 0.2), 0.3, (0, 0, 0.13))),))
@@ -133,7 +135,7 @@ MEAN_LENGTH = {
         "operate": 134,
     },
 }  # fmt: skip
-LENGTH_DEVIATION = 14.0
+LENGTH_DEVIATION = 16.0
 SHORTEST_CLIP, LONGEST_CLIP = 34, 148
 
 H2O_VERB_IDS = {

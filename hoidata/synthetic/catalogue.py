@@ -90,9 +90,10 @@ def _milk() -> Solid:
 
 def _mug() -> Solid:
     cup = [(0, 0), (0.034, 0), (0.038, 0.004), (0.038, 0.095), (0.036, 0.097), (0.031, 0.095), (0.029, 0.08), (0, 0.08)]
-    grip = rounded_box((0.022, 0.02, 0.085)).moved((0.062, 0, 0.048))
-    arms = [rounded_box((0.035, 0.016, 0.014)).moved((0.047, 0, z)) for z in (0.0157, 0.0803)]
-    return united(revolved([(float(r), float(z)) for r, z in cup]), united(grip, *arms))
+    # A hook handle, open below and wide enough for four fingers.
+    grip = rounded_box((0.022, 0.022, 0.085)).moved((0.079, 0, 0.05))
+    arm = rounded_box((0.05, 0.018, 0.014)).moved((0.056, 0, 0.0853))
+    return united(revolved([(float(r), float(z)) for r, z in cup]), united(grip, arm))
 
 
 def _wineglass() -> Solid:
@@ -105,7 +106,17 @@ def _wineglass() -> Solid:
 
 def _teapot() -> Solid:
     body = revolved(
-        [(0, 0), (0.045, 0), (0.06, 0.02), (0.064, 0.05), (0.052, 0.085), (0.03, 0.1), (0.012, 0.104), (0.012, 0.12), (0, 0.122)]
+        [
+            (0, 0),
+            (0.045, 0),
+            (0.06, 0.02),
+            (0.064, 0.05),
+            (0.052, 0.085),
+            (0.03, 0.1),
+            (0.012, 0.104),
+            (0.012, 0.12),
+            (0, 0.122),
+        ]
     )
     # A side handle, as on a kyusu: a thick bar to the right.
     bar = cylinder(0.017, 0.13).rotated(Rotation.from_euler("y", 70, degrees=True).as_matrix()).moved((0.108, 0, 0.075))
@@ -130,18 +141,49 @@ def _apple() -> Solid:
 
 
 def _flashlight() -> Solid:
-    profile = [(0, 0), (0.017, 0), (0.019, 0.003), (0.019, 0.12), (0.03, 0.145), (0.03, 0.168), (0.028, 0.17), (0, 0.17)]
+    profile = [
+        (0, 0),
+        (0.017, 0),
+        (0.019, 0.003),
+        (0.019, 0.12),
+        (0.03, 0.145),
+        (0.03, 0.168),
+        (0.028, 0.17),
+        (0, 0.17),
+    ]
     upright = revolved([(float(r), float(z)) for r, z in profile])
-    return upright.moved((0, 0, -0.085)).rotated(Rotation.from_euler("y", 90, degrees=True).as_matrix()).moved((0, 0, 0.03))
+    return (
+        upright.moved((0, 0, -0.085))
+        .rotated(Rotation.from_euler("y", 90, degrees=True).as_matrix())
+        .moved((0, 0, 0.03))
+    )
 
 
 def _bowl() -> Solid:
-    profile = [(0, 0), (0.035, 0), (0.05, 0.012), (0.068, 0.045), (0.072, 0.065), (0.069, 0.067), (0.062, 0.06), (0, 0.042)]
+    profile = [
+        (0, 0),
+        (0.035, 0),
+        (0.05, 0.012),
+        (0.068, 0.045),
+        (0.072, 0.065),
+        (0.069, 0.067),
+        (0.062, 0.06),
+        (0, 0.042),
+    ]
     return revolved([(float(r), float(z)) for r, z in profile])
 
 
 def _cone_cup() -> Solid:
-    profile = [(0, 0), (0.028, 0), (0.03, 0.003), (0.038, 0.105), (0.04, 0.106), (0.04, 0.116), (0.037, 0.12), (0, 0.12)]
+    profile = [
+        (0, 0),
+        (0.028, 0),
+        (0.03, 0.003),
+        (0.038, 0.105),
+        (0.04, 0.106),
+        (0.04, 0.116),
+        (0.037, 0.12),
+        (0, 0.12),
+    ]
     return revolved([(float(r), float(z)) for r, z in profile])
 
 
@@ -149,6 +191,19 @@ def _spray() -> Solid:
     body = revolved([(0, 0), (0.03, 0), (0.033, 0.003), (0.033, 0.1), (0.018, 0.13), (0.018, 0.16), (0, 0.16)])
     head = rounded_box((0.028, 0.075, 0.03)).moved((0, -0.012, 0.172))
     return united(body, head)
+
+
+def _ketchup_bottle() -> Solid:
+    profile = [
+        (0, -0.15),
+        (0.027, -0.15),
+        (0.03, -0.147),
+        (0.033, -0.06),
+        (0.026, -0.012),
+        (0.022, -0.0005),
+        (0, -0.0005),
+    ]
+    return revolved([(float(r), float(z)) for r, z in profile]).moved((0, -0.024, 0))
 
 
 def _mixer_base() -> Solid:
@@ -188,7 +243,9 @@ GRAB_OBJECTS = (
 )
 
 
-def _hinged(name: str, words: str, width: float, depth: float, base: float, lid: float, stand_m: float = 0.0) -> ObjectSpec:
+def _hinged(
+    name: str, words: str, width: float, depth: float, base: float, lid: float, stand_m: float = 0.0
+) -> ObjectSpec:
     """Two slabs, hinged behind: width along the hinge, depth towards the person, heights of base and lid."""
     return ObjectSpec(
         name, words,
@@ -211,8 +268,7 @@ ARCTIC_OBJECTS = (
     ),
     ObjectSpec(
         "ketchup", "ketchup",
-        lambda: revolved([(0, -0.15), (0.027, -0.15), (0.03, -0.147), (0.033, -0.06), (0.026, -0.012), (0.022, -0.0005), (0, -0.0005)]).moved((0, -0.024, 0)),
-        lambda: cylinder(0.022, 0.03).moved((0, -0.024, 0.0155)),
+        _ketchup_bottle, lambda: cylinder(0.022, 0.03).moved((0, -0.024, 0.0155)),
         0.0, HINGE_BEHIND,
     ),
     ObjectSpec(

@@ -53,35 +53,37 @@ def _shift(truth: TruthSequence) -> np.ndarray:
     return SHIFT_M * direction / np.linalg.norm(direction)
 
 
-def explained_by_verb(verbs: list[str], lengths: np.ndarray) -> float:
+def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
     """Share of the variance of clip lengths that the verb's mean explains."""
-    frame = pd.DataFrame({"verb": verbs, "length": np.asarray(lengths, dtype=np.float64)})
-    residual = frame["length"] - frame.groupby("verb")["length"].transform("mean")
-    return 1.0 - float((residual**2).sum() / ((frame["length"] - frame["length"].mean()) ** 2).sum())
+    names, values = np.array(verbs), np.array(lengths, dtype=np.float64)
+    means = {verb: values[names == verb].mean() for verb in set(verbs)}
+    residual = values - np.array([means[verb] for verb in verbs])
+    return 1.0 - float((residual**2).sum() / ((values - values.mean()) ** 2).sum())
 
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
     """One row per dataset: shares of held frames that pass, extremes in mm, controls, and what the verb explains."""
     with worker_pool(jobs) as run:
-        figures = pd.DataFrame(list(run(sequence_figures, sequences)), columns=list(SequenceFigures._fields))
-    rows = []
-    for dataset, own in figures.groupby("dataset", sort=False):
-        held = own["held"].sum()
-        rows.append(
-            {
-                "dataset": dataset,
-                "sequences": len(own),
-                "held frames": int(held),
-                "pass %": 100 * own["feasible"].sum() / held,
-                "pass % shifted 10 mm": 100 * own["feasible_shifted"].sum() / held,
-                "pass % without contact": 100 * own["feasible_without_contact"].sum() / held,
-                "largest hand-object distance mm": 1000 * own["largest_distance_m"].max(),
-                "largest penetration mm": 1000 * own["largest_penetration_m"].max(),
-                "clip length explained by verb %": 100 * explained_by_verb(list(own["verb"]), own["clip_frames"].to_numpy()),
-                "longest clip": int(own["clip_frames"].max()),
-            }
-        )
-    return pd.DataFrame(rows)
+        figures: list[SequenceFigures] = list(run(sequence_figures, sequences))
+    datasets = dict.fromkeys(one.dataset for one in figures)
+    return pd.DataFrame([_row(dataset, [one for one in figures if one.dataset == dataset]) for dataset in datasets])
+
+
+def _row(dataset: str, own: list[SequenceFigures]) -> dict[str, str | int | float]:
+    held = sum(one.held for one in own)
+    return {
+        "dataset": dataset,
+        "sequences": len(own),
+        "held frames": held,
+        "pass %": 100 * sum(one.feasible for one in own) / held,
+        "pass % shifted 10 mm": 100 * sum(one.feasible_shifted for one in own) / held,
+        "pass % without contact": 100 * sum(one.feasible_without_contact for one in own) / held,
+        "largest hand-object distance mm": 1000 * max(one.largest_distance_m for one in own),
+        "largest penetration mm": 1000 * max(one.largest_penetration_m for one in own),
+        "clip length explained by verb %": 100
+        * explained_by_verb([one.verb for one in own], [one.clip_frames for one in own]),
+        "longest clip": max(one.clip_frames for one in own),
+    }
 
 
 def check_corpus(

@@ -23,7 +23,9 @@ class _WriteTask(NamedTuple):
     members: list[TruthSequence]
 
 
-def write_corpus(dataset: str, root: str | Path, seed: int = 0, size: Size = "full", jobs: int = 2) -> list[TruthSequence]:
+def write_corpus(
+    dataset: str, root: str | Path, seed: int = 0, size: Size = "full", jobs: int = 2
+) -> list[TruthSequence]:
     """Make and write the embedded corpus of "h2o", "grab" or "arctic"; what was below ``root`` is replaced whole.
 
     Returns the truth it was written from. Bytes depend on dataset, seed and size alone, never on ``jobs``.
@@ -78,7 +80,9 @@ def _write_task(task: _WriteTask) -> None:
 
 
 def _progress() -> Progress:
-    return Progress(TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn())
+    return Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
+    )
 
 
 def _shown(progress: Progress, title: str, total: int, results: Iterator[Any]) -> Iterator[Any]:

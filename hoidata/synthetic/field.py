@@ -19,7 +19,8 @@ class Field(Protocol):
 
 @dataclass(frozen=True)
 class GridField:
-    """Trilinear interpolation of exact signed distances on a grid; beyond it, a lower bound is added.
+    """Trilinear interpolation of exact signed distances on a grid; beyond it, a lower bound: the object keeps
+    MARGIN_M from the grid's faces.
 
     origin_m: (3,) first node. spacing_m: step of the grid. values_m: (x, y, z) distances at the nodes.
     """
@@ -44,7 +45,7 @@ class GridField:
             rows.append(start + z * (values[flat + offset + 1] - start))
         near = rows[0] + y * (rows[1] - rows[0])
         far = rows[2] + y * (rows[3] - rows[2])
-        return near + x * (far - near) + beyond
+        return np.where(beyond > 0, beyond + MARGIN_M, near + x * (far - near))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Making the sequences of one corpus: grasps per action, then actions until each is sound; the same for any number of jobs."""
+"""Making the sequences of one corpus: grasps per action, then actions until each is sound. Any number of jobs."""
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -69,18 +69,24 @@ def make_action(task: _Task) -> list[tuple[int, TruthSequence]]:
 
 def _person(dataset: str, seed: int, subject: str, pair: HandPair) -> Person:
     number = int("".join(filter(str.isdigit, subject)))
-    return make_person(dataset, subject, pair, np.random.default_rng([seed, DATASET_IDS[dataset], _PERSON_STREAM, number]))
+    return make_person(
+        dataset, subject, pair, np.random.default_rng([seed, DATASET_IDS[dataset], _PERSON_STREAM, number])
+    )
 
 
 def _pool(task: _Task, people: list[Person], pair: HandPair) -> GraspPool:
     action = ACTIONS[task.dataset][task.action]
-    scene = Scene(object_spec(task.dataset, action.object_name), object_model(task.dataset, action.object_name), action.hold.hinge_rad)
+    scene = Scene(
+        object_spec(task.dataset, action.object_name),
+        object_model(task.dataset, action.object_name),
+        action.hold.hinge_rad,
+    )
     rng = np.random.default_rng([task.seed, DATASET_IDS[task.dataset], _POOL_STREAM, task.action])
     return search_pool(scene, action.hold, pair, np.stack([person.betas for person in people]), rng)
 
 
 def _sound_sequence(task: _Task, entry: Entry, person: Person, grips, pair: HandPair) -> TruthSequence:
-    """Draw until the whole action is sound: start, size of the path, the grasp (the usual ones first, then reserves)."""
+    """Draw until the whole action is sound: start, size of the path, the grasp (usual ones first, then reserves)."""
     dataset, action = task.dataset, ACTIONS[task.dataset][task.action]
     spec, model = object_spec(dataset, action.object_name), object_model(dataset, action.object_name)
     number = int("".join(filter(str.isdigit, entry.subject)))
@@ -93,12 +99,18 @@ def _sound_sequence(task: _Task, entry: Entry, person: Person, grips, pair: Hand
         truth = make_sequence(dataset, action, spec, model, grip, person, _key(task, entry), length, rng)
         if measure(truth, pair).is_sound:
             return truth
-    raise HoidataError(f"{dataset}: {action.verb} {action.object_name} by {entry.subject} is not sound after {_ATTEMPTS} draws")
+    raise HoidataError(
+        f"{dataset}: {action.verb} {action.object_name} by {entry.subject} is not sound after {_ATTEMPTS} draws"
+    )
 
 
 def _key(task: _Task, entry: Entry) -> str:
     action = ACTIONS[task.dataset][task.action]
-    return f"{entry.subject}/{action.object_name}_{action.intent}_{entry.number}" if task.dataset == "grab" else entry.subject
+    return (
+        f"{entry.subject}/{action.object_name}_{action.intent}_{entry.number}"
+        if task.dataset == "grab"
+        else entry.subject
+    )
 
 
 _PLACES = ("h1", "h2", "k1", "k2", "o1", "o2")

@@ -166,7 +166,9 @@ def draw_candidates(
     low, high = vertices.min(0), vertices.max(0)
     middle = (low + high) / 2 if reach.through_m is None else np.asarray(reach.through_m)
     extent = (high - low) if reach.through_m is None else np.full(3, 0.02)
-    direction = np.asarray(reach.direction) / np.linalg.norm(reach.direction) + reach.width * rng.normal(size=(count, 3))
+    direction = np.asarray(reach.direction) / np.linalg.norm(reach.direction) + reach.width * rng.normal(
+        size=(count, 3)
+    )
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     through = middle + 0.2 * extent * rng.normal(size=(count, 3))
     placement = draw_placements(field, direction * sign, through * sign, reach.blend, rng, 0.1)
@@ -261,7 +263,9 @@ class PosedHands:
         local = rotvec_to_rotmat(self.hand_pose.reshape(-1, 15, 3))
         rotmats = np.concatenate([self.rotmats[:, None], local], axis=1)
         with torch.no_grad():
-            vertices, joints = layer(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (self.wrist_m, rotmats, self.betas)))
+            vertices, joints = layer(
+                *(torch.from_numpy(np.ascontiguousarray(a)) for a in (self.wrist_m, rotmats, self.betas))
+            )
         return vertices.numpy(), joints.numpy()
 
 
@@ -274,7 +278,9 @@ def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
         return PosedHands("right", closed.wrist_m, closed.rotmats, pose, opened, betas[rows])
     mirror = np.diag(MIRROR)
     flip = lambda rotvec: mirror_rotvec_x(rotvec.reshape(-1, 15, 3)).reshape(-1, 45)  # noqa: E731
-    return PosedHands("left", closed.wrist_m * MIRROR, mirror @ closed.rotmats @ mirror, flip(pose), flip(opened), betas[rows])
+    return PosedHands(
+        "left", closed.wrist_m * MIRROR, mirror @ closed.rotmats @ mirror, flip(pose), flip(opened), betas[rows]
+    )
 
 
 def verify(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair) -> np.ndarray:

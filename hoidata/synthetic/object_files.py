@@ -1,4 +1,4 @@
-"""Small helpers the writers of the three formats share: text, meshes, and NumPy's object files as NumPy 1 wrote them."""
+"""What the writers of the three formats share: text, meshes, and NumPy's object files as NumPy 1 wrote them."""
 
 import io
 import pickle

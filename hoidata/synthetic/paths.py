@@ -1,7 +1,7 @@
 """How objects move under each verb: a few keyframes over the phase of the action, joined by minimum-jerk curves.
 
 Offsets are metres from where the object stood, in the world (z up, person at -y, x to the person's right), rotations
-degrees about world axes through the object's middle. Written for the right hand; a left hand's path is the mirror image.
+degrees about world axes through the object's middle. Written for the right hand; a left hand's is the mirror image.
 """
 
 from dataclasses import dataclass
@@ -96,8 +96,8 @@ MOTIONS: dict[str, Motion] = {
     ),
     "pass": Motion((Key(0), Key(0.12), Key(0.5, (0, 0.14, 0.13)), Key(0.92, (0, 0.25, 0)), Key(1, (0, 0.25, 0)))),
     "toast": Motion(
-        (Key(0), Key(0.1), Key(0.32, (0, 0.02, 0.2)), Key(0.5, (-0.08, 0.16, 0.26), (0, -14, 0)), Key(0.7, (0, 0.02, 0.18)),
-         Key(0.96), Key(1))
+        (Key(0), Key(0.1), Key(0.32, (0, 0.02, 0.2)), Key(0.5, (-0.08, 0.16, 0.26), (0, -14, 0)),
+         Key(0.7, (0, 0.02, 0.18)), Key(0.96), Key(1))
     ),
     "shake": Motion(
         (Key(0), Key(0.08), Key(0.25, (0, -0.03, 0.17)), Key(0.8, (0, -0.03, 0.17)), Key(0.97), Key(1)),
@@ -108,8 +108,8 @@ MOTIONS: dict[str, Motion] = {
          Key(1, (-0.1, 0.16, 0)))
     ),
     "eat": Motion(
-        (Key(0), Key(0.08), Key(0.3, (0, -0.2, 0.27)), Key(0.45, (0, -0.12, 0.2)), Key(0.62, (0, -0.2, 0.27), (20, 0, 0)),
-         Key(0.96), Key(1))
+        (Key(0), Key(0.08), Key(0.3, (0, -0.2, 0.27)), Key(0.45, (0, -0.12, 0.2)),
+         Key(0.62, (0, -0.2, 0.27), (20, 0, 0)), Key(0.96), Key(1))
     ),
     "use": Motion(
         (Key(0), Key(0.08), Key(0.26, (0, 0.08, 0.14)), Key(0.8, (0, 0.08, 0.14)), Key(0.97), Key(1)),
@@ -129,12 +129,13 @@ MOTIONS: dict[str, Motion] = {
         Swing(0.4, 0.76, 4, (0, 0, 0.015)),
     ),
     "type": Motion(
-        (Key(0), Key(0.07), Key(0.24, (0, -0.14, 0.16), (28, 0, 0)), Key(0.8, (0, -0.14, 0.16), (28, 0, 0)), Key(0.97), Key(1)),
+        (Key(0), Key(0.07), Key(0.24, (0, -0.14, 0.16), (28, 0, 0)), Key(0.8, (0, -0.14, 0.16), (28, 0, 0)),
+         Key(0.97), Key(1)),
         Swing(0.24, 0.8, 6, (0, 0, 0.004)),
     ),
     "open": Motion(
-        (Key(0, hinge=0.35), Key(0.1, hinge=0.35), Key(0.3, (0, 0, 0.09), hinge=0.35), Key(0.75, (0, 0, 0.09), hinge=0.95),
-         Key(0.97, hinge=0.95), Key(1, hinge=0.95))
+        (Key(0, hinge=0.35), Key(0.1, hinge=0.35), Key(0.3, (0, 0, 0.09), hinge=0.35),
+         Key(0.75, (0, 0, 0.09), hinge=0.95), Key(0.97, hinge=0.95), Key(1, hinge=0.95))
     ),
     "close": Motion(
         (Key(0, hinge=0.95), Key(0.1, hinge=0.95), Key(0.3, (0, -0.02, 0.07), hinge=0.95),

@@ -36,7 +36,7 @@ _TRIED_PER_ROUND = 6
 
 
 class GraspPool(NamedTuple):
-    """grips[subject][choice]: tuple of grips (one per hand); the first GRASPS_PER_PAIR are used, the rest are reserves."""
+    """grips[subject][choice]: a tuple with one grip per hand; GRASPS_PER_PAIR are used, the others are reserves."""
 
     grips: list[list[tuple[Grip, ...]]]
 
@@ -46,7 +46,7 @@ def search_pool(scene: Scene, hold: Hold, pair: HandPair, betas: np.ndarray, rng
     average = capsule_hands(pair.right, np.zeros((1, 10)))
     own = capsule_hands(pair.right, betas)
     table: list[list[tuple[Grip, ...]]] = [[] for _ in betas]
-    ranked: list[tuple[np.ndarray, list[list[tuple[Grip, ...] | None]]]] = []
+    ranked: list[tuple[np.ndarray, list[tuple[Grip, ...] | None]]] = []
     for round_number in range(_MOST_ROUNDS):
         placements = _promising(scene, hold, average, rng)
         if placements is None:

@@ -86,7 +86,7 @@ def make_sequence(
     rotmats, translation = _object_pose(spec, model, path, rng)
     hinge = path.hinge_rad if model.is_articulated else None
     idle_absent = dataset == "h2o" and bool(rng.random() < 0.5)
-    hands = {side: _idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
+    hands: dict[Side, HandTrack] = {side: _idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
     for grip in grips:
         hands[grip.side] = _acting_hand(grip, person, model, rotmats, translation, hinge, times, timing)
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
@@ -130,7 +130,7 @@ def _object_pose(
 def _acting_hand(
     grip: Grip, person: Person, model: ObjectModel, rotmats, translation, hinge, times: np.ndarray, timing: Timing
 ) -> HandTrack:
-    """The hand fixed to its part of the object while it holds, straight away from it along its back before and after."""
+    """The hand fixed to its part of the object while it holds; before and after, straight away along its back."""
     follow = rotmats
     if grip.part == 1 and model.hinge is not None and hinge is not None:
         follow = rotmats @ rotvec_to_rotmat(model.hinge.axis * hinge[:, None])
@@ -138,7 +138,9 @@ def _acting_hand(
     arriving = 1 - minimum_jerk((times - (timing.contact_start - CLOSE - APPROACH)) / APPROACH)
     leaving = minimum_jerk((times - timing.contact_stop - OPEN) / RETREAT)
     wrist = follow @ grip.wrist_m + translation + _AWAY_M * (arriving + leaving)[:, None] * world[:, :, 1]
-    closed = minimum_jerk((times - timing.contact_start + CLOSE) / CLOSE) - minimum_jerk((times - timing.contact_stop) / OPEN)
+    closed = minimum_jerk((times - timing.contact_start + CLOSE) / CLOSE) - minimum_jerk(
+        (times - timing.contact_stop) / OPEN
+    )
     pose = grip.open_pose + closed[:, None] * (grip.hand_pose - grip.open_pose)
     return _track(person, grip.side, wrist, rotmat_to_rotvec(world), pose, True)
 
@@ -168,8 +170,11 @@ def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Gener
     betas = np.round(np.clip(0.6 * rng.normal(size=10), -1.5, 1.5), 6).astype(np.float32).astype(np.float64)
     if dataset != "grab":
         return Person(subject, betas, None)
-    meshes = {side: (pair[side].template_m + pair[side].shape_directions @ betas).astype(np.float32) for side in SIDES}
-    return Person(subject, betas, {side: mesh.astype(np.float64) for side, mesh in meshes.items()})
+    meshes: dict[Side, np.ndarray] = {}
+    for side in SIDES:
+        shaped = pair[side].template_m + pair[side].shape_directions @ betas
+        meshes[side] = shaped.astype(np.float32).astype(np.float64)
+    return Person(subject, betas, meshes)
 
 
 def _lowest_point(track: ObjectTrack) -> np.ndarray:
@@ -177,4 +182,7 @@ def _lowest_point(track: ObjectTrack) -> np.ndarray:
     model = track.model
     points = articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad)
     up = rotvec_to_rotmat(track.rotvec)[:, 2]
-    return np.einsum("fpi,fi->fp", np.broadcast_to(points, (len(up), *points.shape[1:])), up).min(1) + track.translation_m[:, 2]
+    return (
+        np.einsum("fpi,fi->fp", np.broadcast_to(points, (len(up), *points.shape[1:])), up).min(1)
+        + track.translation_m[:, 2]
+    )

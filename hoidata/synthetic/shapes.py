@@ -1,5 +1,6 @@
 """Watertight triangle meshes of simple solids: rounded boxes, solids of revolution, prisms, and their exact unions."""
 
+import itertools
 from typing import NamedTuple
 
 import igl.copyleft.cgal as cgal
@@ -113,7 +114,7 @@ def _ring_quads(n_rings: int, sections: int, wrap: bool) -> np.ndarray:
 
 def _subdivided(profile: np.ndarray, spacing_m: float) -> np.ndarray:
     pieces = [profile[:1]]
-    for start, end in zip(profile[:-1], profile[1:], strict=True):
+    for start, end in itertools.pairwise(profile):
         count = max(int(np.ceil(np.linalg.norm(end - start) / spacing_m)), 1)
         pieces.append(start + (end - start) * (np.arange(1, count + 1) / count)[:, None])
     return np.concatenate(pieces)
@@ -149,7 +150,11 @@ def united(*solids: Solid) -> Solid:
     whole = solids[0]
     for solid in solids[1:]:
         vertices, faces, _ = cgal.mesh_boolean(
-            whole.vertices_m, np.ascontiguousarray(whole.faces), solid.vertices_m, np.ascontiguousarray(solid.faces), "union"
+            whole.vertices_m,
+            np.ascontiguousarray(whole.faces),
+            solid.vertices_m,
+            np.ascontiguousarray(solid.faces),
+            "union",
         )
         whole = Solid(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64))
     return whole

@@ -61,11 +61,15 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
     """
     truth = truth.at_30_fps()
     held = np.flatnonzero(truth.held)
-    near = {side: _distances(truth, side, pair, hand_shift_m) for side in truth.acting_sides}
+    near: dict[Side, SurfaceDistances] = {
+        side: _distances(truth, side, pair, hand_shift_m) for side in truth.acting_sides
+    }
     penetration = np.max([penetration_depth_m(one) for one in near.values()], axis=0)
     distance = np.max([one.distance_m[held].min(1) for one in near.values()], axis=0)
     joint = np.max([_joint_distance(truth, side, pair, one, hand_shift_m)[held] for side, one in near.items()], axis=0)
-    return Soundness(_residuals(truth, near, pair, held), np.maximum(distance, 0), penetration, joint, _idle(truth, pair))
+    return Soundness(
+        _residuals(truth, near, pair, held), np.maximum(distance, 0), penetration, joint, _idle(truth, pair)
+    )
 
 
 def residuals_without_contact(truth: TruthSequence) -> np.ndarray:
@@ -80,7 +84,9 @@ def _wrench(truth: TruthSequence):
     return required_wrench(motion, FPS, GRAVITY), motion
 
 
-def _residuals(truth: TruthSequence, near: dict[Side, SurfaceDistances], pair: HandPair, held: np.ndarray) -> np.ndarray:
+def _residuals(
+    truth: TruthSequence, near: dict[Side, SurfaceDistances], pair: HandPair, held: np.ndarray
+) -> np.ndarray:
     wrench, motion = _wrench(truth)
     patches = {side: hand_patches(pair[side]) for side in near}
     residual = np.empty(len(held))
@@ -108,7 +114,9 @@ def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.nda
     points = _object_points(truth, track_vertices(truth.hands[side], pair[side]), shift_m)
     hinge = truth.object.hinge_rad
     angle = np.zeros(len(points)) if hinge is None else hinge
-    signature = np.concatenate([points[:, list(TIP_VERTICES)].reshape(len(points), -1), points[:, :8].reshape(len(points), -1)], 1)
+    signature = np.concatenate(
+        [points[:, list(TIP_VERTICES)].reshape(len(points), -1), points[:, :8].reshape(len(points), -1)], 1
+    )
     keys = np.round(np.column_stack([signature, angle]) / _SAME_M)
     changed = np.concatenate([[True], (np.abs(np.diff(keys, axis=0)) > 1).any(1)])
     first = np.flatnonzero(changed)

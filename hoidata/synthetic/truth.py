@@ -79,7 +79,9 @@ class TruthSequence:
         return replace(
             self,
             hands={side: _picked_hand(hand, frames) for side, hand in self.hands.items()},
-            object=replace(track, rotvec=track.rotvec[frames], translation_m=track.translation_m[frames], hinge_rad=hinge),
+            object=replace(
+                track, rotvec=track.rotvec[frames], translation_m=track.translation_m[frames], hinge_rad=hinge
+            ),
             held=self.held[frames],
             clip=_span(frames, self.clip),
             contact=_span(frames, self.contact),

@@ -47,7 +47,11 @@ def _part_parameters(name: str, vertices: np.ndarray) -> dict[str, list]:
     low, high = vertices.min(0), vertices.max(0)
     box = [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     points = vertices[np.linspace(0, len(vertices) - 1, 16).astype(int)].tolist()
-    return {f"mocap_{name}": points[:4], f"bbox_{name}": [[float(x) for x in row] for row in box], f"keypoints_{name}": points}
+    return {
+        f"mocap_{name}": points[:4],
+        f"bbox_{name}": [[float(x) for x in row] for row in box],
+        f"keypoints_{name}": points,
+    }
 
 
 def _misc(sequences: list[TruthSequence]) -> dict[str, dict]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_vertices
@@ -67,7 +67,10 @@ def _template_path(subject: str, side: Side) -> str:
 
 def write_grab_sequence(root: Path, truth: TruthSequence, pair: HandPair) -> None:
     """grab/<subject>/<object>_<intent>_<n>.npz."""
-    body = {"params": _body(truth.n_frames), "vtemp": f"tools/subject_meshes/{_gender(truth.subject)}/{truth.subject}.ply"}
+    body = {
+        "params": _body(truth.n_frames),
+        "vtemp": f"tools/subject_meshes/{_gender(truth.subject)}/{truth.subject}.ply",
+    }
     members: dict[str, Any] = {
         "gender": _gender(truth.subject),
         "sbj_id": truth.subject,
@@ -134,7 +137,7 @@ def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
     for side in truth.acting_sides:
         vertices = track_vertices(one.hands[side], pair[side]).astype(np.float64)
         local = to_object_frame(vertices, rotvec_to_rotmat(one.object.rotvec), one.object.translation_m)[0]
-        distance, index = cKDTree(local).query(track)
+        distance, index = KDTree(local).query(track)
         joint = pair[side].skin_weights.argmax(1)[index]
         ids = np.where(joint == 0, _HAND_ID[side], _FINGER_ID[side] + joint - 1)
         # A coarse mesh may have no vertex under the fingers: its nearest one is marked all the same.

@@ -50,7 +50,7 @@ def write_h2o_sequence(root: Path, members: list[TruthSequence], pair: HandPair)
 
 
 def write_h2o_lists(root: Path, sequences: list[TruthSequence]) -> None:
-    """label_split/action_*.txt: the labelled runs of each split; the test list carries no labels, as in the original."""
+    """label_split/action_*.txt: labelled runs of each split; the test list carries no labels, as in the original."""
     last = {truth.source_key: 0 for truth in sequences}
     for truth in sequences:
         last[truth.source_key] = max(last[truth.source_key], truth.raw_start + truth.n_frames + GAP_FRAMES - 1)
@@ -114,7 +114,9 @@ def _fill_rows(rows: dict[str, list[str]], truth: TruthSequence, cameras: np.nda
         rows["verb_label"][frame] = f"{H2O_VERB_IDS[truth.verb]}\n"
 
 
-def _hand_blocks(track: HandTrack, pair: HandPair, side, turn: np.ndarray, eye: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _hand_blocks(
+    track: HandTrack, pair: HandPair, side, turn: np.ndarray, eye: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """(frame, 62) flag, translation, 48 pose, 10 betas; (frame, 64) flag and 21 points; both in the camera frame."""
     n_frames = track.n_frames
     if not track.valid.any():
@@ -136,7 +138,9 @@ def _object_rows(truth: TruthSequence, turn: np.ndarray, eye: np.ndarray) -> tup
     pose[:, :3, :3] = turn @ Rotation.from_rotvec(track.rotvec).as_matrix()
     pose[:, :3, 3] = np.einsum("fij,fj->fi", turn, track.translation_m - eye)
     low, high = track.model.vertices_m.min(0), track.model.vertices_m.max(0)
-    corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    corners = np.array(
+        [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
+    )
     edges = np.array([(corners[a] + corners[b]) / 2 for a, b in _EDGES])
     points = np.concatenate([[(low + high) / 2], corners, edges])
     seen = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
