@@ -14,6 +14,7 @@ from torch.nn import functional
 
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.schema.dataset import ClipBatch
+from models.features import scaled_text
 
 HAND_FLAGS = 2
 
@@ -43,11 +44,15 @@ class ContactConfig:
 
 @dataclass(frozen=True)
 class ContactLossConfig:
-    """Weights of KL divergence and Dice term beside the mean cross-entropy; augment: turn and scale objects."""
+    """Weights of KL divergence and Dice term beside the mean cross-entropy.
+
+    augment: turn and scale objects. points: how many points of every object a step sees, drawn anew each time.
+    """
 
     kl_weight: float = 0.01
     dice_weight: float = 1.0
     augment: bool = True
+    points: int = 1024
 
 
 def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
@@ -148,7 +153,7 @@ class ContactModel(nn.Module):
         """Logits (B, N) from points (B, N, 3), sentence (B, text), hand flags (B, 2) and z (B, latent)."""
         points, scale = normalised_points(points_m)
         overall, local = self.object_net(points)
-        clip = torch.cat((overall, scale, text, acts.float(), latent), -1)
+        clip = torch.cat((overall, scale, scaled_text(text), acts.float(), latent), -1)
         mixed = self.from_point(torch.cat((local, points), -1)) + self.from_clip(clip)[:, None]
         return self.rest(mixed)[..., 0]
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hoidata.schema.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES, ClipBatch
 from models.contact import PointNet, PointNetConfig, normalised_points
-from models.features import Normaliser, proper_hands, proper_object
+from models.features import Normaliser, proper_hands, proper_object, scaled_text
 from models.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_bar, sample_motion
 from models.transformer import (
     Encoder,
@@ -147,7 +147,7 @@ class DiffusionModel(nn.Module):
         contact = condition.touched
         if self.config.contact_input == "moments":
             contact = contact_moments(condition.points_m, condition.normals, condition.touched)
-        text = self.text_in(condition.text)
+        text = self.text_in(scaled_text(condition.text))
         body = self.object_condition_in(torch.cat((condition.object, contact, scale), -1))
         if keep is not None:
             text, body = text * keep[:, :1], body * keep[:, 1:]

@@ -19,6 +19,11 @@ from hoidata.schema.dataset import HAND_FEATURES, N_ROTATIONS, OBJECT_FEATURES, 
 SMALLEST_SCALE = 0.05
 
 
+def scaled_text(text: Tensor) -> Tensor:
+    """Sentence features (..., D) at a length of sqrt(D): numbers near one, whatever length an encoder gives them."""
+    return nn.functional.normalize(text, dim=-1) * text.shape[-1] ** 0.5
+
+
 def hand_wrist_m(hands: Tensor) -> Tensor:
     """Wrist positions (..., 3) of hand features (..., 99)."""
     return hands[..., :3]

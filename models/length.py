@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.schema.dataset import MAX_FRAMES
+from models.features import scaled_text
 
 SHORTEST_FRAMES = 8
 
@@ -38,8 +39,9 @@ class LengthModel(nn.Module):
         )
 
     def forward(self, text: Tensor, acts: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_spread = self.layers(torch.cat((text, acts.float()), -1)).unbind(-1)
-        return mean + 0.5, log_spread.clamp(-4, 0) - 1
+        mean, log_spread = self.layers(torch.cat((scaled_text(text), acts.float()), -1)).unbind(-1)
+        # Between 1 and 55 frames, reached smoothly: a hard limit would have no gradient.
+        return mean + 0.5, 2 * log_spread.tanh() - 3
 
     @torch.no_grad()
     def expected_frames(self, text: Tensor, acts: Tensor) -> Tensor:

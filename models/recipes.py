@@ -49,10 +49,13 @@ class ContactRecipe:
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
+        some = torch.randperm(points.shape[1], generator=generator)[: self.weights.points].to(self.device)
+        touched = batch.touched[:, some]
         noise = torch.randn(len(batch), self.network.config.latent, generator=generator).to(self.device)
-        text = any_form(batch, generator)
-        logits, mean, log_variance = self.network(points, text, batch.acts, batch.touched, noise)
-        return contact_loss(logits, batch.touched, mean, log_variance, self.weights)
+        logits, mean, log_variance = self.network(
+            points[:, some], any_form(batch, generator), batch.acts, touched, noise
+        )
+        return contact_loss(logits, touched, mean, log_variance, self.weights)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> float:
