@@ -46,8 +46,8 @@ def _base_and_lid(angles_rad: tuple[float, ...]) -> Hold:
     )
 
 
-OPENING = _base_and_lid((0.35, 0.65, 0.95))
-CLOSING = _base_and_lid((0.95, 0.65, 0.35))
+OPENING = _base_and_lid((0.4, 0.62, 0.85))
+CLOSING = _base_and_lid((0.85, 0.62, 0.4))
 MUG_HANDLE = Hold((("right", Reach((1, -0.35, 0.2), 0.35, (0.079, 0, 0.045), (0.0, 0.9))),))
 TEAPOT_HANDLE = Hold((("right", Reach((0.5, -0.4, 0.9), 0.3, (0.125, 0, 0.08), (0, 0.8))),))
 HAMMER_HANDLE = Hold((("right", Reach((0.3, -0.4, 0.9), 0.3, (0.05, 0, 0.02), (0, 0.8))),))
@@ -109,13 +109,13 @@ ARCTIC_ACTIONS = (
     Action("place", "notebook", SIDES),
     Action("place", "phone", LEFT),
     Action("place", "ketchup", RIGHT),
-    Action("open", "box", OPENING),
+    Action("open", "capsulemachine", OPENING),
     Action("open", "microwave", OPENING),
     Action("close", "laptop", CLOSING),
     Action("close", "waffleiron", CLOSING),
     Action("sprinkle", "ketchup", LEFT),
     Action("type", "phone", RIGHT),
-    Action("operate", "microwave", _base_and_lid((0.35, 0.6, 0.85))),
+    Action("operate", "microwave", _base_and_lid((0.4, 0.62, 0.85))),
 )
 
 ACTIONS = {"h2o": H2O_ACTIONS, "grab": GRAB_ACTIONS, "arctic": ARCTIC_ACTIONS}

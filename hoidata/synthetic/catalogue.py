@@ -256,7 +256,7 @@ def _hinged(
 
 
 ARCTIC_OBJECTS = (
-    _hinged("box", "box", 0.17, 0.13, 0.08, 0.025),
+    _hinged("box", "box", 0.17, 0.13, 0.08, 0.04),
     _hinged("laptop", "laptop", 0.24, 0.18, 0.022, 0.018, 0.08),
     _hinged("notebook", "notebook", 0.15, 0.2, 0.018, 0.016, 0.08),
     _hinged("phone", "phone", 0.056, 0.09, 0.016, 0.012, 0.08),

@@ -5,7 +5,7 @@ Recipe and measured yields: placements come from a cone of directions, fingers c
 counts in the end is the hand's mesh against the object's mesh.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,6 +33,8 @@ _TORQUE_SCALE_M = 0.05
 _CLOSURE_RESIDUAL = 1e-6
 _CAPSULE_CONTACT_M = 0.002
 _NEAR_M = 0.004
+# On the way in and out: (how far the fingers are closed, how far the hand is withdrawn in metres).
+_STAGES = ((0.75, 0.0), (0.4, 0.0), (0.0, 0.0), (0.0, 0.03))
 # Where the elbow may be, seen from the right wrist: towards the person and outwards, not in front.
 _ELBOW = np.array([0.5, -0.8, 0.2]) / np.linalg.norm([0.5, -0.8, 0.2])
 
@@ -290,9 +292,28 @@ def verify(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair) ->
     """
     meshes = [hand.mesh(pair) for hand in hands]
     score = np.full(len(hands[0].wrist_m), np.inf)
-    for angle in hold.angles_rad or (hold.hinge_rad,):
+    angles = hold.angles_rad or (hold.hinge_rad,)
+    for angle in angles:
         score = np.minimum(score, _verify_at(scene, hold, hands, meshes, pair, angle))
+    for angle in {angles[0], angles[-1]}:
+        score = np.where(_comes_and_goes(scene, hold, hands, pair, angle), score, 0.0)
     return score
+
+
+def _comes_and_goes(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair, angle: float) -> np.ndarray:
+    """(row,) whether opening, half-closed and withdrawing hands, too, stay out of the object."""
+    follow = follow_lid(scene, angle)
+    clear = np.ones(len(hands[0].wrist_m), dtype=bool)
+    hinge = np.full(len(clear), angle) if scene.model.is_articulated else None
+    for (_, reach), hand in zip(hold.reaches, hands, strict=True):
+        turn = scene.upright.T @ (follow if reach.part == 1 else np.eye(3))
+        for closed, away_m in _STAGES:
+            pose = hand.open_pose + closed * (hand.hand_pose - hand.open_pose)
+            wrist = hand.wrist_m + away_m * hand.rotmats[:, :, 1]
+            vertices = replace(hand, hand_pose=pose, wrist_m=wrist).mesh(pair)[0]
+            distance = surface_distances(scene.model, hinge, vertices @ turn.T, 1e-4).distance_m
+            clear &= distance.min(1) > -LARGEST_PENETRATION_M
+    return clear
 
 
 def _verify_at(scene: Scene, hold: Hold, hands, meshes, pair: HandPair, angle: float) -> np.ndarray:

@@ -134,17 +134,17 @@ MOTIONS: dict[str, Motion] = {
         Swing(0.24, 0.8, 6, (0, 0, 0.004)),
     ),
     "open": Motion(
-        (Key(0, hinge=0.35), Key(0.1, hinge=0.35), Key(0.3, (0, 0, 0.09), hinge=0.35),
-         Key(0.75, (0, 0, 0.09), hinge=0.95), Key(0.97, hinge=0.95), Key(1, hinge=0.95))
+        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.3, (0, 0, 0.09), hinge=0.4),
+         Key(0.75, (0, 0, 0.09), hinge=0.85), Key(0.97, hinge=0.85), Key(1, hinge=0.85))
     ),
     "close": Motion(
-        (Key(0, hinge=0.95), Key(0.1, hinge=0.95), Key(0.3, (0, -0.02, 0.07), hinge=0.95),
-         Key(0.72, (0, -0.02, 0.07), hinge=0.35), Key(0.97, hinge=0.35), Key(1, hinge=0.35))
+        (Key(0, hinge=0.85), Key(0.1, hinge=0.85), Key(0.3, (0, -0.02, 0.07), hinge=0.85),
+         Key(0.72, (0, -0.02, 0.07), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
     ),
     "operate": Motion(
-        (Key(0, hinge=0.35), Key(0.1, hinge=0.35), Key(0.25, (0, -0.03, 0.05), hinge=0.35),
+        (Key(0, hinge=0.4), Key(0.1, hinge=0.4), Key(0.25, (0, -0.03, 0.05), hinge=0.4),
          Key(0.42, (0, -0.03, 0.05), hinge=0.85), Key(0.58, (0, -0.03, 0.05), hinge=0.85),
-         Key(0.78, (0, -0.03, 0.05), hinge=0.35), Key(0.97, hinge=0.35), Key(1, hinge=0.35))
+         Key(0.78, (0, -0.03, 0.05), hinge=0.4), Key(0.97, hinge=0.4), Key(1, hinge=0.4))
     ),
 }  # fmt: skip
 _MIRRORED_SHIFT = np.array([-1.0, 1.0, 1.0])

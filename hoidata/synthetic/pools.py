@@ -28,10 +28,10 @@ from hoidata.synthetic.hand_capsules import CapsuleHands, capsule_hands
 
 GRASPS_PER_PAIR = 2
 _KEPT = 8
-_RESERVES = 3
+_RESERVES = 2
 _ROUND = 96
 _MOST_ROUNDS = 40
-_ENOUGH_ROUNDS = 6
+_ENOUGH_ROUNDS = 4
 _TRIED_PER_ROUND = 6
 
 

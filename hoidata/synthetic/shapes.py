@@ -6,6 +6,7 @@ from typing import NamedTuple
 import igl.copyleft.cgal as cgal
 import numpy as np
 
+_WELD_DIGITS = 6
 Profile = list[tuple[float, float]]
 
 
@@ -156,5 +157,13 @@ def united(*solids: Solid) -> Solid:
             np.ascontiguousarray(solid.faces),
             "union",
         )
-        whole = Solid(np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64))
+        whole = _welded(vertices, faces)
     return whole
+
+
+def _welded(vertices: np.ndarray, faces: np.ndarray) -> Solid:
+    """Vertices on a grid of a micrometre, equal ones made one, collapsed triangles left out: files keep it closed."""
+    unique, inverse = np.unique(np.round(vertices, _WELD_DIGITS), axis=0, return_inverse=True)
+    a, b, c = inverse.reshape(-1)[faces].T
+    kept = (a != b) & (b != c) & (c != a)
+    return _compact(unique, np.stack([a, b, c], axis=1)[kept])
