@@ -26,15 +26,20 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Give an empty temporary folder beside ``path``; put it in the place of ``path`` when the block ends well."""
+    """Give an empty temporary folder beside ``path``; put it in the place of ``path`` when the block ends well.
+
+    The old folder is moved aside whole before it is deleted: a process killed meanwhile leaves no part of it here.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
     part.chmod(0o755)
     try:
         yield part
+        old = part.with_suffix(".old")
         if path.exists():
-            shutil.rmtree(path)
+            os.replace(path, old)
         os.replace(part, path)
+        shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -5,11 +5,13 @@ its arguments; everything else is refused before it is looked up. Every problem 
 """
 
 import io
+import math
 import pickle
 import pickletools
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import FunctionType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -58,12 +60,28 @@ class _Unpickler(pickle.Unpickler):
 
     def find_class(self, module: str, name: str) -> Any:
         try:
-            return self._allow[module, name]
+            allowed = self._allow[module, name]
         except KeyError:
             raise pickle.UnpicklingError(f"it names {module}.{name}, which is not allowed") from None
+        return _Callable(allowed) if isinstance(allowed, FunctionType) else allowed
 
     def persistent_load(self, pid: Any) -> Any:
         raise pickle.UnpicklingError("it holds a persistent id, which is not allowed")
+
+
+class _Callable:
+    """An allowed function that a pickle can call and nothing else: BUILD on it could set its defaults for all files."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._function(*arguments)
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError("it changes a function, which is not allowed")
 
 
 def _check_opcodes(data: bytes) -> None:
@@ -123,13 +141,15 @@ class _Array(np.ndarray):
     def __setstate__(self, state: tuple) -> None:  # type: ignore[override]
         _, shape, dtype, is_fortran, raw = state
         kind = _checked_dtype(dtype)
-        if kind.hasobject:
-            if not isinstance(raw, list):
-                raise pickle.UnpicklingError("an object array without a list of its items")
-        else:
-            raw = _as_bytes(raw)
         if not all(isinstance(length, int) and length >= 0 for length in shape):
             raise pickle.UnpicklingError(f"an array of shape {shape}")
+        if kind.hasobject and not isinstance(raw, list):
+            raise pickle.UnpicklingError("an object array without a list of its items")
+        raw = raw if kind.hasobject else _as_bytes(raw)
+        # NumPy trusts the length of an object array's list and reads past its end.
+        wanted = math.prod(shape) * (1 if kind.hasobject else kind.itemsize)
+        if len(raw) != wanted:
+            raise pickle.UnpicklingError(f"an array of shape {tuple(shape)} with {len(raw)} in the place of {wanted}")
         super().__setstate__((1, tuple(shape), kind, bool(is_fortran), raw))  # type: ignore[arg-type]
 
 
@@ -147,7 +167,9 @@ class _DtypeRecord:
 
 
 class _NdarrayType:
-    """Stands for ``numpy.ndarray`` where a pickle names it as the type to rebuild; cannot be called."""
+    """Stands for ``numpy.ndarray`` where a pickle names it as the type to rebuild; cannot be called or changed."""
+
+    __slots__ = ()
 
 
 _NDARRAY = _NdarrayType()

@@ -85,12 +85,14 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
 def _obj_index(word: str, n_vertices: int) -> int:
     """OBJ counts from 1; negative indices count back from the last vertex read."""
     index = int(word.split("/")[0])
+    if index == 0:
+        raise ValueError("corner 0")
     return index - 1 if index > 0 else n_vertices + index
 
 
 def _read_ply(path: Path) -> Mesh:
     with open(path, "rb") as stream:
-        fields = load_ply(stream, prefer_color="vertex", skip_materials=True)
+        fields = load_ply(stream, fix_texture=False, prefer_color="vertex", skip_materials=True)
     faces = fields.get("faces")
     triangles = np.zeros((0, 3)) if faces is None else trimesh.geometry.triangulate_quads(faces)
     return Mesh(np.asarray(fields["vertices"], dtype=np.float64), np.asarray(triangles, dtype=np.int64))

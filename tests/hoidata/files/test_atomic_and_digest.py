@@ -1,5 +1,6 @@
 import hashlib
 import math
+import shutil
 
 import pytest
 
@@ -41,6 +42,24 @@ def test_folder_is_replaced_as_a_whole_or_not_at_all(tmp_path):
         (part / "new").write_text("3")
     assert [path.name for path in target.iterdir()] == ["new"]
     assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):
+    target = tmp_path / "store"
+    with atomic_folder(target) as part:
+        (part / "old").write_text("1")
+    seen = []
+    rmtree = shutil.rmtree
+
+    def watched(folder, **options):
+        if any(folder.glob("*")):
+            seen.append((folder != target, [path.name for path in target.iterdir()]))
+        rmtree(folder, **options)
+
+    monkeypatch.setattr(shutil, "rmtree", watched)
+    with atomic_folder(target) as part:
+        (part / "new").write_text("2")
+    assert seen == [(True, ["new"])]
 
 
 def test_digests_of_file_and_bytes_agree(tmp_path):

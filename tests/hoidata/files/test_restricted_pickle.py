@@ -154,6 +154,25 @@ def test_allowed_names_refuse_harmful_arguments(data):
         restricted_load(data, ARRAYS, encoding="latin1")
 
 
+@pytest.mark.parametrize("shape", [b"M\x00\x40\x85", b"K\x02\x85", b"K\x03K\x03\x86"], ids=["many", "few", "square"])
+def test_an_object_array_that_claims_another_number_of_items_is_refused(shape):
+    """NumPy itself reads past the end of the list: such a file used to kill the process."""
+    data = pickle.dumps(np.array([1, "x", None], dtype=object), 3)
+    assert data.count(b"K\x03\x85") == 1
+    with pytest.raises(BadInput, match="in the place of"):
+        restricted_load(data.replace(b"K\x03\x85", shape), ARRAYS)
+
+
+@pytest.mark.parametrize(
+    "name", [b"builtins\nset", b"_codecs\nencode", b"numpy\nndarray", b"numpy.core.multiarray\nscalar"]
+)
+@pytest.mark.parametrize("state", [b"N}X\x0c\x00\x00\x00__defaults__K\x07\x85s\x86", b"}X\x01\x00\x00\x00aK\x07s"])
+def test_an_allowed_name_cannot_be_changed_for_the_files_that_follow(name, state):
+    with pytest.raises(BadInput):
+        restricted_load(b"\x80\x02c" + name + b"\n" + state + b"b.", ARRAYS)
+    assert restricted_load(b"\x80\x02cbuiltins\nset\n)R.", ARRAYS) == set()
+
+
 def test_every_truncation_is_a_bad_input():
     data = pickle.dumps(sample(), 2)
     for length in range(0, len(data), 7):

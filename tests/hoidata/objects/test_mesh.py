@@ -45,7 +45,41 @@ def test_a_ply_keeps_vertex_order(tmp_path: Path, encoding):
     assert read.faces.tolist() == [[0, 1, 2], [3, 4, 0]]
 
 
+PLY_WITH_TEXTURE = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+property float s
+property float t
+element face 2
+property list uchar int vertex_indices
+{per_face}end_header
+0 0 1 0.9 0.1
+0 0 0 0.2 0.3
+1 0 0 0.5 0.5
+0 1 0 0.1 0.8
+3 3 1 2{first}
+3 1 0 2{second}
+"""
+TEXTURES = {
+    "per vertex": ("", "", ""),
+    "per corner": ("property list uchar float texcoord\n", " 6 .1 .1 .2 .2 .3 .3", " 6 .7 .7 .8 .8 .3 .3"),
+}
+
+
+@pytest.mark.parametrize("kind", TEXTURES)
+def test_texture_coordinates_neither_split_nor_reorder_the_vertices_of_a_ply(tmp_path: Path, kind):
+    per_face, first, second = TEXTURES[kind]
+    (tmp_path / "a.ply").write_text(PLY_WITH_TEXTURE.format(per_face=per_face, first=first, second=second))
+    mesh = load_mesh(tmp_path / "a.ply")
+    assert mesh.vertices.tolist() == [[0, 0, 1], [0, 0, 0], [1, 0, 0], [0, 1, 0]]
+    assert mesh.faces.tolist() == [[3, 1, 2], [1, 0, 2]]
+
+
 BAD = {
+    "zero.obj": ("v 0 0 0\nv 1 0 0\nf 0 1 2\nv 0 1 0\n", "numbers"),
     "empty.obj": ("", "vertices"),
     "no_faces.obj": ("v 0 0 0\nv 1 0 0\n", "faces"),
     "words.obj": ("v 0 zero 0\nf 1 1 1\n", "numbers"),
