@@ -34,6 +34,7 @@ def check(
 
     Sound: at least 98 % of held frames pass, hands stay within 20 mm of the object and less than 10 mm inside it.
     """
+    import numpy as np
     from rich.console import Console
 
     from hoidata.errors import BadInput
@@ -44,7 +45,7 @@ def check(
         raise BadInput("--size", "full or small", size, "correct it")
     figures = check_corpus(size, seed, jobs())
     Console().print(as_text(figures))
-    sound = (
+    sound = np.asarray(
         (figures["pass %"] >= 98)
         & (figures["largest hand-object distance mm"] < 20)
         & (figures["largest penetration mm"] < 10)
