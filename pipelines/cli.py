@@ -30,8 +30,9 @@ def main() -> None:
         app()
     except HoidataError as error:
         from rich.console import Console
+        from rich.markup import escape
 
-        Console(stderr=True).print(f"[bold red]hoidata:[/] {error}", markup=True, highlight=False, soft_wrap=True)
+        Console(stderr=True).print(f"[bold red]hoidata:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
 
 

@@ -10,7 +10,7 @@ from typing import Literal
 
 from hoidata.errors import HoidataError
 from hoidata.lineage.graph import read_params
-from hoidata.lineage.manifests import read_manifest
+from hoidata.lineage.manifests import Manifest, read_manifest
 from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
@@ -76,16 +76,19 @@ def _raw(profile: str, dataset: str) -> Finding:
         return Finding(part, "broken", str(error))
     root = place.generated_raw if profile == "embedded" else own_root(dataset)
     if not manifest.present:
-        unscanned = f"; {root} is not scanned, run `hoidata raw scan {dataset} --root {root}`" if root else ""
-        return Finding(part, "absent", f"not present{unscanned}" if unscanned else _where_to_get(profile, manifest))
+        return Finding(part, "absent", _why_absent(profile, manifest, root))
     if root is None or not root.is_dir():
         remedy = "written by the stage raw" if profile == "embedded" else f"set {root_variable(dataset)}"
         return Finding(part, "absent", f"manifest is there, files are not; {remedy}")
     return Finding(part, "ok", f"{root}{' (synthetic)' if manifest.synthetic else ''}")
 
 
-def _where_to_get(profile: str, manifest) -> str:
-    return f"register at {manifest.where_to_register}" if profile == "own" else "has no embedded corpus"
+def _why_absent(profile: str, manifest: Manifest, root: Path | None) -> str:
+    if profile == "embedded":
+        return "has no embedded corpus"
+    if root:
+        return f"{root} is not scanned; run `hoidata raw scan {manifest.dataset} --root {root}`"
+    return f"get it at: {manifest.where_to_register}"
 
 
 def _hand(profile: str) -> Finding:

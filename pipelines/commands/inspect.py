@@ -12,6 +12,7 @@ def doctor() -> None:
     """Say what is installed and which raw folders, hand, encoder and GPU were found; exit code 1 if one is broken."""
     enter_project()
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     from pipelines.doctor import examine
@@ -20,7 +21,7 @@ def doctor() -> None:
     table = Table("part", "state", "found")
     colours = {"ok": "green", "absent": "yellow", "broken": "red"}
     for finding in findings:
-        table.add_row(finding.part, f"[{colours[finding.state]}]{finding.state}[/]", finding.found)
+        table.add_row(finding.part, f"[{colours[finding.state]}]{finding.state}[/]", escape(finding.found))
     Console().print(table)
     raise typer.Exit(1 if any(finding.state == "broken" for finding in findings) else 0)
 
