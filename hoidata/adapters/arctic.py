@@ -68,6 +68,10 @@ class ArcticAdapter:
     needs_mano: bool = True
     source_fps: float = 30.0
     frame_notes: str = "ARCTIC's motion-capture world, right-handed, z up, metres; gravity along -z"
+    hand_notes: str = (
+        "MANO: axis-angles relative to the mean pose, which was added; betas per sequence, translation added to the "
+        "rest wrist; left shape directions as released"
+    )
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence that has a hand or an object file; the two are paired by name, never by position."""

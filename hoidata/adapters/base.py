@@ -41,6 +41,8 @@ class Adapter(Protocol):
     needs_mano: the raw files hold MANO parameters, meaningless without the licensed MANO files.
     source_fps: frames per second of the raw files (a file's own figure wins).
     frame_notes: the world frame in one sentence: handedness, up axis, gravity or why it is unknown.
+    hand_notes: what the source's hand parameters mean: mean pose, shape, translation, and whether the left hand's
+    shape directions are taken as released (their x has the wrong sign; who fitted betas to them needs them so).
     """
 
     @property
@@ -55,6 +57,8 @@ class Adapter(Protocol):
     def source_fps(self) -> float: ...
     @property
     def frame_notes(self) -> str: ...
+    @property
+    def hand_notes(self) -> str: ...
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """Locate: the keys of all sequences below ``root``, sorted. Looks at names only, opens no motion file."""

@@ -117,6 +117,7 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
         "synthetic": synthetic,
         "hand_model": {"name": hands.name, "digest": hands.digest},
         "frame_notes": adapter.frame_notes,
+        "hand_notes": adapter.hand_notes,
         "licence": adapter.licence,
         "where_to_register": adapter.where_to_register,
         "source_fps": adapter.source_fps,

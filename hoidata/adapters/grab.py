@@ -51,6 +51,10 @@ class GrabAdapter:
     needs_mano: bool = True
     source_fps: float = 120.0
     frame_notes: str = "GRAB's motion-capture world, right-handed, z up, metres; gravity along -z"
+    hand_notes: str = (
+        "MANO: absolute axis-angles (flat mean), the subject's own rest mesh and no betas, translation added to its "
+        "rest wrist; left shape directions unused"
+    )
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``grab/sN/*.npz``."""

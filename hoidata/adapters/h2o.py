@@ -68,6 +68,10 @@ class H2OAdapter:
     needs_mano: bool = True
     source_fps: float = 30.0
     frame_notes: str = "H2O's camera-rig world, right-handed, metres; gravity unknown: its axes are not documented"
+    hand_notes: str = (
+        "MANO: absolute axis-angles (flat mean), betas per frame, translation added to the rest wrist; "
+        "left shape directions as released"
+    )
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``subjectN/<place>/<number>`` that has a cam4 folder."""

@@ -127,6 +127,7 @@ class ManipNetAdapter:
     needs_mano: bool = False
     source_fps: float = 120.0
     frame_notes: str = "Unity's world seen in a mirror with normal x: right-handed, y up, gravity along -y"
+    hand_notes: str = "17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape for the subject"
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per folder below ``sequences``; all recordings are of one subject."""

@@ -121,6 +121,11 @@ def test_the_wrist_stands_at_the_shaped_rest_wrist_plus_trans(lift, hands, formu
         assert np.linalg.norm(rest[0]) > 0.05
 
 
+def test_things_fall_along_minus_z_of_the_vicon_world(lift):
+    assert lift.gravity.tolist() == [0, 0, -1]
+    assert lift.source_fps == 30
+
+
 def test_millimetres_become_metres_in_mesh_and_translation(lift):
     np.testing.assert_allclose(lift.object.model.vertices_m, np.array(BOTTOM_MM + TOP_MM) / 1000, atol=1e-9)
     np.testing.assert_allclose(lift.object.translation_m, TRANSLATION_MM[14:44] / 1000, atol=1e-6)

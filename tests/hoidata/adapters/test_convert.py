@@ -66,6 +66,8 @@ def test_every_sequence_becomes_a_clip_and_the_store_says_where_it_comes_from(ro
     assert store.info["synthetic"]
     assert store.clip(store.ids[0]).synthetic
     assert "GRAB" in store.info["licence"]
+    assert store.info["frame_notes"] == GrabAdapter.frame_notes
+    assert store.info["hand_notes"] == GrabAdapter.hand_notes
 
 
 @pytest.mark.slow
@@ -165,6 +167,8 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     assert adapter.licence
     assert adapter.where_to_register
     assert "gravity" in adapter.frame_notes
+    assert ("MANO:" in adapter.hand_notes) == adapter.needs_mano
+    assert ("left shape directions" in adapter.hand_notes) == adapter.needs_mano
     assert adapter.source_fps >= 30
     assert pickle.loads(pickle.dumps(adapter)) == adapter
     assert adapter.sequences(tmp_path) == []

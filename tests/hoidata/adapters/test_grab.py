@@ -94,6 +94,7 @@ def test_a_file_becomes_one_clip_from_first_to_last_contact_at_30_frames_per_sec
     assert clip.source_frames.tolist() == [12, 16, 20, 24, 28, 32, 36, 40, 44]
     assert clip.source_fps == 120
     assert (clip.clip_id, clip.subject) == ("grab/s3/cubelarge_offhand_1", "s3")
+    assert clip.gravity.tolist() == [0, 0, -1]
 
 
 def test_the_last_contact_frame_is_kept_when_it_is_a_strided_one(root, load_all):
