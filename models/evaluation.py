@@ -189,7 +189,11 @@ class Evaluation:
         return *generator.sample(condition, sampler, draws), touched
 
     def refiner(self) -> dict[str, float]:
-        """Penetration and distance of contact joints of generated motions, before and after, by the exact mesh."""
+        """Penetration and distance of contact joints of generated motions, before and after, by the exact mesh.
+
+        Penetration: depth of the deepest vertex, mean over acting hands and frames. Contact joints: those within 2 cm
+        of the surface in the true clip, frame by frame; their distance to the surface in the generated motion.
+        """
         network = self.loaded["refiner"].network
         assert isinstance(network, RefinerModel)
         surface = Surface.of(self.hands, self.test, self.config.field_resolution, torch.device("cpu"))
@@ -200,29 +204,38 @@ class Evaluation:
             hands, objects, touched = self._generate(batch, batch.text[:, 0])
             refined = refine(network, surface.coarse(batch, hands, objects, touched))
             rows += self._surface_rows(batch, hands, refined, objects)
-        before, after = (np.array([row[kind] for row in rows]) for kind in ("before", "after"))
+        before, after, true = (np.array([row[kind] for row in rows]) for kind in ("before", "after", "true"))
         return {
             "clips": len(self.test),
             "motions": len(rows),
             "penetration_before_mm": float(before[:, 0].mean()),
             "penetration_after_mm": float(after[:, 0].mean()),
+            "penetration_true_mm": float(true[:, 0].mean()),
             "contact_distance_before_mm": float(np.nanmean(before[:, 1])),
             "contact_distance_after_mm": float(np.nanmean(after[:, 1])),
+            "contact_distance_true_mm": float(np.nanmean(true[:, 1])),
             "contact_motions": int(np.isfinite(before[:, 1]).sum()),
         }
 
     def _surface_rows(
         self, batch: ClipBatch, hands: Tensor, refined: Tensor, objects: Tensor
     ) -> list[dict[str, tuple[float, float]]]:
-        rows = []
-        both = [self.hands.vertices(motion, batch.betas, batch.template_m) for motion in (hands, refined)]
+        """Penetration and contact distance of every motion, before and after, and of the clip itself."""
+        motions = {"before": (hands, objects), "after": (refined, objects), "true": (batch.hands, batch.object)}
+        meshes = {
+            name: self.hands.vertices(moved, batch.betas, batch.template_m) for name, (moved, _) in motions.items()
+        }
+        stride, rows = self.config.frame_stride, []
         for index, sample in enumerate(batch.samples):
-            seen = [HandsAndObject.of(sample, mesh[index], joints[index], objects[index]) for mesh, joints in both]
-            near = seen[0].joint_distances(self.config.frame_stride) < metrics.TOUCH_M
+            seen = {
+                name: HandsAndObject.of(sample, *(part[index] for part in meshes[name]), motions[name][1][index])
+                for name in motions
+            }
+            touching = seen["true"].joint_distances(stride) < metrics.TOUCH_M
             rows.append(
                 {
-                    name: (motion.penetration_mm(self.config.frame_stride), _mean_mm(motion, near, self.config))
-                    for name, motion in zip(("before", "after"), seen, strict=True)
+                    name: (motion.penetration_mm(stride), _mean_mm(motion.joint_distances(stride), touching))
+                    for name, motion in seen.items()
                 }
             )
         return rows
@@ -275,9 +288,9 @@ class HandsAndObject:
         return None if self.hinge_rad is None else self.hinge_rad[frames]
 
 
-def _mean_mm(motion: HandsAndObject, near: np.ndarray, config: EvaluationConfig) -> float:
-    """Mean distance in millimetres of the joints that were near the surface before; NaN where none was."""
-    return float(motion.joint_distances(config.frame_stride)[near].mean() * 1000) if near.any() else float("nan")
+def _mean_mm(distances_m: np.ndarray, touching: np.ndarray) -> float:
+    """Mean distance in millimetres of the joints that touch in the truth; NaN where none does."""
+    return float(distances_m[touching].mean() * 1000) if touching.any() else float("nan")
 
 
 @torch.no_grad()

@@ -6,6 +6,7 @@ reaches the query points only. Masks are 0/1 tensors; an empty mask gives zero.
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from hoidata.schema.dataset import CONTACT_THRESHOLD_M
 
@@ -57,13 +58,15 @@ def penetration_loss(signed_distance_m: Tensor, mask: Tensor, scale_m: float = 0
     return masked_mean(depth.square().sum(-1), mask)
 
 
-def contact_loss(joint_distance_m: Tensor, coarse_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
-    """Eq. 11: squared distance to the surface of the joints that come within 2 cm of it in the coarse motion.
+def contact_loss(distance_m: Tensor, true_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
+    """Eq. 11: joints that touch (within 2 cm of the surface in the truth) come as near as they truly are.
 
-    Distances (B, 2, F, 21), unsigned or signed; mask (B, 2, F).
+    Signed distances (B, 2, F, 21), mask (B, 2, F). A joint lies a finger's radius below its skin: pulling it onto the
+    surface itself, as the paper does, would push the skin inside. Squared up to 3 cm of error, linear beyond (Huber).
     """
-    near = touching_joints(coarse_distance_m) & (mask[..., None] > 0)
-    return masked_mean((joint_distance_m / scale_m).square(), near)
+    near = touching_joints(true_distance_m) & (mask[..., None] > 0)
+    apart = (distance_m - true_distance_m) / scale_m
+    return masked_mean(2 * functional.huber_loss(apart, torch.zeros_like(apart), reduction="none", delta=3.0), near)
 
 
 def touching_joints(distance_m: Tensor) -> Tensor:

@@ -15,6 +15,7 @@ from models.sampling import TRAIN_STEPS, SamplerConfig
 from models.surface import Surface
 
 GENERATED_AT_ONCE = 32
+PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")
 
 
 @dataclass(frozen=True)
@@ -38,18 +39,31 @@ class RefinerLossConfig:
 
 @dataclass(frozen=True)
 class _Coarse:
-    """One generated motion of a clip, in metres: hands (2, F, 99), object (F, 10); and the hands to stay near, relative
-    to the object: target (2, F, 99)."""
+    """One generated motion of a clip as the refiner sees it, frame first, and the hands to stay near.
 
-    hands: Tensor
-    object: Tensor
+    seen: the tensors of :class:`CoarseMotion` that have frames, by name, (F, ...). target: (F, 2, 99), relative to the
+    object. true_distance_m: (F, 2, 21) of the joints to the surface in the clip itself.
+    """
+
+    seen: dict[str, Tensor]
     target: Tensor
+    true_distance_m: Tensor
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A batch of coarse motions with what they are compared with; side before frame."""
+
+    batch: ClipBatch
+    coarse: CoarseMotion
+    target: Tensor
+    true_distance_m: Tensor
 
 
 class RefinerRecipe:
     """Half of the coarse motions are clips noised and denoised once, as in Text2HOI's released training: they are to go
     back to the clip's own hands relative to the object. The others are sampled from noise, as in use, where no true
-    hands exist: they are to stay near themselves. All are to touch and not to penetrate."""
+    hands exist: they are to stay near themselves. All are to touch as the clip does, and not to penetrate."""
 
     needs_entries = False
 
@@ -87,36 +101,40 @@ class RefinerRecipe:
         found = self._losses(network, self.held_out, torch.Generator().manual_seed(0))
         return float(found["total"])
 
-    def _losses(
-        self, network: RefinerModel, seen: tuple[ClipBatch, CoarseMotion, Tensor], generator: torch.Generator
-    ) -> dict[str, Tensor]:
-        batch, coarse, target = seen
+    def _losses(self, network: RefinerModel, seen: _Seen, generator: torch.Generator) -> dict[str, Tensor]:
+        batch, coarse, weights = seen.batch, seen.coarse, self.weights
         refined = network(coarse)
-        change = (hands_in_object_frame(refined, coarse.object) - target) / network.reach
+        change = (hands_in_object_frame(refined, coarse.object) - seen.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
-        chosen = losses.pick_frames(batch.frames, self.weights.frames, generator)
-        present = losses.take_frames(coarse.present, chosen, 2)
-        vertices, joints = self.surface.hands.vertices(
-            losses.take_frames(refined, chosen, 2), batch.betas, batch.template_m
-        )
-        points = torch.cat((vertices[..., self.vertices, :], joints), -2)
-        _, distance, _ = self.surface.measure(batch, points, losses.take_frames(coarse.object, chosen, 1))
-        before = losses.take_frames(coarse.distance_m, chosen, 2)
-        skin, inner = distance.split([len(self.vertices), 21], -1)
+        chosen = losses.pick_frames(batch.frames, weights.frames, generator)
+        present, true = (losses.take_frames(part, chosen, 2) for part in (coarse.present, seen.true_distance_m))
+        skin, inner = self._distances(batch, losses.take_frames(refined, chosen, 2), coarse.object, chosen)
         penetration = losses.penetration_loss(skin, present)
-        contact = losses.contact_loss(inner, before, present)
-        weights = self.weights
-        total = weights.simple_weight * simple
-        total = total + weights.penetration_weight * penetration + weights.contact_weight * contact
+        contact = losses.contact_loss(inner, true, present)
+        total = weights.simple_weight * simple + weights.penetration_weight * penetration
+        total = total + weights.contact_weight * contact
         return {"total": total, "simple": simple, "penetration": penetration, "contact": contact}
 
-    def _batch(self, batch: ClipBatch, motions: list[_Coarse]) -> tuple[ClipBatch, CoarseMotion, Tensor]:
-        hands = pad_sequence([m.hands.transpose(0, 1) for m in motions], batch_first=True).transpose(1, 2)
-        target = pad_sequence([m.target.transpose(0, 1) for m in motions], batch_first=True).transpose(1, 2)
-        objects = pad_sequence([m.object for m in motions], batch_first=True)
-        with torch.no_grad():
-            coarse = self.surface.coarse(batch, hands, objects, batch.touched)
-        return batch, coarse, target
+    def _distances(self, batch: ClipBatch, hands: Tensor, objects: Tensor, chosen: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distances of some vertices (B, 2, K, V) and the joints (B, 2, K, 21) of hands in the chosen frames."""
+        vertices, joints = self.surface.hands.vertices(hands, batch.betas, batch.template_m)
+        points = torch.cat((vertices[..., self.vertices, :], joints), -2)
+        _, distance, _ = self.surface.measure(batch, points, losses.take_frames(objects, chosen, 1))
+        skin, inner = distance.split([len(self.vertices), joints.shape[-2]], -1)
+        return skin, inner
+
+    def _batch(self, batch: ClipBatch, motions: list[_Coarse]) -> _Seen:
+        padded = {
+            name: pad_sequence([motion.seen[name] for motion in motions], batch_first=True) for name in motions[0].seen
+        }
+        objects = padded.pop("object")
+        hands = {name: tensor.transpose(1, 2) for name, tensor in padded.items()}
+        target, true = (
+            pad_sequence([getattr(motion, name) for motion in motions], batch_first=True).transpose(1, 2)
+            for name in ("target", "true_distance_m")
+        )
+        common = {"present": batch.present, "points_m": batch.points_m, "touched": batch.touched}
+        return _Seen(batch, CoarseMotion(object=objects, **hands, **common), target, true)
 
     @torch.no_grad()
     def _make(self, samples: list[ClipSample], kind: str, draws: torch.Generator) -> list[_Coarse]:
@@ -127,11 +145,15 @@ class RefinerRecipe:
             rows = order[start : start + GENERATED_AT_ONCE]
             batch = collate([samples[index] for index in rows], with_entries=False).to(self.device)
             hands, objects = self._generate(batch, kind, draws)
-            true = hands_in_object_frame(batch.hands, batch.object)
-            target = true if kind == "once" else hands_in_object_frame(hands, objects)
+            coarse = self.surface.coarse(batch, hands, objects, batch.touched)
+            own = (batch.hands, batch.object) if kind == "once" else (hands, objects)
+            target = hands_in_object_frame(*own).transpose(1, 2)
+            true = self.surface.measure(batch, batch.joints_m, batch.object)[1].transpose(1, 2)
+            seen = {name: getattr(coarse, name).transpose(1, 2) for name in PER_HAND} | {"object": objects}
             for row, index in enumerate(rows):
                 stop = samples[index].length
-                made[index] = _Coarse(hands[row, :, :stop], objects[row, :stop], target[row, :, :stop])
+                parts = {name: tensor[row, :stop].clone() for name, tensor in seen.items()}
+                made[index] = _Coarse(parts, target[row, :stop].clone(), true[row, :stop].clone())
         return [made[index] for index in range(len(samples))]
 
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:

@@ -66,11 +66,14 @@ def test_penetration_counts_only_what_is_inside() -> None:
     assert float(losses.penetration_loss(distance, torch.zeros(1, 1, 1))) == 0
 
 
-def test_contact_pulls_only_joints_that_were_near() -> None:
-    before = torch.tensor([0.019, 0.021, -0.01]).reshape(1, 1, 1, 3)
-    now = torch.tensor([0.01, 5.0, 0.03]).reshape(1, 1, 1, 3)
-    # Joints one and three count: (1 cm)^2 and (3 cm)^2.
-    assert float(losses.contact_loss(now, before, torch.ones(1, 1, 1))) == pytest.approx(5.0)
+def test_contact_pulls_only_joints_that_truly_touch() -> None:
+    true = torch.tensor([0.010, 0.021, -0.010]).reshape(1, 1, 1, 3)
+    now = torch.tensor([0.020, 5.0, 0.010]).reshape(1, 1, 1, 3)
+    # Joints one and three count, off by 1 cm and 2 cm: (1 + 4) / 2.
+    assert float(losses.contact_loss(now, true, torch.ones(1, 1, 1))) == pytest.approx(2.5)
+    assert float(losses.contact_loss(true, true, torch.ones(1, 1, 1))) == 0
+    # 10 cm off: linear beyond 3 cm, 2 x 3 x (10 - 1.5) instead of 100.
+    assert float(losses.contact_loss(true + 0.1, true, torch.ones(1, 1, 1))) == pytest.approx(51, rel=1e-5)
 
 
 def test_masked_mean_of_nothing_is_zero() -> None:
