@@ -1,6 +1,6 @@
 """Checks every adapter makes on raw numbers: each failure is a BadInput that names the file, expected and got."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,13 +30,19 @@ def finite(where: str, array: np.ndarray) -> None:
         raise BadInput(where, "finite numbers", f"NaN or infinity in row {int(np.argmin(good))}")
 
 
-def rotations(where: str, matrices: np.ndarray) -> np.ndarray:
-    """Refuse 3x3 matrices (frame, 3, 3) that are not proper rotations to 1e-3."""
-    error = np.abs(matrices @ matrices.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    bad = (error > 1e-3) | (np.linalg.det(matrices) < 0)
+def rigid_transforms(folder: str, names: Sequence[str], matrices: np.ndarray) -> None:
+    """Refuse 4x4 matrices (frame, 4, 4) that do not turn and shift column vectors, to 1e-3; names: file of each frame.
+
+    A matrix written column by column has its shift in the last row, so it is noticed.
+    """
+    rotation, last_row = matrices[:, :3, :3], matrices[:, 3]
+    turn_error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    error = np.maximum(turn_error, np.abs(last_row - (0, 0, 0, 1)).max(axis=1))
+    bad = (error > 1e-3) | (np.linalg.det(rotation) < 0)
     if bad.any():
-        raise BadInput(where, "rotation matrices", f"a matrix off by {error[bad].max():.3g} in row {int(bad.argmax())}")
-    return matrices
+        first = int(bad.argmax())
+        got = f"one off by {error[first]:.3g}" if error[first] > 1e-3 else "a mirror"
+        raise BadInput(f"{folder}/{names[first]}", "a rotation and a shift above the row 0 0 0 1", got)
 
 
 def entry(where: str, mapping: Any, key: str) -> Any:

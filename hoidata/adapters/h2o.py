@@ -201,9 +201,10 @@ def _read_frames(raw: RawTree, folder: str) -> _Frames:
     _check_ids(kinds["action_label"], files, label[:, 0], len(ACTIONS))
     _check_ids(kinds["obj_pose_rt"], files, objects[:, 0], len(OBJECTS))
     camera = camera.reshape(-1, 4, 4)
-    checks.rotations(kinds["cam_pose"], camera[:, :3, :3])
-    tracked = objects[objects[:, 0] != 0, 1:].reshape(-1, 4, 4)
-    checks.rotations(kinds["obj_pose_rt"], tracked[:, :3, :3])
+    checks.rigid_transforms(kinds["cam_pose"], files, camera)
+    tracked = np.flatnonzero(objects[:, 0])
+    names = [files[frame] for frame in tracked]
+    checks.rigid_transforms(kinds["obj_pose_rt"], names, objects[tracked, 1:].reshape(-1, 4, 4))
     return _Frames(folder, int(files[0][:6]), camera, hands, objects, label[:, 0].astype(int))
 
 
@@ -219,7 +220,10 @@ def _common_files(raw: RawTree, kinds: dict[str, str]) -> list[str]:
     names = {folder: {n for n in raw.names(folder) if FRAME_FILE.fullmatch(n)} for folder in kinds.values()}
     for folder, found in names.items():
         if not found:
-            raise BadInput(folder, "a folder of NNNNNN.txt files", "none", "download the pose archive of this subject")
+            remedy = "download the pose archive of this subject"
+            if folder == kinds["action_label"]:
+                remedy += "; nothing to do for subject4, whose action labels are withheld"
+            raise BadInput(folder, "a folder of NNNNNN.txt files", "none", remedy)
     numbers = sorted(int(name[:6]) for name in set().union(*names.values()))
     expected = [f"{number:06d}.txt" for number in range(numbers[0], numbers[-1] + 1)]
     for folder, found in names.items():

@@ -7,6 +7,8 @@ from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack
 
 REMEDY = "the adapter broke a rule of Clip: report it"
 FARTHEST_M = 100.0  # a place farther from the origin than any capture room is wide means a wrong unit
+OBJECT_SIZE_M = (0.001, 10.0)  # the longest side of a mesh: millimetres or metres taken for each other are far outside
+HAND_SIZE_M = (0.05, 0.5)
 
 
 def check_clip(clip: Clip) -> Clip:
@@ -36,6 +38,7 @@ def _check_hand(where: str, track: HandTrack, n_frames: int) -> None:
         raise BadInput(f"{where}.valid", f"{n_frames} booleans", f"{track.valid.dtype} {track.valid.shape}", REMEDY)
     if track.template_m is not None:
         _check_array(f"{where}.template_m", track.template_m, (778, 3))
+        _check_size(f"{where}.template_m", track.template_m, HAND_SIZE_M)
     _check_places(f"{where}.wrist_m", track.wrist_m[track.valid])
 
 
@@ -43,6 +46,7 @@ def _check_object(where: str, track: ObjectTrack, n_frames: int) -> None:
     _check_array(f"{where}.rotvec", track.rotvec, (n_frames, 3))
     _check_array(f"{where}.translation_m", track.translation_m, (n_frames, 3))
     _check_places(f"{where}.translation_m", track.translation_m)
+    _check_size(f"{where}.model.vertices_m", track.model.vertices_m, OBJECT_SIZE_M)
     if (track.hinge_rad is not None) != track.model.is_articulated:
         raise BadInput(f"{where}.hinge_rad", "an angle exactly where the model has a hinge", "otherwise", REMEDY)
     if track.hinge_rad is not None:
@@ -60,3 +64,10 @@ def _check_places(where: str, places_m: np.ndarray) -> None:
     if len(places_m) and np.abs(places_m).max() > FARTHEST_M:
         farthest = f"{np.abs(places_m).max():.3g} m"
         raise BadInput(where, f"places within {FARTHEST_M:g} m of the origin", farthest, "check the unit of the file")
+
+
+def _check_size(where: str, vertices_m: np.ndarray, expected_m: tuple[float, float]) -> None:
+    size_m = float(np.ptp(vertices_m, axis=0).max())
+    if not expected_m[0] <= size_m <= expected_m[1]:
+        expected = f"a mesh {expected_m[0]:g} to {expected_m[1]:g} m long"
+        raise BadInput(where, expected, f"{size_m:.3g} m", "check the unit of the mesh file")

@@ -190,6 +190,12 @@ BAD_FILES = {
     "no numbers": ("action_label/000007.txt", _put("milk"), "1 numbers"),
     "an unknown label": ("action_label/000007.txt", _put("37"), "0 to 36"),
     "a matrix that is no rotation": ("cam_pose/000007.txt", _put(" ".join(["0.5"] * 16)), "rotation"),
+    "a matrix by columns": ("cam_pose/000007.txt", lambda path: write_text(path, camera(7).T), "row 0 0 0 1"),
+    "a mirror": (
+        "obj_pose_rt/000007.txt",
+        lambda path: write_text(path, [7, *(object_in_camera(7) @ np.diag([1, 1, -1, 1])).ravel()]),
+        "a mirror",
+    ),
 }
 
 
@@ -203,8 +209,17 @@ def test_a_bad_frame_file_is_named_with_what_was_expected(root, load_all, name):
     assert expected in f"{caught.value.expected} {caught.value.got}"
 
 
+def test_a_bad_object_pose_is_named_by_its_file_also_behind_frames_without_object(root, load_all):
+    folder = root / "subject2/k1/3/cam4/obj_pose_rt"
+    for frame in (0, 1):
+        write_text(folder / f"{frame:06d}.txt", np.zeros(17))
+    write_text(folder / "000007.txt", [7, *np.full(16, 0.5)])
+    with pytest.raises(BadInput, match=r"obj_pose_rt/000007\.txt"):
+        load_all(H2OAdapter(), root)
+
+
 def test_a_sequence_without_action_labels_says_so(root, load_all):
     for path in sorted((root / "subject2/k1/3/cam4/action_label").iterdir()):
         path.unlink()
-    with pytest.raises(BadInput, match="action_label"):
+    with pytest.raises(BadInput, match=r"action_label.*subject4.*withheld"):
         load_all(H2OAdapter(), root)
