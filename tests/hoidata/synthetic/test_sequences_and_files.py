@@ -1,0 +1,236 @@
+"""One action of each format, made and written; the whole small corpora are in test_corpora.py."""
+
+import io
+import json
+import zipfile
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.files.restricted_pickle import ARRAYS, restricted_load
+from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints
+from hoidata.objects.mesh import load_mesh
+from hoidata.synthetic.check import sequence_figures
+from hoidata.synthetic.corpus import write_raw
+from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
+from hoidata.synthetic.grasps import closes_force
+from hoidata.synthetic.soundness import measure
+from hoidata.synthetic.truth import TruthSequence
+
+ONE_ACTION = {"h2o": 0, "grab": 1, "arctic": 1}
+
+
+def _one(dataset: str) -> TruthSequence:
+    task = next(task for task in tasks_of(dataset, 3, "small") if task.action == ONE_ACTION[dataset])
+    made = make_action(task._replace(entries=task.entries[:1]))
+    return place_in_raw_sequences(dataset, [truth for _, truth in made])[0]
+
+
+@pytest.fixture(scope="module")
+def truths() -> dict[str, TruthSequence]:
+    return {dataset: _one(dataset) for dataset in ONE_ACTION}
+
+
+@pytest.fixture(scope="module")
+def root(truths, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("raw")
+    for dataset, truth in truths.items():
+        write_raw(dataset, [truth], folder / dataset)
+    return folder
+
+
+def test_a_cage_of_contacts_closes_force_and_a_pinch_does_not():
+    faces = np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    assert closes_force(0.05 * faces, faces, np.zeros(3))
+    assert not closes_force(0.05 * faces[:2], faces[:2], np.zeros(3))
+    pinch = np.array([[1.0, 0, 0], [-1, 0, 0], [1.0, 0, 0]])
+    assert not closes_force(0.05 * pinch, pinch, np.zeros(3))
+
+
+@pytest.mark.parametrize("dataset", ONE_ACTION)
+def test_every_held_frame_is_sound(truths, dataset):
+    sound = measure(truths[dataset], load_embedded_hands())
+    assert len(sound.residual) > 15
+    assert sound.residual.max() < 0.01
+    assert sound.distance_m.max() < 0.02
+    assert sound.penetration_m.max() < 0.01
+    assert sound.idle_m > 0.2
+    assert sound.is_sound
+
+
+@pytest.mark.parametrize("dataset", ONE_ACTION)
+def test_hands_that_are_shifted_or_missing_do_not_explain_the_motion(truths, dataset):
+    figures = sequence_figures(truths[dataset])
+    assert figures.feasible == figures.held
+    assert figures.feasible_without_contact <= 0.02 * figures.held
+    far = measure(truths[dataset], load_embedded_hands(), np.array([0.0, 0.0, 0.3]))
+    assert not far.is_sound
+    assert (far.residual > 0.01).all()
+
+
+@pytest.mark.parametrize("dataset", ONE_ACTION)
+def test_while_held_the_hand_does_not_move_against_the_object(truths, dataset):
+    truth = truths[dataset]
+    frames = np.arange(*truth.contact)
+    track = truth.object
+    rotation = Rotation.from_rotvec(track.rotvec[frames])
+    for side in truth.acting_sides:
+        local = rotation.inv().apply(truth.hands[side].wrist_m[frames] - track.translation_m[frames])
+        assert np.abs(local - local[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("dataset", ONE_ACTION)
+def test_equal_seeds_give_equal_sequences_and_other_seeds_others(truths, dataset):
+    again = _one(dataset)
+    np.testing.assert_array_equal(again.object.translation_m, truths[dataset].object.translation_m)
+    side = again.acting_sides[0]
+    np.testing.assert_array_equal(again.hands[side].hand_pose, truths[dataset].hands[side].hand_pose)
+
+
+def _npz_member(path, name):
+    with zipfile.ZipFile(path) as archive:
+        return archive.read(f"{name}.npy")
+
+
+def _unboxed(npy: bytes):
+    stream = io.BytesIO(npy)
+    assert np.lib.format.read_magic(stream) == (1, 0)
+    shape, _, kind = np.lib.format.read_array_header_1_0(stream)
+    assert shape == ()
+    assert kind == np.dtype(object)
+    return restricted_load(stream, ARRAYS).item()
+
+
+def test_grab_members_are_0d_and_pickled_as_numpy_1_did(truths, root):
+    truth = truths["grab"]
+    path = root / "grab" / "grab" / f"{truth.source_key}.npz"
+    with np.load(path, allow_pickle=False) as archive:
+        assert set(archive.files) == {
+            "gender", "sbj_id", "obj_name", "motion_intent", "framerate", "n_frames", "n_comps", "body", "lhand",
+            "rhand", "object", "table", "contact",
+        }  # fmt: skip
+        assert archive["framerate"].shape == ()
+        assert archive["motion_intent"].item() == truth.intent
+        assert archive["n_frames"].item() == truth.n_frames
+    for name in ("body", "lhand", "rhand", "object", "table", "contact"):
+        assert b"numpy._core" not in _npz_member(path, name)
+        _unboxed(_npz_member(path, name))
+    contact = _unboxed(_npz_member(path, "contact"))["object"]
+    assert contact.shape == (truth.n_frames, len(truth.object.model.vertices_m))
+    touched = np.flatnonzero((contact > 0).any(1))
+    np.testing.assert_array_equal(touched, np.arange(*truth.contact))
+    left_ids = {0, 21, *range(26, 41)}
+    assert set(np.unique(contact)) <= left_ids  # "eat apple" is done with the left hand
+
+
+def test_grab_objects_follow_the_row_vector_convention(truths, root):
+    truth = truths["grab"]
+    parameters = _unboxed(_npz_member(root / "grab" / "grab" / f"{truth.source_key}.npz", "object"))["params"]
+    mesh = load_mesh(root / "grab" / "tools/object_meshes/contact_meshes" / f"{truth.object_name}.ply")
+    frame = truth.n_frames // 2
+    rows = mesh.vertices @ Rotation.from_rotvec(parameters["global_orient"][frame]).as_matrix()
+    turn = Rotation.from_rotvec(truth.object.rotvec[frame]).as_matrix()
+    wanted = (turn @ truth.object.model.vertices_m.T).T + truth.object.translation_m[frame]
+    np.testing.assert_allclose(rows + parameters["transl"][frame], wanted, atol=1e-6)
+
+
+def test_grab_hands_add_their_translation_to_the_wrist_of_the_personal_mesh(truths, root):
+    truth, pair = truths["grab"], load_embedded_hands()
+    member = _unboxed(_npz_member(root / "grab" / "grab" / f"{truth.source_key}.npz", "lhand"))
+    personal = load_mesh(root / "grab" / member["vtemp"]).vertices
+    wrist = pair.left.joint_regressor[0] @ personal + member["params"]["transl"]
+    np.testing.assert_allclose(wrist, truth.hands["left"].wrist_m, atol=1e-6)
+    assert member["params"]["hand_pose"].shape == (truth.n_frames, 24)
+    assert member["params"]["fullpose"].shape == (truth.n_frames, 45)
+
+
+def _row(folder, kind: str, frame: int) -> np.ndarray:
+    return np.array((folder / kind / f"{frame:06d}.txt").read_text().split(), dtype=np.float64)
+
+
+def test_h2o_lines_have_the_right_counts_and_numbering(truths, root):
+    truth = truths["h2o"]
+    folder = root / "h2o" / truth.source_key / "cam4"
+    frame = truth.raw_start + truth.clip[0]
+    counts = {"cam_pose": 16, "hand_pose": 128, "hand_pose_mano": 124, "obj_pose": 64, "obj_pose_rt": 17,
+              "action_label": 1, "verb_label": 1}  # fmt: skip
+    assert {kind: len(_row(folder, kind, frame)) for kind in counts} == counts
+    labels = [int(_row(folder, "action_label", n)[0]) for n in range(len(list((folder / "action_label").iterdir())))]
+    labelled = np.flatnonzero(labels)
+    np.testing.assert_array_equal(labelled, np.arange(*truth.clip) + truth.raw_start)
+    assert set(np.array(labels)[labelled]) == {2}  # grab espresso
+
+
+def test_h2o_points_return_to_the_world_through_the_moving_camera(truths, root):
+    truth, pair = truths["h2o"], load_embedded_hands()
+    folder = root / "h2o" / truth.source_key / "cam4"
+    cameras = []
+    for own in (truth.clip[0], truth.clip[1] - 1):
+        frame = truth.raw_start + own
+        camera = _row(folder, "cam_pose", frame).reshape(4, 4)
+        cameras.append(camera)
+        np.testing.assert_allclose(camera[:3, :3] @ camera[:3, :3].T, np.eye(3), atol=1e-12)
+        pose = camera @ _row(folder, "obj_pose_rt", frame)[1:].reshape(4, 4)
+        np.testing.assert_allclose(pose[:3, 3], truth.object.translation_m[own], atol=1e-9)
+        wanted = Rotation.from_rotvec(truth.object.rotvec[own]).as_matrix()
+        np.testing.assert_allclose(pose[:3, :3], wanted, atol=1e-9)
+        points = _row(folder, "hand_pose", frame)[64:]
+        world = points[1:].reshape(21, 3) @ camera[:3, :3].T + camera[:3, 3]
+        joints = track_joints(truth.hands["right"], pair.right)[own]
+        np.testing.assert_allclose(world[0], joints[0], atol=1e-6)
+        np.testing.assert_allclose(world[4], joints[20], atol=1e-6)  # thumb tip
+        np.testing.assert_allclose(world[8], joints[16], atol=1e-6)  # index tip
+        np.testing.assert_allclose(world[20], joints[18], atol=1e-6)  # little finger's tip
+    assert np.abs(cameras[0] - cameras[1]).max() > 1e-3
+    assert len(TIP_VERTICES) == 5
+
+
+def test_arctic_files_are_in_millimetres_relative_to_the_mean_pose(truths, root):
+    truth, pair = truths["arctic"], load_embedded_hands()
+    stem = root / "arctic" / "raw_seqs" / truth.source_key
+    data = (stem.parent / f"{stem.name}.mano.npy").read_bytes()
+    assert b"numpy._core" not in data
+    hands = _unboxed(data)
+    own = truth.clip[0]
+    frame = truth.raw_start + own
+    right = hands["right"]
+    assert right["shape"].shape == (10,)
+    np.testing.assert_allclose(
+        right["pose"][frame] + pair.right.mean_pose, truth.hands["right"].hand_pose[own], atol=1e-6
+    )
+    track = np.load(stem.parent / f"{stem.name}.object.npy", allow_pickle=False)
+    assert track.shape[1] == 7
+    np.testing.assert_allclose(track[frame, 4:] / 1000, truth.object.translation_m[own], atol=1e-6)
+
+
+def test_arctic_parts_and_meshes_belong_together(truths, root):
+    truth = truths["arctic"]
+    folder = root / "arctic" / "meta" / "object_vtemplates" / truth.object_name
+    mesh = load_mesh(folder / "mesh.obj")
+    parts = np.array(json.loads((folder / "parts.json").read_text()))
+    assert len(parts) == len(mesh.vertices)
+    top = np.array(json.loads((folder / "top_keypoints_300.json").read_text())["keypoints"])
+    nearest = np.linalg.norm(mesh.vertices[:, None] - top, axis=2).argmin(0)
+    assert (parts[nearest] == 0).all()
+    np.testing.assert_allclose(mesh.vertices / 1000, truth.object.model.vertices_m, atol=1e-9)
+
+
+def test_arctic_descriptions_name_range_verb_and_hand_in_four_tokens(truths, root):
+    truth = truths["arctic"]
+    line = (root / "arctic" / "description" / truth.source_key / "description.txt").read_text().splitlines()[0]
+    span, verb, hand, last = line.split(" ")
+    start, stop = map(int, span.split("-"))
+    assert (start - 1, stop) == (truth.raw_start + truth.clip[0], truth.raw_start + truth.clip[1])
+    assert (verb, hand, last) == ("shake,", "right", "hand")
+    assert list(truth.source_frames) == list(range(start - 1, stop))
+
+
+def test_grab_clips_are_every_fourth_frame_of_the_contact(truths):
+    truth = truths["grab"]
+    frames = truth.source_frames
+    assert (frames % 4 == 0).all()
+    assert (np.diff(frames) == 4).all()
+    assert truth.contact[0] <= frames[0] < truth.contact[0] + 4
+    assert truth.contact[1] - 4 <= frames[-1] < truth.contact[1]
+    assert truth.clip_truth().n_frames == len(frames)

@@ -1,0 +1,166 @@
+import numpy as np
+import pytest
+import trimesh
+
+from hoidata.objects.distance import signed_distance
+from hoidata.objects.mesh import mass_properties
+from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
+from hoidata.synthetic.field import MirroredField, gradient, grid_field
+from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
+
+ALL = [(dataset, spec.name) for dataset, specs in OBJECTS.items() for spec in specs]
+GRAB_NAMES = [
+    "airplane", "alarmclock", "apple", "banana", "binoculars", "bowl", "camera", "cubelarge", "cubemedium",
+    "cubesmall", "cup", "cylinderlarge", "cylindermedium", "cylindersmall", "doorknob", "duck", "elephant",
+    "eyeglasses", "flashlight", "flute", "fryingpan", "gamecontroller", "hammer", "hand", "headphones", "knife",
+    "lightbulb", "mouse", "mug", "phone", "piggybank", "pyramidlarge", "pyramidmedium", "pyramidsmall", "scissors",
+    "spherelarge", "spheremedium", "spheresmall", "stamp", "stanfordbunny", "stapler", "teapot", "toothbrush",
+    "toothpaste", "toruslarge", "torusmedium", "torussmall", "train", "watch", "waterbottle", "wineglass",
+]  # fmt: skip
+H2O_NAMES = [
+    "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino",
+]  # fmt: skip
+ARCTIC_NAMES = [
+    "box",
+    "capsulemachine",
+    "espressomachine",
+    "ketchup",
+    "laptop",
+    "microwave",
+    "mixer",
+    "notebook",
+    "phone",
+    "scissors",
+    "waffleiron",
+]
+
+
+def _closed_parts(dataset: str, name: str) -> list[trimesh.Trimesh]:
+    model = object_model(dataset, name)
+    parts = [0, 1] if model.is_articulated else [0]
+    return [trimesh.Trimesh(model.vertices_m, model.faces[model.face_part == part], process=True) for part in parts]
+
+
+@pytest.mark.parametrize(
+    ("solid", "volume"),
+    [
+        (sharp_box((0.1, 0.2, 0.3)), 0.006),
+        (sphere(0.05, 80), 4 / 3 * np.pi * 0.05**3),
+        (cylinder(0.03, 0.1, 0.001, 120), np.pi * 0.03**2 * 0.1),
+        (torus(0.06, 0.02, 90, 60), 2 * np.pi**2 * 0.06 * 0.02**2),
+    ],
+)
+def test_solids_are_closed_and_have_the_textbook_volume(solid, volume):
+    mesh = trimesh.Trimesh(*solid, process=False)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(volume, rel=0.005)
+
+
+def test_a_rounded_box_lies_on_its_analytic_surface():
+    size, radius = np.array([0.1, 0.06, 0.04]), 0.005
+    points = rounded_box((0.1, 0.06, 0.04), radius).vertices_m
+    outside = np.maximum(np.abs(points) - (size / 2 - radius), 0)
+    np.testing.assert_allclose(np.linalg.norm(outside, axis=1), radius, atol=1e-12)
+
+
+def test_a_union_is_one_closed_solid_without_inner_walls():
+    union = united(cylinder(0.04, 0.1), sharp_box((0.1, 0.02, 0.02)))
+    mesh = trimesh.Trimesh(*union, process=False)
+    assert mesh.is_watertight
+    assert mesh.body_count == 1
+    inside = 2 * 0.02 * 0.02 * 0.0387  # the bar runs 78 mm through the cylinder
+    assert mesh.volume == pytest.approx(trimesh.Trimesh(*cylinder(0.04, 0.1)).volume + 0.1 * 0.02**2 - inside, rel=0.01)
+
+
+def test_a_profile_must_start_and_end_on_the_axis():
+    with pytest.raises(ValueError, match="on the axis"):
+        revolved([(0.01, 0.0), (0.02, 0.1), (0.0, 0.2)])
+
+
+@pytest.mark.parametrize(("dataset", "name"), ALL)
+def test_every_part_of_every_object_is_one_closed_solid(dataset, name):
+    for part in _closed_parts(dataset, name):
+        assert part.is_watertight
+        assert part.is_winding_consistent
+        assert part.body_count == 1
+        assert part.volume > 2e-5
+    model = object_model(dataset, name)
+    assert mass_properties(model.vertices_m, model.faces).source == "solid"
+
+
+def test_objects_have_real_names_and_differ_in_shape_and_size():
+    names = {dataset: [spec.name for spec in specs] for dataset, specs in OBJECTS.items()}
+    assert set(names["h2o"]) <= set(H2O_NAMES)
+    assert set(names["grab"]) <= set(GRAB_NAMES)
+    assert set(names["arctic"]) <= set(ARCTIC_NAMES)
+    volumes = {round(sum(part.volume for part in _closed_parts(*key)), 7) for key in ALL}
+    assert len(volumes) == len(ALL) >= 16
+
+
+def test_some_meshes_are_dense_and_even_and_some_coarse():
+    dense, coarse = 0, 0
+    for key in ALL:
+        model = object_model(*key)
+        longest = trimesh.Trimesh(model.vertices_m, model.faces, process=False).edges_unique_length.max()
+        dense += len(model.vertices_m) >= 1024 and longest <= 0.02
+        coarse += len(model.vertices_m) <= 24
+    assert dense >= 8
+    assert coarse >= 2
+
+
+@pytest.mark.parametrize("name", [spec.name for spec in OBJECTS["arctic"]])
+def test_arctic_objects_turn_about_minus_z_through_their_origin_without_cutting_themselves(name):
+    model = object_model("arctic", name)
+    assert model.hinge is not None
+    np.testing.assert_array_equal(model.hinge.axis, [0, 0, -1])
+    np.testing.assert_array_equal(model.hinge.origin_m, 0)
+    base, lid = (model.faces[model.face_part == part] for part in (0, 1))
+    for angle in (0.0, 0.35, 0.95):
+        turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+        moved = model.vertices_m[np.unique(lid)] @ turn.T
+        assert signed_distance(model.vertices_m, base, moved).distance_m.min() > -1e-6
+
+
+@pytest.mark.parametrize("key", [("grab", "mug"), ("h2o", "book"), ("grab", "toruslarge"), ("h2o", "spray")])
+def test_the_search_field_agrees_with_the_mesh_to_half_a_millimetre_near_its_faces(key):
+    model = object_model(*key)
+    field = grid_field(model.vertices_m, model.faces)
+    mesh = trimesh.Trimesh(model.vertices_m, model.faces, process=False)
+    on_surface, face = trimesh.sample.sample_surface(mesh, 4000, seed=3)
+    rng = np.random.default_rng(0)
+    points = np.asarray(on_surface) + rng.uniform(-0.003, 0.01, (4000, 1)) * mesh.face_normals[face]
+    error = np.abs(field(points) - signed_distance(model.vertices_m, model.faces, points).distance_m)
+    assert np.quantile(error, 0.95) < 0.0005
+    assert error.max() < 0.003
+
+
+def test_far_from_the_grid_the_field_never_promises_more_room_than_there_is():
+    model = object_model("grab", "mug")
+    field = grid_field(model.vertices_m, model.faces)
+    points = np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3))
+    assert (field(points) <= signed_distance(model.vertices_m, model.faces, points).distance_m + 0.001).all()
+
+
+def test_a_mirrored_field_is_the_field_of_the_mirrored_object():
+    model = object_model("grab", "mug")
+    mirrored = grid_field(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1])
+    points = np.random.default_rng(1).uniform(-0.08, 0.1, (600, 3))
+    seen, wanted = MirroredField(grid_field(model.vertices_m, model.faces))(points), mirrored(points)
+    near = wanted < 0.025
+    assert near.sum() > 40
+    assert np.abs(seen - wanted)[near].max() < 0.003
+
+
+def test_the_gradient_of_a_ball_points_away_from_its_middle():
+    field = grid_field(*sphere(0.05, 60))
+    directions = np.random.default_rng(5).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert np.einsum("pi,pi->p", gradient(field, 0.052 * directions), directions).min() > 0.98
+
+
+def test_hinged_objects_stand_with_the_hinge_across_or_upright():
+    for spec in OBJECTS["arctic"]:
+        axis = spec.upright_from_object @ [0, 0, -1]
+        assert np.abs(axis).max() == pytest.approx(1.0)
+    assert object_spec("arctic", "microwave").upright_from_object[2, 2] == 1.0
