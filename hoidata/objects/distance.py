@@ -4,7 +4,7 @@ Exact nearest-triangle search is libigl's. The sign is the angle-weighted pseudo
 where the surface is closed, and the winding number's (Jacobson et al. 2013) where it has holes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import igl
 import numpy as np
@@ -63,11 +63,14 @@ def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarr
 def signed_distance(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> SignedDistance:
     """Signed distance from ``points_m (point, 3)`` to the mesh ``(vertex, 3)``, ``(face, 3)``; metres, one frame.
 
-    Vertices that coincide (a mesh split along texture seams) count as one, so seams do not open the surface.
+    Vertices that coincide (a mesh split along texture seams) count as one, so seams do not open the surface. A mesh
+    turned inside out is turned back.
     Raises BadInput as :func:`closest_points` does.
     """
     surface = _surface(vertices_m, faces)
     closed = _is_closed(surface.faces)
+    if _is_inside_out(surface, closed):
+        surface = replace(surface, faces=np.ascontiguousarray(surface.faces[:, ::-1]))
     kinds = igl.SignedDistanceType
     kind = kinds.SIGNED_DISTANCE_TYPE_PSEUDONORMAL if closed else kinds.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
     parts = [igl.signed_distance(chunk, surface.vertices_m, surface.faces, kind)[:3] for chunk in _chunks(points_m)]
@@ -106,6 +109,15 @@ def _is_closed(faces: np.ndarray) -> bool:
     forward = np.sort(edges[:, 0] * size + edges[:, 1])
     backward = np.sort(edges[:, 1] * size + edges[:, 0])
     return bool(np.array_equal(forward, backward))
+
+
+def _is_inside_out(surface: _Surface, closed: bool) -> bool:
+    """Negative volume: more than rounding of it (two opposite shells enclose nothing), or where the surface is open
+    and its volume vague, more than 1 % of the bounding box.
+    """
+    corners = (surface.vertices_m - surface.vertices_m.mean(axis=0))[surface.faces]
+    volume = np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    return bool(volume < -(1e-6 if closed else 0.01) * np.ptp(surface.vertices_m, axis=0).prod())
 
 
 def _chunks(points_m: np.ndarray) -> list[np.ndarray]:

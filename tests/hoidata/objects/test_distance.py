@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.distance import closest_points, signed_distance
+from hoidata.objects.distance import _is_inside_out, _surface, closest_points, signed_distance
 
 
 def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -41,6 +41,27 @@ def test_a_mesh_split_into_separate_triangles_gives_the_same_signs(queries: np.n
     soup = box.vertices[box.faces].reshape(-1, 3)
     split = signed_distance(soup, np.arange(len(soup)).reshape(-1, 3), queries)
     np.testing.assert_allclose(split.distance_m, signed_distance(box.vertices, box.faces, queries).distance_m)
+
+
+@pytest.mark.parametrize("missing", [0, 1], ids=["closed", "open"])
+def test_a_mesh_turned_inside_out_has_the_same_inside(queries: np.ndarray, missing: int) -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
+    vertices, faces = sphere.vertices + np.array([0.3, 0, 0]), sphere.faces[missing:]
+    outward = signed_distance(vertices, faces, queries + np.array([0.3, 0, 0]))
+    inward = signed_distance(vertices, faces[:, ::-1], queries + np.array([0.3, 0, 0]))
+    assert (outward.distance_m < 0).sum() > 100
+    np.testing.assert_allclose(inward.distance_m, outward.distance_m, atol=1e-12)
+    np.testing.assert_allclose(inward.normal, outward.normal, atol=1e-12)
+
+
+def test_two_opposite_shells_enclose_nothing_and_are_never_turned() -> None:
+    """As ManipNet's mug2: the volume is zero but for rounding, whose sign must not decide."""
+    sphere = trimesh.creation.icosphere(subdivisions=2, radius=0.05)
+    faces = np.concatenate([sphere.faces, sphere.faces[:, ::-1]])
+    for order in (faces, faces[::-1]):
+        for shift in np.eye(3) / 3:
+            surface = _surface(sphere.vertices + shift, order)
+            assert not _is_inside_out(surface, closed=True)
 
 
 def test_faces_are_numbered_as_the_caller_numbers_them(queries: np.ndarray) -> None:
