@@ -117,3 +117,27 @@ def test_sampling_twice_gives_the_same_bytes() -> None:
 def test_a_mesh_without_area_is_refused() -> None:
     with pytest.raises(BadInput, match="faces with area"):
         sample_points(ObjectModel("line", np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3, np.uint8)))
+
+
+def grid(columns: int, rows: int, longest_edge_m: float) -> ObjectModel:
+    """A flat grid of squares cut along one diagonal, their longest edge."""
+    step = longest_edge_m / np.sqrt(2)
+    x, y = np.meshgrid(np.arange(columns) * step, np.arange(rows) * step)
+    corner = np.arange(columns * rows).reshape(rows, columns)
+    a, b, c, d = (part.ravel() for part in (corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]))
+    faces = np.concatenate([np.column_stack((a, b, c)), np.column_stack((a, c, d))])
+    vertices = np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size)))
+    return ObjectModel("sheet", vertices, faces, np.zeros(x.size, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "longest_edge_m", "method"),
+    [
+        (32, 32, 0.0199, "vertices-fps"),
+        (32, 32, 0.0201, "surface-fps"),
+        (33, 31, 0.0199, "surface-fps"),
+    ],
+    ids=["1024 vertices", "an edge over 2 cm", "1023 vertices"],
+)
+def test_vertices_serve_from_1024_of_them_and_up_to_edges_of_2_cm(columns, rows, longest_edge_m, method) -> None:
+    assert sample_points(grid(columns, rows, longest_edge_m)).method == method
