@@ -59,7 +59,7 @@ class GrabAdapter:
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``grab/sN/*.npz``."""
         found = {path for top in ROOTS for path in (Path(root) / top / "grab").glob("s*/*.npz")}
-        keys = [SequenceKey(self.name, path.parent.name, f"{path.parent.name}/{path.stem}") for path in found]
+        keys = {SequenceKey(self.name, path.parent.name, f"{path.parent.name}/{path.stem}") for path in found}
         return sorted(keys)
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
@@ -129,7 +129,7 @@ class _SequenceFile:
 
     def _count(self, key: str) -> int:
         value = np.asarray(checks.entry(self.path, self.data, key))
-        if value.shape or value.dtype.kind not in "fiu" or not value >= 1 or value != round(float(value)):
+        if value.shape or value.dtype.kind not in "fiu" or not 1 <= value < np.inf or value != round(float(value)):
             raise BadInput(f"{self.path}: {key}", "a whole number of 1 or more", repr(value)[:40])
         return int(value)
 

@@ -163,6 +163,12 @@ def test_the_object_mesh_keeps_every_vertex_in_its_place(clip):
     )
 
 
+def test_a_download_unpacked_twice_gives_each_sequence_once(root, load_all):
+    write_sequence(root / "GRAB", sequence())
+    assert [str(key) for key in GrabAdapter().sequences(root)] == ["grab/s3/cubelarge_offhand_1"]
+    assert len(load_all(GrabAdapter(), root)) == 1
+
+
 def test_a_margin_counts_frames_of_the_clip(root, load_all):
     (clip,) = load_all(GrabAdapter(margin_frames=2), root)
     assert clip.source_frames[[0, -1]].tolist() == [4, 52]
@@ -218,6 +224,11 @@ BAD_FILES = {
         "(61, 8)",
     ),
     "a frame rate of 100": (_edit(lambda data: data.__setitem__("framerate", 100.0)), "framerate", "multiple of 30"),
+    "a frame rate without end": (
+        _edit(lambda data: data.__setitem__("framerate", np.inf)),
+        "framerate",
+        "whole number",
+    ),
     "a path that leaves the folder": (
         _edit(lambda data: data["object"].__setitem__("object_mesh", "../../etc/passwd.ply")),
         "passwd",
