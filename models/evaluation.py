@@ -228,7 +228,7 @@ class Evaluation:
         stride, rows = self.config.frame_stride, []
         for index, sample in enumerate(batch.samples):
             seen = {
-                name: HandsAndObject.of(sample, *(part[index] for part in meshes[name]), motions[name][1][index])
+                name: HandsAndObject.of(sample, meshes[name][0][index], meshes[name][1][index], motions[name][1][index])
                 for name in motions
             }
             touching = seen["true"].joint_distances(stride) < metrics.TOUCH_M

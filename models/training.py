@@ -153,7 +153,7 @@ def make_repeatable(seed: int, threads: int) -> None:
     torch.set_num_threads(threads)
     torch.use_deterministic_algorithms(True)
     # Nothing here reads memory before writing it; filling it first would cost a seventh of the time.
-    torch.utils.deterministic.fill_uninitialized_memory = False
+    setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010 (pyright does not know it)
     torch.set_float32_matmul_precision("medium")
 
 

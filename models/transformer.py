@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
-FUSED_FIRST = (SDPBackend.EFFICIENT_ATTENTION, SDPBackend.FLASH_ATTENTION, SDPBackend.MATH)
+FUSED_FIRST: list[SDPBackend] = [SDPBackend.EFFICIENT_ATTENTION, SDPBackend.FLASH_ATTENTION, SDPBackend.MATH]
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Block(nn.Module):
         query, key, value = self.query_key_value(x).reshape(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         dropout = self.dropout if self.training else 0.0
         # On CPUs plain matrix products beat the fused kernel, whose backward pass alone takes half a training step.
-        kernels = [SDPBackend.MATH] if x.device.type == "cpu" else list(FUSED_FIRST)
+        kernels = [SDPBackend.MATH] if x.device.type == "cpu" else FUSED_FIRST
         with sdpa_kernel(kernels):
             mixed = functional.scaled_dot_product_attention(query, key, value, seen[:, None, None], dropout_p=dropout)
         return self.attended(mixed.transpose(1, 2).reshape(batch, tokens, width))
