@@ -117,6 +117,22 @@ def test_the_flag_of_a_frame_decides_whether_the_hand_is_valid(clip):
     assert len(clip.hands["left"].betas) == 1
 
 
+def test_source_frames_are_the_numbers_of_the_files_also_when_the_first_are_absent(root, clip, load_all):
+    for path in sorted((root / "subject2/k1/3/cam4").glob("*/00000[01].txt")):
+        path.unlink()
+    (later,) = load_all(H2OAdapter(), root)
+    assert later.clip_id == clip.clip_id
+    assert later.source_frames.tolist() == list(range(3, 25))
+    np.testing.assert_array_equal(later.hands["right"].wrist_m, clip.hands["right"].wrist_m)
+
+
+def test_a_frame_that_no_folder_has_is_a_gap(root, load_all):
+    for path in sorted((root / "subject2/k1/3/cam4").glob("*/000010.txt")):
+        path.unlink()
+    with pytest.raises(BadInput, match=r"cam_pose/000010\.txt.*each of 27 frames"):
+        load_all(H2OAdapter(), root)
+
+
 def test_the_folder_names_of_the_readme_are_read_too(root, clip, load_all):
     folder = root / "subject2" / "k1" / "3" / "cam4"
     (folder / "hand_pose_mano").rename(folder / "hand_pose_MANO")
