@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from scipy.optimize import nnls
 
-from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.hands.tracks import kinematics_of
 from hoidata.objects.model import ObjectModel
@@ -354,7 +354,3 @@ def to_grip(scene: Scene, reach: Reach, hands: PosedHands, row: int) -> Grip:
         hands.side, back @ hands.wrist_m[row], back @ hands.rotmats[row],
         hands.hand_pose[row], hands.open_pose[row], int(reach.part == 1),
     )  # fmt: skip
-
-
-def grip_rotvec(grip: Grip) -> np.ndarray:
-    return rotmat_to_rotvec(grip.rotmat)

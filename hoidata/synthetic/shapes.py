@@ -157,7 +157,7 @@ def united(*solids: Solid) -> Solid:
             np.ascontiguousarray(solid.faces),
             "union",
         )
-        whole = _welded(vertices, faces)
+        whole = _welded(np.asarray(vertices), np.asarray(faces))
     return whole
 
 

@@ -1,6 +1,6 @@
 """Whether a synthetic action is physically sound, measured on the hands' meshes against the object's mesh."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -152,9 +152,3 @@ def _idle(truth: TruthSequence, pair: HandPair) -> float:
         gap = np.linalg.norm(track_joints(hand, pair[side]) - centre[:, None], axis=2).min() - radius
         nearest = min(nearest, float(gap))
     return nearest
-
-
-def shifted(truth: TruthSequence, shift_m: np.ndarray) -> TruthSequence:
-    """The same action with both hands moved in the world."""
-    hands = {side: replace(hand, wrist_m=hand.wrist_m + shift_m) for side, hand in truth.hands.items()}
-    return replace(truth, hands=hands)
