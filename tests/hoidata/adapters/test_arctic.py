@@ -161,11 +161,31 @@ def test_parts_may_be_json_booleans(root, load_all, lift):
     assert again.object.model.part.tolist() == lift.object.model.part.tolist()
 
 
-def test_the_verb_object_pairs_that_text2hoi_left_out_give_no_clip(root, load_all):
-    write_sequence(root, "notebook_use_02", "1-40 write, right hand\n20-60 open, left hand\n")
-    write_template(root, "notebook")
-    verbs = [clip.verb for clip in load_all(ArcticAdapter(), root) if "notebook" in clip.clip_id]
-    assert verbs == ["open"]
+@pytest.mark.parametrize(
+    ("verb", "noun"), [("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")]
+)
+def test_the_verb_object_pairs_that_text2hoi_left_out_give_no_clip(root, load_all, verb, noun):
+    lines = f"1-40 {verb}, right hand\n20-60 open, left hand\n"
+    write_sequence(root, f"{noun}_use_02", lines)
+    write_template(root, noun)
+    assert [clip.verb for clip in load_all(ArcticAdapter(), root) if noun in clip.clip_id] == ["open"]
+    write_sequence(root, "box_use_02", lines)
+    assert [clip.verb for clip in load_all(ArcticAdapter(), root) if "box_use" in clip.clip_id] == [verb, "open"]
+
+
+def test_trailing_digits_of_an_object_name_are_not_part_of_it(root, load_all):
+    write_sequence(root, "box2_use_01", "1-40 open, left hand\n")
+    (clip,) = [clip for clip in load_all(ArcticAdapter(), root) if "box2" in clip.clip_id]
+    assert (clip.object.model.name, clip.object_words) == ("box", "box")
+
+
+@pytest.mark.parametrize(
+    ("noun", "words"), [("capsulemachine", "capsule machine"), ("waffleiron", "waffle iron"), ("laptop", "laptop")]
+)
+def test_joined_object_names_become_words(root, load_all, noun, words):
+    write_sequence(root, f"{noun}_use_01", "1-40 open, left hand\n")
+    write_template(root, noun)
+    assert {clip.object_words for clip in load_all(ArcticAdapter(), root) if noun in clip.clip_id} == {words}
 
 
 def test_a_bad_line_is_listed_and_the_others_convert(root, load_all):

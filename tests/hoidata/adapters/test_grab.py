@@ -112,6 +112,30 @@ def test_words_come_from_intent_and_object_name_with_the_size_kept(clip):
     assert object_words("mug") == "mug"
 
 
+@pytest.mark.parametrize(
+    ("intent", "verb"),
+    [("switchON", "switch on"), ("takepicture", "take picture"), ("pass", "pass"), ("drink", "drink")],
+)
+def test_joined_intents_become_words_and_others_stay(root, load_all, intent, verb):
+    write_sequence(root, sequence() | {"motion_intent": intent})
+    (clip,) = load_all(GrabAdapter(), root)
+    assert clip.verb == verb
+
+
+def test_every_joined_object_name_of_grab_becomes_words():
+    joined = {
+        "alarmclock": "alarm clock", "fryingpan": "frying pan", "gamecontroller": "game controller",
+        "lightbulb": "light bulb", "piggybank": "piggy bank", "stanfordbunny": "Stanford bunny",
+        "waterbottle": "water bottle", "wineglass": "wine glass",
+    }  # fmt: skip
+    assert {name: object_words(name) for name in joined} == joined
+    for shape in ("cube", "cylinder", "pyramid", "sphere", "torus"):
+        for size in ("small", "medium", "large"):
+            assert object_words(shape + size) == f"{size} {shape}"
+    for name in ("airplane", "eyeglasses", "headphones", "toothbrush", "toothpaste", "flashlight", "doorknob"):
+        assert object_words(name) == name
+
+
 def test_a_flat_hand_has_the_shape_and_the_wrist_of_its_personal_mesh(clip, hands, formula):
     rest = formula.rest_points(hands.left, template_m=personal_mesh("left").astype(np.float32))
     joints = track_joints(clip.hands["left"], hands.left)
