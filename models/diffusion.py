@@ -21,6 +21,7 @@ from models.transformer import (
     TransformerConfig,
     agent_codes,
     sinusoid,
+    smoothed,
     to_frames,
     to_tokens,
     tokens_seen,
@@ -31,7 +32,11 @@ CONTACT_MOMENTS = 13
 
 @dataclass(frozen=True)
 class DiffusionConfig:
-    """transformer: its sizes. point_net: as in the contact model it comes from. The defaults are the paper's."""
+    """transformer: its sizes. point_net: as in the contact model it comes from. The defaults are the paper's.
+
+    smoothing_frames: samples are smoothed over time by a Gaussian of this deviation: a small model, trained for
+    minutes, lets some of the noise it starts from through.
+    """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
@@ -40,6 +45,7 @@ class DiffusionConfig:
     contact_input: Literal["map", "moments"] = "map"
     frames_to_go: bool = False
     condition_dropout: float = 0.1
+    smoothing_frames: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -187,7 +193,9 @@ class MotionGenerator:
         n_clips, n_frames = condition.frames.shape
         denoise = guided(self.network, condition, sampler.guidance)
         shapes = (n_clips, 2, n_frames, HAND_FEATURES), (n_clips, n_frames, OBJECT_FEATURES)
-        return self._features(sample_motion(denoise, *shapes, sampler, generator))
+        hands, objects = sample_motion(denoise, *shapes, sampler, generator)
+        width = self.network.config.smoothing_frames
+        return self._features((smoothed(hands, condition.frames, width), smoothed(objects, condition.frames, width)))
 
     @torch.no_grad()
     def denoise_once(

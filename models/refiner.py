@@ -19,6 +19,7 @@ from models.transformer import (
     TransformerConfig,
     agent_codes,
     sinusoid,
+    smoothed,
     to_frames,
     to_tokens,
     tokens_seen,
@@ -33,7 +34,8 @@ REACH_M = 0.05
 class RefinerConfig:
     """transformer: its sizes. contact_map: also read the raw contact map and the norms of the placed points (paper).
 
-    wrist_reach_m, rotation_reach: what an output of one means for the wrist and for a 6D number.
+    wrist_reach_m, rotation_reach: what an output of one means for the wrist and for a 6D number. smoothing_frames: the
+    residual is smoothed over time by a Gaussian of this deviation, so that corrections never jitter.
     """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
@@ -41,6 +43,7 @@ class RefinerConfig:
     points: int = 1024
     wrist_reach_m: float = 0.05
     rotation_reach: float = 0.3
+    smoothing_frames: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,8 @@ class RefinerModel(nn.Module):
         seen[:, 0] |= ~seen.any(1)
         both = self.encoder(tokens.flatten(1, 2), seen).unflatten(1, tokens.shape[1:3]).unbind(1)
         change = [to_frames(layer(x), n_frames, k) for layer, x in zip(self.hands_out, both, strict=True)]
-        return hands_in_world(local + torch.stack(change, 1) * self.reach, coarse.object)
+        residual = smoothed(torch.stack(change, 1), coarse.present.any(1), self.config.smoothing_frames)
+        return hands_in_world(local + residual * self.reach, coarse.object)
 
     def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:
         scaled = torch.cat((local[..., :3] * 10, local[..., 3:]), -1)

@@ -110,6 +110,20 @@ def to_frames(tokens: Tensor, n_frames: int, frames_per_token: int) -> Tensor:
     return tokens.reshape(*tokens.shape[:-2], -1, tokens.shape[-1] // frames_per_token)[..., :n_frames, :]
 
 
+def smoothed(x: Tensor, frames: Tensor, width_frames: float) -> Tensor:
+    """Gaussian mean over time of (B, ..., F, D) with standard deviation ``width_frames``; 0 changes nothing.
+
+    Only frames set in ``frames`` (B, F) count, so ends stay in place and padding does not enter.
+    """
+    if not width_frames:
+        return x
+    place = torch.arange(x.shape[-2], device=x.device, dtype=x.dtype)
+    near = torch.exp(-0.5 * ((place[:, None] - place) / width_frames).square())
+    weight = near * frames[:, None].to(x.dtype) + 1e-12
+    weight = weight / weight.sum(-1, keepdim=True)
+    return weight.reshape(len(x), *[1] * (x.ndim - 3), *weight.shape[1:]) @ x
+
+
 def tokens_seen(frames: Tensor, frames_per_token: int) -> Tensor:
     """(..., token) True where a token holds at least one frame of ``frames`` (..., F) bool."""
     return to_tokens(frames[..., None].float(), frames_per_token).amax(-1) > 0

@@ -16,7 +16,7 @@ from models.length import LengthConfig, LengthModel, length_loss
 from models.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
 from models.sampling import SamplerConfig, add_noise, alphas_bar, noise_schedule, sample_motion
 from models.surface import Surface
-from models.transformer import TransformerConfig
+from models.transformer import TransformerConfig, smoothed
 
 SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2
@@ -166,6 +166,21 @@ def test_noise_is_mixed_as_in_the_papers_first_equation() -> None:
     signal = torch.tensor([0.81, 0.36])
     noised = add_noise(torch.ones(2, 3), torch.full((2, 3), 2.0), torch.tensor([0, 1]), signal)
     torch.testing.assert_close(noised[:, 0], torch.tensor([0.9 + 2 * 0.19**0.5, 0.6 + 2 * 0.8]))
+
+
+def test_smoothing_keeps_steady_motion_and_ends_and_never_sees_padding() -> None:
+    frames = torch.arange(30) < torch.tensor([[30], [12]])
+    x = torch.full((2, 2, 30, 5), 3.0)
+    x[1, :, 12:] = 1e6
+    smooth = smoothed(x, frames, 2.0)
+    torch.testing.assert_close(smooth.transpose(1, 2)[frames], torch.full((42, 2, 5), 3.0))
+    spike = torch.zeros(1, 30, 1)
+    spike[0, 15] = 1
+    found = smoothed(spike, frames[:1], 2.0)[0, :, 0]
+    # A Gaussian of deviation 2 has its peak at 1 / (2 sqrt(2 pi)), and its neighbours fall by exp(-1/8).
+    assert float(found[15]) == pytest.approx(0.1995, abs=1e-3)
+    assert float(found[16] / found[15]) == pytest.approx(0.8825, abs=1e-3)
+    assert smoothed(x, frames, 0.0) is x
 
 
 def fitted(parameters, loss, steps: int = 150, rate: float = 3e-3) -> float:
