@@ -119,6 +119,12 @@ def test_a_mesh_without_area_is_refused() -> None:
         sample_points(ObjectModel("line", np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3, np.uint8)))
 
 
+def test_a_face_moves_with_the_hinge_when_two_of_its_corners_do() -> None:
+    faces = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]])
+    model = ObjectModel("strip", np.zeros((6, 3)), faces, np.array([0, 0, 0, 1, 1, 1], np.uint8))
+    assert model.face_part.tolist() == [0, 0, 1, 1]
+
+
 def grid(columns: int, rows: int, longest_edge_m: float) -> ObjectModel:
     """A flat grid of squares cut along one diagonal, their longest edge."""
     step = longest_edge_m / np.sqrt(2)

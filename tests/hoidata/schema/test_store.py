@@ -42,7 +42,8 @@ def clips(make_clip):
         sources=(SourceFile("s2/b.npz", 12, "ab" * 32), SourceFile("mesh.obj", 3, "cd" * 32)),
         source_fps=120.0,
     )
-    longer = replace(odd, other_objects=(hinged.object, hinged.object))
+    moved = replace(hinged.object, translation_m=hinged.object.translation_m + np.float32(0.5))
+    longer = replace(odd, other_objects=(hinged.object, moved))
     return [plain, longer, make_clip(20, "left", seed=3, clip_id="test/s1/c")]
 
 
