@@ -1,10 +1,13 @@
 """Measures of evaluation, as plain functions of arrays: the same for every system whose motions are clips."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.spatial import KDTree
 
-from hoidata.objects.distance import signed_distance
-from hoidata.objects.model import ObjectModel, articulate
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.objects.distance import closest_points, signed_distance
+from hoidata.objects.model import ObjectModel
 
 TOUCH_M = 0.02
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
@@ -55,33 +58,39 @@ def points_in_object_frame(points_m: np.ndarray, rotmat: np.ndarray, position_m:
 
 
 def depths_m(model: ObjectModel, points_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
-    """(frame, point) depth below the surface, metres, of points (frame, point, 3) of the object frame; 0 outside."""
+    """(frame, point) depth below the surface, metres, of points (frame, point, 3) of the object frame; 0 outside.
+
+    On an articulated object, below the surface of the part a point lies in.
+    """
     depth = np.zeros(points_m.shape[:2])
-    low, high = _bounds(model, hinge_rad)
-    close = np.logical_and(points_m >= low, points_m <= high).min(axis=-1)
-    if model.hinge is None or hinge_rad is None:
-        if close.any():
-            depth[close] = -signed_distance(model.vertices_m, model.faces, points_m[close]).distance_m
-        return depth.clip(min=0)
-    for frame in np.flatnonzero(close.max(axis=1)):
-        mesh = articulate(model.vertices_m, model.part, model.hinge, hinge_rad[frame : frame + 1])[0]
-        inside = close[frame]
-        depth[frame, inside] = -signed_distance(mesh, model.faces, points_m[frame, inside]).distance_m
-    return depth.clip(min=0)
+    for faces, points in _parts(model, points_m, hinge_rad):
+        corners = model.vertices_m[np.unique(faces)]
+        close = np.logical_and(points >= corners.min(axis=0), points <= corners.max(axis=0)).min(axis=-1)
+        if close.max():
+            inside = -signed_distance(model.vertices_m, faces, points[close]).distance_m
+            depth[close] = np.maximum(depth[close], inside)
+    return depth
 
 
 def surface_distances_m(model: ObjectModel, points_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
     """(frame, point) unsigned distance to the mesh surface, metres, of points (frame, point, 3) of the object frame."""
+    each = [
+        closest_points(model.vertices_m, faces, points.reshape(-1, 3)).distance_m.reshape(points.shape[:2])
+        for faces, points in _parts(model, points_m, hinge_rad)
+    ]
+    return np.minimum.reduce(each)
+
+
+def _parts(
+    model: ObjectModel, points_m: np.ndarray, hinge_rad: np.ndarray | None
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Faces of every part, and the points (frame, point, 3) seen from that part: meshes stay, points turn."""
     if model.hinge is None or hinge_rad is None:
-        flat = signed_distance(model.vertices_m, model.faces, points_m.reshape(-1, 3)).distance_m
-        return np.abs(flat).reshape(points_m.shape[:2])
-    rows = []
-    for frame, points in enumerate(points_m):
-        mesh = articulate(model.vertices_m, model.part, model.hinge, hinge_rad[frame : frame + 1])[0]
-        rows.append(np.abs(signed_distance(mesh, model.faces, points).distance_m))
-    return np.stack(rows)
-
-
-def _bounds(model: ObjectModel, hinge_rad: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    vertices = articulate(model.vertices_m, model.part, model.hinge, hinge_rad).reshape(-1, 3)
-    return vertices.min(axis=0), vertices.max(axis=0)
+        yield model.faces, points_m
+        return
+    turn = rotvec_to_rotmat(model.hinge.axis * np.asarray(hinge_rad, dtype=np.float64)[:, None])
+    turned = (points_m - model.hinge.origin_m) @ turn + model.hinge.origin_m
+    for part, points in enumerate((points_m, turned)):
+        faces = model.faces[model.face_part == part]
+        if len(faces):
+            yield faces, points
