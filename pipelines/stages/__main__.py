@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import sys
 
 STAGES = ("raw", "convert", "annotate", "contact", "train", "evaluate", "report")
@@ -15,6 +16,9 @@ def main() -> int:
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
     options = parser.parse_args()
+    # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read when torch loads.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("GOMP_SPINCOUNT", "0")
     try:
         module = importlib.import_module(f"pipelines.stages.{options.stage}")
     except ModuleNotFoundError as error:
