@@ -16,7 +16,7 @@ def main() -> int:
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
     options = parser.parse_args()
-    # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read when torch loads.
+    # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read as torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("GOMP_SPINCOUNT", "0")
     try:
