@@ -74,8 +74,8 @@ def batches(dataset: HoiDataset, size: int, generator: torch.Generator, with_ent
 
 
 def _split(items: list[Item], size: int) -> list[list[Item]]:
-    """The items in order, in nearly equal parts of ``size`` or a little more (fewer only where there are fewer)."""
-    parts = max(1, len(items) // size)
+    """The items in order, in as many nearly equal parts as come closest to ``size`` each."""
+    parts = max(1, round(len(items) / size))
     edges = [len(items) * part // parts for part in range(parts + 1)]
     return [items[start:stop] for start, stop in pairwise(edges)]
 

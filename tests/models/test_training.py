@@ -45,7 +45,7 @@ def train(name: str, root: Path, out: Path) -> Path:
     upstream = {UPSTREAM[name]: out / UPSTREAM[name]} if name in UPSTREAM else {}
     return train_model(
         name, root, out / name, PARAMS[name], provenance=lambda facts: {"model": facts["model"]}, upstream=upstream,
-        threads=1,
+        threads=2,
     )  # fmt: skip
 
 
