@@ -9,6 +9,7 @@ import pandas as pd
 from hoidata.errors import BadInput
 
 SPLITS = ("train", "validation", "test")
+ROUND = ("train", "train", "train", "validation", "test")
 
 
 @dataclass(frozen=True)
@@ -18,9 +19,11 @@ class SplitRule:
     by "subject": clips of the subjects in ``validation`` and ``test`` go there, all others train.
     by "time": in every source sequence the last ``test_share`` of its clips test, the ``validation_share`` before
     them validate (rounded, at least one clip each where a sequence has three or more).
+    by "rounds": in time order of every source sequence, of five successive clips three train, one validates, one tests
+    (the shares are not used). For recordings whose end shows other actions than their beginning.
     """
 
-    by: Literal["subject", "time"] = "subject"
+    by: Literal["subject", "time", "rounds"] = "subject"
     validation: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
     validation_share: float = 0.15
@@ -29,8 +32,8 @@ class SplitRule:
     def __post_init__(self) -> None:
         object.__setattr__(self, "validation", tuple(self.validation))
         object.__setattr__(self, "test", tuple(self.test))
-        if self.by not in ("subject", "time"):
-            raise BadInput("split rule: by", "subject or time", repr(self.by), "mend params.yaml")
+        if self.by not in ("subject", "time", "rounds"):
+            raise BadInput("split rule: by", "subject, time or rounds", repr(self.by), "mend params.yaml")
         shared = sorted(set(self.validation) & set(self.test))
         if shared:
             raise BadInput("split rule", "no subject in both validation and test", str(shared), "mend params.yaml")
@@ -53,7 +56,7 @@ def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
     else:
         ordered = rows.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
         for _, group in ordered.groupby("sequence"):
-            split.loc[group.index] = _by_time(len(group), rule)
+            split.loc[group.index] = _by_rounds(len(group)) if rule.by == "rounds" else _by_time(len(group), rule)
     check_no_leak(rows, split, rule)
     return split.set_axis(sequences.index)
 
@@ -64,6 +67,10 @@ def _by_time(n_clips: int, rule: SplitRule) -> list[str]:
     test = max(least, round(rule.test_share * n_clips)) if rule.test_share else 0
     validation = max(least, round(rule.validation_share * n_clips)) if rule.validation_share else 0
     return ["train"] * (n_clips - validation - test) + ["validation"] * validation + ["test"] * test
+
+
+def _by_rounds(n_clips: int) -> list[str]:
+    return [ROUND[place % len(ROUND)] for place in range(n_clips)]
 
 
 def check_no_leak(sequences: pd.DataFrame, split: pd.Series, rule: SplitRule) -> None:

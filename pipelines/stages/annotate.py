@@ -6,9 +6,9 @@ from pipelines.stages.base import Place, StageParams, empty_reason, load_hands, 
 
 
 class SplitParams(StageParams):
-    """How one dataset is split: by named subjects, or by time where there is only one subject."""
+    """How one dataset is split: by named subjects, or in time where there is only one subject."""
 
-    by: Literal["subject", "time"]
+    by: Literal["subject", "time", "rounds"]
     validation: tuple[str, ...] = ()
     test: tuple[str, ...] = ()
 

@@ -34,6 +34,14 @@ def test_a_rule_by_time_tests_on_the_end_of_every_sequence():
     assert split.tolist()[20:] == ["train", "train", "validation", "test"]
 
 
+def test_a_rule_by_rounds_spreads_the_held_out_clips_over_every_sequence():
+    rows = one_sequence(11) + one_sequence(3, "mug")
+    split = assign_split(table(rows), SplitRule(by="rounds"))
+    assert [i for i, part in enumerate(split[:11]) if part == "test"] == [4, 9]
+    assert [i for i, part in enumerate(split[:11]) if part == "validation"] == [3, 8]
+    assert split.tolist()[11:] == ["train"] * 3
+
+
 def test_the_split_does_not_depend_on_the_order_of_the_rows():
     rows = table(one_sequence(20) + one_sequence(9, "mug"))
     shuffled = rows.sample(frac=1, random_state=np.random.RandomState(3))
