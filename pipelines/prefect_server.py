@@ -14,6 +14,7 @@ from urllib.parse import urlparse
 from hoidata.errors import MissingResource
 
 START_TIMEOUT_S = 180
+STOP_TIMEOUT_S = 15
 POOL = "local"
 
 
@@ -34,8 +35,17 @@ def serve() -> int:
         return 0
     finally:
         for process in reversed(running):
-            process.terminate()
-            process.wait()
+            _stop(process)
+
+
+def _stop(process: subprocess.Popen) -> None:
+    """Ask a process to end; one that waits for its clients longer than STOP_TIMEOUT_S is ended."""
+    process.terminate()
+    try:
+        process.wait(STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 def api_url() -> str:
