@@ -162,8 +162,13 @@ def united(*solids: Solid) -> Solid:
 
 
 def _welded(vertices: np.ndarray, faces: np.ndarray) -> Solid:
-    """Vertices on a grid of a micrometre, equal ones made one, collapsed triangles left out: files keep it closed."""
+    """Vertices on a grid of a micrometre, equal ones made one, collapsed triangles left out: files keep it closed.
+
+    Triangles begin with their lowest vertex and are sorted: CGAL begins and lists them differently from run to run.
+    """
     unique, inverse = np.unique(np.round(vertices, _WELD_DIGITS), axis=0, return_inverse=True)
     a, b, c = inverse.reshape(-1)[faces].T
     kept = (a != b) & (b != c) & (c != a)
-    return _compact(unique, np.stack([a, b, c], axis=1)[kept])
+    corners = np.stack([a, b, c], axis=1)[kept]
+    turned = np.take_along_axis(corners, (corners.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    return _compact(unique, turned[np.lexsort(turned.T[::-1])])

@@ -164,3 +164,10 @@ def test_hinged_objects_stand_with_the_hinge_across_or_upright():
         axis = spec.upright_from_object @ [0, 0, -1]
         assert np.abs(axis).max() == pytest.approx(1.0)
     assert object_spec("arctic", "microwave").upright_from_object[2, 2] == 1.0
+
+
+def test_triangles_of_a_union_stand_in_one_order_only():
+    union = united(rounded_box((0.1, 0.08, 0.06), 0.01), rounded_box((0.04, 0.04, 0.12), 0.005))
+    assert (union.faces.argmin(axis=1) == 0).all()
+    assert union.faces.tolist() == sorted(union.faces.tolist())
+    assert mass_properties(union.vertices_m, union.faces).volume_m3 > 0.1 * 0.08 * 0.06 * 0.9
