@@ -10,14 +10,14 @@ import numpy as np
 import orjson
 
 from hoidata.adapters import checks
-from hoidata.adapters.base import Quarantined, RawTree, SequenceKey
-from hoidata.adapters.hand_parameters import hand_track, wrist_from_transl
+from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema.clip import SIDES, Clip, HandTrack, HandType, ObjectTrack, Side
+from hoidata.schema.clip import SIDES, Clip, HandTrack, HandType, ObjectTrack, Side, WorldFrame
+from hoidata.schema.hand_parameters import HandConvention, SourceHand, to_track
 
 MILLIMETRES = 1e-3
 EXCLUDED = {("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")}  # as Text2HOI does
@@ -27,7 +27,23 @@ OBJECT_WORDS = {
     "waffleiron": "waffle iron",
 }
 ROOTS = ("", "data", "arctic_data/data")
+TOPS = ("", "data/", "arctic_data/data/")
 HINGE_AXIS = (0.0, 0.0, -1.0)
+FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
+CONVENTION = HandConvention(
+    translation="transl",
+    fingers="mean-relative",
+    shape="betas per sequence",
+    left_shape="as released",
+    note="MANO: axis-angles relative to the mean pose, betas per sequence, translation added to the rest wrist",
+)
+PARTS = (
+    DatasetPart("hand and object motion", tuple(f"{top}raw_seqs/s*/*.object.npy" for top in TOPS), "raw_seqs.zip"),
+    DatasetPart("object meshes", tuple(f"{top}meta/object_vtemplates/*/mesh.obj" for top in TOPS), "meta.zip"),
+    DatasetPart(
+        "segments and words", tuple(f"{top}description/s*/*/description.txt" for top in TOPS), "Text2HOI's repository"
+    ),
+)
 RANGE = re.compile(r"(\d+)-(\d+)")
 
 
@@ -63,15 +79,15 @@ class ArcticAdapter:
     margin_frames: int = 0
     shortest_frames: int = 20
     name: str = "arctic"
+    version: str = "1.0"
     licence: str = "ARCTIC licence (MPI): non-commercial research, no redistribution"
     where_to_register: str = "https://arctic.is.tue.mpg.de (raw_seqs.zip, meta.zip) and Text2HOI's description files"
     needs_mano: bool = True
     source_fps: float = 30.0
-    frame_notes: str = "ARCTIC's motion-capture world, right-handed, z up, metres; gravity along -z"
-    hand_notes: str = (
-        "MANO: axis-angles relative to the mean pose, which was added; betas per sequence, translation added to the "
-        "rest wrist; left shape directions as released"
-    )
+    may_be_shared: bool = False
+    frame: WorldFrame = FRAME
+    hand_convention: HandConvention = CONVENTION
+    parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence that has a hand or an object file; the two are paired by name, never by position."""
@@ -205,13 +221,7 @@ def _hand(where: str, block: Any, side: Side, hands: HandPair) -> HandTrack:
     betas = checks.table(f"{where}.shape", shape[None] if shape.ndim == 1 else shape, 10)
     if len(betas) not in (1, len(pose)):
         raise BadInput(f"{where}.shape", f"10 numbers, or {len(pose)} rows of them", f"{len(betas)} rows")
-    return hand_track(
-        wrist_m=wrist_from_transl(transl, betas, hands[side]),
-        global_orient=rotation,
-        # Stored relative to the mean pose. Angles may exceed pi and stay as they are.
-        hand_pose=pose + hands[side].mean_pose,
-        betas=betas,
-    )
+    return to_track(SourceHand(transl, rotation, pose, betas), CONVENTION, hands[side])
 
 
 def _object_model(raw: RawTree, top: str, name: str) -> ObjectModel:

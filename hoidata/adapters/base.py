@@ -15,10 +15,11 @@ from typing import Protocol, runtime_checkable
 from hoidata.errors import BadInput
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
-from hoidata.schema.clip import Clip, SourceFile
+from hoidata.schema.clip import Clip, SourceFile, WorldFrame
+from hoidata.schema.hand_parameters import HandConvention
 from hoidata.schema.quarantine import Quarantined
 
-__all__ = ["Adapter", "Quarantined", "RawTree", "SequenceKey"]
+__all__ = ["Adapter", "DatasetPart", "Quarantined", "RawTree", "SequenceKey"]
 
 
 @dataclass(frozen=True, order=True)
@@ -33,22 +34,44 @@ class SequenceKey:
         return f"{self.dataset}/{self.name}"
 
 
+@dataclass(frozen=True)
+class DatasetPart:
+    """Files a raw folder must hold: at least one match of one of ``patterns`` (globs below the raw root).
+
+    what: in words; where: the archive or page it comes from. optional: conversion works without it.
+    """
+
+    what: str
+    patterns: tuple[str, ...]
+    where: str
+    optional: bool = False
+
+    def is_in(self, root: Path) -> bool:
+        return any(next(Path(root).glob(pattern), None) is not None for pattern in self.patterns)
+
+
 @runtime_checkable
 class Adapter(Protocol):
     """Reader of one dataset. Must be picklable (a frozen dataclass without open files): workers get a copy.
 
-    name: of the dataset, lower case. licence, where_to_register: shown to users who lack the data.
+    Its settings (margins, which hands) are dataclass fields with defaults, set in params.yaml under ``convert``.
+
+    name: of the dataset, lower case. version: of the release the adapter reads. licence, where_to_register: shown to
+    users who lack the data. may_be_shared: the licence lets derived data be passed on.
     needs_mano: the raw files hold MANO parameters, meaningless without the licensed MANO files.
     source_fps: frames per second of the raw files (a file's own figure wins).
-    frame_notes: the world frame in one sentence: handedness, up axis, gravity or why it is unknown.
-    hand_notes: what the source's hand parameters mean: mean pose, shape, translation, and whether the left hand's
-    shape directions are taken as released (their x has the wrong sign; who fitted betas to them needs them so).
+    frame: the world frame of its clips. hand_convention: what the source's hand parameters mean.
+    parts: what a complete raw folder holds, and where each part is to be had.
     """
 
     @property
     def name(self) -> str: ...
     @property
+    def version(self) -> str: ...
+    @property
     def licence(self) -> str: ...
+    @property
+    def may_be_shared(self) -> bool: ...
     @property
     def where_to_register(self) -> str: ...
     @property
@@ -56,9 +79,11 @@ class Adapter(Protocol):
     @property
     def source_fps(self) -> float: ...
     @property
-    def frame_notes(self) -> str: ...
+    def frame(self) -> WorldFrame: ...
     @property
-    def hand_notes(self) -> str: ...
+    def hand_convention(self) -> HandConvention: ...
+    @property
+    def parts(self) -> tuple[DatasetPart, ...]: ...
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """Locate: the keys of all sequences below ``root``, sorted. Looks at names only, opens no motion file."""

@@ -5,7 +5,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from hoidata.adapters.base import Adapter, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.schema.clip import Clip, SourceFile
+from hoidata.schema.hand_parameters import hands_for
 from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import write_store
 from hoidata.schema.validation import check_clip
@@ -61,6 +62,7 @@ def convert_dataset(
     synthetic: the raw data was generated; every clip and the store say so. progress: a bar on stderr and the summary
     on stdout.
     """
+    hands = hands_for(adapter.hand_convention, hands)
     keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
     reason = None if keys else _why_empty(adapter, root)
     files = manifest.values() if isinstance(manifest, Mapping) else manifest
@@ -116,9 +118,11 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
         "dataset": adapter.name,
         "synthetic": synthetic,
         "hand_model": {"name": hands.name, "digest": hands.digest},
-        "frame_notes": adapter.frame_notes,
-        "hand_notes": adapter.hand_notes,
+        "dataset_version": adapter.version,
+        "frame": {"handedness": "right", **asdict(adapter.frame)},
+        "hand_convention": adapter.hand_convention.as_json(),
         "licence": adapter.licence,
+        "may_be_shared": adapter.may_be_shared,
         "where_to_register": adapter.where_to_register,
         "source_fps": adapter.source_fps,
         "empty_reason": reason,

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from hoidata.adapters import checks
-from hoidata.adapters.base import Quarantined, RawTree, SequenceKey
-from hoidata.adapters.hand_parameters import hand_track, wrist_from_transl
+from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.files import load_npz_objects
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
+from hoidata.schema.hand_parameters import HandConvention, SourceHand, to_track
 
 VERBS = {"offhand": "hand over", "switchON": "switch on", "takepicture": "take picture"}  # all others are words already
 OBJECT_WORDS = {
@@ -34,6 +34,27 @@ OBJECT_WORDS = {
 }
 SIZED_SHAPE = re.compile(r"(cube|cylinder|pyramid|sphere|torus)(large|medium|small)")
 ROOTS = ("", "GRAB")
+FRAME = WorldFrame("+z", "stated", "GRAB's motion-capture world, right-handed, z up, metres")
+CONVENTION = HandConvention(
+    translation="transl",
+    fingers="absolute",
+    shape="personal mesh",
+    left_shape="unused",
+    note="MANO: absolute axis-angles, the subject's own rest mesh without betas, translation added to its rest wrist",
+)
+PARTS = (
+    DatasetPart("sequences", ("grab/s*/*.npz", "GRAB/grab/s*/*.npz"), "grab__s1.zip to grab__s10.zip"),
+    DatasetPart(
+        "object meshes",
+        ("tools/object_meshes/contact_meshes/*.ply", "GRAB/tools/object_meshes/contact_meshes/*.ply"),
+        "object_meshes.zip",
+    ),
+    DatasetPart(
+        "the subjects' hand meshes",
+        ("tools/subject_meshes/*/*_rhand.ply", "GRAB/tools/subject_meshes/*/*_rhand.ply"),
+        "tools__subject_meshes.zip",
+    ),
+)
 MEMBERS = ("obj_name", "motion_intent", "framerate", "n_frames", "lhand", "rhand", "object", "contact")
 
 
@@ -46,15 +67,15 @@ class GrabAdapter:
 
     margin_frames: int = 0
     name: str = "grab"
+    version: str = "1.0"
     licence: str = "GRAB licence (MPI): non-commercial research, no redistribution"
     where_to_register: str = "https://grab.is.tue.mpg.de (GRAB parts and object_meshes.zip)"
     needs_mano: bool = True
     source_fps: float = 120.0
-    frame_notes: str = "GRAB's motion-capture world, right-handed, z up, metres; gravity along -z"
-    hand_notes: str = (
-        "MANO: absolute axis-angles (flat mean), the subject's own rest mesh and no betas, translation added to its "
-        "rest wrist; left shape directions unused"
-    )
+    may_be_shared: bool = False
+    frame: WorldFrame = FRAME
+    hand_convention: HandConvention = CONVENTION
+    parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``grab/sN/*.npz``."""
@@ -175,14 +196,14 @@ def _hand(raw: RawTree, file: _SequenceFile, side: Side, frames: np.ndarray, han
     template = _template(raw, file.beside(member, "vtemp"))
     orient = checks.table(f"{where}.global_orient", params["global_orient"], 3, file.n_frames)
     transl = checks.table(f"{where}.transl", params["transl"], 3, file.n_frames)
-    betas = np.zeros((1, 10))  # the personal mesh already has the subject's shape
-    return hand_track(
-        wrist_m=wrist_from_transl(transl[frames], betas, hands[side], template),
+    source = SourceHand(
+        translation_m=transl[frames],
         global_orient=orient[frames],
-        hand_pose=_finger_pose(where, params, hands[side].components, file.n_frames)[frames],
-        betas=betas,
+        fingers=_finger_pose(where, params, hands[side].components, file.n_frames)[frames],
+        betas=np.zeros((1, 10)),  # the personal mesh already has the subject's shape
         template_m=template,
     )
+    return to_track(source, CONVENTION, hands[side])
 
 
 def _finger_pose(where: str, params: Mapping[str, Any], components: np.ndarray, n_frames: int) -> np.ndarray:

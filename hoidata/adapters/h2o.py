@@ -10,19 +10,32 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.adapters import checks
-from hoidata.adapters.base import Quarantined, RawTree, SequenceKey
-from hoidata.adapters.hand_parameters import hand_track, move_points, move_rotvec, wrist_from_transl
+from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
+from hoidata.schema.hand_parameters import FrameChange, HandConvention, SourceHand, to_track
 
 CAMERA = "cam4"
 OBJECTS = ("", "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")  # by class id
 OLD_NAMES = {"spray": "lotion_spray", "cocoa": "ovomaltine", "chips": "pringles", "cappuccino": "starbucks"}
 FRAME_FILE = re.compile(r"\d{6}\.txt")
+FRAME = WorldFrame(None, "unknown", "H2O's camera-rig world, right-handed, metres; axes not documented")
+CONVENTION = HandConvention(
+    translation="transl",
+    fingers="absolute",
+    shape="betas per frame",
+    left_shape="as released",
+    note="MANO in the camera's frame: absolute axis-angles, betas per frame, translation added to the rest wrist",
+)
+PARTS = (
+    DatasetPart("pose files of the head camera", ("subject*/*/*/cam4/obj_pose_rt/*.txt",), "subjectN_pose_v1_1.tar.gz"),
+    DatasetPart("object meshes", ("object/*/*.obj",), "object.zip"),
+    DatasetPart("segments of all subjects", ("label_split/action_*.txt",), "label_split.zip", optional=True),
+)
 _SHELF = ("book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")
 ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is background
     ("", ""),
@@ -63,15 +76,15 @@ class H2OAdapter:
     margin_frames: int = 0
     shortest_frames: int = 21
     name: str = "h2o"
+    version: str = "1.1"
     licence: str = "research use after registration; no licence text is published with the files"
     where_to_register: str = "https://h2odataset.ethz.ch (subjectN_pose_v1_1.tar.gz, object.zip)"
     needs_mano: bool = True
     source_fps: float = 30.0
-    frame_notes: str = "H2O's camera-rig world, right-handed, metres; gravity unknown: its axes are not documented"
-    hand_notes: str = (
-        "MANO: absolute axis-angles (flat mean), betas per frame, translation added to the rest wrist; "
-        "left shape directions as released"
-    )
+    may_be_shared: bool = False
+    frame: WorldFrame = FRAME
+    hand_convention: HandConvention = CONVENTION
+    parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``subjectN/<place>/<number>`` that has a cam4 folder."""
@@ -119,6 +132,7 @@ class H2OAdapter:
             ),
             source_frames=np.arange(frames.first + start, frames.first + stop, dtype=np.int32),
             gravity=None,
+            gravity_note="H2O does not document the axes of its world",
             verb=verb,
             object_words=noun,
             source_fps=self.source_fps,
@@ -135,17 +149,14 @@ def label_runs(label: np.ndarray, shortest: int) -> list[tuple[int, int]]:
 def _hand(side: Side, block: np.ndarray, camera: np.ndarray, hands: HandPair) -> HandTrack:
     """block: (frame, 124) = left then right: flag, transl 3, orient 3, fingers 45, betas 10; camera: (frame, 4, 4)."""
     block = block[:, :62] if side == "left" else block[:, 62:]
-    valid = block[:, 0] != 0
-    block = np.where(valid[:, None], block, 0.0)
-    betas, rotation = block[:, 52:62], camera[:, :3, :3]
-    wrist = wrist_from_transl(block[:, 1:4], betas, hands[side])
-    return hand_track(
-        wrist_m=move_points(wrist, rotation, camera[:, :3, 3]),
-        global_orient=move_rotvec(block[:, 4:7], rotation),
-        hand_pose=block[:, 7:52],
-        betas=betas,
-        valid=valid,
+    source = SourceHand(
+        translation_m=block[:, 1:4],
+        global_orient=block[:, 4:7],
+        fingers=block[:, 7:52],
+        betas=block[:, 52:62],
+        valid=block[:, 0] != 0,
     )
+    return to_track(source, CONVENTION, hands[side], FrameChange(camera[:, :3, :3], camera[:, :3, 3]))
 
 
 def _clip_id(key: SequenceKey, frames: _Frames, start: int, stop: int) -> str:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.adapters.base import Quarantined, RawTree, SequenceKey
+from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.adapters.bvh import BvhMotion, parse_bvh, unpack_text
 from hoidata.adapters.manipnet_segments import (
     LIFTED_M,
@@ -33,7 +33,8 @@ from hoidata.hands.fitting import HandFit, fit_hands, fit_shape
 from hoidata.objects.distance import closest_points
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
+from hoidata.schema.hand_parameters import HandConvention
 
 METRES_PER_UNIT = 0.1
 HAND_REFERENCE = "hand/hand_reference.json"
@@ -60,6 +61,19 @@ NOUNS = {
     "tri prism": "triangular prism",
     "wineglass": "wine glass",
 }
+FRAME = WorldFrame("+y", "stated", "Unity's world seen in a mirror with normal x: right-handed, y up")
+CONVENTION = HandConvention(
+    translation="wrist",
+    fingers="absolute",
+    shape="fitted",
+    left_shape="unused",
+    note="17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape for the subject",
+)
+PARTS = (
+    DatasetPart("object and hand motion", ("sequences/*/*.bvh.gz",), "the data release"),
+    DatasetPart("object meshes", ("objects/*/*.obj.gz",), "the data release"),
+    DatasetPart("the hand's capsules and tips", (HAND_REFERENCE,), "the data release"),
+)
 SHAPE_FRAMES_PER_SEQUENCE = 20
 MIRROR_X = np.array([-1.0, 1.0, 1.0])
 
@@ -122,12 +136,15 @@ class ManipNetAdapter:
     """
 
     name: str = "manipnet"
+    version: str = "1.0"
     licence: str = "CC BY-NC 4.0"
     where_to_register: str = "no registration: the data release of the ManipNet paper (SIGGRAPH 2021)"
     needs_mano: bool = False
     source_fps: float = 120.0
-    frame_notes: str = "Unity's world seen in a mirror with normal x: right-handed, y up, gravity along -y"
-    hand_notes: str = "17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape for the subject"
+    may_be_shared: bool = True
+    frame: WorldFrame = FRAME
+    hand_convention: HandConvention = CONVENTION
+    parts: tuple[DatasetPart, ...] = PARTS
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per folder below ``sequences``; all recordings are of one subject."""

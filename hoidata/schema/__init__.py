@@ -1,5 +1,31 @@
 """What a clip is, and how clips are stored."""
 
-from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, HandType, ObjectTrack, Side, SourceFile
+from hoidata.schema.clip import (
+    FPS,
+    SIDES,
+    BodyTrack,
+    CameraTrack,
+    Clip,
+    HandTrack,
+    HandType,
+    ObjectTrack,
+    Side,
+    SourceContact,
+    SourceFile,
+    WorldFrame,
+)
 
-__all__ = ["FPS", "SIDES", "Clip", "HandTrack", "HandType", "ObjectTrack", "Side", "SourceFile"]
+__all__ = [
+    "FPS",
+    "SIDES",
+    "BodyTrack",
+    "CameraTrack",
+    "Clip",
+    "HandTrack",
+    "HandType",
+    "ObjectTrack",
+    "Side",
+    "SourceContact",
+    "SourceFile",
+    "WorldFrame",
+]

@@ -1,7 +1,7 @@
 """The unified store of one dataset: a folder of Parquet tables and stored NPZ arrays.
 
-    meta/info.json            schema_version, dataset, synthetic, fps, hand_model, units, axes, licence, frame_notes and
-                              hand_notes (what the source's frame and hand parameters mean)
+    meta/info.json            schema_version, dataset, synthetic, fps, hand_model, units, axes, licence, frame and
+                              hand_convention (what the source's frame and hand parameters mean)
     meta/sequences.parquet    one row per clip: id, words, and where its rows lie in the arrays
     meta/objects.parquet      one row per object     meta/files.parquet       one row per raw file
     meta/quarantine.parquet   what was left out, with the reason

@@ -79,7 +79,7 @@ QUARANTINE = pa.schema([(name, _TEXT) for name in ("source_key", "where", "expec
 def write_store(folder: str | Path, clips: Iterable[Clip | Quarantined], info: dict[str, Any]) -> dict[str, int]:
     """Write clips, in the order given, as the store ``folder``; it appears whole or not at all.
 
-    info: JSON values added to ``meta/info.json`` (dataset, synthetic, hand_model, licence, frame_notes, ...).
+    info: JSON values added to ``meta/info.json`` (dataset, synthetic, hand_model, licence, frame, ...).
     Returns the counts: clips, frames, objects, files, quarantined. Raises BadInput for a clip that breaks the schema,
     an id given twice, or two different objects of one name.
     """

@@ -3,7 +3,7 @@
 import hashlib
 import pickle
 import shutil
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +66,8 @@ def test_every_sequence_becomes_a_clip_and_the_store_says_where_it_comes_from(ro
     assert store.info["synthetic"]
     assert store.clip(store.ids[0]).synthetic
     assert "GRAB" in store.info["licence"]
-    assert store.info["frame_notes"] == GrabAdapter.frame_notes
-    assert store.info["hand_notes"] == GrabAdapter.hand_notes
+    assert store.info["frame"] == {"handedness": "right", **asdict(GrabAdapter().frame)}
+    assert store.info["hand_convention"]["translation"] == "transl"
 
 
 @pytest.mark.slow
@@ -166,9 +166,10 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     assert adapter.needs_mano == (name in ("h2o", "grab", "arctic"))
     assert adapter.licence
     assert adapter.where_to_register
-    assert "gravity" in adapter.frame_notes
-    assert ("MANO:" in adapter.hand_notes) == adapter.needs_mano
-    assert ("left shape directions" in adapter.hand_notes) == adapter.needs_mano
+    assert adapter.frame.note
+    assert adapter.hand_convention.note
+    assert adapter.parts
+    assert not any(part.is_in(tmp_path) for part in adapter.parts)
     assert adapter.source_fps >= 30
     assert pickle.loads(pickle.dumps(adapter)) == adapter
     assert adapter.sequences(tmp_path) == []
