@@ -5,7 +5,7 @@ import sys
 import typer
 
 from hoidata.errors import HoidataError
-from pipelines.commands import generate, graph, inspect, raw, synth
+from pipelines.commands import generate, graph, inspect, raw, share, synth
 
 app = typer.Typer(
     name="hoidata",
@@ -21,6 +21,7 @@ app.command("up")(graph.up)
 app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
 app.command("lineage")(inspect.lineage)
+app.command("share")(share.share)
 app.command("generate")(generate.generate)
 
 

@@ -5,13 +5,15 @@ A folder of per-frame text files is one entry, digested as ``RawTree.read_folder
 """
 
 import json
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any, Literal
 
-from hoidata.adapters.base import RawTree
+from hoidata.adapters.base import Adapter, DatasetPart, RawTree
 from hoidata.errors import BadInput
 from hoidata.files import atomic_file
 from hoidata.schema.clip import SourceFile
@@ -27,6 +29,7 @@ class Manifest:
 
     present: False means the user does not have it: every stage of it is empty. source: ``generated`` from ``recipe``
     (then everything made from it is synthetic) or the user's ``files``. files: empty in a committed recipe.
+    version: of the dataset's release. may_be_shared: the licence lets what is derived from it be passed on.
     """
 
     dataset: str
@@ -34,6 +37,8 @@ class Manifest:
     source: Literal["generated", "files"]
     licence: str
     where_to_register: str = ""
+    version: str = ""
+    may_be_shared: bool = False
     recipe: dict[str, Any] | None = None
     files: tuple[SourceFile, ...] = ()
 
@@ -76,10 +81,20 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
         part.write_text(f'{lines},\n  "files": {body}\n}}\n')
 
 
-def scan_files(root: Path) -> tuple[SourceFile, ...]:
-    """Every raw file below ``root`` an adapter might read, digested; images, videos and archives are passed over."""
+def absent_manifest(adapter: Adapter) -> Manifest:
+    """The manifest of a dataset the user does not have (yet)."""
+    facts = {"version": adapter.version, "may_be_shared": adapter.may_be_shared}
+    return Manifest(adapter.name, False, "files", adapter.licence, adapter.where_to_register, **facts)
+
+
+def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[SourceFile, ...]:
+    """Every raw file below ``root``, digested; images, videos and archives are passed over.
+
+    parts: only files that one of these parts names (``Adapter.parts``), so that what no adapter reads is not hashed.
+    """
+    patterns = ["**"] if parts is None else [pattern for part in parts for pattern in part.patterns]
     tree = RawTree(root)
-    for folder, names in _folders(root):
+    for folder, names in _folders(root, "", [tuple(pattern.split("/")) for pattern in patterns]):
         if names and all(FRAME_FILE.fullmatch(name) for name in names):
             tree.read_folder(folder, names)
             continue
@@ -88,14 +103,45 @@ def scan_files(root: Path) -> tuple[SourceFile, ...]:
     return tree.sources
 
 
-def _folders(root: Path) -> Iterator[tuple[str, list[str]]]:
-    """Each folder below root (as a relative path) with the sorted names of its data files."""
-    for place in sorted([root, *(item for item in root.rglob("*") if item.is_dir())]):
-        folder = "" if place == root else place.relative_to(root).as_posix()
-        if any(part.startswith(".") for part in folder.split("/")):
-            continue
-        names = sorted(item.name for item in place.iterdir() if item.is_file())
-        yield folder, [name for name in names if not name.startswith(".") and not NEVER_READ.search(name)]
+def _folders(root: Path, folder: str, patterns: list[tuple[str, ...]]) -> Iterator[tuple[str, list[str]]]:
+    """Each folder below root (as a relative path) with the sorted names of its data files that match a pattern.
+
+    patterns: what is left of each below this folder, segment by segment; ``**`` stands for everything below.
+    """
+    entries = sorted(os.scandir(root / folder), key=lambda entry: entry.name)
+    entries = [entry for entry in entries if not entry.name.startswith(".")]
+    files = [entry.name for entry in entries if entry.is_file() and not NEVER_READ.search(entry.name)]
+    yield folder, [name for name in files if any(len(rest) == 1 and _fits(name, rest[0]) for rest in patterns)]
+    for entry in entries:
+        below = [rest if rest[0] == "**" else rest[1:] for rest in patterns if _fits(entry.name, rest[0])]
+        below = [rest for rest in below if rest]
+        if below and entry.is_dir() and not _leads_back(root / folder, Path(entry.path)):
+            yield from _folders(root, f"{folder}/{entry.name}" if folder else entry.name, below)
+
+
+def _leads_back(place: Path, link: Path) -> bool:
+    """A link to a folder it lies in would never end."""
+    return link.is_symlink() and place.resolve().is_relative_to(link.resolve())
+
+
+def _fits(name: str, segment: str) -> bool:
+    return segment == "**" or fnmatchcase(name, segment)
+
+
+def missing_parts(adapter: Adapter, root: Path) -> list[DatasetPart]:
+    """The parts of a dataset of which nothing is below ``root``, required ones first."""
+    return sorted((part for part in adapter.parts if not part.is_in(root)), key=lambda part: part.optional)
+
+
+def part_of(adapter: Adapter, path: str) -> DatasetPart | None:
+    """The part of the dataset a manifest entry belongs to; a folder of frame files is known by its files."""
+    tries = [tuple(text.split("/")) for text in (path, f"{path}/000000.txt")]
+    for part in adapter.parts:
+        for pattern in part.patterns:
+            segments = pattern.split("/")
+            if any(len(names) == len(segments) and all(map(_fits, names, segments)) for names in tries):
+                return part
+    return None
 
 
 @dataclass(frozen=True)
@@ -106,9 +152,12 @@ class Difference:
     problem: Literal["missing", "changed", "unlisted"]
 
 
-def verify_files(root: Path, manifest: Manifest) -> list[Difference]:
-    """How the files below ``root`` differ from the manifest; an empty list when they are those it lists."""
-    listed, found = manifest.by_path, {entry.path: entry for entry in scan_files(root)}
+def verify_files(root: Path, manifest: Manifest, parts: Sequence[DatasetPart] | None = None) -> list[Difference]:
+    """How the files below ``root`` differ from the manifest; an empty list when they are those it lists.
+
+    parts: as in ``scan_files``, and the same ones.
+    """
+    listed, found = manifest.by_path, {entry.path: entry for entry in scan_files(root, parts)}
     differences = [Difference(path, "missing") for path in listed if path not in found]
     differences += [Difference(path, "unlisted") for path in found if path not in listed]
     both = listed.keys() & found.keys()

@@ -9,6 +9,7 @@ from pipelines.commands.project import current_profile, enter_project, remember_
 
 app = typer.Typer(no_args_is_help=True)
 Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
+SHOWN_DIFFERENCES = 50
 MANO_FILES = ("MANO_RIGHT.pkl", "MANO_LEFT.pkl")
 
 
@@ -29,7 +30,10 @@ def scan(
     remember_root(name, root)
     size = sum(entry.size for entry in manifest.files)
     typer.echo(f"{place.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
-    if name != HAND and set_profile("own"):
+    if name == HAND:
+        return
+    _state_terms(manifest)
+    if set_profile("own"):
         typer.echo("params.yaml: profile set to own (set it back to embedded to return; nothing is retrained)")
 
 
@@ -37,18 +41,51 @@ def _scan_dataset(place, root: Path):
     from hoidata.adapters.registry import get_adapter
     from hoidata.errors import BadInput
     from hoidata.lineage.graph import read_params
-    from hoidata.lineage.manifests import Manifest, scan_files
+    from hoidata.lineage.manifests import absent_manifest, scan_files
     from pipelines.stages.raw import require_hand
 
     known = read_params(Path())["datasets"]
-    if place.dataset not in known:
-        raise BadInput("dataset", f"one of {', '.join(known)} or mano", place.dataset, "correct the name")
-    require_hand(place)
     adapter = get_adapter(place.dataset)
-    if not adapter.sequences(root):
-        remedy = f"give the folder that {adapter.name} unpacks to ({adapter.where_to_register})"
-        raise BadInput(root, f"sequences of {adapter.name}", "none found", remedy)
-    return Manifest(adapter.name, True, "files", adapter.licence, adapter.where_to_register, files=scan_files(root))
+    if place.dataset not in known:
+        remedy = f"add {place.dataset} to `datasets` in params.yaml"
+        raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
+    _ensure_manifests(adapter)
+    require_hand(place)
+    _require_parts(adapter, root)
+    return absent_manifest(adapter).with_files(scan_files(root))
+
+
+def _ensure_manifests(adapter) -> None:
+    """A dataset new to the project is absent from both profiles until it is scanned."""
+    from hoidata.lineage.manifests import absent_manifest, write_manifest
+    from pipelines.stages.base import Place
+
+    for profile in ("embedded", "own"):
+        path = Place(profile, adapter.name).manifest
+        if not path.is_file():
+            write_manifest(path, absent_manifest(adapter))
+
+
+def _require_parts(adapter, root: Path) -> None:
+    """Refuse a folder in which a required part is missing; name optional ones. Both with where to get them."""
+    from hoidata.errors import BadInput
+    from hoidata.lineage.manifests import missing_parts
+
+    missing = missing_parts(adapter, root)
+    required = [part for part in missing if not part.optional]
+    if required or not adapter.sequences(root):
+        what = "; ".join(f"{part.what} ({part.patterns[0]}, from {part.where})" for part in required)
+        got = f"no {what}" if what else "none"
+        remedy = f"give the folder that {adapter.name} unpacks to; register at {adapter.where_to_register}"
+        raise BadInput(root, f"sequences of {adapter.name}", got, remedy)
+    for part in missing:
+        typer.echo(f"{adapter.name}: without {part.what} ({part.patterns[0]}), to be had from {part.where}")
+
+
+def _state_terms(manifest) -> None:
+    typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
+    if not manifest.may_be_shared:
+        typer.echo("What is made from it stays on this machine: `dvc push` leaves it out (see `hoidata share --help`)")
 
 
 def _scan_hand(place, root: Path):
@@ -78,17 +115,29 @@ def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are 
 
 def _verify_one(dataset: str) -> bool:
     """Print how one dataset's files compare with its manifest; True when there is nothing to complain about."""
+    from hoidata.adapters.registry import get_adapter
     from hoidata.lineage.manifests import read_manifest, verify_files
     from pipelines.stages.base import Place, raw_root
 
-    place = Place(current_profile(), dataset)
+    place, adapter = Place(current_profile(), dataset), get_adapter(dataset)
     manifest = read_manifest(place.manifest)
     if not manifest.present:
         typer.echo(f"{dataset}: not present; {manifest.licence}; {manifest.where_to_register}")
+        for part in adapter.parts:
+            typer.echo(f"  {part.what}: {part.where}{' (optional)' if part.optional else ''}")
         return True
     listed = read_manifest(place.raw_manifest) if manifest.synthetic else manifest
     differences = verify_files(raw_root(place), listed)
-    for item in differences:
-        typer.echo(f"{dataset}: {item.path} is {item.problem}")
+    for item in differences[:SHOWN_DIFFERENCES]:
+        typer.echo(f"{dataset}: {item.path} is {item.problem}{_where_to_get(adapter, item.path)}")
+    if len(differences) > SHOWN_DIFFERENCES:
+        typer.echo(f"{dataset}: and {len(differences) - SHOWN_DIFFERENCES} more")
     typer.echo(f"{dataset}: {len(listed.files)} entries, {len(differences)} differences")
     return not differences
+
+
+def _where_to_get(adapter, path: str) -> str:
+    from hoidata.lineage.manifests import part_of
+
+    part = part_of(adapter, path)
+    return f" ({part.what}, from {part.where})" if part else f" ({adapter.where_to_register})"

@@ -1,10 +1,21 @@
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from hoidata.adapters import DatasetPart, get_adapter
 from hoidata.errors import BadInput
 from hoidata.files import sha256_bytes
-from hoidata.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
+from hoidata.lineage.manifests import (
+    Manifest,
+    absent_manifest,
+    missing_parts,
+    part_of,
+    read_manifest,
+    scan_files,
+    verify_files,
+    write_manifest,
+)
 from hoidata.schema.clip import SourceFile
 
 
@@ -85,3 +96,39 @@ def test_a_file_of_a_manifest_needs_path_size_and_digest(tmp_path):
     (tmp_path / "a.json").write_text(text.replace('"size": 1, ', ""))
     with pytest.raises(BadInput, match="size"):
         read_manifest(tmp_path / "a.json")
+
+
+PARTS = (
+    DatasetPart("poses", ("cam4/*/*.txt",), "pose.zip"),
+    DatasetPart("sequences", ("s*/*.npz", "GRAB/s*/*.npz"), "s1.zip"),
+    DatasetPart("tables", ("tables/*.ply",), "tables.zip", optional=True),
+    DatasetPart("meshes", ("meshes/*.ply",), "meshes.zip"),
+)
+
+
+def test_a_scan_by_parts_lists_only_files_an_adapter_reads(raw):
+    assert [entry.path for entry in scan_files(raw, PARTS)] == ["cam4/hand_pose", "s1/mug.npz"]
+    (raw / "GRAB" / "s1").mkdir(parents=True)
+    (raw / "GRAB" / "s1" / "cup.npz").write_text("x")
+    assert next(entry.path for entry in scan_files(raw, PARTS)) == "GRAB/s1/cup.npz"
+
+
+def test_a_link_that_leads_back_does_not_make_a_scan_endless(raw):
+    (raw / "s1" / "again").symlink_to(raw)
+    assert [entry.path for entry in scan_files(raw)] == ["cam4/hand_pose", "s1/mug.npz", "tools/table.json"]
+
+
+def test_missing_parts_are_named_required_ones_first(raw):
+    adapter = SimpleNamespace(parts=PARTS)
+    assert [part.what for part in missing_parts(adapter, raw)] == ["meshes", "tables"]
+    assert part_of(adapter, "s3/cup.npz") is PARTS[1]
+    assert part_of(adapter, "cam4/obj_pose_rt") is PARTS[0]
+    assert part_of(adapter, "s3/deep/cup.npz") is None
+
+
+@pytest.mark.parametrize("name", ["h2o", "grab", "arctic", "manipnet"])
+def test_the_manifest_of_a_dataset_nobody_has_states_its_terms(name):
+    committed = read_manifest(Path(__file__).parents[3] / "manifests" / "own" / f"{name}.json")
+    assert committed == absent_manifest(get_adapter(name))
+    assert not committed.present
+    assert committed.may_be_shared == (name == "manipnet")

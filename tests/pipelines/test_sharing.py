@@ -1,0 +1,48 @@
+"""What is derived from licensed data stays here unless the user says otherwise."""
+
+from pathlib import Path
+
+import yaml
+
+PROJECT = Path(__file__).parents[2]
+MAY_LEAVE = ("raw.json", "metrics/")  # digests and figures
+
+
+def outputs(project: Path) -> dict[str, dict]:
+    """Every cached output of the graph with its flags."""
+    stages = yaml.safe_load((project / "dvc.yaml").read_text())["stages"].values()
+    outs = [out for stage in stages for out in stage.get("outs", []) + stage.get("metrics", [])]
+    return {path: flags for out in outs for path, flags in (out if isinstance(out, dict) else {out: {}}).items()}
+
+
+def kept_here(project: Path) -> set[str]:
+    return {path for path, flags in outputs(project).items() if flags.get("push") is False}
+
+
+def test_no_derived_data_is_pushed_as_delivered():
+    derived = {path for path in outputs(PROJECT) if not any(part in path for part in MAY_LEAVE)}
+    assert len(derived) >= 6
+    assert kept_here(PROJECT) == derived
+
+
+def test_sharing_is_switched_on_and_off_for_all_of_it(project, project_tools):
+    before = (project / "dvc.yaml").read_text()
+    shown = project_tools.run(project, "hoidata", "share", "--on")
+    assert shown.returncode == 0, shown.stderr
+    assert kept_here(project) == set()
+    assert project_tools.run(project, "hoidata", "share", "--off").returncode == 0
+    assert (project / "dvc.yaml").read_text() == before
+
+
+def test_dvc_push_sends_nothing_derived_until_it_is_shared(project, project_tools, tmp_path):
+    built = project_tools.run(project, "dvc", "repro", "convert@embedded-manipnet")
+    assert built.returncode == 0, built.stderr
+    project_tools.run(project, "dvc", "remote", "add", "-d", "there", str(tmp_path / "remote"))
+
+    def pushed() -> int:
+        assert project_tools.run(project, "dvc", "push").returncode == 0
+        return sum(path.is_file() for path in (tmp_path / "remote").rglob("*"))
+
+    kept = pushed()
+    assert project_tools.run(project, "hoidata", "share", "--on").returncode == 0
+    assert pushed() > kept
