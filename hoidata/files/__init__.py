@@ -4,6 +4,7 @@ from hoidata.files.atomic import atomic_file, atomic_folder
 from hoidata.files.digest import canonical_json, sha256_bytes, sha256_file
 from hoidata.files.numpy_files import load_npy, load_npy_object, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
+from hoidata.files.torch_pickle import load_torch_pickle
 
 __all__ = [
     "ARRAYS",
@@ -14,6 +15,7 @@ __all__ = [
     "load_npy",
     "load_npy_object",
     "load_npz_objects",
+    "load_torch_pickle",
     "restricted_load",
     "sha256_bytes",
     "sha256_file",

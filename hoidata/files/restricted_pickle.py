@@ -9,7 +9,7 @@ import math
 import pickle
 import pickletools
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from pathlib import Path
 from types import FunctionType
 from typing import Any, BinaryIO
@@ -23,7 +23,9 @@ Allow = Mapping[tuple[str, str], Any]
 
 _REMEDY = "download it again from the dataset's own site; it is not opened otherwise, because it could run code"
 # Never written by the tools we read from, or able to reach beyond the allow-list.
-_REFUSED_OPCODES = {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"}
+REFUSED_OPCODES = frozenset(
+    {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"}
+)
 _MEMO_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
 _DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}|O8?)")
 
@@ -44,7 +46,7 @@ def restricted_load(
     if len(data) > max_bytes:
         raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
     try:
-        _check_opcodes(data)
+        check_opcodes(data)
         return _plain(_Unpickler(io.BytesIO(data), allow, encoding).load(), {})
     except BadInput:
         raise
@@ -69,7 +71,16 @@ class _Unpickler(pickle.Unpickler):
         raise pickle.UnpicklingError("it holds a persistent id, which is not allowed")
 
 
-class _Callable:
+class StandIn:
+    """Something a pickle may name or pass on but not change (BUILD), and that no result holds."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        raise pickle.UnpicklingError(f"it changes a {type(self).__name__}, which is not allowed")
+
+
+class _Callable(StandIn):
     """An allowed function that a pickle can call and nothing else: BUILD on it could set its defaults for all files."""
 
     __slots__ = ("_function",)
@@ -80,14 +91,11 @@ class _Callable:
     def __call__(self, *arguments: Any) -> Any:
         return self._function(*arguments)
 
-    def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError("it changes a function, which is not allowed")
 
-
-def _check_opcodes(data: bytes) -> None:
+def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES) -> None:
     """Refuse opcodes we never need, and memo indices beyond the file's length (they would allocate at will)."""
     for opcode, argument, _ in pickletools.genops(data):
-        if opcode.name in _REFUSED_OPCODES:
+        if opcode.name in refused:
             raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
         if opcode.name in _MEMO_OPCODES and isinstance(argument, int) and argument > len(data):
             raise pickle.UnpicklingError(f"it stores memo entry {argument} in {len(data)} bytes")
@@ -100,7 +108,7 @@ def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
     """
     if id(value) in seen:
         return seen[id(value)][1]
-    if isinstance(value, _Array):
+    if isinstance(value, CheckedArray):
         result = value.view(np.ndarray)
         seen[id(value)] = value, result
         if result.dtype.hasobject:
@@ -111,6 +119,8 @@ def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
         result = tuple(_plain(item, seen) for item in value)
         seen[id(value)] = value, result
         return result
+    if isinstance(value, StandIn | _DtypeRecord):
+        raise pickle.UnpicklingError(f"it holds a {type(value).__name__} by itself")
     if isinstance(value, dict | list | Record):
         seen[id(value)] = value, value
         _make_parts_plain(value, seen)
@@ -135,7 +145,7 @@ class Record:
         self.state = state
 
 
-class _Array(np.ndarray):
+class CheckedArray(np.ndarray):
     """An array whose pickled state is checked before NumPy sees it."""
 
     def __setstate__(self, state: tuple) -> None:  # type: ignore[override]
@@ -166,7 +176,7 @@ class _DtypeRecord:
         self.dtype = self.dtype.newbyteorder(order)
 
 
-class _NdarrayType:
+class _NdarrayType(StandIn):
     """Stands for ``numpy.ndarray`` where a pickle names it as the type to rebuild; cannot be called or changed."""
 
     __slots__ = ()
@@ -197,10 +207,10 @@ def _as_bytes(raw: Any) -> bytes:
     raise pickle.UnpicklingError(f"a {type(raw).__name__} in the place of array data")
 
 
-def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> _Array:
+def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> CheckedArray:
     if subtype is not _NDARRAY or tuple(shape) != (0,):
         raise pickle.UnpicklingError("an array subclass or a preset shape, which is not allowed")
-    return np.ndarray.__new__(_Array, (0,), np.int8)
+    return np.ndarray.__new__(CheckedArray, (0,), np.int8)
 
 
 def _scalar(dtype: Any, raw: Any = b"") -> Any:
@@ -217,7 +227,7 @@ def _frombuffer(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
     kind = _checked_dtype(dtype)
     if kind.hasobject or order not in ("C", "F"):
         raise pickle.UnpicklingError("a buffer of objects or unknown order, which is not allowed")
-    return np.frombuffer(bytearray(_as_bytes(raw)), kind).reshape(shape, order=order)
+    return np.frombuffer(bytearray(_as_bytes(raw)), kind).reshape(shape, order=order).view(CheckedArray)
 
 
 def _encode(text: Any, encoding: Any = None) -> bytes:
