@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hoidata.geometry.stretches import Stretch, runs, sudden_steps
+
 FROZEN_SOURCE_FRAMES = 12
 FAR_WRIST_M = 1.0
 # A step is a jump when it is large for any motion, or notable and several times what the motion around it does.
@@ -28,11 +30,6 @@ LONGEST_FRAMES = 150
 BRIEF_FRAMES = 5
 MOVED_M, TURNED_RAD = 0.03, np.deg2rad(30)
 CARRIED_M, SPUN_RAD = 0.15, np.deg2rad(60)
-
-
-class Stretch(NamedTuple):
-    start: int
-    stop: int
 
 
 class Cut(NamedTuple):
@@ -127,13 +124,6 @@ def rotation_angle(rotation: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip((np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
-def runs(flags: np.ndarray) -> list[Stretch]:
-    """Maximal stretches of True in (frame,) booleans."""
-    change = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
-    pairs = zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True)
-    return [Stretch(int(start), int(stop)) for start, stop in pairs]
-
-
 def _frozen(*bodies: BodyMotion) -> list[Stretch]:
     same = np.all([(body.raw[1:] == body.raw[:-1]).all(axis=1) for body in bodies], axis=0)
     return [Stretch(a, b + 1) for a, b in runs(same) if b + 1 - a >= FROZEN_SOURCE_FRAMES]
@@ -143,7 +133,8 @@ def _jumps(body: BodyMotion) -> list[Cut]:
     """Four frames around each jump, merged where they overlap."""
     step_m = np.linalg.norm(np.diff(body.position_m, axis=0), axis=1)
     step_rad = rotation_angle(body.rotation[:-1].transpose(0, 2, 1) @ body.rotation[1:])
-    sudden = _sudden(step_m, NOTABLE_STEP_M, LARGE_STEP_M) | _sudden(step_rad, NOTABLE_STEP_RAD, LARGE_STEP_RAD)
+    sudden = sudden_steps(step_m, NOTABLE_STEP_M, LARGE_STEP_M, JUMP_RATIO, JUMP_NEIGHBOURS)
+    sudden |= sudden_steps(step_rad, NOTABLE_STEP_RAD, LARGE_STEP_RAD, JUMP_RATIO, JUMP_NEIGHBOURS)
     bad = np.zeros(len(body.position_m), dtype=bool)
     for step in np.flatnonzero(sudden):
         bad[max(0, step - 1) : step + 3] = True
@@ -153,14 +144,6 @@ def _jumps(body: BodyMotion) -> list[Cut]:
         got = f"{body.name} jumps {step_m[steps].max() * 100:.1f} cm, {np.rad2deg(step_rad[steps].max()):.0f} degrees"
         cuts.append(Cut(start, stop, "steady motion from frame to frame", got))
     return cuts
-
-
-def _sudden(step: np.ndarray, notable: float, large: float) -> np.ndarray:
-    if not len(step):
-        return np.zeros(0, dtype=bool)
-    padded = np.pad(step, JUMP_NEIGHBOURS, mode="reflect" if len(step) > JUMP_NEIGHBOURS else "edge")
-    around = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * JUMP_NEIGHBOURS + 1), axis=1)
-    return (step > large) | ((step > notable) & (step > JUMP_RATIO * around))
 
 
 def _without_brief(lifted: np.ndarray) -> np.ndarray:
