@@ -5,9 +5,8 @@ locate (``sequences``: which sequences are there), load (read the files of one s
 convert (change of frame, unit and convention, into ``Clip``). Nothing outside an adapter knows a dataset's quirks.
 """
 
-import contextlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -20,6 +19,9 @@ from hoidata.schema.hand_parameters import HandConvention
 from hoidata.schema.quarantine import Quarantined
 
 __all__ = ["Adapter", "DatasetPart", "Quarantined", "RawTree", "SequenceKey"]
+
+_SMALL_BYTES = 65536
+_LARGEST_FRAME_FILE = 1 << 20
 
 
 @dataclass(frozen=True, order=True)
@@ -139,8 +141,7 @@ class RawTree:
         """
         contents, lines = [], []
         listed = self.manifest is not None and folder not in self.manifest
-        for name in names:
-            data = self._read_small(folder, name)
+        for name, data in self._small_files(folder, names):
             digest = sha256_bytes(data)
             if listed:
                 self._check(SourceFile(f"{folder}/{name}", len(data), digest))
@@ -157,18 +158,31 @@ class RawTree:
         place = self.root / folder
         if not place.is_dir():
             return []
-        return sorted(item.name for item in place.iterdir() if item.name.lower().endswith(suffix) and item.is_file())
+        with os.scandir(place) as items:
+            return sorted(item.name for item in items if item.name.lower().endswith(suffix) and item.is_file())
 
     def has(self, path: str) -> bool:
         return (self.root / path).is_file()
 
-    def _read_small(self, folder: str, name: str) -> bytes:
-        """As ``_inside(...).read_bytes()``, without resolving the path of every plain file of a checked folder."""
-        plain = os.path.join(self.root, folder, name)
-        if self._is_inside(folder) and not os.path.islink(plain):
-            with contextlib.suppress(OSError), open(plain, "rb") as stream:
-                return stream.read()
-        return self._inside(f"{folder}/{name}").read_bytes()
+    def _small_files(self, folder: str, names: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+        """Name and bytes of each file. The folder is opened once: a path per file costs more than the bytes do."""
+        if not self._is_inside(folder) or not (self.root / folder).is_dir():
+            yield from ((name, self._read_linked_or_large(f"{folder}/{name}")) for name in names)
+            return
+        opened = os.open(self.root / folder, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            for name in names:
+                data = _read_small(opened, name)
+                yield name, self._read_linked_or_large(f"{folder}/{name}") if data is None else data
+        finally:
+            os.close(opened)
+
+    def _read_linked_or_large(self, path: str) -> bytes:
+        place = self._inside(path)
+        size = place.stat().st_size
+        if size > _LARGEST_FRAME_FILE:
+            raise BadInput(path, f"a file of one frame, at most {_LARGEST_FRAME_FILE} bytes", f"{size} bytes")
+        return place.read_bytes()
 
     def _is_inside(self, path: str) -> bool:
         if path not in self._inside_of_root:
@@ -196,3 +210,20 @@ class RawTree:
             expected = f"SHA-256 {listed.sha256[:12]} ({listed.size} bytes)"
             got = f"{found.sha256[:12]} ({found.size} bytes)"
             raise BadInput(found.path, expected, got, "restore the file, or scan the raw folder again")
+
+
+def _read_small(folder: int, name: str) -> bytes | None:
+    """The bytes of a file of an open folder; None for a link, a missing file, another folder's or a big one."""
+    if "/" in name:
+        return None
+    try:
+        stream = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, dir_fd=folder)
+    except OSError:
+        return None
+    try:
+        data = os.read(stream, _SMALL_BYTES)
+    except OSError:
+        return None
+    finally:
+        os.close(stream)
+    return data if len(data) < _SMALL_BYTES else None

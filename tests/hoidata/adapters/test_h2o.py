@@ -244,3 +244,10 @@ def test_a_sequence_without_action_labels_says_so(root, load_all):
         path.unlink()
     with pytest.raises(BadInput, match=r"action_label.*subject4.*withheld"):
         load_all(H2OAdapter(), root)
+
+
+def test_a_frame_file_too_big_to_be_one_is_refused_without_reading_it(root, load_all):
+    with open(root / "subject2/k1/3/cam4/cam_pose/000007.txt", "wb") as stream:
+        stream.truncate(1 << 40)
+    with pytest.raises(BadInput, match=r"cam_pose/000007\.txt.*at most 1048576 bytes"):
+        load_all(H2OAdapter(), root)
