@@ -52,3 +52,25 @@ def entry(where: str, mapping: Any, key: str) -> Any:
     if key not in mapping:
         raise BadInput(where, f"the entry {key!r}", f"only {', '.join(sorted(map(str, mapping))) or 'none'}")
     return mapping[key]
+
+
+def whole_setting(adapter: str, name: str, value: Any) -> None:
+    """Refuse a setting that is not a whole number of 0 or more."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        _refuse_setting(adapter, name, "a whole number of 0 or more", value)
+
+
+def switch_setting(adapter: str, name: str, value: Any) -> None:
+    """Refuse a setting that is not true or false."""
+    if not isinstance(value, bool):
+        _refuse_setting(adapter, name, "true or false", value)
+
+
+def choice_setting(adapter: str, name: str, value: Any, choices: Sequence[str]) -> None:
+    """Refuse a setting that is none of the choices."""
+    if value not in choices:
+        _refuse_setting(adapter, name, " or ".join(choices), value)
+
+
+def _refuse_setting(adapter: str, name: str, expected: str, value: Any) -> None:
+    raise BadInput(f"settings of the adapter {adapter}: {name}", expected, repr(value)[:40], "correct params.yaml")

@@ -1,0 +1,49 @@
+"""GRAB's 29 intents and the names of its objects in words (Taheri et al. 2020; the renamed ones as in Text2HOI)."""
+
+import re
+
+# What GRAB files as ``motion_intent``, and the verb.
+INTENTS = {
+    **{word: word for word in ("browse", "brush", "call", "chop", "clean", "cook", "drink", "eat", "fly", "inspect")},
+    **{word: word for word in ("lift", "open", "pass", "peel", "play", "pour", "screw", "see", "set", "shake")},
+    **{word: word for word in ("squeeze", "stamp", "staple", "toast", "use", "wear")},
+    "offhand": "hand over",
+    "switchON": "switch on",
+    "takepicture": "take picture",
+}
+_SHAPES, _SIZES = ("cube", "cylinder", "pyramid", "sphere", "torus"), ("small", "medium", "large")
+# The 51 objects that are handled; the sizes of the plain shapes are part of their words.
+OBJECTS = {
+    **{shape + size: f"{size} {shape}" for shape in _SHAPES for size in _SIZES},
+    **{name: name for name in ("airplane", "apple", "banana", "binoculars", "bowl", "camera", "cup", "doorknob")},
+    **{name: name for name in ("duck", "elephant", "eyeglasses", "flashlight", "flute", "hammer", "hand")},
+    **{name: name for name in ("headphones", "knife", "mouse", "mug", "phone", "scissors", "stamp", "stapler")},
+    **{name: name for name in ("teapot", "toothbrush", "toothpaste", "train", "watch")},
+    "alarmclock": "alarm clock",
+    "fryingpan": "frying pan",
+    "gamecontroller": "game controller",
+    "lightbulb": "light bulb",
+    "piggybank": "piggy bank",
+    "stanfordbunny": "Stanford bunny",
+    "waterbottle": "water bottle",
+    "wineglass": "wine glass",
+}
+# Further meshes in GRAB's folder of objects.
+OTHER_MESHES = {
+    "coffeemug": "coffee mug",
+    "cubemiddle": "middle cube",
+    "rubberduck": "rubber duck",
+    "table": "table",
+    "wristwatch": "wristwatch",
+}
+_BEFORE_CAPITAL = re.compile(r"(?<=[a-z])(?=[A-Z])|[_\s-]+")
+
+
+def verb_words(intent: str) -> str | None:
+    """The action in words. An intent GRAB does not have is taken apart where its writing shows words; "" is None."""
+    return INTENTS.get(intent) or " ".join(_BEFORE_CAPITAL.split(intent)).strip().lower() or None
+
+
+def object_words(name: str) -> str:
+    """GRAB's joined object name in words, size first: ``cubelarge`` is "large cube". Names it lacks stay."""
+    return OBJECTS.get(name) or OTHER_MESHES.get(name, name)
