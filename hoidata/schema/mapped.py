@@ -1,5 +1,8 @@
 """Arrays of a stored (uncompressed) NPZ file mapped into memory: only the pages that are read are loaded."""
 
+import io
+import math
+import mmap
 import zipfile
 from pathlib import Path
 
@@ -9,10 +12,11 @@ from numpy.lib import format as npy_format
 from hoidata.errors import BadInput
 
 _LOCAL_HEADER = 30  # bytes of a zip local header before name and extra field
+_NPY_HEADER = 1 << 16  # at most so many bytes describe the dtype and shape of a member
 
 
 def map_npz(path: str | Path) -> dict[str, np.ndarray]:
-    """Every array of a stored NPZ as a read-only memory map, by name.
+    """Every array of a stored NPZ as a read-only view of one memory map, by name.
 
     Nothing is unpickled. Raises BadInput when the file is missing, truncated, compressed or holds Python objects.
     """
@@ -20,25 +24,29 @@ def map_npz(path: str | Path) -> dict[str, np.ndarray]:
         raise BadInput(path, "an array file of the store", "nothing there", "run the conversion again")
     try:
         with zipfile.ZipFile(path) as archive, open(path, "rb") as stream:
-            return {item.filename.removesuffix(".npy"): _map_member(path, stream, item) for item in archive.infolist()}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+            mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
+            return {item.filename.removesuffix(".npy"): _view(mapped, item) for item in archive.infolist()}
+    except (OSError, ValueError, EOFError, SyntaxError, TypeError, zipfile.BadZipFile) as error:
         raise BadInput(path, "a stored NPZ file of plain arrays", str(error), "run the conversion again") from error
 
 
-def _map_member(path: str | Path, stream, item: zipfile.ZipInfo) -> np.ndarray:
+def _view(mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndarray:
     if item.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{item.filename} is compressed")
-    stream.seek(item.header_offset)
-    header = stream.read(_LOCAL_HEADER)
+    header = mapped[item.header_offset : item.header_offset + _LOCAL_HEADER]
     # The local header's own lengths count: its extra field may differ from the one in the directory.
     skipped = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")
-    stream.seek(item.header_offset + _LOCAL_HEADER + skipped)
+    start = item.header_offset + _LOCAL_HEADER + skipped
+    stream = io.BytesIO(mapped[start : start + min(item.file_size, _NPY_HEADER)])
     version = npy_format.read_magic(stream)
     read_header = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
     shape, fortran, dtype = read_header(stream)
     if dtype.hasobject:
         raise ValueError(f"{item.filename} holds Python objects")
-    if 0 in shape:
+    count = math.prod(shape)
+    if stream.tell() + count * dtype.itemsize > item.file_size:
+        raise ValueError(f"{item.filename} is shorter than its shape {shape} says")
+    if count == 0:
         return np.zeros(shape, dtype)
-    order = "F" if fortran else "C"
-    return np.memmap(path, dtype=dtype, mode="r", offset=stream.tell(), shape=shape, order=order)
+    flat = np.frombuffer(mapped, dtype, count, start + stream.tell())
+    return flat.reshape(shape, order="F" if fortran else "C")

@@ -6,9 +6,12 @@
     meta/objects.parquet      one row per object     meta/files.parquet       one row per raw file
     meta/quarantine.parquet   what was left out, with the reason
     arrays/frames-00000.npz   one member per array, the clips of a shard one after another; never compressed
+    arrays/body-00000.npz     SMPL-X body parameters, where the source has them
+    arrays/source_contact-00000.npz  contact labels of the source, where it has them
     arrays/objects.npz        <object>/vertices_m, <object>/faces, <object>/part; arrays/templates.npz personal hands
 
-In one line: ``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_drink_1")``. With plain NumPy::
+``hoidata/schema/README.md`` describes every field. In one line:
+``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_drink_1")``. With plain NumPy::
 
     rows = pandas.read_parquet("clips/meta/sequences.parquet").set_index("clip_id")
     row = rows.loc["grab/s1/mug_drink_1"]
@@ -16,7 +19,8 @@ In one line: ``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_d
     wrist_m = arrays["left_wrist_m"][row.first_row : row.first_row + row.n_frames]
 
 Betas start at ``<side>_betas_row`` and have 1 row or one per frame (``<side>_betas_count``); the k-th further object
-starts at ``other_row + k * n_frames`` of the ``other_*`` arrays.
+starts at ``other_row + k * n_frames`` of the ``other_*`` arrays; camera, body and contact rows start at their own
+``*_row``, -1 for a clip that has none.
 """
 
 from dataclasses import dataclass, field
@@ -26,14 +30,27 @@ from typing import Any
 import numpy as np
 import orjson
 import pandas as pd
+import pyarrow.parquet as pq
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side, SourceFile
+from hoidata.schema.clip import (
+    SIDES,
+    BodyTrack,
+    CameraTrack,
+    Clip,
+    HandTrack,
+    ObjectTrack,
+    Side,
+    SourceContact,
+    SourceFile,
+)
+from hoidata.schema.fields import SCHEMA_VERSION, SEQUENCES, TABLES
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.quarantine import Quarantined
-from hoidata.schema.writing import SCHEMA_VERSION, write_store
+from hoidata.schema.versions import checked_version, filled_info, filled_table
+from hoidata.schema.writing import write_store
 
 __all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"]
 
@@ -42,29 +59,43 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     """Open a store for reading.
 
     hands: the hand model its parameters belong to; not needed when that is the embedded one, or when no joints are
-    asked for. Raises MissingResource when ``folder`` is no store, BadInput for a newer schema or other hands.
+    asked for. A store of an earlier minor version is read with what later ones added filled in; nothing is written.
+    Raises MissingResource when ``folder`` is no store, BadInput for another major version or other hands.
     """
     folder = Path(folder)
+    info = read_info(folder)
     path = folder / "meta" / "info.json"
+    version = checked_version(folder, info["schema_version"])
+    written = info.get("hand_model", {}).get("digest")
+    if hands is not None and written and hands.digest != written:
+        remedy = "open it with the hands it was converted with"
+        raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
+    sequences, objects, files, quarantine = (_read_table(folder / file.path) for file in TABLES.values())
+    sequences = filled_table(SEQUENCES, sequences, version).set_index("clip_id", drop=False).rename_axis(None)
+    return Store(folder, filled_info(info, version), sequences, objects, files, quarantine, hands)
+
+
+def read_info(folder: str | Path) -> dict[str, Any]:
+    """``meta/info.json`` as it is on disk.
+
+    Raises MissingResource when ``folder`` is no store, BadInput when the file is no JSON object with a schema_version.
+    """
+    path = Path(folder) / "meta" / "info.json"
     if not path.is_file():
         raise MissingResource(f"{folder} is no store: {path} is missing; run the conversion of this dataset first")
     try:
         info = orjson.loads(path.read_bytes())
-        major = int(info["schema_version"].split(".")[0])
-    except (orjson.JSONDecodeError, KeyError, ValueError, AttributeError, TypeError) as error:
+        _ = info["schema_version"]
+    except (orjson.JSONDecodeError, KeyError, TypeError) as error:
         raise BadInput(path, "JSON with a schema_version", str(error), "run the conversion again") from error
-    if major != int(SCHEMA_VERSION.split(".")[0]):
-        remedy = "upgrade hoidata to the version that wrote it, or convert again"
-        raise BadInput(path, f"schema version {SCHEMA_VERSION}", info["schema_version"], remedy)
-    written = info.get("hand_model", {}).get("digest")
-    if hands is not None and written is not None and hands.digest != written:
-        remedy = "open it with the hands it was converted with"
-        raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
-    sequences, objects, files, quarantine = (
-        pd.read_parquet(folder / "meta" / f"{name}.parquet") for name in ("sequences", "objects", "files", "quarantine")
-    )
-    sequences = sequences.set_index("clip_id", drop=False).rename_axis(None)
-    return Store(folder, info, sequences, objects, files, quarantine, hands)
+    return info
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    try:
+        return pq.read_table(path, memory_map=True, use_threads=False).to_pandas()
+    except (OSError, ValueError) as error:  # pyarrow's errors are both
+        raise BadInput(path, "a Parquet table of the store", str(error), "run the conversion again") from error
 
 
 @dataclass
@@ -80,10 +111,12 @@ class Store:
     hands: HandPair | None = None
     _arrays: dict[str, dict[str, np.ndarray]] = field(default_factory=dict, repr=False)
     _models: dict[str, ObjectModel] = field(default_factory=dict, repr=False)
+    _rows: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False)
+    _sources: list[SourceFile] = field(default_factory=list, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Workers open the array files anew: a pickled memory map would carry the whole dataset."""
-        return {**self.__dict__, "_arrays": {}, "_models": {}}
+        return {**self.__dict__, "_arrays": {}, "_models": {}, "_rows": {}, "_sources": []}
 
     def __len__(self) -> int:
         return len(self.sequences)
@@ -95,18 +128,20 @@ class Store:
     def clip(self, clip_id: str) -> Clip:
         """The clip as it was written, float32. Raises KeyError when there is none of that id."""
         row = self._row(clip_id)
-        start, stop = row["first_row"], row["first_row"] + row["n_frames"]
-        others = [self._other_object(row, number) for number in range(len(row["other_objects"]))]
+        frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
+        shard = self._file(f"frames-{row['shard']:05d}")
         return Clip(
             hands={side: self._hand(row, side) for side in SIDES},
-            object=self._object(row["object"], row["shard"], "object", start, stop),
-            other_objects=tuple(others),
-            source_frames=self._rows(row["shard"], "source_frames", start, stop),
+            object=self._object(row["object"], shard, "object", frames),
+            other_objects=tuple(self._other_objects(row, shard)),
+            source_frames=shard["source_frames"][frames].copy(),
             gravity=None if row["gravity"] is None else np.array(row["gravity"]),
             source_from_world=np.array(row["source_from_world"]).reshape(4, 4),
-            sources=tuple(self._source(number) for number in row["source_files"]),
-            **{name: row[name] for name in ("clip_id", "dataset", "subject", "sequence", "verb", "object_words")},
-            **{name: row[name] for name in ("labelled_hand", "source_fps", "synthetic")},
+            sources=self._sources_of(row),
+            camera=self._camera(row, shard),
+            body=self._body(row),
+            source_contact=self._source_contact(row),
+            **{name: row[name] for name in _PLAIN},
         )
 
     def joints(self, clip_id: str, side: Side) -> np.ndarray:
@@ -132,7 +167,7 @@ class Store:
             if match.empty:
                 raise KeyError(f"no object {name!r} in {self.folder}; there are: {', '.join(self.objects['object'])}")
             facts = match.iloc[0]
-            arrays = {key: np.array(self._file("objects")[f"{name}/{key}"]) for key in ("vertices_m", "faces", "part")}
+            arrays = {key: self._file("objects")[f"{name}/{key}"].copy() for key in ("vertices_m", "faces", "part")}
             hinge = None
             if facts["articulated"]:
                 hinge = Hinge(axis=np.array(facts["hinge_axis"]), origin_m=np.array(facts["hinge_origin_m"]))
@@ -140,54 +175,111 @@ class Store:
         return self._models[name]
 
     def _row(self, clip_id: str) -> dict[str, Any]:
-        if clip_id not in self.sequences.index:
+        """Columns are made plain Python values once: a row of a pandas table costs more than reading the clip."""
+        if not self._rows and len(self):
+            columns = {str(name): _plain_column(column) for name, column in self.sequences.items()}
+            rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
+            self._rows = {row["clip_id"]: row for row in rows}
+        if clip_id not in self._rows:
             raise KeyError(f"no clip {clip_id!r} in {self.folder}, which has {len(self)} clips")
-        row: dict[str, Any] = self.sequences.loc[clip_id].to_dict()
-        return {key: _plain(value) for key, value in row.items()}
+        return self._rows[clip_id]
 
     def _file(self, name: str) -> dict[str, np.ndarray]:
         if name not in self._arrays:
             self._arrays[name] = map_npz(self.folder / "arrays" / f"{name}.npz")
         return self._arrays[name]
 
-    def _rows(self, shard: int, name: str, start: int, stop: int) -> np.ndarray:
-        return np.array(self._file(f"frames-{shard:05d}")[name][start:stop])
-
     def _hand(self, row: dict[str, Any], side: Side) -> HandTrack:
-        start, stop = row["first_row"], row["first_row"] + row["n_frames"]
-        betas_start = row[f"{side}_betas_row"]
-        template = row[f"{side}_template"]
+        shard = self._file(f"frames-{row['shard']:05d}")
+        frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
+        betas, template = row[f"{side}_betas_row"], row[f"{side}_template"]
         return HandTrack(
-            **{
-                name: self._rows(row["shard"], f"{side}_{name}", start, stop)
-                for name in ("wrist_m", "global_orient", "hand_pose", "valid")
-            },
-            betas=self._rows(row["shard"], f"{side}_betas", betas_start, betas_start + row[f"{side}_betas_count"]),
-            template_m=None if template is None else np.array(self._file("templates")[template]),
+            wrist_m=shard[f"{side}_wrist_m"][frames].copy(),
+            global_orient=shard[f"{side}_global_orient"][frames].copy(),
+            hand_pose=shard[f"{side}_hand_pose"][frames].copy(),
+            betas=shard[f"{side}_betas"][betas : betas + row[f"{side}_betas_count"]].copy(),
+            valid=shard[f"{side}_valid"][frames].copy(),
+            template_m=None if template is None else self._file("templates")[template].copy(),
         )
 
-    def _object(self, name: str, shard: int, prefix: str, start: int, stop: int) -> ObjectTrack:
+    def _object(self, name: str, shard: dict[str, np.ndarray], prefix: str, rows: slice) -> ObjectTrack:
         model = self.object_model(name)
         return ObjectTrack(
             model,
-            rotvec=self._rows(shard, f"{prefix}_rotvec", start, stop),
-            translation_m=self._rows(shard, f"{prefix}_translation_m", start, stop),
-            hinge_rad=self._rows(shard, f"{prefix}_hinge_rad", start, stop) if model.is_articulated else None,
+            rotvec=shard[f"{prefix}_rotvec"][rows].copy(),
+            translation_m=shard[f"{prefix}_translation_m"][rows].copy(),
+            hinge_rad=shard[f"{prefix}_hinge_rad"][rows].copy() if model.is_articulated else None,
         )
 
-    def _other_object(self, row: dict[str, Any], number: int) -> ObjectTrack:
-        start = row["other_row"] + number * row["n_frames"]
-        return self._object(row["other_objects"][number], row["shard"], "other", start, start + row["n_frames"])
+    def _other_objects(self, row: dict[str, Any], shard: dict[str, np.ndarray]) -> list[ObjectTrack]:
+        first, length = row["other_row"], row["n_frames"]
+        starts = range(first, first + length * len(row["other_objects"]), length)
+        pairs = zip(row["other_objects"], starts, strict=True)
+        return [self._object(name, shard, "other", slice(start, start + length)) for name, start in pairs]
 
-    def _source(self, number: int) -> SourceFile:
-        facts = self.files.iloc[number]
-        return SourceFile(str(facts["path"]), int(facts["size"]), str(facts["sha256"]))
+    def _camera(self, row: dict[str, Any], shard: dict[str, np.ndarray]) -> CameraTrack | None:
+        first = row["camera_row"]
+        if first < 0:
+            return None
+        arrays = {
+            name: shard[f"camera_{name}"][first : first + row["n_frames"]].copy()
+            for name in ("rotvec", "position_m", "images")
+        }
+        intrinsics = row["camera_intrinsics"]
+        return CameraTrack(
+            row["camera_name"], **arrays, intrinsics=None if intrinsics is None else np.array(intrinsics)
+        )
+
+    def _body(self, row: dict[str, Any]) -> BodyTrack | None:
+        if row["body_row"] < 0:
+            return None
+        shard = self._file(f"body-{row['shard']:05d}")
+        rows = slice(row["body_row"], row["body_row"] + row["n_frames"])
+        expressions = slice(row["expression_row"], row["expression_row"] + row["n_frames"])
+        return BodyTrack(
+            **{name: shard[name][rows].copy() for name in ("transl_m", "global_orient", "body_pose", "face_pose")},
+            expression=None if row["expression_row"] < 0 else shard["expression"][expressions].copy(),
+        )
+
+    def _source_contact(self, row: dict[str, Any]) -> SourceContact | None:
+        first, count = row["source_contact_row"], row["source_contact_count"]
+        if first < 0:
+            return None
+        if count == 0:
+            return SourceContact(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.uint8))
+        shard = self._file(f"source_contact-{row['shard']:05d}")
+        return SourceContact(**{name: shard[name][first : first + count].copy() for name in shard})
+
+    def _sources_of(self, row: dict[str, Any]) -> tuple[SourceFile, ...]:
+        if not self._sources and len(self.files):
+            columns = (self.files[name].tolist() for name in ("path", "size", "sha256"))
+            self._sources = [SourceFile(*values) for values in zip(*columns, strict=True)]
+        return tuple(self._sources[number] for number in row["source_files"])
+
+
+_PLAIN = (
+    "clip_id",
+    "dataset",
+    "subject",
+    "sequence",
+    "verb",
+    "object_words",
+    "labelled_hand",
+    "source_fps",
+    "synthetic",
+    "gravity_note",
+    "hands_from",
+    "fit_error_m",
+)
+
+
+def _plain_column(column: pd.Series) -> list[Any]:
+    """Python values; a missing one (pandas has three kinds) is None."""
+    values = column.tolist()
+    if column.dtype.kind in "biu":
+        return values
+    return [value.tolist() if isinstance(value, np.ndarray) else _plain(value) for value in values]
 
 
 def _plain(value: Any) -> Any:
-    """NumPy scalars as Python ones; a missing value (pandas has three kinds) as None."""
-    if isinstance(value, np.ndarray | list):
-        return list(value)
-    if isinstance(value, np.generic):
-        value = value.item()
     return None if value is None or value is pd.NA or value != value else value

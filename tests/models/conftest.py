@@ -10,11 +10,11 @@ import trimesh
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.contact.stage import contact_store
-from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.schema.annotated import AnnotatedStore, load_annotated
 from hoidata.schema.clip import Clip, HandTrack, ObjectTrack
 from hoidata.schema.dataset import ClipBatch, HoiDataset, collate
+from hoidata.schema.info import generated_info
 from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import write_store
 
@@ -87,8 +87,7 @@ def make_clip(number: int, plan: Plan) -> Clip:
 
 
 def write_annotated(root: Path, clips: list[Clip]) -> Path:
-    digest = load_embedded_hands().digest
-    write_store(root / "clips", clips, {"dataset": "toy", "hand_model": {"name": "embedded", "digest": digest}})
+    write_store(root / "clips", clips, generated_info("toy"))
     rule = SplitRule(validation=("s2",), test=("s3",))
     annotate_store(root / "clips", root / "annotation", encoder="hash", split=rule)
     contact_store(root / "clips", root / "contact")

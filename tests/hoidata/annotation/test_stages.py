@@ -17,6 +17,7 @@ from hoidata.objects.model import Hinge, ObjectModel, articulate, place
 from hoidata.objects.sampling import sample_points
 from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack
 from hoidata.schema.annotated import AnnotatedStore, load_annotated
+from hoidata.schema.info import generated_info
 from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import open_store, write_store
 
@@ -68,8 +69,7 @@ def clips() -> list[Clip]:
 
 
 def write_all(root: Path, made: list[Clip]) -> Path:
-    digest = load_embedded_hands().digest
-    write_store(root / "clips", made, {"dataset": "toy", "hand_model": {"name": "embedded", "digest": digest}})
+    write_store(root / "clips", made, generated_info("toy"))
     annotate_store(root / "clips", root / "annotation", encoder="hash", split=RULE)
     contact_store(root / "clips", root / "contact")
     return root

@@ -8,22 +8,30 @@ import pytest
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.schema import SIDES, SourceFile
+from hoidata.schema import SIDES, BodyTrack, CameraTrack, SourceContact, SourceFile
+from hoidata.schema.info import generated_info
 from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import open_store, write_store
 
 LEFT_OUT = Quarantined("test/s9/bad_1", "bad_1.npz", "7 columns", "6", "download it again")
 
 
-def store_info() -> dict:
-    hands = load_embedded_hands()
-    return {"dataset": "test", "synthetic": True, "hand_model": {"name": hands.name, "digest": hands.digest}}
+INFO = generated_info("test")
 
 
 @pytest.fixture
 def clips(make_clip):
-    """Rigid and articulated, invalid frames, betas per frame, a personal template, a second object, no label."""
-    plain = make_clip(seed=1, clip_id="test/s1/a", gravity=None)
+    """Rigid and articulated, invalid frames, betas per frame, a personal template, a second object, no label.
+
+    Camera, body and contact labels in some; some frames without, an empty list of contacts, no expression.
+    """
+    plain = replace(
+        make_clip(seed=1, clip_id="test/s1/a", gravity=None),
+        gravity_note="estimated from nothing",
+        hands_from="keypoints",
+        fit_error_m=0.0042,
+        source_contact=contact(0, 30),
+    )
     hinged = make_clip(40, "both", articulated=True, seed=2, clip_id="test/s2/b", verb=None)
     left = hinged.hands["left"]
     rng = np.random.default_rng(5)
@@ -44,12 +52,38 @@ def clips(make_clip):
     )
     moved = replace(hinged.object, translation_m=hinged.object.translation_m + np.float32(0.5))
     longer = replace(odd, other_objects=(hinged.object, moved))
-    return [plain, longer, make_clip(20, "left", seed=3, clip_id="test/s1/c")]
+    longer = replace(
+        longer,
+        camera=camera(40, np.array([600.0, 600, 320, 240, 640, 480])),
+        body=body(40, True),
+        gravity_note="fitted",
+    )
+    last = make_clip(20, "left", seed=3, clip_id="test/s1/c")
+    return [plain, longer, replace(last, camera=camera(20), body=body(20, False), source_contact=contact(57, 20))]
+
+
+def camera(n_frames: int, intrinsics: np.ndarray | None = None) -> CameraTrack:
+    rng = np.random.default_rng(n_frames)
+    rotvec, position = rng.normal(size=(2, n_frames, 3)).astype(np.float32)
+    return CameraTrack("cam4", rotvec, position, np.arange(n_frames, dtype=np.int32) * 2, intrinsics)
+
+
+def body(n_frames: int, expression: bool) -> BodyTrack:
+    rng = np.random.default_rng(n_frames)
+    arrays = [rng.normal(size=(n_frames, columns)).astype(np.float32) for columns in (3, 3, 63, 9, 10)]
+    return BodyTrack(*arrays[:4], expression=arrays[4] if expression else None)
+
+
+def contact(count: int, n_frames: int) -> SourceContact:
+    rng = np.random.default_rng(count)
+    rows = np.unique(np.stack((rng.integers(0, n_frames, count), rng.integers(0, 8, count)), axis=1), axis=0)
+    frame, vertex = rows.T.astype(np.int32)
+    return SourceContact(frame, vertex, rng.integers(21, 56, len(rows)).astype(np.uint8))
 
 
 @pytest.fixture
 def folder(tmp_path: Path, clips) -> Path:
-    write_store(tmp_path / "clips", [clips[0], LEFT_OUT, *clips[1:]], store_info())
+    write_store(tmp_path / "clips", [clips[0], LEFT_OUT, *clips[1:]], INFO)
     return tmp_path / "clips"
 
 
@@ -101,7 +135,7 @@ def test_joints_are_those_of_the_clip(folder, clips):
 
 
 def test_the_same_clips_give_the_same_bytes(folder, clips, tmp_path):
-    write_store(tmp_path / "again", [clips[0], LEFT_OUT, *clips[1:]], store_info())
+    write_store(tmp_path / "again", [clips[0], LEFT_OUT, *clips[1:]], INFO)
     for path in sorted(folder.rglob("*.*")):
         assert path.read_bytes() == (tmp_path / "again" / path.relative_to(folder)).read_bytes(), path.name
 
@@ -109,7 +143,7 @@ def test_the_same_clips_give_the_same_bytes(folder, clips, tmp_path):
 def test_what_is_read_from_a_store_writes_the_same_store(folder, tmp_path):
     store = open_store(folder)
     again = [store.clip(clip_id) for clip_id in store.ids]
-    write_store(tmp_path / "again", [again[0], LEFT_OUT, *again[1:]], store_info())
+    write_store(tmp_path / "again", [again[0], LEFT_OUT, *again[1:]], INFO)
     for path in sorted(folder.rglob("*.*")):
         assert path.read_bytes() == (tmp_path / "again" / path.relative_to(folder)).read_bytes(), path.name
 
@@ -122,9 +156,9 @@ def test_plain_numpy_and_pandas_can_read_it(folder, clips):
 
 
 def test_many_clips_go_to_several_shards(tmp_path, make_clip, monkeypatch):
-    monkeypatch.setattr("hoidata.schema.writing.FRAMES_PER_SHARD", 50)
+    monkeypatch.setattr("hoidata.schema.shards.FRAMES_PER_SHARD", 50)
     clips = [make_clip(30, seed=number, clip_id=f"test/s1/{number}") for number in range(5)]
-    write_store(tmp_path / "clips", clips, store_info())
+    write_store(tmp_path / "clips", clips, INFO)
     store = open_store(tmp_path / "clips")
     assert store.sequences["shard"].tolist() == [0, 0, 1, 1, 2]
     for clip in clips:
@@ -140,7 +174,7 @@ def test_the_tables_say_what_was_left_out_and_what_was_read(folder):
 
 
 def test_an_empty_store_opens_and_has_all_columns(tmp_path, folder):
-    write_store(tmp_path / "empty", [], store_info())
+    write_store(tmp_path / "empty", [], INFO)
     store = open_store(tmp_path / "empty")
     assert store.ids == []
     assert list(store.sequences.columns) == list(open_store(folder).sequences.columns)
@@ -152,7 +186,10 @@ def test_a_newer_major_version_is_refused(folder):
     path.write_text(json.dumps({**info, "schema_version": "1.7.0"}))
     assert len(open_store(folder)) == 3
     path.write_text(json.dumps({**info, "schema_version": "2.0.0"}))
-    with pytest.raises(BadInput, match=r"expected schema version 1\.0\.0, got 2\.0\.0; upgrade hoidata"):
+    with pytest.raises(BadInput, match=r"expected schema version 1\.1\.0, got 2\.0\.0; upgrade .* hoidata migrate /"):
+        open_store(folder)
+    path.write_text(json.dumps({**info, "schema_version": "0.9.0"}))
+    with pytest.raises(BadInput, match=r"got 0\.9\.0; run: hoidata migrate /"):
         open_store(folder)
 
 
@@ -180,13 +217,24 @@ def test_a_truncated_array_file_is_named(folder):
         open_store(folder).clip("test/s1/a")
 
 
-def test_an_id_given_twice_and_a_clip_that_breaks_the_rules_are_refused(tmp_path, clips):
-    with pytest.raises(BadInput, match="same id twice"):
-        write_store(tmp_path / "clips", [clips[0], clips[0]], store_info())
+def test_a_clip_that_breaks_the_rules_is_refused(tmp_path, clips):
     millimetres = replace(clips[0].object, translation_m=clips[0].object.translation_m * 1000)
     with pytest.raises(BadInput, match="unit"):
-        write_store(tmp_path / "clips", [replace(clips[0], object=millimetres)], store_info())
+        write_store(tmp_path / "clips", [replace(clips[0], object=millimetres)], INFO)
     assert not (tmp_path / "clips").exists()
+
+
+def test_the_second_clip_of_one_id_is_left_out_and_listed(tmp_path, clips, folder):
+    second = replace(clips[2], clip_id=clips[0].clip_id)
+    counts = write_store(tmp_path / "twice", [clips[0], second, *clips[1:]], INFO)
+    assert counts["clips"] == 3
+    store = open_store(tmp_path / "twice")
+    np.testing.assert_array_equal(store.clip("test/s1/a").object.rotvec, clips[0].object.rotvec)
+    (row,) = store.quarantine.to_dict("records")
+    assert row["source_key"] == "test/s1/a"
+    assert "a second one, frames 0 to 19 of s1/c" in row["got"]
+    frames = "arrays/frames-00000.npz"
+    assert (tmp_path / "twice" / frames).read_bytes() == (folder / frames).read_bytes()
 
 
 def test_a_store_survives_pickling_without_carrying_its_arrays(folder):

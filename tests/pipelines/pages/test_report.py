@@ -7,6 +7,7 @@ import pytest
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.contact.stage import contact_store
+from hoidata.schema.info import generated_info
 from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import write_store
@@ -28,8 +29,7 @@ def folders(hands, page_clip, tmp_path):
     clips = [replace(page_clip(hinged=name == "s2"), clip_id=f"test/{name}/box", subject=name) for name in names]
     left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN in <frame 3>", "download it again")
     root = folders.data / "grab"
-    info = {"dataset": "grab", "synthetic": True, "hand_model": {"name": hands.name, "digest": hands.digest}}
-    write_store(root / "clips", [*clips, left_out], info)
+    write_store(root / "clips", [*clips, left_out], generated_info("grab", hands))
     annotate_store(root / "clips", root / "annotation", encoder="hash", split=SplitRule(test=("s2",)), threshold_m=0.2)
     contact_store(root / "clips", root / "contact", threshold_m=0.2)
     (folders.data / "arctic" / "clips").mkdir(parents=True)
@@ -86,8 +86,7 @@ def test_recorded_and_generated_motion_and_contact_maps_stand_side_by_side(train
 
 def test_dataset_of_which_nothing_could_be_used_still_lists_why(folders, hands, tmp_path):
     left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN", "download it again")
-    info = {"dataset": "h2o", "synthetic": True, "hand_model": {"name": hands.name, "digest": hands.digest}}
-    write_store(folders.data / "h2o" / "clips", [left_out], info)
+    write_store(folders.data / "h2o" / "clips", [left_out], generated_info("h2o", hands))
     text = write_report(tmp_path / "report", "embedded", ["h2o"], hands, folders).read_text()
     assert "Empty: no sequence gave a clip." in text
     assert "<td>finite numbers</td>" in text
