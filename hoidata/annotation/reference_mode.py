@@ -1,0 +1,51 @@
+"""Sentences as the reference implementation of Text2HOI writes them, for comparing with models trained on those.
+
+No articles, "with" in the passive, everything but the first letter in lower case, object names without their size. Its
+misspellings ("openning", "takes take") and its passives without an auxiliary are not copied.
+"""
+
+import re
+
+from hoidata.annotation.grammar import Grammar, default_grammar
+from hoidata.annotation.sentences import FourSentences
+from hoidata.schema import HandType
+
+HAND_WORDS: dict[HandType, str] = {"left": "left hand", "right": "right hand", "both": "both hands"}
+# What the reference calls an object, where its name differs from ours.
+JOINED = {
+    "wine glass": "wineglass",
+    "capsule machine": "capsulemachine",
+    "espresso machine": "espressomachine",
+    "waffle iron": "waffleiron",
+    "coffee mug": "coffeemug",
+    "rubber duck": "rubberduck",
+}
+SIZED = re.compile(r"(?:large|medium|small) (cube|cylinder|pyramid|sphere|torus)")
+
+
+def reference_sentences(verb: str, object_words: str, hand: HandType, grammar: Grammar | None = None) -> FourSentences:
+    """Imperative, passive, subject and gerund form, in hoidata's order of forms.
+
+    verb, object_words: base forms as in ``four_sentences``. Example: "Place book with both hands." / "Book is placed
+    with both hands." / "Both hands place book." / "Placing book with both hands."
+    """
+    grammar = grammar or default_grammar()
+    forms, words = grammar.verb(verb), reference_words(object_words)
+    hands = HAND_WORDS[hand]
+    present = forms.base if hand == "both" else forms.third_singular
+    return (
+        _sentence(f"{forms.base} {words} with {hands}"),
+        _sentence(f"{words} is {forms.past_participle} with {hands}"),
+        _sentence(f"{hands} {present} {words}"),
+        _sentence(f"{forms.gerund} {words} with {hands}"),
+    )
+
+
+def reference_words(object_words: str) -> str:
+    """The reference's name of an object: "large cube" is "cube", "wine glass" is "wineglass"."""
+    sized = SIZED.fullmatch(object_words.lower())
+    return sized[1] if sized else JOINED.get(object_words.lower(), object_words.lower())
+
+
+def _sentence(words: str) -> str:
+    return words[0].upper() + words[1:].lower() + "."

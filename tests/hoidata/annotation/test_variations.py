@@ -1,0 +1,132 @@
+"""Richer sentences are kept only when hand, verb and object can be read back; the reference's are as it writes them."""
+
+import csv
+from importlib.resources import files
+
+import numpy as np
+import pytest
+
+from hoidata.annotation.hand_choice import HAND_TYPES
+from hoidata.annotation.prompts import Lexicon
+from hoidata.annotation.reference_mode import reference_sentences
+from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.variations import SentenceMaker, manner_of, word_table
+
+ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
+ARCTIC_OBJECTS = (
+    "box", "capsule machine", "espresso machine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
+    "scissors", "waffle iron",
+)  # fmt: skip
+HOMOGRAPH_VERBS = ("stamp", "staple", "brush", "watch", "hand over", "screw", "use", "pass")
+HOMOGRAPH_OBJECTS = ("stamp", "stapler", "toothbrush", "watch", "hand", "train", "knife")
+
+
+@pytest.fixture(scope="module")
+def arctic() -> SentenceMaker:
+    return SentenceMaker(ARCTIC_VERBS, ARCTIC_OBJECTS)
+
+
+def test_the_papers_four_sentences_are_among_the_variations(arctic) -> None:
+    for verb, thing, hand in (("open", "box", "both"), ("lift", "laptop", "left"), ("place", "phone", "right")):
+        assert set(four_sentences(verb, thing, hand)) <= set(arctic.variations(verb, thing, hand).sentences)
+
+
+def test_natural_frames_say_how_things_are_used(arctic) -> None:
+    cut, typed = arctic.variations("cut", "scissors", "right"), arctic.variations("type", "laptop", "both")
+    assert "Cut with a pair of scissors in the right hand." in cut.sentences
+    assert "A pair of scissors is used to cut by the right hand." in cut.sentences
+    assert "Both hands are typing on this laptop." in typed.sentences
+    assert "These scissors are used to cut by your right hand." in cut.sentences
+
+
+@pytest.mark.parametrize("hand", HAND_TYPES)
+def test_there_are_many_distinct_sentences_for_every_pair_and_no_two_hands_share_one(arctic, hand) -> None:
+    others = [other for other in HAND_TYPES if other != hand]
+    for verb, thing in zip(ARCTIC_VERBS, ARCTIC_OBJECTS, strict=True):
+        found = arctic.variations(verb, thing, hand)
+        assert len(found.sentences) == len(set(found.sentences)) >= 60
+        assert not set(found.sentences) & {
+            s for other in others for s in arctic.variations(verb, thing, other).sentences
+        }
+
+
+def test_what_cannot_be_read_back_is_dropped_and_counted() -> None:
+    maker = SentenceMaker(HOMOGRAPH_VERBS, HOMOGRAPH_OBJECTS)
+    dropped = 0
+    for verb in HOMOGRAPH_VERBS:
+        for thing in HOMOGRAPH_OBJECTS:
+            found = maker.variations(verb, thing, "left")
+            dropped += found.dropped
+            assert all(maker.reads_back(sentence, verb, thing, "left") for sentence in found.sentences)
+    assert dropped > 0
+    assert not maker.reads_back("Lift a stamp with the left hand.", "stamp", "stamp", "left")
+    assert not maker.reads_back("Stamp a stamp with the right hand.", "stamp", "stamp", "left")
+    assert not maker.reads_back("Stamp a stamp.", "stamp", "stamp", "left")
+
+
+def test_a_synonym_that_is_another_verb_of_the_dataset_is_not_used() -> None:
+    def bases(*verbs: str) -> list[str]:
+        return [forms.base for forms in SentenceMaker(verbs, ["box"]).synonyms("lift")]
+
+    assert bases("lift", "open") == ["lift", "raise"]
+    assert bases("lift", "raise") == ["lift"]
+
+
+def test_a_form_that_stands_for_two_words_is_refused() -> None:
+    with pytest.raises(ValueError, match="lifts"):
+        Lexicon([("lifts", "lift"), ("lifts", "raise")], [])
+
+
+def test_adverbs_stand_only_where_a_speed_was_measured(arctic) -> None:
+    plain = arctic.variations("open", "box", "left").sentences
+    slow = arctic.variations("open", "box", "left", manner_of(0.1, (0.2, 0.9))).sentences
+    assert not any("slowly" in sentence or "quickly" in sentence for sentence in plain)
+    assert "Slowly, open a box with the left hand." in slow
+    assert "A box is opened by the left hand slowly." in slow
+    assert not any("quickly" in sentence for sentence in slow)
+    assert [manner_of(speed, (0.2, 0.9)) for speed in (0.2, 0.9, 1.0)] == [None, None, "quickly"]
+
+
+def test_every_synonym_of_the_table_has_forms_of_its_own() -> None:
+    grammar = {row["base"] for row in csv.DictReader(_shipped("grammar.csv")) if row["kind"] == "verb"}
+    assert set(word_table().synonyms.values()) <= grammar
+    assert set(word_table().synonyms) <= grammar
+    assert set(word_table().prepositions) <= grammar | {"write"}
+
+
+@pytest.mark.slow
+def test_sampled_variations_of_all_grab_words_keep_nearly_everything() -> None:
+    """The share dropped is what homographs cost ("stamp", "hand"), not a fault of the frames."""
+    rows = list(csv.DictReader(_shipped("grammar.csv")))
+    verbs = [row["base"] for row in rows if row["kind"] == "verb"]
+    things = [row["base"] for row in rows if row["kind"] == "object"]
+    maker, random = SentenceMaker(verbs, things), np.random.default_rng(0)
+    kept = dropped = 0
+    for _ in range(40):
+        verb, thing = str(random.choice(verbs)), str(random.choice(things))
+        found = maker.variations(verb, thing, HAND_TYPES[random.integers(3)])
+        kept, dropped = kept + len(found.sentences), dropped + found.dropped
+    assert kept > 3000
+    assert dropped < 0.03 * kept
+
+
+@pytest.mark.parametrize(
+    ("verb", "thing", "hand", "expected"),
+    [
+        ("place", "book", "both", ("Place book with both hands.", "Book is placed with both hands.",
+                                   "Both hands place book.", "Placing book with both hands.")),
+        ("open", "wine glass", "left", ("Open wineglass with left hand.", "Wineglass is opened with left hand.",
+                                        "Left hand opens wineglass.", "Opening wineglass with left hand.")),
+        ("take out", "large cube", "right", ("Take out cube with right hand.", "Cube is taken out with right hand.",
+                                             "Right hand takes out cube.", "Taking out cube with right hand.")),
+        ("hand over", "Stanford bunny", "both", (
+            "Hand over stanford bunny with both hands.", "Stanford bunny is handed over with both hands.",
+            "Both hands hand over stanford bunny.", "Handing over stanford bunny with both hands.")),
+    ],
+)  # fmt: skip
+def test_reference_sentences_are_the_references_without_its_misspellings(verb, thing, hand, expected) -> None:
+    assert reference_sentences(verb, thing, hand) == expected
+
+
+def _shipped(name: str) -> list[str]:
+    return files("hoidata.annotation").joinpath(name).read_text(encoding="utf-8").splitlines()
