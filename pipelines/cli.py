@@ -5,7 +5,7 @@ import sys
 import typer
 
 from hoidata.errors import HoidataError
-from pipelines.commands import generate, graph, inspect, raw, share, synth
+from pipelines.commands import adapters, generate, graph, inspect, raw, share, synth
 
 app = typer.Typer(
     name="hoidata",
@@ -15,6 +15,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.add_typer(synth.app, name="synth", help="The embedded corpora: write them, check their physics.")
+app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list them, check that one keeps the rules.")
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)

@@ -1,0 +1,111 @@
+"""``hoidata adapters``: which readers of datasets there are, and whether one keeps the rules."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from hoidata.hands import HandPair
+
+app = typer.Typer(no_args_is_help=True)
+COLOURS = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
+Name = Annotated[str, typer.Argument(help="A name that `hoidata adapters list` shows.")]
+Root = Annotated[Path, typer.Option(help="A raw folder it can read.", exists=True, file_okay=False, resolve_path=True)]
+Sequences = Annotated[int, typer.Option(help="How many sequences to load, spread over those there are.", min=1)]
+Hand = Annotated[
+    str, typer.Option(help="embedded, or the folder of the MANO files; by default those registered, if any.")
+]
+Setting = Annotated[list[str] | None, typer.Option(help="One setting of the adapter, key=value; may be repeated.")]
+Strict = Annotated[bool, typer.Option("--strict", help="Warnings fail too.")]
+
+
+@app.command("list")
+def list_adapters() -> None:
+    """All known adapters: dataset version, licence, where they come from, settings with their defaults."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    from hoidata.adapters.registry import registered_adapters
+
+    table = Table("name", "version", "licence", "may be shared", "from", "settings")
+    for row in registered_adapters():
+        if row.adapter is None:
+            table.add_row(row.name, "", f"[bold red]{escape(row.problem)}", "", escape(row.origin), "")
+            continue
+        facts, settings = row.adapter, ", ".join(f"{key}={value!r}" for key, value in row.settings.items())
+        shared = "yes" if facts.may_be_shared else "no"
+        table.add_row(*map(escape, (row.name, facts.version, facts.licence, shared, row.origin, settings)))
+    Console().print(table)
+
+
+@app.command()
+def check(
+    name: Name,
+    root: Root,
+    sequences: Sequences = 4,
+    hand: Hand = "",
+    setting: Setting = None,
+    strict: Strict = False,
+) -> None:
+    """Try every rule of an adapter on real input. Exit code 1 when one fails.
+
+    Nothing below ROOT is written to; altered copies are hard links in a temporary folder.
+    """
+    from hoidata.adapters.conformance import check_adapter
+    from hoidata.adapters.registry import get_adapter
+
+    adapter = get_adapter(name, **_settings(setting or []))
+    hands, note = _hands(hand, adapter.needs_mano)
+    findings = check_adapter(adapter, root, hands, sequences)
+    bad = {"fail", "warn"} if strict else {"fail"}
+    failed = sum(item.outcome in bad for item in findings)
+    _print(name, findings, note)
+    raise typer.Exit(1 if failed else 0)
+
+
+def _settings(pairs: list[str]) -> dict[str, Any]:
+    """``margin_frames=5`` as a number, other values as YAML reads them."""
+    import yaml
+
+    from hoidata.errors import BadInput
+
+    settings = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals:
+            raise BadInput("--setting", "key=value", pair, "correct it")
+        settings[key] = yaml.safe_load(value)
+    return settings
+
+
+def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
+    """The hand to check with, and what to say about it."""
+    from hoidata.hands import load_embedded_hands, load_mano_hands
+    from pipelines.stages.base import HAND, own_root
+
+    registered = own_root(HAND)
+    folder = Path(choice) if choice not in ("", "embedded") else (registered if not choice else None)
+    if folder is not None:
+        return load_mano_hands(folder), f"hand: MANO files of {folder}"
+    note = "hand: embedded"
+    if needs_mano:
+        note += "; on files made with MANO, warnings about touch mean nothing without --hand FOLDER"
+    return load_embedded_hands(), note
+
+
+def _print(name: str, findings, note: str) -> None:
+    from collections import Counter
+
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table("", "rule", "seen", title=f"adapter {name}", caption=note)
+    for item in findings:
+        table.add_row(f"[{COLOURS[item.outcome]}]{item.outcome}", escape(item.rule), escape(item.detail))
+    counts = Counter(item.outcome for item in findings)
+    console = Console()
+    console.print(table)
+    console.print(", ".join(f"{counts[outcome]} {outcome}" for outcome in COLOURS if counts[outcome]))
