@@ -1,19 +1,23 @@
-"""One dataset from raw files to the store: every sequence converts or is listed with its reason."""
+"""One dataset from raw files to the store: every sequence converts or is listed with its reason.
 
-import multiprocessing
+Each sequence's results are kept as soon as they are made (``finished``); when all are there, they become the store in
+the order of the keys. So a run that was killed goes on where it was, at most one sequence per worker is in memory, and
+the bytes depend neither on the number of workers nor on how often the run was killed.
+"""
+
 import sys
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 from rich.progress import Progress
 
 from hoidata.adapters.base import Adapter, RawTree, SequenceKey
+from hoidata.adapters.finished import FinishedWork, job_of
+from hoidata.adapters.workers import WorkerLost, in_workers
 from hoidata.errors import BadInput
+from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
 from hoidata.schema.clip import Clip, SourceFile
 from hoidata.schema.hand_parameters import hands_for
@@ -21,12 +25,16 @@ from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import write_store
 from hoidata.schema.validation import check_clip
 
-Results = list[Clip | Quarantined]
+DEFECT = "report this defect of hoidata"
 
 
 @dataclass(frozen=True)
 class ConversionSummary:
-    """What a conversion did. left_out: every sequence, or stretch of one, that gave no clip, with its reason."""
+    """What a conversion did.
+
+    left_out: every sequence, or stretch of one, that gave no clip, with its reason. taken_up: sequences an interrupted
+    run had finished before.
+    """
 
     dataset: str
     sequences: int
@@ -34,11 +42,13 @@ class ConversionSummary:
     frames: int
     left_out: tuple[Quarantined, ...]
     empty_reason: str | None = None
+    taken_up: int = 0
 
     def __str__(self) -> str:
         if self.empty_reason:
             return f"{self.dataset}: empty ({self.empty_reason})"
         head = f"{self.dataset}: {self.clips} clips, {self.frames} frames from {self.sequences} sequences"
+        head += f" ({self.taken_up} finished before)" if self.taken_up else ""
         lines = [f"{head}; {len(self.left_out)} left out{':' if self.left_out else ''}"]
         for item in self.left_out:
             lines.append(f"  {item.source_key}: {item.where}: expected {item.expected}, got {item.got}; {item.remedy}")
@@ -61,42 +71,87 @@ def convert_dataset(
     and bytes of the result do not depend on it. manifest: each file read must be listed with its SHA-256.
     synthetic: the raw data was generated; every clip and the store say so. progress: a bar on stderr and the summary
     on stdout.
+
+    A run that ends early, even by ``kill -9``, leaves ``.<name>.work`` beside ``out``; the next one takes up what was
+    finished there if neither raw files, code nor settings have changed. Raises BadInput when a worker process is
+    lost, when ``out`` is being written by another run, or when there is no room.
     """
     hands = hands_for(adapter.hand_convention, hands)
     keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
     reason = None if keys else _why_empty(adapter, root)
     files = manifest.values() if isinstance(manifest, Mapping) else manifest
     listed = None if files is None else {item.path: item for item in files}
-    convert = partial(convert_sequence, adapter, Path(root or "."), hands, listed, synthetic)
+    out, root = Path(out), Path(root or ".")
+    work = FinishedWork(out.with_name(f".{out.name}.work"), root)
+    convert = SequenceConverter(adapter, root, hands, listed, synthetic, work)
     left_out: list[Quarantined] = []
-    info = _store_info(adapter, hands, synthetic, reason)
-    with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        groups = bar.track(_in_order(convert, keys, jobs), len(keys), description=f"convert {adapter.name}")
-        counts = write_store(out, _flattened(groups, left_out), info)
-    summary = ConversionSummary(adapter.name, len(keys), counts["clips"], counts["frames"], tuple(left_out), reason)
+    with exclusive(out) as lock:
+        remove_leftovers(out)
+        work.open(job_of(adapter, hands, root, keys, listed, synthetic))
+        taken_up = _convert_all(convert, keys, jobs, lock, progress)
+        groups = (work.read(key) for key in keys)
+        counts = write_store(out, _flattened(groups, left_out), _store_info(adapter, hands, synthetic, reason))
+        work.remove()
+    summary = ConversionSummary(
+        adapter.name, len(keys), counts["clips"], counts["frames"], tuple(left_out), reason, taken_up
+    )
     if progress:
         print(summary, file=sys.stdout)
     return summary
 
 
-def convert_sequence(
-    adapter: Adapter,
-    root: Path,
-    hands: HandPair,
-    manifest: dict[str, SourceFile] | None,
-    synthetic: bool,
-    key: SequenceKey,
-) -> Results:
-    """The checked clips of one sequence; one Quarantined in their place when it cannot be used."""
-    try:
-        results = adapter.load(RawTree(root, manifest), key, hands)
-        clips = [item if isinstance(item, Quarantined) else replace(item, synthetic=synthetic) for item in results]
-        return [item if isinstance(item, Quarantined) else check_clip(item) for item in clips]
-    except BadInput as error:
-        return [_left_out(key, root, error)]
-    except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
-        problem = BadInput(str(key), "a sequence the adapter can read", repr(error), "report this defect of hoidata")
-        return [_left_out(key, root, problem)]
+@dataclass(frozen=True)
+class SequenceConverter:
+    """What a worker needs: called with a key, it leaves that sequence's results in ``work``."""
+
+    adapter: Adapter
+    root: Path
+    hands: HandPair
+    manifest: Mapping[str, SourceFile] | None
+    synthetic: bool
+    work: FinishedWork
+
+    def __call__(self, key: SequenceKey) -> None:
+        raw = RawTree(self.root, self.manifest)
+        try:
+            results = [self._checked(item) for item in self.adapter.load(raw, key, self.hands)]
+        except BadInput as error:
+            self.work.keep(key, [_left_out(key, self.root, error)], None)
+        except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
+            problem = BadInput(
+                str(key), "a sequence the adapter can read", repr(error), "report this defect of hoidata"
+            )
+            self.work.keep(key, [_left_out(key, self.root, problem)], None)
+        else:
+            self.work.keep(key, results, raw.sources)
+
+    def _checked(self, item: Clip | Quarantined) -> Clip | Quarantined:
+        return item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
+
+
+def _convert_all(convert: SequenceConverter, keys: Sequence[SequenceKey], jobs: int, lock: int, progress: bool) -> int:
+    """Convert every sequence that was not finished before; how many were."""
+    missing = [key for key in keys if not convert.work.holds(key)]
+    taken_up = len(keys) - len(missing)
+    title = f"convert {convert.adapter.name}" + (f" ({taken_up} finished before)" if taken_up else "")
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        task = bar.add_task(title, total=len(keys), completed=taken_up)
+        done = 0
+        try:
+            for _ in in_workers(convert, missing, jobs, lock):
+                done += 1
+                bar.advance(task)
+        except WorkerLost as error:
+            raise _worker_lost(error, taken_up + done, len(keys)) from error
+    return taken_up
+
+
+def _worker_lost(error: WorkerLost, finished: int, total: int) -> BadInput:
+    remedy = (
+        f"run it again: {finished} of {total} sequences are finished and kept; if memory ran out, set HOIDATA_JOBS=1"
+    )
+    where = ", ".join(map(str, error.in_flight)) or "conversion"
+    return BadInput(where, "worker processes that live until they are done", f"one lost ({error.cause})", remedy)
 
 
 def _left_out(key: SequenceKey, root: Path, error: BadInput) -> Quarantined:
@@ -129,42 +184,9 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
     }
 
 
-def _flattened(groups: Iterable[Results], left_out: list[Quarantined]) -> Iterator[Clip | Quarantined]:
+def _flattened(groups: Iterable[list[Clip | Quarantined]], left_out: list[Quarantined]) -> Iterator[Clip | Quarantined]:
     for group in groups:
         for item in group:
             if isinstance(item, Quarantined):
                 left_out.append(item)
             yield item
-
-
-def _in_order(convert: Callable[[SequenceKey], Results], keys: list[SequenceKey], jobs: int) -> Iterator[Results]:
-    """Results in the order of the keys; at most four sequences per worker wait at any time."""
-    if jobs <= 1 or len(keys) < 2:
-        yield from map(convert, keys)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(convert,)) as pool:
-        waiting: deque[Future[Results]] = deque()
-        for key in keys:
-            waiting.append(pool.submit(_work, key))
-            if len(waiting) >= 4 * jobs:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-
-
-_convert_here: Callable[[SequenceKey], Results] | None = None
-
-
-def _start_worker(convert: Callable[[SequenceKey], Results]) -> None:
-    """Give a worker its adapter and hands once, and one thread: the pool already uses the cores."""
-    import torch
-
-    torch.set_num_threads(1)
-    global _convert_here
-    _convert_here = convert
-
-
-def _work(key: SequenceKey) -> Results:
-    assert _convert_here is not None
-    return _convert_here(key)

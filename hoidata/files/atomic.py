@@ -1,11 +1,20 @@
-"""Writing that leaves either the old file or the whole new one, never a part."""
+"""Writing that leaves either the old file or the whole new one, never a part; and one writer at a time."""
 
+import contextlib
+import fcntl
 import os
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from hoidata.errors import BadInput
+
+# A run that was killed may leave workers behind for the moment they need to notice it.
+_WAIT_S = 10.0
 
 
 @contextmanager
@@ -43,3 +52,66 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(old, ignore_errors=True)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def remove_leftovers(path: str | Path) -> None:
+    """Delete what killed writers of ``path`` left beside it; an old folder they had moved aside goes back first.
+
+    Only for the one who holds ``exclusive(path)``: a living writer's files look the same.
+    """
+    path = Path(path)
+    if not path.parent.is_dir():
+        return
+    pattern = re.compile(rf"\.{re.escape(path.name)}\.[^.]+\.(part|old)")
+    left = sorted(item for item in path.parent.iterdir() if pattern.fullmatch(item.name))
+    for item in left:
+        if item.suffix == ".old" and not path.exists():
+            os.replace(item, path)
+    for item in left:
+        if item.is_dir() and not item.is_symlink():
+            shutil.rmtree(item)
+        else:
+            item.unlink(missing_ok=True)
+
+
+@contextmanager
+def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
+    """Hold the one right to write ``path``; gives the file descriptor of the lock ``.<name>.lock`` beside it.
+
+    The system frees the lock when the last process that has the descriptor ends, however it ends. Raises BadInput
+    when another process still holds it after ``wait_s`` seconds.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = path.parent / f".{path.name}.lock"
+    descriptor = _lock(lock, path, time.monotonic() + wait_s)
+    try:
+        os.truncate(descriptor, 0)
+        os.write(descriptor, str(os.getpid()).encode())
+        yield descriptor
+    finally:
+        lock.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _lock(lock: Path, path: Path, deadline: float) -> int:
+    while True:
+        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR, 0o644)
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_still(descriptor, lock):
+                return descriptor
+        os.close(descriptor)
+        if time.monotonic() > deadline:
+            holder = lock.read_text() if lock.exists() else ""
+            got = f"process {holder or 'unknown'} at work on it"
+            raise BadInput(path, "nobody else to write it", got, "wait for that run to end, or end it, and run again")
+        time.sleep(0.05)
+
+
+def _is_still(descriptor: int, lock: Path) -> bool:
+    """The locked file is the one of that name: its holder before us deletes it when he is done."""
+    try:
+        return os.path.samestat(os.fstat(descriptor), lock.stat())
+    except FileNotFoundError:
+        return False
