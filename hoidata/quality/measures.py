@@ -1,0 +1,204 @@
+"""All measures of one clip and of one object."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hoidata.hands import HandPair, track_joints, track_vertices
+from hoidata.objects.model import ObjectModel, articulate, place
+from hoidata.objects.sampling import sample_points
+from hoidata.quality import motion
+from hoidata.quality.meshes import SurfaceFacts, part_faces, part_facts
+from hoidata.quality.penetration import depths_m, object_frame
+from hoidata.quality.shape import largest_beta
+from hoidata.quality.thresholds import Thresholds
+from hoidata.quality.timing import time_offset
+from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+
+NAN = float("nan")
+STILL_M = 0.001
+Joints = Mapping[Side, np.ndarray]
+TIMING_POINTS = 64
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """What the clips of one object share. points_m: (64, 3) spread over its surface; part: (64,) of each.
+
+    corners_m, corner_part: the 8 corners of each part's bounding box. surfaces: of each part.
+    """
+
+    model: ObjectModel
+    surfaces: dict[int, SurfaceFacts]
+    points_m: np.ndarray
+    part: np.ndarray
+    corners_m: np.ndarray
+    corner_part: np.ndarray
+
+    @classmethod
+    def of(cls, model: ObjectModel) -> "ObjectFacts":
+        surfaces, points = part_facts(model), sample_points(model, TIMING_POINTS)
+        boxes = [_box_corners(model.vertices_m[np.unique(part_faces(model, part))]) for part in surfaces]
+        corner_part = np.repeat(np.array(list(surfaces), dtype=np.uint8), 8)
+        return cls(model, surfaces, points.points_m, points.part, np.concatenate(boxes), corner_part)
+
+    @property
+    def solid_parts(self) -> list[int]:
+        return [part for part, surface in self.surfaces.items() if surface.is_solid]
+
+
+def object_row(facts: ObjectFacts) -> dict[str, Any]:
+    """The measures of an object's mesh, the worst of its parts, and what it is."""
+    surfaces = facts.surfaces.values()
+    return {
+        "parts": len(facts.surfaces),
+        "faces": len(facts.model.faces),
+        "watertight": all(surface.open_edge_share == 0 for surface in surfaces),
+        "solid": len(facts.solid_parts) == len(facts.surfaces),
+        "volume_m3": sum(surface.volume_m3 for surface in surfaces),
+        "open_edge_share": max(surface.open_edge_share for surface in surfaces),
+        "unfilled_share": max(surface.unfilled_share for surface in surfaces),
+        "shells": float(max(surface.shells for surface in surfaces)),
+        "degenerate_share": max(surface.degenerate_share for surface in surfaces),
+        "size_m": float(np.ptp(facts.model.vertices_m, axis=0).max()),
+    }
+
+
+def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresholds) -> dict[str, Any]:
+    """Every measure of a clip but ``beta_distance``, which needs the subject's other clips; NaN where there is none."""
+    seen: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
+    joints: Joints = {side: track_joints(clip.hands[side], hands[side]) for side in seen}
+    corners = placed(clip.object, facts.corners_m, facts.corner_part)
+    valid = {side: track.valid for side, track in clip.hands.items()}
+    return {
+        **_shaking(clip, joints, corners, thresholds),
+        **_jumps(clip, joints, corners, thresholds),
+        **_frozen(clip, joints, corners),
+        **_penetration(clip, facts, hands, thresholds),
+        **_offset(clip, joints, facts, thresholds),
+        "largest_beta": max((largest_beta(clip.hands[side].betas) for side in seen), default=NAN),
+        "gap_share": max(motion.gap_share(flags) for flags in valid.values()),
+        "handless_share": float((~(valid["left"] | valid["right"])).mean()),
+        **{f"{side}_invalid_share": float((~flags).mean()) for side, flags in valid.items()},
+    }
+
+
+def placed(track: ObjectTrack, points_m: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """(frame, point, 3) world places of object-frame points (point, 3) of the given parts, metres."""
+    moved = articulate(points_m, part, track.model.hinge, track.hinge_rad)
+    return place(moved, np.asarray(track.rotvec, np.float64), np.asarray(track.translation_m, np.float64))
+
+
+def _box_corners(vertices_m: np.ndarray) -> np.ndarray:
+    low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
+    return np.array(np.meshgrid(*zip(low, high, strict=True), indexing="ij")).reshape(3, 8).T
+
+
+def _shaking(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
+    wrists, fingers = [], []
+    for side, places in joints.items():
+        valid = clip.hands[side].valid
+        wrists.append(motion.accelerations_m_s2(places[:, :1], valid))
+        fingers.append(motion.accelerations_m_s2(places[:, 1:] - places[:, :1], valid))
+    thing = motion.accelerations_m_s2(corners, np.ones(len(corners), bool))
+    shaking = np.array([series > thresholds.shaking_m_s2 for series in (*wrists, *fingers, thing)]).any(axis=0)
+    return {
+        "wrist_acceleration_m_s2": max(map(_median, wrists), default=NAN),
+        "finger_acceleration_m_s2": max(map(_median, fingers), default=NAN),
+        "object_acceleration_m_s2": _median(thing),
+        "shaking_share": float(shaking.mean()),
+    }
+
+
+def _median(values: np.ndarray) -> float:
+    """Of the finite values; 0, which no limit is below, without any."""
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else 0.0
+
+
+def _jumps(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
+    rule = thresholds.sudden_m, thresholds.large_m, thresholds.sudden_ratio
+    steps = [motion.steps_m(places, clip.hands[side].valid) for side, places in joints.items()]
+    hand = max((motion.largest_jump(step, *rule) for step in steps), default=motion.Jump(NAN, -1))
+    thing = motion.largest_jump(motion.steps_m(corners, np.ones(len(corners), bool)), *rule)
+    return {
+        "hand_jump_m": hand.size_m,
+        "hand_jump_frame": hand.frame,
+        "object_jump_m": thing.size_m,
+        "object_jump_frame": thing.frame,
+    }
+
+
+def _frozen(clip: Clip, joints: Joints, corners: np.ndarray) -> dict[str, float]:
+    always = np.ones(clip.n_frames, bool)
+    same: Joints = {
+        side: motion.equal_steps(_hand_numbers(clip.hands[side]), clip.hands[side].valid) for side in joints
+    }
+    moves: Joints = {side: motion.steps_m(places, clip.hands[side].valid) > STILL_M for side, places in joints.items()}
+    thing_moves = motion.steps_m(corners, always) > STILL_M
+    alone = [same[side] & (thing_moves | _any(moves, but=side, like=thing_moves)) for side in joints]
+    things = [motion.equal_steps(_object_numbers(track), always) for track in (clip.object, *clip.other_objects)]
+    return {
+        "frozen_hand_frames": float(max(map(motion.longest_frozen, alone), default=0)),
+        "frozen_all_frames": float(motion.longest_frozen(np.all([*same.values(), *things], axis=0))),
+    }
+
+
+def _any(moves: Joints, but: Side, like: np.ndarray) -> np.ndarray:
+    return np.any([np.zeros_like(like), *(flags for side, flags in moves.items() if side != but)], axis=0)
+
+
+def _hand_numbers(track: HandTrack) -> np.ndarray:
+    return np.concatenate([track.wrist_m, track.global_orient, track.hand_pose], axis=1)
+
+
+def _object_numbers(track: ObjectTrack) -> np.ndarray:
+    hinge = np.zeros(track.n_frames) if track.hinge_rad is None else track.hinge_rad
+    return np.column_stack([track.rotvec, track.translation_m, hinge])
+
+
+def _penetration(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresholds) -> dict[str, Any]:
+    if not facts.solid_parts:
+        note = f"penetration not measured: the mesh of {facts.model.name} is not solid"
+        return {"penetration_m": NAN, "penetration_share": NAN, "note": note}
+    frames = np.arange(0, clip.n_frames, thresholds.penetration_every)
+    depth = np.zeros(len(frames))
+    for side in SIDES:
+        seen = clip.hands[side].valid[frames]
+        if seen.any():
+            depth[seen] = np.maximum(depth[seen], _hand_depths(clip, side, frames[seen], facts, hands))
+    solid, parts = len(facts.solid_parts), len(facts.surfaces)
+    return {
+        "penetration_m": float(depth.max()),
+        "penetration_share": float((depth > thresholds.too_deep_m).mean()),
+        "note": "" if solid == parts else f"penetration measured in the {solid} solid of {parts} parts only",
+    }
+
+
+def _hand_depths(clip: Clip, side: Side, frames: np.ndarray, facts: ObjectFacts, hands: HandPair) -> np.ndarray:
+    track, thing = clip.hands[side], clip.object
+    chosen = replace(
+        track,
+        wrist_m=track.wrist_m[frames],
+        global_orient=track.global_orient[frames],
+        hand_pose=track.hand_pose[frames],
+        betas=track.betas if len(track.betas) == 1 else track.betas[frames],
+        valid=track.valid[frames],
+    )
+    vertices = track_vertices(chosen, hands[side])
+    local = object_frame(vertices, thing.rotvec[frames], thing.translation_m[frames])
+    hinge = None if thing.hinge_rad is None else thing.hinge_rad[frames]
+    return depths_m(facts.model, hinge, local, facts.solid_parts)
+
+
+def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Thresholds) -> dict[str, float]:
+    points = placed(clip.object, facts.points_m, facts.part)
+    found = time_offset([(places, clip.hands[side].valid) for side, places in joints.items()], points)
+    sure = found.confidence >= thresholds.offset_confidence
+    return {
+        "time_offset_frames": found.frames if sure else NAN,
+        "time_offset_confidence": found.confidence,
+        "time_offset_samples": found.samples,
+    }

@@ -1,0 +1,107 @@
+"""Faults of object meshes: holes, nothing enclosed, several shells, triangles without area, implausible size."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from hoidata.objects.model import ObjectModel
+
+SLIVER = 1e-6
+SOLID_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class SurfaceFacts:
+    """One surface, vertices that coincide taken as one, collapsed triangles left out.
+
+    open_edge_share: share of directed edges without exactly their opposite; 0 means watertight and evenly oriented.
+    volume_m3: enclosed volume, negative for a surface turned inside out; hull_m3: of the convex hull. shells: pieces
+    that share no vertex. degenerate_share: share of triangles that are collapsed or a million times longer than high.
+    """
+
+    open_edge_share: float
+    volume_m3: float
+    hull_m3: float
+    shells: int
+    degenerate_share: float
+
+    @property
+    def unfilled_share(self) -> float:
+        """1 - volume / convex hull: 1 for a surface that encloses nothing, above 1 for one turned inside out."""
+        return 1.0 - self.volume_m3 / self.hull_m3 if self.hull_m3 > 0 else 1.0
+
+    @property
+    def is_solid(self) -> bool:
+        """Watertight and enclosing more than 0.1 % of its hull, so that "inside" has a meaning."""
+        return self.open_edge_share == 0 and abs(self.volume_m3) > SOLID_SHARE * self.hull_m3
+
+
+def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
+    """Facts of the mesh (vertex, 3), (face, 3), metres."""
+    unique, inverse = np.unique(np.asarray(vertices_m, dtype=np.float64), axis=0, return_inverse=True)
+    merged = inverse.reshape(-1)[faces]
+    a, b, c = merged.T
+    kept = merged[(a != b) & (b != c) & (c != a)]
+    return SurfaceFacts(
+        open_edge_share=_open_edge_share(kept),
+        volume_m3=_volume(unique, kept),
+        hull_m3=_hull_volume(unique[np.unique(kept)]),
+        shells=_shells(kept),
+        degenerate_share=float(_is_degenerate(unique[merged]).mean()),
+    )
+
+
+def part_facts(model: ObjectModel) -> dict[int, SurfaceFacts]:
+    """Facts of each part, by its number; one, 0, for a rigid object."""
+    parts = np.unique(model.face_part).tolist() if model.is_articulated else [0]
+    return {part: surface_facts(model.vertices_m, part_faces(model, part)) for part in parts}
+
+
+def part_faces(model: ObjectModel, part: int) -> np.ndarray:
+    """(face, 3) triangles of one part; all of them for a rigid object."""
+    return model.faces[model.face_part == part] if model.is_articulated else model.faces
+
+
+def _open_edge_share(faces: np.ndarray) -> float:
+    if not len(faces):
+        return 1.0
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = int(faces.max()) + 1
+    keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
+    sign = np.repeat([1, -1], len(edges))
+    found, number = np.unique(keys, return_inverse=True)
+    unmatched = np.bincount(number, sign, len(found))
+    return float(np.maximum(unmatched, 0).sum() / len(edges))
+
+
+def _volume(vertices_m: np.ndarray, faces: np.ndarray) -> float:
+    """Divergence theorem: signed tetrahedra between the triangles and the centre of the vertices."""
+    corners = (vertices_m - vertices_m.mean(axis=0))[faces]
+    return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+
+
+def _hull_volume(vertices_m: np.ndarray) -> float:
+    try:
+        return float(ConvexHull(vertices_m).volume)
+    except (QhullError, ValueError):  # flat, or fewer than four points: there is nothing to enclose
+        return 0.0
+
+
+def _shells(faces: np.ndarray) -> int:
+    if not len(faces):
+        return 0
+    used, corner = np.unique(faces, return_inverse=True)
+    a, b, c = corner.reshape(-1, 3).T
+    links = coo_matrix((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, c])), shape=(len(used), len(used)))
+    return int(connected_components(links, directed=False)[0])
+
+
+def _is_degenerate(corners_m: np.ndarray) -> np.ndarray:
+    """(face,) booleans of triangles (face, 3, 3): twice the area is below 1e-6 of the longest edge squared."""
+    edges = np.roll(corners_m, -1, axis=1) - corners_m
+    longest = np.linalg.norm(edges, axis=2).max(axis=1)
+    area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1)
+    return area <= SLIVER * longest**2

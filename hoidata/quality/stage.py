@@ -1,0 +1,186 @@
+"""Stage quality: every clip and object of a store measured and judged.
+
+clips.parquet    one row per clip: verdict, reasons, the measures of ``thresholds.CLIP_MEASURES``; null where one
+                 could not be taken (``note`` says why)
+meshes.parquet   one row per object: likewise, ``thresholds.MESH_MEASURES``
+info.json        thresholds, counts
+"""
+
+import multiprocessing
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from rich.console import Console
+from rich.progress import Progress
+
+from hoidata.files import atomic_folder, canonical_json
+from hoidata.files.tables import write_table
+from hoidata.hands import HandPair
+from hoidata.quality.measures import ObjectFacts, clip_row, object_row
+from hoidata.quality.shape import distances_to_others
+from hoidata.quality.thresholds import (
+    CLIP_MEASURES,
+    MESH_MEASURES,
+    Finding,
+    Thresholds,
+    findings,
+    reasons_of,
+    verdict_of,
+)
+from hoidata.schema.clip import SIDES
+from hoidata.schema.store import Store, open_store
+
+# Below this a second process costs more to start than it saves.
+FRAMES_PER_JOB = 50_000
+_TEXT, _NUMBER, _COUNT = pa.string(), pa.float64(), pa.int32()
+_JUDGED = [("verdict", _TEXT), ("reasons", _TEXT)]
+CLIPS = pa.schema(
+    [
+        *(("clip_id", _TEXT), ("object", _TEXT), *_JUDGED, ("note", _TEXT)),
+        *((measure.name, _NUMBER) for measure in CLIP_MEASURES),
+        *((f"{side}_invalid_share", _NUMBER) for side in SIDES),
+        ("time_offset_confidence", _NUMBER),
+        *((name, _COUNT) for name in ("time_offset_samples", "hand_jump_frame", "object_jump_frame")),
+    ]
+)
+MESHES = pa.schema(
+    [
+        *(("object", _TEXT), *_JUDGED, ("parts", _COUNT), ("faces", _COUNT)),
+        *(("watertight", pa.bool_()), ("solid", pa.bool_()), ("volume_m3", _NUMBER)),
+        *((measure.name, _NUMBER) for measure in MESH_MEASURES),
+    ]
+)
+
+
+def quality_store(
+    clips_folder: str | Path,
+    out_folder: str | Path,
+    *,
+    thresholds: Thresholds | None = None,
+    hands: HandPair | None = None,
+    jobs: int = 1,
+    progress: bool = True,
+) -> dict[str, int]:
+    """Measure and judge every clip and object of the store; the folder appears whole or not at all.
+
+    A clip is left out for its own measures or for its object's mesh. hands: as in ``open_store``. jobs: worker
+    processes at most; order and bytes of the result do not depend on it. progress: a bar on stderr.
+    Returns counts: clips, ok, warned, left_out, objects, objects_warned, objects_left_out.
+    """
+    thresholds = thresholds or Thresholds()
+    store = open_store(clips_folder, hands)
+    facts = {name: ObjectFacts.of(store.object_model(name)) for name in store.objects["object"]}
+    meshes = [{"object": name, **object_row(item)} for name, item in facts.items()]
+    mesh_findings = {row["object"]: findings(row, MESH_MEASURES, thresholds.limits) for row in meshes}
+    clips = _measured(store, facts, thresholds, jobs, progress)
+    _add_beta_distances(store, clips)
+    for row in clips:
+        found = findings(row, CLIP_MEASURES, thresholds.limits)
+        _judge(row, [*found, *_inherited(row["object"], mesh_findings[row["object"]])])
+    for row in meshes:
+        _judge(row, mesh_findings[row["object"]])
+    counts = _counts(clips, meshes)
+    with atomic_folder(out_folder) as part:
+        write_table(part / "clips.parquet", [_nulled(row, CLIPS) for row in clips], CLIPS)
+        write_table(part / "meshes.parquet", [_nulled(row, MESHES) for row in meshes], MESHES)
+        info = {"thresholds": as_json(thresholds), "counts": counts}
+        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+    return counts
+
+
+def as_json(thresholds: Thresholds) -> dict[str, Any]:
+    """The thresholds in the form of their section of params.yaml."""
+    limits = {name: limit._asdict() for name, limit in thresholds.limits.items()}
+    return asdict(thresholds) | {"limits": limits}
+
+
+def _inherited(name: str, found: list[Finding]) -> list[Finding]:
+    """A mesh that cannot be used takes its clips with it; what it is only warned of stays with the mesh."""
+    return [Finding("left out", f"object {name}: {item.reason}") for item in found if item.verdict == "left out"]
+
+
+def _judge(row: dict[str, Any], found: list[Finding]) -> None:
+    row |= {"verdict": verdict_of(found), "reasons": reasons_of(found)}
+
+
+def _measured(
+    store: Store, facts: dict[str, ObjectFacts], thresholds: Thresholds, jobs: int, progress: bool
+) -> list[dict[str, Any]]:
+    """The rows of all clips in the store's order."""
+    store.hand_pair()
+    measure = partial(_measure, store, facts, thresholds)
+    frames = sum(store.sequences["n_frames"].tolist())
+    jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        return list(bar.track(_in_order(measure, store.ids, jobs), len(store), description="quality"))
+
+
+def _measure(store: Store, facts: dict[str, ObjectFacts], thresholds: Thresholds, clip_id: str) -> dict[str, Any]:
+    clip = store.clip(clip_id)
+    name = clip.object.model.name
+    return {"clip_id": clip_id, "object": name, **clip_row(clip, facts[name], store.hand_pair(), thresholds)}
+
+
+def _in_order(measure: "partial[dict[str, Any]]", ids: list[str], jobs: int) -> Iterator[dict[str, Any]]:
+    if jobs <= 1:
+        yield from map(measure, ids)
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(measure,)) as pool:
+        yield from pool.map(_work, ids, chunksize=16)
+
+
+_measure_here: "partial[dict[str, Any]] | None" = None
+
+
+def _start_worker(measure: "partial[dict[str, Any]]") -> None:
+    """Give a worker its store once, and one thread: the pool already uses the cores."""
+    import torch
+
+    torch.set_num_threads(1)
+    global _measure_here
+    _measure_here = measure
+
+
+def _work(clip_id: str) -> dict[str, Any]:
+    assert _measure_here is not None
+    return _measure_here(clip_id)
+
+
+def _add_beta_distances(store: Store, rows: list[dict[str, Any]]) -> None:
+    """``beta_distance`` of every row: the worse hand; a hand that is never valid, or has a template, has no shape."""
+    worst: dict[str, list[float]] = {row["clip_id"]: [] for row in rows}
+    for _, clips in store.sequences.groupby("subject", sort=False):
+        for side in SIDES:
+            shown = clips[(clips[f"{side}_valid_frames"] > 0) & clips[f"{side}_template"].isna()]
+            betas = {clip_id: store.clip(clip_id).hands[side].betas for clip_id in shown["clip_id"]}
+            for clip_id, distance in distances_to_others(betas).items():
+                worst[clip_id].append(distance)
+    for row in rows:
+        finite = [distance for distance in worst[row["clip_id"]] if np.isfinite(distance)]
+        row["beta_distance"] = max(finite, default=float("nan"))
+
+
+def _nulled(row: dict[str, Any], schema: pa.Schema) -> dict[str, Any]:
+    """NaN as null: "could not be measured" is not a number."""
+    return {name: None if isinstance(row[name], float) and np.isnan(row[name]) else row[name] for name in schema.names}
+
+
+def _counts(clips: list[dict[str, Any]], meshes: list[dict[str, Any]]) -> dict[str, int]:
+    of_clips, of_meshes = (Counter(row["verdict"] for row in rows) for rows in (clips, meshes))
+    return {
+        "clips": len(clips),
+        "ok": of_clips["ok"],
+        "warned": of_clips["warned"],
+        "left_out": of_clips["left out"],
+        "objects": len(meshes),
+        "objects_warned": of_meshes["warned"],
+        "objects_left_out": of_meshes["left out"],
+    }

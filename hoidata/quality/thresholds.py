@@ -1,0 +1,150 @@
+"""What is measured, the limits on it, and the verdict on one row of measures."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
+
+from hoidata.errors import BadInput
+
+Verdict = Literal["ok", "warned", "left out"]
+
+
+@dataclass(frozen=True)
+class Measure:
+    """unit: "" for a count or a share. words: what it is, for people; its faults sit at high values.
+
+    frame: the column that says at which frame it was found, "" where there is none.
+    """
+
+    name: str
+    unit: str
+    words: str
+    frame: str = ""
+
+
+CLIP_MEASURES = (
+    Measure("wrist_acceleration_m_s2", "m/s²", "median acceleration of the wrist, the worse hand"),
+    Measure("finger_acceleration_m_s2", "m/s²", "median acceleration of the finger joints about the wrist"),
+    Measure("object_acceleration_m_s2", "m/s²", "median acceleration of the object's corners"),
+    Measure("shaking_share", "", "share of frames in which one of them shakes"),
+    Measure("hand_jump_m", "m", "largest sudden step of a joint", "hand_jump_frame"),
+    Measure("object_jump_m", "m", "largest sudden step of a corner of the object", "object_jump_frame"),
+    Measure("frozen_hand_frames", "frames", "longest stretch of one hand exactly still while something else moves"),
+    Measure("frozen_all_frames", "frames", "longest stretch of everything exactly still"),
+    Measure("penetration_m", "m", "deepest hand vertex inside the object"),
+    Measure("penetration_share", "", "share of frames in which a hand is too deep inside"),
+    Measure("time_offset_frames", "frames", "lag between hands and object, either way"),
+    Measure("largest_beta", "sd", "largest shape coefficient"),
+    Measure("beta_distance", "sd", "distance of the shape from the subject's other clips"),
+    Measure("gap_share", "", "share of frames in which a hand is lost and comes back"),
+    Measure("handless_share", "", "share of frames without any hand"),
+)
+MESH_MEASURES = (
+    Measure("open_edge_share", "", "share of edges at a hole, or of uneven orientation"),
+    Measure("unfilled_share", "", "1 - volume / convex hull: 1 encloses nothing, above 1 is inside out"),
+    Measure("shells", "", "separate pieces of a part"),
+    Measure("degenerate_share", "", "share of triangles without area"),
+    Measure("size_m", "m", "longest side of the bounding box"),
+)
+MEASURES = {measure.name: measure for measure in (*CLIP_MEASURES, *MESH_MEASURES)}
+
+
+class Limit(NamedTuple):
+    """A measure above ``warn`` is reported; above ``leave_out`` its clip is not used. None: never."""
+
+    warn: float | None
+    leave_out: float | None
+
+
+# Chosen on the embedded corpora (251 clips) and ManipNet's recordings (45): no clip of theirs reaches ``leave_out``.
+# Where good clips can reach any value (a closed mesh around a cavity, an open mesh), a measure only warns.
+DEFAULT_LIMITS: dict[str, Limit] = {
+    "wrist_acceleration_m_s2": Limit(15.0, 60.0),
+    "finger_acceleration_m_s2": Limit(15.0, 60.0),
+    "object_acceleration_m_s2": Limit(15.0, 60.0),
+    "shaking_share": Limit(0.05, 0.5),
+    "hand_jump_m": Limit(0.12, 0.3),
+    "object_jump_m": Limit(0.05, 0.2),
+    "frozen_hand_frames": Limit(45.0, None),
+    "frozen_all_frames": Limit(30.0, 90.0),
+    "penetration_m": Limit(0.02, None),
+    "penetration_share": Limit(0.5, None),
+    "time_offset_frames": Limit(1.0, 5.0),
+    "largest_beta": Limit(3.0, 10.0),
+    "beta_distance": Limit(1.5, 6.0),
+    "gap_share": Limit(0.05, 0.5),
+    "handless_share": Limit(0.1, 0.9),
+    "open_edge_share": Limit(0.0, None),
+    "unfilled_share": Limit(0.99, None),
+    "shells": Limit(1.0, None),
+    "degenerate_share": Limit(0.01, 0.9),
+    "size_m": Limit(1.0, 3.0),
+}
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Settings of the measures and limits on them; the same as the section ``quality`` of params.yaml.
+
+    penetration_every: penetration is measured in every n-th frame, the first included. too_deep_m: from where a hand
+    counts as too deep. shaking_m_s2: from which acceleration a frame counts as shaking. sudden_m, sudden_ratio: a step
+    is sudden above ``sudden_m`` and ``sudden_ratio`` times the motion around it, or above ``large_m``.
+    offset_confidence: time offsets of a lower correlation are not judged. limits: by name of the measure.
+    """
+
+    penetration_every: int = 5
+    too_deep_m: float = 0.01
+    shaking_m_s2: float = 50.0
+    sudden_m: float = 0.03
+    sudden_ratio: float = 4.0
+    large_m: float = 0.3
+    offset_confidence: float = 0.8
+    limits: Mapping[str, Limit] = field(default_factory=lambda: dict(DEFAULT_LIMITS))
+
+    def __post_init__(self) -> None:
+        if set(self.limits) != set(MEASURES):
+            wrong = sorted(set(self.limits) ^ set(MEASURES))
+            known = f"a limit for each of: {', '.join(MEASURES)}"
+            raise BadInput("quality.limits", known, f"missing or unknown: {', '.join(wrong)}", "correct the names")
+        if self.penetration_every < 1:
+            raise BadInput("quality.penetration_every", "1 or more frames", f"{self.penetration_every}", "correct it")
+
+
+class Finding(NamedTuple):
+    """One measure above a limit, in words."""
+
+    verdict: Verdict
+    reason: str
+
+
+def findings(values: Mapping[str, float], measures: Sequence[Measure], limits: Mapping[str, Limit]) -> list[Finding]:
+    """What is wrong with one row of measures, by the worse limit of each. NaN (could not be measured) is never wrong.
+
+    The size of a signed measure counts.
+    """
+    found: list[Finding] = []
+    for measure in measures:
+        value, limit = abs(values[measure.name]), limits[measure.name]
+        if limit.leave_out is not None and value > limit.leave_out:
+            found.append(Finding("left out", _reason(measure, values, limit.leave_out)))
+        elif limit.warn is not None and value > limit.warn:
+            found.append(Finding("warned", _reason(measure, values, limit.warn)))
+    return found
+
+
+def verdict_of(found: Sequence[Finding]) -> Verdict:
+    """The worst verdict of the findings; "ok" without any."""
+    verdicts = {finding.verdict for finding in found}
+    return "left out" if "left out" in verdicts else "warned" if verdicts else "ok"
+
+
+def reasons_of(found: Sequence[Finding]) -> str:
+    """The findings behind the verdict in one line; "" without any. Warnings of a clip left out do not explain it."""
+    worst = verdict_of(found)
+    return "; ".join(finding.reason for finding in found if finding.verdict == worst)
+
+
+def _reason(measure: Measure, values: Mapping[str, float], limit: float) -> str:
+    unit = f" {measure.unit}" if measure.unit else ""
+    place = f" at frame {values[measure.frame]:g}" if measure.frame else ""
+    return f"{measure.words}: {values[measure.name]:.3g}{unit}{place}, above {limit:g}{unit}"

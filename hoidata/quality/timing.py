@@ -1,0 +1,91 @@
+"""Do hand and object tell the same time? A held object moves as the hand does; a lag between them shows as an offset.
+
+For a joint near the object, its velocity is compared with that of the object's nearest point, both as vectors, at every
+lag: the normalised cross-correlation of velocities. Unlike speeds, velocities disagree about direction too, which
+makes the peak sharp.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from hoidata.schema.clip import FPS
+
+NEAR_M = 0.05
+MOVING_M_S = 0.05
+LARGEST_LAG = 10
+FEWEST_SAMPLES = 15
+
+
+class TimeOffset(NamedTuple):
+    """frames: by how many frames the hands come after the object (negative: before); NaN where it cannot be told.
+
+    confidence: the correlation at that lag, 1 for joints that move exactly with the object; NaN likewise.
+    samples: how many pairs of a hand and a frame in which the object moves near it this rests on.
+    """
+
+    frames: float
+    confidence: float
+    samples: int
+
+
+class Pairs(NamedTuple):
+    """What one hand adds. object_m_s: (sample, 3); hand_m_s: (lag, sample, 3), the joint's velocity at each lag."""
+
+    object_m_s: np.ndarray
+    hand_m_s: np.ndarray
+
+
+def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], object_points_m: np.ndarray) -> TimeOffset:
+    """The lag in -10 to 10 frames at which the hands' velocities agree best with the object's.
+
+    hands: of each, joints (frame, 21, 3), metres, and usable (frame,) bool. object_points_m: (frame, point, 3) points
+    fixed to the object (or to its parts), spread over its surface. Samples are frames in which a joint is within 5 cm
+    of such a point that moves at 5 cm/s or more; fewer than 15 of them tell nothing. At lag ``L``:
+    ``sum u(t) . v(t + L) / sqrt(sum |u(t)|^2 sum |v(t + L)|^2)``, u of the point, v of the joint, central differences.
+    """
+    pairs = [near_pairs(joints, usable, object_points_m) for joints, usable in hands]
+    samples = sum(len(pair.object_m_s) for pair in pairs)
+    if samples < FEWEST_SAMPLES:
+        return TimeOffset(float("nan"), float("nan"), samples)
+    moved = np.concatenate([pair.object_m_s for pair in pairs])
+    hand = np.concatenate([pair.hand_m_s for pair in pairs], axis=1)
+    energy = np.sqrt((moved**2).sum() * (hand**2).sum(axis=(1, 2)))
+    score = (hand * moved).sum(axis=(1, 2)) / np.maximum(energy, 1e-12)
+    best = int(score.argmax())
+    return TimeOffset(float(best - LARGEST_LAG), float(score[best]), samples)
+
+
+def near_pairs(joints_m: np.ndarray, usable: np.ndarray, object_points_m: np.ndarray) -> Pairs:
+    """Velocities of the nearest joint and object point in the frames in which the hand is near a moving object."""
+    n_frames, margin = len(joints_m), LARGEST_LAG + 1
+    lags = np.arange(-LARGEST_LAG, LARGEST_LAG + 1)
+    # Every lag sees the same frames, so that none wins by leaving out those that disagree.
+    whole = [frame for frame in range(margin, n_frames - margin) if usable[frame - margin : frame + margin + 1].all()]
+    kept, joint, point = _nearest(joints_m, object_points_m, whole)
+    object_m_s, hand_m_s = _velocities(object_points_m), _velocities(joints_m)
+    moving = np.linalg.norm(object_m_s[kept, point], axis=-1) >= MOVING_M_S
+    kept, joint, point = kept[moving], joint[moving], point[moving]
+    return Pairs(object_m_s[kept, point], hand_m_s[kept[None] + lags[:, None], joint[None]])
+
+
+def _nearest(
+    joints_m: np.ndarray, points_m: np.ndarray, frames: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of the frames in which they are within 5 cm: the frame, the joint and the point nearest to each other."""
+    found = []
+    for frame in frames:
+        distance, point = map(np.asarray, KDTree(points_m[frame]).query(joints_m[frame], distance_upper_bound=NEAR_M))
+        joint = int(distance.argmin())
+        if np.isfinite(distance[joint]):
+            found.append((frame, joint, int(point[joint])))
+    columns = np.array(found, dtype=np.int64).reshape(-1, 3).T
+    return columns[0], columns[1], columns[2]
+
+
+def _velocities(points_m: np.ndarray) -> np.ndarray:
+    """(frame, point, 3) m/s by central differences; one-sided at both ends."""
+    points = np.asarray(points_m, dtype=np.float64)
+    return np.gradient(points, 1 / FPS, axis=0) if len(points) > 1 else np.zeros_like(points)
