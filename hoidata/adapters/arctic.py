@@ -4,19 +4,26 @@ import re
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
-import orjson
 
 from hoidata.adapters import checks
+from hoidata.adapters.arctic_files import (
+    Description,
+    body_track,
+    head_camera,
+    parse_descriptions,
+    parse_misc,
+    parse_parts,
+)
 from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema.clip import SIDES, Clip, HandTrack, HandType, ObjectTrack, Side, WorldFrame
+from hoidata.schema.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.schema.hand_parameters import HandConvention, SourceHand, to_track
 
 MILLIMETRES = 1e-3
@@ -26,7 +33,6 @@ OBJECT_WORDS = {
     "espressomachine": "espresso machine",
     "waffleiron": "waffle iron",
 }
-ROOTS = ("", "data", "arctic_data/data")
 TOPS = ("", "data/", "arctic_data/data/")
 HINGE_AXIS = (0.0, 0.0, -1.0)
 FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
@@ -44,17 +50,9 @@ PARTS = (
         "segments and words", tuple(f"{top}description/s*/*/description.txt" for top in TOPS), "Text2HOI's repository"
     ),
 )
-RANGE = re.compile(r"(\d+)-(\d+)")
-
-
-@dataclass(frozen=True)
-class Description:
-    """One line of a description file: frames ``start`` to ``stop`` counted from 1, both included."""
-
-    start: int
-    stop: int
-    verb: str
-    hand: HandType
+WITHHELD_SUBJECT = "s03"
+KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
+Stretches = Literal["described", "whole"]
 
 
 @dataclass(frozen=True)
@@ -63,6 +61,8 @@ class _Motion:
 
     hands: dict[Side, HandTrack]
     object: ObjectTrack
+    camera: CameraTrack | None
+    body: BodyTrack | None
 
     @property
     def n_frames(self) -> int:
@@ -73,11 +73,17 @@ class _Motion:
 class ArcticAdapter:
     """Raw root: the folder with ``raw_seqs/``, ``meta/`` and ``description/`` (or ``data/`` above them).
 
-    margin_frames: frames kept before and after each described range. shortest_frames: shorter ranges are no clips.
+    clips: "described" gives one clip per line of Text2HOI's description files; "whole" one clip per sequence without
+    a verb, descriptions or not. margin_frames: frames kept before and after each described range. shortest_frames:
+    shorter ranges are no clips. trimmed_frames: left out at both ends of a whole sequence (ARCTIC's own baselines
+    leave out 10, whose images are black). body: keep the parameters of the subject's SMPL-X body.
     """
 
     margin_frames: int = 0
     shortest_frames: int = 20
+    clips: Stretches = "described"
+    trimmed_frames: int = 0
+    body: bool = False
     name: str = "arctic"
     version: str = "1.0"
     licence: str = "ARCTIC licence (MPI): non-commercial research, no redistribution"
@@ -89,24 +95,31 @@ class ArcticAdapter:
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
 
+    def __post_init__(self) -> None:
+        for name in ("margin_frames", "shortest_frames", "trimmed_frames"):
+            checks.whole_setting(self.name, name, getattr(self, name))
+        checks.choice_setting(self.name, "clips", self.clips, get_args(Stretches))
+        checks.switch_setting(self.name, "body", self.body)
+
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per sequence that has a hand or an object file; the two are paired by name, never by position."""
+        """One key per sequence that has any of its files; they are paired by name, never by position."""
         names = set()
-        for top in ROOTS:
+        for top in TOPS:
             for path in (Path(root) / top / "raw_seqs").glob("s*/*.npy"):
                 stem, _, kind = path.name.partition(".")
-                if kind in ("mano.npy", "object.npy"):
+                if kind in KINDS:
                     names.add((path.parent.name, stem))
         return [SequenceKey(self.name, subject, f"{subject}/{stem}") for subject, stem in sorted(names)]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip per described range of at least 20 frames."""
-        where = _description_path(raw, key)
+        """One clip per described range of at least 20 frames; or the whole sequence as one."""
+        if self.clips == "whole":
+            return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
+        where = _found(raw, f"description/{key.name}/description.txt")
         descriptions, results = _read_descriptions(raw, where, key)
-        motion = _read_motion(raw, key, hands)
+        motion = _read_motion(raw, key, hands, self.body)
         noun = motion.object.model.name
-        ids = _clip_ids(key, descriptions)
-        for description, clip_id in zip(descriptions, ids, strict=True):
+        for description, clip_id in zip(descriptions, _clip_ids(key, descriptions), strict=True):
             if (description.verb, noun) in EXCLUDED or description.stop - description.start + 1 < self.shortest_frames:
                 continue
             if description.stop > motion.n_frames:
@@ -116,9 +129,28 @@ class ArcticAdapter:
             results.append(self._clip(raw, key, clip_id, motion, description))
         return results
 
+    def _whole(self, raw: RawTree, key: SequenceKey, motion: _Motion) -> Clip:
+        start, stop = self.trimmed_frames, motion.n_frames - self.trimmed_frames
+        if start >= stop:
+            remedy = "nothing to do, or lower the setting trimmed_frames"
+            raise BadInput(str(key), f"more than {2 * self.trimmed_frames} frames", f"{motion.n_frames}", remedy)
+        return self._cut(raw, key, str(key), motion, None, start, stop)
+
     def _clip(self, raw: RawTree, key: SequenceKey, clip_id: str, motion: _Motion, description: Description) -> Clip:
         start = max(0, description.start - 1 - self.margin_frames)
         stop = min(motion.n_frames, description.stop + self.margin_frames)
+        return self._cut(raw, key, clip_id, motion, description, start, stop)
+
+    def _cut(
+        self,
+        raw: RawTree,
+        key: SequenceKey,
+        clip_id: str,
+        motion: _Motion,
+        description: Description | None,
+        start: int,
+        stop: int,
+    ) -> Clip:
         whole = Clip(
             clip_id=clip_id,
             dataset=self.name,
@@ -128,55 +160,33 @@ class ArcticAdapter:
             object=motion.object,
             source_frames=np.arange(motion.n_frames, dtype=np.int32),
             gravity=np.array([0.0, 0.0, -1.0]),
-            verb=description.verb,
+            verb=None if description is None else description.verb,
             object_words=OBJECT_WORDS.get(motion.object.model.name, motion.object.model.name),
-            labelled_hand=description.hand,
+            labelled_hand=None if description is None else description.hand,
             sources=raw.sources,
             source_fps=self.source_fps,
+            camera=motion.camera,
+            body=motion.body,
         )
         return whole.cut(start, stop)
 
 
-def parse_description(line: str) -> Description:
-    """``12-100 grab, right hand``: range from 1, verb, hand, a fourth word that means nothing. Raises ValueError."""
-    words = line.split()
-    if len(words) != 4:
-        raise ValueError(f"{len(words)} words")
-    ends = RANGE.fullmatch(words[0])
-    if ends is None or not 1 <= int(ends[1]) <= int(ends[2]):
-        raise ValueError(f"the range {words[0]!r}")
-    if words[2] not in get_args(HandType):
-        raise ValueError(f"the hand {words[2]!r}")
-    return Description(int(ends[1]), int(ends[2]), words[1].rstrip(","), words[2])  # type: ignore[arg-type]
-
-
-def _description_path(raw: RawTree, key: SequenceKey) -> str:
-    names = [f"{top}/description/{key.name}/description.txt".lstrip("/") for top in ROOTS]
-    return next((name for name in names if raw.has(name)), names[0])
+def _found(raw: RawTree, path: str) -> str:
+    """The path below whichever top folder holds it; where it should be when none does."""
+    names = [f"{top}{path}" for top in TOPS]
+    usual = [name for name, top in zip(names, TOPS, strict=True) if (raw.root / top / "raw_seqs").is_dir()]
+    return next((name for name in names if raw.has(name)), (usual or names)[0])
 
 
 def _read_descriptions(
     raw: RawTree, where: str, key: SequenceKey
 ) -> tuple[list[Description], list[Clip | Quarantined]]:
-    if not raw.has(where):
-        remedy = "nothing to do where none was published (s03, espressomachine); else add Text2HOI's description files"
+    if key.subject == WITHHELD_SUBJECT or not raw.has(where):
+        _refuse_withheld(raw, key)
+        remedy = "nothing to do where none was published (espressomachine); else add Text2HOI's description files"
         raise BadInput(where, "a description of the sequence's segments", "no file", remedy)
-    try:
-        lines = raw.read(where).decode("utf-8").splitlines()
-    except UnicodeDecodeError as error:
-        raise BadInput(where, "UTF-8 text", str(error)) from error
-    described: list[Description] = []
-    problems: list[Clip | Quarantined] = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
-        try:
-            described.append(parse_description(line))
-        except ValueError as error:
-            expected = "'<start>-<end> <action>, <left|right|both> hand'"
-            place = f"{where}:{number}"
-            problems.append(Quarantined(f"{key}/line-{number:03d}", place, expected, str(error), "mend the line"))
-    return described, problems
+    described, problems = parse_descriptions(raw.read(where), where)
+    return described, [Quarantined.from_error(f"{key}/line-{number:03d}", problem) for number, problem in problems]
 
 
 def _clip_ids(key: SequenceKey, descriptions: list[Description]) -> list[str]:
@@ -190,10 +200,19 @@ def _clip_ids(key: SequenceKey, descriptions: list[Description]) -> list[str]:
     return ids
 
 
-def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair) -> _Motion:
-    tops = [top for top in ROOTS if (raw.root / top / "raw_seqs").is_dir()]
-    stem = f"{tops[0]}/raw_seqs/{key.name}".lstrip("/")
-    pose_path, hand_path = f"{stem}.object.npy", f"{stem}.mano.npy"
+def _refuse_withheld(raw: RawTree, key: SequenceKey) -> None:
+    """Say so when the files that are missing were never published."""
+    paths = [_found(raw, f"raw_seqs/{key.name}.{kind}") for kind in ("mano.npy", "object.npy")]
+    missing = [path for path in paths if not raw.has(path)]
+    if key.subject == WITHHELD_SUBJECT and missing:
+        got = f"none: ARCTIC withholds the motion of its test subject {WITHHELD_SUBJECT}"
+        raise BadInput(missing[0], "a motion file", got, "nothing to do; its results are scored by ARCTIC's server")
+
+
+def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair, with_body: bool) -> _Motion:
+    _refuse_withheld(raw, key)
+    paths = {kind: _found(raw, f"raw_seqs/{key.name}.{kind}") for kind in KINDS}
+    pose_path, hand_path = paths["object.npy"], paths["mano.npy"]
     pose = checks.table(pose_path, load_npy_object(raw.file(pose_path)), 7)
     params = load_npy_object(raw.file(hand_path))
     tracks: dict[Side, HandTrack] = {}
@@ -203,14 +222,24 @@ def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair) -> _Motion:
             got = f"{tracks[side].n_frames}"
             raise BadInput(f"{hand_path}: {side}", f"{len(pose)} frames as in {pose_path}", got)
     name = re.sub(r"\d+$", "", key.name.partition("/")[2].split("_")[0])
-    model = _object_model(raw, tops[0], name)
     track = ObjectTrack(
-        model,
+        _object_model(raw, name),
         rotvec=pose[:, 1:4].astype(np.float32),
         translation_m=(pose[:, 4:7] * MILLIMETRES).astype(np.float32),
         hinge_rad=pose[:, 0].astype(np.float32),
     )
-    return _Motion(tracks, track)
+    camera = _camera(raw, paths["egocam.dist.npy"], key.subject, len(pose))
+    body_path = paths["smplx.npy"]
+    body = body_track(body_path, load_npy_object(raw.file(body_path)), len(pose)) if with_body else None
+    return _Motion(tracks, track, camera, body)
+
+
+def _camera(raw: RawTree, path: str, subject: str, n_frames: int) -> CameraTrack | None:
+    if not raw.has(path):
+        return None
+    misc = _found(raw, "meta/misc.json")
+    offset = parse_misc(raw.read(misc), misc).get(subject, 0) if raw.has(misc) else 0
+    return head_camera(path, load_npy_object(raw.file(path)), n_frames, offset)
 
 
 def _hand(where: str, block: Any, side: Side, hands: HandPair) -> HandTrack:
@@ -224,22 +253,11 @@ def _hand(where: str, block: Any, side: Side, hands: HandPair) -> HandTrack:
     return to_track(SourceHand(transl, rotation, pose, betas), CONVENTION, hands[side])
 
 
-def _object_model(raw: RawTree, top: str, name: str) -> ObjectModel:
-    folder = f"{top}/meta/object_vtemplates/{name}".lstrip("/")
-    mesh = load_mesh(raw.file(f"{folder}/mesh.obj"))
-    is_base = _parts(raw, f"{folder}/parts.json", len(mesh.vertices))
+def _object_model(raw: RawTree, name: str) -> ObjectModel:
+    mesh_path = _found(raw, f"meta/object_vtemplates/{name}/mesh.obj")
+    part_path = _found(raw, f"meta/object_vtemplates/{name}/parts.json")
+    mesh = load_mesh(raw.file(mesh_path))
+    is_base = parse_parts(raw.read(part_path), part_path, len(mesh.vertices))
     hinge = Hinge(axis=np.array(HINGE_AXIS), origin_m=np.zeros(3))
     part = (~is_base).astype(np.uint8)
     return ObjectModel(name, mesh.vertices * MILLIMETRES, mesh.faces, part, hinge)
-
-
-def _parts(raw: RawTree, path: str, n_vertices: int) -> np.ndarray:
-    """(vertex,) bool, True for the base. In the file 0 (false) is the top, which moves; ARCTIC's docs have it wrong."""
-    try:
-        values = orjson.loads(raw.read(path))
-    except orjson.JSONDecodeError as error:
-        raise BadInput(path, "a JSON list", str(error)) from error
-    if not isinstance(values, list) or len(values) != n_vertices or any(value not in (0, 1) for value in values):
-        got = f"a list of {len(values)}" if isinstance(values, list) else type(values).__name__
-        raise BadInput(path, f"a list of {n_vertices} zeros and ones, one per vertex of mesh.obj", got)
-    return np.array(values, dtype=bool)

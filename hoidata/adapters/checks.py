@@ -8,15 +8,18 @@ import numpy as np
 from hoidata.errors import BadInput
 
 
-def table(where: str, value: Any, columns: int, rows: int | None = None) -> np.ndarray:
-    """``value`` as a finite float64 array (row, column). rows: how many are expected, None for any number from 1."""
+def table(where: str, value: Any, columns: int, rows: int | None = None, row: str = "frames") -> np.ndarray:
+    """``value`` as a finite float64 array (row, column).
+
+    rows: how many are expected, None for any number from 1. row: what they are called in errors.
+    """
     array = np.asarray(value)
     if array.dtype.kind not in "fiu":
         raise BadInput(where, "numbers", f"an array of type {array.dtype}")
     if array.ndim != 2 or array.shape[1] != columns:
         raise BadInput(where, f"an array of {columns} columns", f"shape {array.shape}")
     if rows is not None and len(array) != rows:
-        raise BadInput(where, f"{rows} frames", f"{len(array)}")
+        raise BadInput(where, f"{rows} {row}", f"{len(array)}")
     if not len(array):
         raise BadInput(where, "at least one frame", "none")
     finite(where, array)

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.adapters import Quarantined
-from hoidata.adapters.arctic import ArcticAdapter, parse_description
+from hoidata.adapters.arctic import ArcticAdapter
+from hoidata.adapters.arctic_files import parse_description
 from hoidata.errors import BadInput
 from hoidata.hands import track_joints
 from hoidata.objects import articulate, place
