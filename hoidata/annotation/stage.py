@@ -4,7 +4,7 @@ The folder it writes is described in ``hoidata.schema.annotated``.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,18 +63,19 @@ def annotate_store(
     threshold_m: float = CONTACT_THRESHOLD_M,
     points: int = POINT_COUNT,
     hands: HandPair | None = None,
+    left_out: Mapping[str, str] | None = None,
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
 
     encoder: a name for ``load_encoder``, or the encoder itself. split: None puts every clip into train.
     threshold_m: a hand acts when one of its joints comes closer to one of ``points`` sampled points.
     hands: as in ``open_store``. Clips without an acting hand, or without a word for their object, are listed with that
-    reason and get no sentence.
+    reason and get no sentence. left_out: the same for further clips: reasons by clip id, as quality control found them.
     Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing.
     """
     store = open_store(clips_folder, hands)
     encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
-    found = _annotate_clips(store, threshold_m, points)
+    found = _annotate_clips(store, threshold_m, points, left_out or {})
     named = [item for item in found if item.sentences]
     sentences = list(dict.fromkeys(text for item in named for text in item.sentences or ()))
     counts = _counts(found, sentences)
@@ -88,14 +89,15 @@ def annotate_store(
     return counts
 
 
-def _annotate_clips(store: Store, threshold_m: float, points: int) -> list[_Annotated]:
+def _annotate_clips(store: Store, threshold_m: float, points: int, left_out: Mapping[str, str]) -> list[_Annotated]:
     indices = {name: ProximityIndex(cloud) for name, cloud in sample_objects(store, points).items()}
     found = []
     for clip_id in store.ids:
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *_sentences(clip, evidence)))
+        words = (None, left_out[clip_id]) if clip_id in left_out else _sentences(clip, evidence)
+        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *words))
     return found
 
 

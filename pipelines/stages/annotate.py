@@ -34,6 +34,7 @@ def run(place: Place) -> None:
 def annotate(place: Place, params: AnnotateParams) -> None:
     """Clips to words."""
     from hoidata.annotation.stage import annotate_store
+    from hoidata.quality.verdicts import left_out_reasons
     from hoidata.schema.splits import SplitRule
 
     rule = params.split.get(place.dataset)
@@ -45,5 +46,6 @@ def annotate(place: Place, params: AnnotateParams) -> None:
         threshold_m=params.threshold_m,
         points=params.points,
         hands=load_hands(place.profile),
+        left_out=left_out_reasons(place.quality),
     )
     print(f"{place}: {', '.join(f'{count} {name}' for name, count in counts.items())}")

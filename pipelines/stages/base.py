@@ -62,6 +62,10 @@ class Place:
         return self.data / "clips"
 
     @property
+    def quality(self) -> Path:
+        return self.data / "quality"
+
+    @property
     def annotation(self) -> Path:
         return self.data / "annotation"
 

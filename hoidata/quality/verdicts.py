@@ -1,0 +1,20 @@
+"""What quality control says of clips, read back from the folder its stage writes."""
+
+from pathlib import Path
+
+import pandas as pd
+
+from hoidata.errors import MissingResource
+
+
+def left_out_reasons(folder: str | Path) -> dict[str, str]:
+    """Why each clip that failed is left out, by clip id. Raises MissingResource where no stage has written."""
+    path = Path(folder) / "clips.parquet"
+    if not path.is_file():
+        raise MissingResource(f"{path} is not there: run the stage 'quality' of this dataset first")
+    rows = pd.read_parquet(path, columns=["clip_id", "verdict", "reasons"])
+    failed = rows[rows["verdict"] == "left out"]
+    return {
+        clip_id: f"left out by quality control: {reasons}"
+        for clip_id, reasons in zip(failed["clip_id"].tolist(), failed["reasons"].tolist(), strict=True)
+    }
