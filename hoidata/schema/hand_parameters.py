@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import HandModel, HandPair
+from hoidata.hands.model import N_POSE
 from hoidata.schema.clip import HandTrack
 
 
@@ -35,6 +37,15 @@ class HandConvention:
     left_shape: Literal["as released", "corrected", "unused"]
     components: int = 0
     note: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.components <= N_POSE:
+            raise BadInput("components of a hand convention", f"0 (axis-angles) to {N_POSE}", f"{self.components}")
+
+    @property
+    def finger_columns(self) -> int:
+        """Numbers per frame that describe the fingers."""
+        return self.components or N_POSE
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -129,8 +140,13 @@ def from_track(
 
 
 def absolute_fingers(fingers: np.ndarray, convention: HandConvention, model: HandModel) -> np.ndarray:
-    """(frame, 45) absolute axis-angles from axis-angles or principal components."""
+    """(frame, 45) absolute axis-angles from axis-angles or principal components.
+
+    Raises BadInput when there are not as many columns as the convention says.
+    """
     angles = np.asarray(fingers, dtype=np.float64)
+    if angles.ndim != 2 or angles.shape[1] != convention.finger_columns:
+        raise BadInput("finger poses", f"{convention.finger_columns} columns", f"shape {angles.shape}")
     if convention.components:
         angles = angles @ model.components[: convention.components]
     return angles + model.mean_pose if convention.fingers == "mean-relative" else angles

@@ -1,0 +1,75 @@
+"""Joint orders and fingertip vertices against the lists their libraries publish."""
+
+import numpy as np
+import pytest
+
+from hoidata.hands import JOINT_NAMES, TIP_VERTICES, load_embedded_hands
+from hoidata.hands.joint_orders import OPENPOSE, TIP_SETS, from_mano_order, to_mano_order
+
+# smplx and MANO: wrist, index, middle, pinky, ring, thumb, three joints each; then the tips in the same order.
+MANO = [
+    "wrist",
+    "index1", "index2", "index3", "middle1", "middle2", "middle3", "pinky1", "pinky2", "pinky3",
+    "ring1", "ring2", "ring3", "thumb1", "thumb2", "thumb3",
+    "index_tip", "middle_tip", "pinky_tip", "ring_tip", "thumb_tip",
+]  # fmt: skip
+# OpenPose, manopth, H2O: wrist, thumb, index, middle, ring, pinky, each from the palm to its tip.
+OPENPOSE_NAMES = [
+    "wrist",
+    "thumb1", "thumb2", "thumb3", "thumb_tip", "index1", "index2", "index3", "index_tip",
+    "middle1", "middle2", "middle3", "middle_tip", "ring1", "ring2", "ring3", "ring_tip",
+    "pinky1", "pinky2", "pinky3", "pinky_tip",
+]  # fmt: skip
+
+
+def numbered(names: list[str]) -> np.ndarray:
+    """(2 frames, 21, 3): joint ``name`` holds its place in MANO's list, whatever the order it is given in."""
+    one = np.array([[MANO.index(name), MANO.index(name) + 0.1, MANO.index(name) + 0.2] for name in names])
+    return np.stack([one, one + 100])
+
+
+def test_our_own_order_is_manos_with_the_tips_at_the_end():
+    assert list(JOINT_NAMES) == MANO
+
+
+def test_openpose_order_goes_finger_by_finger_from_the_thumb():
+    assert [MANO[place] for place in OPENPOSE] == OPENPOSE_NAMES
+    np.testing.assert_array_equal(to_mano_order(numbered(OPENPOSE_NAMES), "openpose"), numbered(MANO))
+    np.testing.assert_array_equal(from_mano_order(numbered(MANO), "openpose"), numbered(OPENPOSE_NAMES))
+
+
+@pytest.mark.parametrize("order", ["mano", "openpose"])
+def test_there_and_back_gives_the_same_joints(order):
+    joints = np.random.default_rng(0).normal(size=(4, 2, 21, 3))
+    np.testing.assert_array_equal(to_mano_order(from_mano_order(joints, order), order), joints)
+    np.testing.assert_array_equal(from_mano_order(to_mano_order(joints, order), order), joints)
+
+
+def test_manos_own_order_changes_nothing():
+    joints = numbered(MANO)
+    np.testing.assert_array_equal(to_mano_order(joints, "mano"), joints)
+
+
+def test_tip_vertices_are_those_the_libraries_take():
+    # thumb, index, middle, ring, pinky as each library lists them; ours follow index, middle, pinky, ring, thumb.
+    published = {
+        "smplx": (744, 320, 443, 554, 671),
+        "manopth right": (745, 317, 444, 556, 673),
+        "manopth left": (745, 317, 445, 556, 673),
+        "text2hoi": (745, 317, 445, 556, 673),
+    }
+    for name, (thumb, index, middle, ring, pinky) in published.items():
+        assert TIP_SETS[name] == (index, middle, pinky, ring, thumb)
+    assert set(TIP_SETS) == set(published)
+    assert TIP_SETS["text2hoi"] == TIP_VERTICES
+
+
+@pytest.mark.parametrize("name", TIP_SETS)
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_every_tip_set_lies_at_the_ends_of_its_fingers(name, side):
+    model = load_embedded_hands()[side]
+    joints = model.joint_regressor @ model.template_m
+    for vertex, last_joint in zip(TIP_SETS[name], (3, 6, 9, 12, 15), strict=True):
+        away = np.linalg.norm(joints - model.template_m[vertex], axis=1)
+        assert away.argmin() == last_joint
+        assert 0.005 < away.min() < 0.04
