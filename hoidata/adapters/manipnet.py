@@ -7,7 +7,7 @@ To go right-handed, the world and every joint frame are seen in a mirror with no
 
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +25,7 @@ from hoidata.adapters.manipnet_segments import (
     height_above_table,
     interactions,
     motion_verb,
+    widened,
 )
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -131,10 +132,13 @@ def surface_distances(
 class ManipNetAdapter:
     """Raw root: ``sequences/<name>/*.bvh.gz``, ``objects/<group>/<object>.obj.gz``, ``hand/hand_reference.json``.
 
-    Sequences without hand files are refused with that reason. The subject's shape is fitted to 20 frames of each
-    readable two-hand sequence, so every clip also lists the other sequences' hand files among its sources.
+    margin_frames: frames (of 30 fps) kept before and after each interaction, as far as the tracking is usable; ids and
+    verbs are those of the interaction itself. Sequences without hand files are refused with that reason.
+    The subject's shape is fitted to 20 frames of each readable two-hand sequence, so every clip also lists the other
+    sequences' hand files among its sources.
     """
 
+    margin_frames: int = 0
     name: str = "manipnet"
     version: str = "1.0"
     licence: str = "CC BY-NC 4.0"
@@ -168,24 +172,20 @@ class ManipNetAdapter:
             elif verb is None:
                 results.append(_left_out(key, start, stop + 1, "an object that moves", "one that stays on the table"))
             else:
-                results.append(self._clip(raw, key, recording, stretch, verb, betas, hands))
+                kept = widened(stretch, self.margin_frames, usable)
+                sources = raw.recorded(*recording.paths, *_all_hand_files(self.sequences(raw.root)))
+                clip = self._clip(key, recording, kept, betas, hands)
+                results.append(replace(clip, clip_id=_clip_id(key, start, stop), verb=verb, sources=sources))
         return results
 
     def _clip(
-        self,
-        raw: RawTree,
-        key: SequenceKey,
-        recording: Recording,
-        stretch: Stretch,
-        verb: str,
-        betas: np.ndarray,
-        hands: HandPair,
+        self, key: SequenceKey, recording: Recording, stretch: Stretch, betas: np.ndarray, hands: HandPair
     ) -> Clip:
+        """The frames of a stretch as a clip; its id, verb and sources are the caller's to say."""
         frames = slice(*stretch)
-        source_frames = recording.source_frames[frames]
         fits = fit_hands({side: points[frames] for side, points in recording.keypoints_m.items()}, hands, betas)
         return Clip(
-            clip_id=f"{key}/{source_frames[0]:06d}-{source_frames[-1]:06d}",
+            clip_id=str(key),
             dataset=self.name,
             subject=key.subject,
             sequence=key.name,
@@ -195,13 +195,14 @@ class ManipNetAdapter:
                 rotmat_to_rotvec(recording.rotation[frames]).astype(np.float32),
                 recording.translation_m[frames].astype(np.float32),
             ),
-            source_frames=source_frames.astype(np.int32),
+            source_frames=recording.source_frames[frames].astype(np.int32),
             gravity=np.array([0.0, -1.0, 0.0]),
-            verb=verb,
+            verb=None,
             object_words=object_words(recording.model.name),
             source_from_world=np.diag([*(MIRROR_X / METRES_PER_UNIT), 1.0]),
-            sources=raw.recorded(*recording.paths, *_all_hand_files(self.sequences(raw.root))),
             source_fps=recording.source_fps,
+            hands_from="keypoints",
+            fit_error_m=float(np.mean([fits[side].error_m for side in SIDES])),
         )
 
 
@@ -364,6 +365,11 @@ def _hand_track(fit: HandFit) -> HandTrack:
     )
 
 
+def _clip_id(key: SequenceKey, start: int, last: int) -> str:
+    """From source frames, both included."""
+    return f"{key}/{start:06d}-{last:06d}"
+
+
 def _left_out(key: SequenceKey, start: int, stop: int, expected: str, got: str) -> Quarantined:
     where = f"sequences/{key.name}, source frames {start} to {stop - 1}"
-    return Quarantined(f"{key}/{start:06d}-{stop - 1:06d}", where, expected, got, "nothing to do: they are left out")
+    return Quarantined(_clip_id(key, start, stop - 1), where, expected, got, "nothing to do: they are left out")

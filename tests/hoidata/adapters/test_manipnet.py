@@ -344,3 +344,34 @@ def test_times_not_frame_numbers_decide_at_other_rates() -> None:
 )
 def test_file_names_become_words(name: str, words: str) -> None:
     assert object_words(name) == words
+
+
+def test_a_margin_keeps_usable_frames_around_the_interaction_under_the_same_id_and_verb(tmp_path: Path) -> None:
+    """The hand comes down on the object until frame 100, which is lifted from frame 150; frames 8 to 11 are a jump."""
+    left, right, thing = lift_rows()
+    for frame in range(600):
+        height = 1.0 + 3.0 * np.clip((frame - 150) / 240, 0, 1)
+        thing[frame][:2] = [thing[frame][0] + (0.5 if frame < 10 else 0.0), height]
+        right[frame][1] = height + max(0.0, (100 - frame) / 40)
+    raw = write_tree(tmp_path, left, right, thing)
+    (without,) = (item for item in ManipNetAdapter().load(raw, KEY, HANDS) if isinstance(item, Clip))
+    (some,) = (item for item in ManipNetAdapter(margin_frames=5).load(raw, KEY, HANDS) if isinstance(item, Clip))
+    (all_there_are,) = (
+        item for item in ManipNetAdapter(margin_frames=99).load(raw, KEY, HANDS) if isinstance(item, Clip)
+    )
+    first = int(without.source_frames[0])
+    assert 40 < first < 120
+    np.testing.assert_array_equal(some.source_frames, np.arange(first - 20, 600, 4))
+    np.testing.assert_array_equal(all_there_are.source_frames, np.arange(12, 600, 4))
+    assert {(clip.clip_id, clip.verb) for clip in (without, some, all_there_are)} == {(without.clip_id, "lift")}
+
+
+def test_clips_say_that_their_hands_were_fitted_to_keypoints_and_how_well(carried: tuple[RawTree, Clip]) -> None:
+    raw, clip = carried
+    recording = read_recording(raw, KEY.name)
+    error_m = [
+        np.linalg.norm(track_joints(clip.hands[side], HANDS[side]) - points, axis=-1)
+        for side, points in recording.keypoints_m.items()
+    ]
+    assert clip.hands_from == "keypoints"
+    assert clip.fit_error_m == pytest.approx(np.mean(error_m), abs=1e-6)
