@@ -33,7 +33,7 @@ Reading = Callable[[Clip, HandPair], Clip]
 
 @dataclass(frozen=True)
 class _Touch:
-    """Metres from the object (side, frame), NaN if not valid: the wrist, the three nearest tips' mean, the nearest tip."""
+    """Metres from the object (side, frame), NaN if not valid: wrist, mean of the three nearest tips, nearest tip."""
 
     wrist_m: np.ndarray
     tips_m: np.ndarray

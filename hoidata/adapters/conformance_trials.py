@@ -65,7 +65,7 @@ class Trials:
         return finding(rule, _compared(item, there))
 
     def without_one_sequence(self) -> list[Finding]:
-        """Remove what belongs to one sequence alone, or all its files where it shares every one."""
+        """Remove the files of one sequence and see what the others give."""
         rules = (
             "sequences stay the same when another is removed",
             "clips stay the same when another sequence is removed",
@@ -128,10 +128,9 @@ class Trials:
         return finding(rule, problems)
 
     def _own(self, item: Loaded) -> list[str]:
-        """Files of one sequence that no other needs; else those with its name in their path."""
+        """Files of one sequence: with its name in their path, or needed by no other."""
         elsewhere = {path for other in self.loaded if other is not item for path in other.needed}
-        named = [path for path in item.needed if item.key.name in path]
-        return [path for path in item.needed if path not in elsewhere] or named
+        return [path for path in item.needed if item.key.name in path or path not in elsewhere]
 
     def _differences(self, root: Path, items: list[Loaded]) -> list[str]:
         loaded = [load_recorded(self.adapter, root, item.key, self.hands) for item in items]
