@@ -1,90 +1,109 @@
 """H2O (Kwon et al. 2021): per-frame text files of five cameras; hands and objects in the camera's frame.
 
 Only the head camera (cam4) is read, because action labels exist only there. Its pose files are camera-to-world.
+The world's axes are not documented: gravity is estimated from objects at rest, sequence by sequence.
 """
 
-import re
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from hoidata.adapters import checks
 from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.adapters.gravity import GravityEstimate, TrackedObject, estimate_gravity
+from hoidata.adapters.h2o_files import (
+    ACTIONS,
+    LISTS,
+    OBJECTS,
+    HandSource,
+    SequenceFrames,
+    listed_segments,
+    read_frames,
+)
+from hoidata.adapters.h2o_hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
-from hoidata.schema.hand_parameters import FrameChange, HandConvention, SourceHand, to_track
+from hoidata.objects.resting import Footing, footing
+from hoidata.schema.clip import CameraTrack, Clip, ObjectTrack, SourceFile, WorldFrame
+from hoidata.schema.hand_parameters import HandConvention
 
 CAMERA = "cam4"
-OBJECTS = ("", "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")  # by class id
 OLD_NAMES = {"spray": "lotion_spray", "cocoa": "ovomaltine", "chips": "pringles", "cappuccino": "starbucks"}
-FRAME_FILE = re.compile(r"\d{6}\.txt")
-FRAME = WorldFrame(None, "unknown", "H2O's camera-rig world, right-handed, metres; axes not documented")
-CONVENTION = HandConvention(
-    translation="transl",
-    fingers="absolute",
-    shape="betas per frame",
-    left_shape="as released",
-    note="MANO in the camera's frame: absolute axis-angles, betas per frame, translation added to the rest wrist",
-)
+FRAME = WorldFrame(None, "estimated", "H2O's camera-rig world, right-handed, metres; its axes are not documented")
 PARTS = (
     DatasetPart("pose files of the head camera", ("subject*/*/*/cam4/obj_pose_rt/*.txt",), "subjectN_pose_v1_1.tar.gz"),
     DatasetPart("object meshes", ("object/*/*.obj",), "object.zip"),
     DatasetPart("segments of all subjects", ("label_split/action_*.txt",), "label_split.zip", optional=True),
 )
-_SHELF = ("book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")
-ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is background
-    ("", ""),
-    *(("grab", noun) for noun in _SHELF),
-    *(("place", noun) for noun in _SHELF),
-    *(("open", noun) for noun in ("lotion", "milk", "chips")),
-    *(("close", noun) for noun in ("lotion", "milk", "chips")),
-    ("pour", "milk"),
-    *(("take out", noun) for noun in ("espresso", "cocoa", "chips", "cappuccino")),
-    *(("put in", noun) for noun in ("espresso", "cocoa", "cappuccino")),
-    *(("apply", noun) for noun in ("lotion", "spray")),
-    *(("read", noun) for noun in ("book", "espresso")),
-    ("spray", "spray"),
-    ("squeeze", "lotion"),
-)
 
 
-@dataclass(frozen=True)
-class _Frames:
-    """The numbers of one sequence, frame axis first, as in the files (camera frame, metres)."""
+class _Run(NamedTuple):
+    """Frames ``start`` to ``stop`` (exclusive) of one action. verb: None where labels are withheld."""
 
-    folder: str
-    first: int
-    camera: np.ndarray
-    hands: np.ndarray
-    object: np.ndarray
-    label: np.ndarray
+    start: int
+    stop: int
+    verb: str | None
+    noun: str
+
+
+class _Object(NamedTuple):
+    model: ObjectModel
+    footing: Footing
+
+
+class _Sequence(NamedTuple):
+    """Everything the clips of one sequence share. sources: the files behind all of them, meshes apart."""
+
+    key: SequenceKey
+    frames: SequenceFrames
+    hands: SequenceHands
+    objects: dict[str, _Object]
+    gravity: GravityEstimate
+    sources: tuple[SourceFile, ...]
 
 
 @dataclass(frozen=True)
 class H2OAdapter:
     """Raw root: ``object/<name>/<name>.obj`` and ``subjectN/<place>/<number>/cam4/<kind>/NNNNNN.txt``.
 
-    margin_frames: frames kept before and after each labelled run. shortest_frames: runs must be this long or longer.
-    A run is split where the tracked object is not the one its label names.
+    margin_frames: frames kept before and after each run. shortest_frames: runs must be this long or longer.
+    hands: "mano" reads MANO parameters, which need the licensed MANO files; "keypoints" fits the given hand to the 21
+    joints instead and needs none.
+    Runs are those of the per-frame action labels; for a sequence without any (subject4, whose labels are withheld) the
+    segments of ``label_split``. A run is split where the tracked object is not the one its label names, or, without
+    a label, not the one that is tracked most.
     """
 
     margin_frames: int = 0
     shortest_frames: int = 21
+    hands: HandSource = "mano"
     name: str = "h2o"
     version: str = "1.1"
     licence: str = "research use after registration; no licence text is published with the files"
     where_to_register: str = "https://h2odataset.ethz.ch (subjectN_pose_v1_1.tar.gz, object.zip)"
-    needs_mano: bool = True
     source_fps: float = 30.0
     may_be_shared: bool = False
     frame: WorldFrame = FRAME
-    hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
+
+    def __post_init__(self) -> None:
+        if self.hands not in get_args(HandSource):
+            known = " or ".join(get_args(HandSource))
+            raise BadInput("settings of the adapter h2o: hands", known, f"{self.hands!r}", "correct it")
+
+    @property
+    def needs_mano(self) -> bool:
+        return self.hands == "mano"
+
+    @property
+    def hand_convention(self) -> HandConvention:
+        return PARAMETERS if self.needs_mano else FITTED
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``subjectN/<place>/<number>`` that has a cam4 folder."""
@@ -93,98 +112,145 @@ class H2OAdapter:
         return [SequenceKey(self.name, part[0], "/".join(part[:3])) for part in parts]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
-        """One clip per run of frames with one non-zero action label and the object that label names."""
-        frames = _read_frames(raw, f"{key.name}/{CAMERA}")
-        models: dict[str, ObjectModel] = {}
-        results: list[Clip | Quarantined] = []
-        for start, stop in label_runs(frames.label, self.shortest_frames):
-            pieces = _tracked_pieces(frames, start, stop, self.shortest_frames)
-            if not pieces:
-                problem = _untracked(frames, start, stop)
-                results.append(Quarantined.from_error(_clip_id(key, frames, start, stop), problem))
-            for piece in pieces:
-                name = ACTIONS[int(frames.label[start])][1]
-                mesh_path = _mesh_path(raw, name)
-                if name not in models:
-                    models[name] = _object_model(raw, name, mesh_path)
-                clip = self._convert(key, frames, *piece, models[name], hands)
-                results.append(replace(clip, sources=raw.recorded(frames.folder, mesh_path)))
-        return results
+        """One clip per run of frames of one action on the object tracked there; runs that give none, with reasons."""
+        frames = read_frames(raw, f"{key.name}/{CAMERA}", self.hands)
+        found = list(self._runs(raw, key, frames))
+        runs = [item for item in found if isinstance(item, _Run)]
+        if not runs:
+            return [item for item in found if isinstance(item, Quarantined)]
+        paths = {noun: _mesh_path(raw, noun) for noun in sorted({run.noun for run in runs})}
+        objects = {noun: _object(noun, raw.file(path), raw.recorded(path)[0].sha256) for noun, path in paths.items()}
+        own_hands = ParameterHands(frames, hands) if self.needs_mano else KeypointHands(frames, hands)
+        gravity = estimate_gravity(_tracked_objects(frames, objects), own_hands.joints_m(), frames.camera[:, :3, :3])
+        sources = raw.recorded(frames.folder, LISTS, *paths.values())
+        sequence = _Sequence(key, frames, own_hands, objects, gravity, sources)
+        return [item if isinstance(item, Quarantined) else self._clip(sequence, item) for item in found]
 
-    def _convert(
-        self, key: SequenceKey, frames: _Frames, start: int, stop: int, model: ObjectModel, hands: HandPair
-    ) -> Clip:
-        verb, noun = ACTIONS[int(frames.label[start])]
-        clip_id = _clip_id(key, frames, start, stop)
-        start, stop = _with_margin(frames, start, stop, self.margin_frames)
-        camera = frames.camera[start:stop]
-        world_from_object = camera @ frames.object[start:stop, 1:].reshape(-1, 4, 4)
+    def _runs(self, raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[_Run | Quarantined]:
+        """Runs of the labels, or the list's segments, cut to the frames in which their object is tracked."""
+        known: set[tuple[int, int]] = set()
+        for start, stop, label, where in _wanted(raw, key, frames):
+            clip_id = _clip_id(key, frames, start, stop)
+            try:
+                for piece in _tracked_pieces(frames, start, stop, label, self.shortest_frames, where):
+                    if (piece.start, piece.stop) in known:
+                        raise BadInput(where, "each stretch once", f"{clip_id} twice", "correct the list")
+                    known.add((piece.start, piece.stop))
+                    yield piece
+            except BadInput as problem:
+                yield Quarantined.from_error(clip_id, problem)
+
+    def _clip(self, sequence: _Sequence, run: _Run) -> Clip:
+        frames = sequence.frames
+        start, stop = _with_margin(frames, run.start, run.stop, self.margin_frames)
+        world_from_object = frames.camera[start:stop] @ frames.objects[start:stop]
+        tracks, fit_error_m = sequence.hands.tracks(start, stop)
+        source_frames = np.arange(frames.first + start, frames.first + stop, dtype=np.int32)
         return Clip(
-            clip_id=clip_id,
+            clip_id=_clip_id(sequence.key, frames, run.start, run.stop),
             dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
-            hands={side: _hand(side, frames.hands[start:stop], camera, hands) for side in SIDES},
+            subject=sequence.key.subject,
+            sequence=sequence.key.name,
+            hands=tracks,
             object=ObjectTrack(
-                model,
+                sequence.objects[run.noun].model,
                 rotmat_to_rotvec(world_from_object[:, :3, :3]).astype(np.float32),
                 world_from_object[:, :3, 3].astype(np.float32),
             ),
-            source_frames=np.arange(frames.first + start, frames.first + stop, dtype=np.int32),
-            gravity=None,
-            gravity_note="H2O does not document the axes of its world",
-            verb=verb,
-            object_words=noun,
+            source_frames=source_frames,
+            gravity=sequence.gravity.direction,
+            gravity_note=sequence.gravity.note,
+            verb=run.verb,
+            object_words=run.noun,
             source_fps=self.source_fps,
+            sources=sequence.sources,
+            hands_from="parameters" if self.needs_mano else "keypoints",
+            fit_error_m=fit_error_m,
+            camera=_camera_track(frames, start, stop, source_frames),
         )
 
 
-def label_runs(label: np.ndarray, shortest: int) -> list[tuple[int, int]]:
-    """Half-open ranges of one non-zero label that are at least ``shortest`` frames long. label: (frame,) int."""
+def label_runs(label: np.ndarray) -> list[tuple[int, int]]:
+    """Half-open ranges of one non-zero label. label: (frame,) int."""
     edges = np.flatnonzero(np.diff(label)) + 1
     starts, stops = np.r_[0, edges], np.r_[edges, len(label)]
-    return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if label[a] != 0 and b - a >= shortest]
+    return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if label[a] != 0]
 
 
-def _hand(side: Side, block: np.ndarray, camera: np.ndarray, hands: HandPair) -> HandTrack:
-    """block: (frame, 124) = left then right: flag, transl 3, orient 3, fingers 45, betas 10; camera: (frame, 4, 4)."""
-    block = block[:, :62] if side == "left" else block[:, 62:]
-    source = SourceHand(
-        translation_m=block[:, 1:4],
-        global_orient=block[:, 4:7],
-        fingers=block[:, 7:52],
-        betas=block[:, 52:62],
-        valid=block[:, 0] != 0,
-    )
-    return to_track(source, CONVENTION, hands[side], FrameChange(camera[:, :3, :3], camera[:, :3, 3]))
+def _wanted(raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[tuple[int, int, int | None, str]]:
+    """Start, stop (exclusive), action and its source of each run, as the labels say, or else the segment lists.
+
+    Raises BadInput where neither is there, or the list speaks of frames that are not.
+    """
+    if frames.label is not None and frames.label.any():
+        for start, stop in label_runs(frames.label):
+            yield start, stop, int(frames.label[start]), f"{frames.folder}/action_label"
+        return
+    segments, path = listed_segments(raw, key.name)
+    if not segments and frames.label is not None:
+        return
+    if not segments:
+        expected = f"action labels, or {key.name} in a segment list {LISTS}/action_*.txt"
+        remedy = f"unpack label_split.zip here: the labels of subject4 are withheld, its segments are in {LISTS}"
+        raise BadInput(f"{frames.folder}/action_label", expected, "neither", remedy)
+    for segment in segments:
+        start, stop = segment.start - frames.first, segment.last + 1 - frames.first
+        if start < 0 or stop > len(frames):
+            expected = f"frames {frames.first} to {frames.first + len(frames) - 1}, as {frames.folder} has them"
+            got = f"segment {segment.start} to {segment.last} of {key.name}"
+            raise BadInput(path, expected, got, "download the pose archive of this subject again")
+        yield start, stop, segment.label, path
 
 
-def _clip_id(key: SequenceKey, frames: _Frames, start: int, stop: int) -> str:
+def _tracked_pieces(
+    frames: SequenceFrames, start: int, stop: int, label: int | None, shortest: int, where: str
+) -> list[_Run]:
+    """The parts of a run, ``shortest`` frames or longer, in which its object is tracked. Raises BadInput for none.
+
+    The object is the one the label names; without a label the one tracked in most frames (the first of equals).
+    """
+    named_frames = f"frames {frames.first + start} to {frames.first + stop - 1}"
+    if stop - start < shortest:
+        got, remedy = f"{stop - start} ({named_frames})", "nothing to do: it is left out"
+        raise BadInput(where, f"a run of {shortest} frames or more", got, remedy)
+    classes = frames.classes[start:stop]
+    counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))
+    wanted = int(counts.argmax()) if label is None else OBJECTS.index(ACTIONS[label][1])
+    runs = [(first, last) for first, last in label_runs((classes == wanted).astype(int)) if last - first >= shortest]
+    if not counts.any() or not runs:
+        thing = "one object" if label is None else f"class {wanted} ({OBJECTS[wanted]}), the object of action {label},"
+        got = f"classes {np.unique(classes).tolist()} ({named_frames})"
+        expected = f"{thing} for {shortest} frames or more"
+        raise BadInput(f"{frames.folder}/obj_pose_rt", expected, got, "check the annotation")
+    verb = None if label is None else ACTIONS[label][0]
+    return [_Run(start + first, start + last, verb, OBJECTS[wanted]) for first, last in runs]
+
+
+def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) -> str:
     return f"{key}/{frames.first + start:06d}-{frames.first + stop - 1:06d}"
 
 
-def _tracked_pieces(frames: _Frames, start: int, stop: int, shortest: int) -> list[tuple[int, int]]:
-    """The parts of a run, ``shortest`` frames or longer, in which the tracked object is the one the label names."""
-    expected = OBJECTS.index(ACTIONS[int(frames.label[start])][1])
-    tracked = (frames.object[start:stop, 0] == expected).astype(int)
-    return [(start + first, start + last) for first, last in label_runs(tracked, shortest)]
-
-
-def _untracked(frames: _Frames, start: int, stop: int) -> BadInput:
-    label = int(frames.label[start])
-    classes = np.unique(frames.object[start:stop, 0].astype(int)).tolist()
-    noun = ACTIONS[label][1]
-    wanted = f"class {OBJECTS.index(noun)} ({noun}), the object of action {label}, for more than 20 frames"
-    return BadInput(f"{frames.folder}/obj_pose_rt", wanted, f"classes {classes}", "check the annotation")
-
-
-def _with_margin(frames: _Frames, start: int, stop: int, margin: int) -> tuple[int, int]:
+def _with_margin(frames: SequenceFrames, start: int, stop: int, margin: int) -> tuple[int, int]:
     """The piece and up to ``margin`` frames on both sides, as far as the same object is tracked."""
-    same = frames.object[:, 0] == frames.object[start, 0]
+    same = frames.classes == frames.classes[start]
     first, last = max(0, start - margin), min(len(same), stop + margin)
     others = np.flatnonzero(~same)
     before, after = others[others < start], others[others >= stop]
     return max(first, before[-1] + 1 if len(before) else 0), min(last, after[0] if len(after) else len(same))
+
+
+def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndarray) -> CameraTrack:
+    poses = frames.camera[start:stop]
+    rotvec = rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32)
+    return CameraTrack(CAMERA, rotvec, poses[:, :3, 3].astype(np.float32), images, frames.intrinsics)
+
+
+def _tracked_objects(frames: SequenceFrames, objects: dict[str, _Object]) -> list[TrackedObject]:
+    # A frame without an object may hold anything.
+    poses = frames.camera @ np.where(frames.classes[:, None, None] == 0, np.eye(4), frames.objects)
+    return [
+        TrackedObject(thing.footing, frames.classes == OBJECTS.index(noun), poses) for noun, thing in objects.items()
+    ]
 
 
 def _mesh_path(raw: RawTree, name: str) -> str:
@@ -196,74 +262,9 @@ def _mesh_path(raw: RawTree, name: str) -> str:
     raise BadInput(f"object/{name}/{name}.obj", "the object's mesh", "nothing there", "unpack object.zip here")
 
 
-def _object_model(raw: RawTree, name: str, path: str) -> ObjectModel:
-    mesh = load_mesh(raw.file(path))
-    return ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
-
-
-def _read_frames(raw: RawTree, folder: str) -> _Frames:
-    kinds = {kind: _folder_of(raw, folder, kind) for kind in ("cam_pose", "hand_pose_mano", "obj_pose_rt")}
-    kinds["action_label"] = f"{folder}/action_label"
-    files = _common_files(raw, kinds)
-    camera = _numbers(raw, kinds["cam_pose"], files, 16)
-    hands = _numbers(raw, kinds["hand_pose_mano"], files, 124)
-    objects = _numbers(raw, kinds["obj_pose_rt"], files, 17)
-    label = _numbers(raw, kinds["action_label"], files, 1)
-    _check_ids(kinds["action_label"], files, label[:, 0], len(ACTIONS))
-    _check_ids(kinds["obj_pose_rt"], files, objects[:, 0], len(OBJECTS))
-    camera = camera.reshape(-1, 4, 4)
-    checks.rigid_transforms(kinds["cam_pose"], files, camera)
-    tracked = np.flatnonzero(objects[:, 0])
-    names = [files[frame] for frame in tracked]
-    checks.rigid_transforms(kinds["obj_pose_rt"], names, objects[tracked, 1:].reshape(-1, 4, 4))
-    return _Frames(folder, int(files[0][:6]), camera, hands, objects, label[:, 0].astype(int))
-
-
-def _folder_of(raw: RawTree, folder: str, kind: str) -> str:
-    """The real name of a folder whose case differs between releases (hand_pose_mano, hand_pose_MANO)."""
-    place = raw.root / folder
-    found = sorted(item.name for item in place.iterdir() if item.name.lower() == kind)
-    return f"{folder}/{found[-1] if found else kind}"
-
-
-def _common_files(raw: RawTree, kinds: dict[str, str]) -> list[str]:
-    """Names of the frame files, the same in every folder and without a gap; else BadInput names the missing one."""
-    names = {folder: {n for n in raw.names(folder) if FRAME_FILE.fullmatch(n)} for folder in kinds.values()}
-    for folder, found in names.items():
-        if not found:
-            remedy = "download the pose archive of this subject"
-            if folder == kinds["action_label"]:
-                remedy += "; nothing to do for subject4, whose action labels are withheld"
-            raise BadInput(folder, "a folder of NNNNNN.txt files", "none", remedy)
-    numbers = sorted(int(name[:6]) for name in set().union(*names.values()))
-    expected = [f"{number:06d}.txt" for number in range(numbers[0], numbers[-1] + 1)]
-    for folder, found in names.items():
-        missing = next((name for name in expected if name not in found), None)
-        if missing is not None:
-            raise BadInput(f"{folder}/{missing}", f"one file for each of {len(expected)} frames", "nothing there")
-    return expected
-
-
-def _numbers(raw: RawTree, folder: str, files: list[str], columns: int) -> np.ndarray:
-    """(frame, column) float64 from the first line of each file."""
-    rows = []
-    for name, data in zip(files, raw.read_folder(folder, files), strict=True):
-        try:
-            row = [float(word) for word in data.partition(b"\n")[0].split()]
-        except ValueError as error:
-            raise BadInput(f"{folder}/{name}", f"{columns} numbers", str(error)) from error
-        if len(row) != columns:
-            raise BadInput(f"{folder}/{name}", f"{columns} numbers", f"{len(row)}")
-        rows.append(row)
-    values = np.array(rows, dtype=np.float64)
-    good = np.isfinite(values).all(axis=1)
-    if not good.all():
-        raise BadInput(f"{folder}/{files[int(np.argmin(good))]}", "finite numbers", "NaN or infinity")
-    return values
-
-
-def _check_ids(folder: str, files: list[str], values: np.ndarray, count: int) -> None:
-    known = np.isin(values, np.arange(count))
-    if not known.all():
-        at = int(np.argmin(known))
-        raise BadInput(f"{folder}/{files[at]}", f"a whole number from 0 to {count - 1}", f"{values[at]}")
+@lru_cache(maxsize=16)
+def _object(name: str, place: Path, sha256: str) -> _Object:
+    """The mesh read from ``place``; sha256 tells whether it is still the same file: sequences share few objects."""
+    mesh = load_mesh(place)
+    model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
+    return _Object(model, footing(mesh.vertices, mesh.faces))

@@ -145,7 +145,9 @@ def test_twenty_frames_of_a_label_are_too_short_and_twenty_one_enough(root, load
     labels = root / "subject2" / "k1" / "3" / "cam4" / "action_label"
     for frame in (3, 4):
         write_text(labels / f"{frame:06d}.txt", [0])
-    assert load_all(H2OAdapter(), root) == []
+    (short,) = load_all(H2OAdapter(), root)
+    assert isinstance(short, Quarantined)
+    assert (short.source_key, short.got) == ("h2o/subject2/k1/3/000005-000024", "20 (frames 5 to 24)")
     write_text(labels / "000004.txt", [26])
     (clip,) = load_all(H2OAdapter(), root)
     assert clip.n_frames == 21
