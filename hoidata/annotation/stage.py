@@ -1,4 +1,4 @@
-"""Stage annotate: hand type, sentences, text features and split of every clip.
+"""Stage annotate: hand type, sentences and text features of every clip.
 
 The folder it writes is described in ``hoidata.schema.annotated``.
 """
@@ -22,7 +22,6 @@ from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import POINT_COUNT
 from hoidata.schema import SIDES, Clip, HandType, Side
-from hoidata.schema.splits import SplitRule, assign_split
 from hoidata.schema.store import Store, open_store
 
 HAND_TYPE_SOURCE = "proximity"
@@ -40,7 +39,6 @@ HAND_TYPE_TABLE = pa.schema(
         ("reason", _TEXT),
     ]
 )
-SPLIT_TABLE = pa.schema([("clip_id", _TEXT), ("split", _TEXT)])
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,6 @@ def annotate_store(
     out_folder: str | Path,
     *,
     encoder: str | TextEncoder = "use",
-    split: SplitRule | None = None,
     threshold_m: float = CONTACT_THRESHOLD_M,
     points: int = POINT_COUNT,
     hands: HandPair | None = None,
@@ -67,7 +64,7 @@ def annotate_store(
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
 
-    encoder: a name for ``load_encoder``, or the encoder itself. split: None puts every clip into train.
+    encoder: a name for ``load_encoder``, or the encoder itself.
     threshold_m: a hand acts when one of its joints comes closer to one of ``points`` sampled points.
     hands: as in ``open_store``. Clips without an acting hand, or without a word for their object, are listed with that
     reason and get no sentence. left_out: the same for further clips: reasons by clip id, as quality control found them.
@@ -82,7 +79,6 @@ def annotate_store(
     with atomic_folder(out_folder) as part:
         write_table(part / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
         write_table(part / "text.parquet", _text_rows(named, sentences), TEXT_TABLE)
-        write_table(part / "split.parquet", _split_rows(store, named, split or SplitRule()), SPLIT_TABLE)
         _write_embeddings(part / "embeddings.npz", encoder, sentences)
         info = {"encoder": encoder.identity, "threshold_m": threshold_m, "points": points, "counts": counts}
         (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
@@ -139,12 +135,6 @@ def _text_rows(named: Sequence[_Annotated], sentences: Sequence[str]) -> list[di
         for item in named
         for form, sentence in zip(FORMS, item.sentences or (), strict=True)
     ]
-
-
-def _split_rows(store: Store, named: Sequence[_Annotated], rule: SplitRule) -> list[dict]:
-    """Parts are counted over the clips that will be used, so that none runs empty through clips left out."""
-    used = store.sequences.loc[[item.clip_id for item in named]]
-    return [{"clip_id": clip_id, "split": str(part)} for clip_id, part in assign_split(used, rule).items()]
 
 
 def _write_embeddings(path: Path, encoder: TextEncoder, sentences: Sequence[str]) -> None:

@@ -1,19 +1,22 @@
-"""The annotated dataset of one profile and source: clips, words, contacts, read from the three folders stages write.
+"""The annotated dataset of one profile and source: clips, words, contacts, read from the four folders stages write.
 
     clips/        the store (see ``hoidata.schema.store``)
     annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz)
                   hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
                                       reason (why a clip is left out)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
-                  split.parquet       clip_id, split        info.json    encoder, threshold_m, counts
+                  info.json           encoder, threshold_m, counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
                   contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
                   distances-*.npz     frame int16, point int16, joint int8, distance_m float32: one row per entry
                   info.json           threshold_m, points, counts
+    splits/       splits.parquet      clip_id, split (the chosen one), one column per named split
+                  info.json           definitions, clips per part, leak checks
+                  statistics.json     of every stored quantity over the training part
 
 A clip without an acting hand, or without words, has a row with the reason in hand_type.parquet and no sentence; it
-belongs to no split.
+belongs to no part of a split, and neither does a clip that no part of the split covers.
 """
 
 from collections.abc import Sequence
@@ -34,14 +37,19 @@ from hoidata.schema.dataset import DistanceEntries
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.store import Store, open_store
 
+STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
+
+
+STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
+
 
 def load_annotated(root: str | Path, hands: HandPair | None = None) -> "AnnotatedStore":
-    """Open ``root/clips``, ``root/annotation`` and ``root/contact`` for reading.
+    """Open ``root/clips``, ``root/annotation``, ``root/contact`` and ``root/splits`` for reading.
 
     hands: as in ``open_store``. Raises MissingResource naming the stage whose folder is not there.
     """
     root = Path(root)
-    for folder, stage in (("clips", "convert"), ("annotation", "annotate"), ("contact", "contact")):
+    for folder, stage in STAGES.items():
         if not (root / folder).is_dir():
             raise MissingResource(f"{root / folder} is not there: run the stage '{stage}' of this dataset first")
     return AnnotatedStore(root, open_store(root / "clips", hands))
@@ -56,8 +64,11 @@ class AnnotatedStore:
         annotation, contact = root / "annotation", root / "contact"
         self.text = pd.read_parquet(annotation / "text.parquet")
         self.hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
-        split = pd.read_parquet(annotation / "split.parquet")
-        self.splits: dict[str, str] = dict(zip(split["clip_id"], split["split"], strict=True))
+        chosen = pd.read_parquet(root / "splits" / "splits.parquet", columns=["clip_id", "split"])
+        self.splits: dict[str, str | None] = {
+            clip_id: None if pd.isna(part) else str(part) for clip_id, part in chosen.itertuples(index=False)
+        }
+        self.split_info: dict[str, Any] = orjson.loads((root / "splits" / "info.json").read_bytes())
         self.annotation_info: dict[str, Any] = orjson.loads((annotation / "info.json").read_bytes())
         self.contact_info: dict[str, Any] = orjson.loads((contact / "info.json").read_bytes())
         embeddings = read_npz(annotation / "embeddings.npz")
@@ -75,11 +86,11 @@ class AnnotatedStore:
         return len(self.ids())
 
     def ids(self, split: str | None = None) -> list[str]:
-        """Clips of one split, or of all, in the store's order; clips without sentences are left out."""
+        """Clips of one part of the chosen split, or all, in the store's order; clips without sentences are left out."""
         return [key for key in self._sentences if split is None or self.splits[key] == split]
 
     def split_ids(self, split: str) -> list[str]:
-        """Clips of one split, in the store's order."""
+        """Clips of one part of the chosen split, in the store's order."""
         return self.ids(split)
 
     @property
@@ -164,7 +175,8 @@ class AnnotatedStore:
 
     def _refuse_other_clips(self) -> None:
         """Raise BadInput when a stage's output belongs to another conversion than the clips beside it."""
-        for folder, found in (("annotation", self.hand_types.index), ("contact", self._clips.index)):
+        tables = {"annotation": self.hand_types.index, "contact": self._clips.index, "splits": self.splits}
+        for folder, found in tables.items():
             _same_ids(self.root / folder, self.store.ids, list(found))
 
 

@@ -39,7 +39,7 @@ class DatasetFacts:
 
 
 def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
-    """Facts of the dataset below ``root`` (its ``clips``, ``annotation`` and ``contact`` folders)."""
+    """Facts of the dataset below ``root`` (its ``clips``, ``annotation``, ``contact`` and ``splits`` folders)."""
     reason = reason_for_nothing(root / "clips")
     if not (root / "clips" / "meta" / "info.json").is_file():
         return DatasetFacts(name, False, reason or "it was not converted", [], [], [], None, {})
@@ -60,7 +60,8 @@ def reason_for_nothing(folder: Path) -> str:
 
 
 def _is_annotated(root: Path) -> bool:
-    return (root / "annotation" / "text.parquet").is_file() and (root / "contact" / "points.npz").is_file()
+    tables = ("annotation/text.parquet", "contact/points.npz", "splits/splits.parquet")
+    return all((root / table).is_file() for table in tables)
 
 
 def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, str]]:

@@ -1,16 +1,6 @@
-"""Stage annotate: hand type, sentences, text features and split of every clip."""
-
-from typing import Literal
+"""Stage annotate: hand type, sentences and text features of every clip."""
 
 from pipelines.stages.base import Place, StageParams, empty_reason, load_hands, load_params, write_empty
-
-
-class SplitParams(StageParams):
-    """How one dataset is split: by named subjects, or in time where there is only one subject."""
-
-    by: Literal["subject", "time", "rounds"]
-    validation: tuple[str, ...] = ()
-    test: tuple[str, ...] = ()
 
 
 class AnnotateParams(StageParams):
@@ -19,7 +9,6 @@ class AnnotateParams(StageParams):
     encoder: str
     threshold_m: float
     points: int
-    split: dict[str, SplitParams]
 
 
 def run(place: Place) -> None:
@@ -35,14 +24,11 @@ def annotate(place: Place, params: AnnotateParams) -> None:
     """Clips to words."""
     from hoidata.annotation.stage import annotate_store
     from hoidata.quality.verdicts import left_out_reasons
-    from hoidata.schema.splits import SplitRule
 
-    rule = params.split.get(place.dataset)
     counts = annotate_store(
         place.clips,
         place.annotation,
         encoder=params.encoder,
-        split=SplitRule(rule.by, rule.validation, rule.test) if rule else None,
         threshold_m=params.threshold_m,
         points=params.points,
         hands=load_hands(place.profile),

@@ -74,6 +74,10 @@ class Place:
         return self.data / "contact"
 
     @property
+    def splits(self) -> Path:
+        return self.data / "splits"
+
+    @property
     def checkpoints(self) -> Path:
         return Path("checkpoints", self.profile, self.dataset)
 

@@ -15,8 +15,8 @@ from hoidata.schema.annotated import AnnotatedStore, load_annotated
 from hoidata.schema.clip import Clip, HandTrack, ObjectTrack
 from hoidata.schema.dataset import ClipBatch, HoiDataset, collate
 from hoidata.schema.info import generated_info
-from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import write_store
+from hoidata.splits import split_store
 
 torch.set_num_threads(1)
 GRASP_HEIGHT_M = 0.01
@@ -88,9 +88,10 @@ def make_clip(number: int, plan: Plan) -> Clip:
 
 def write_annotated(root: Path, clips: list[Clip]) -> Path:
     write_store(root / "clips", clips, generated_info("toy"))
-    rule = SplitRule(validation=("s2",), test=("s3",))
-    annotate_store(root / "clips", root / "annotation", encoder="hash", split=rule)
+    annotate_store(root / "clips", root / "annotation", encoder="hash")
     contact_store(root / "clips", root / "contact")
+    rule = {"by": "subject", "train": ["s1"], "validation": ["s2"], "test": ["s3"]}
+    split_store(root / "clips", root / "annotation", root / "splits", rule)
     return root
 
 

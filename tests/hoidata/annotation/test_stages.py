@@ -1,4 +1,4 @@
-"""The stages annotate and contact, and reading both back, on a small store of clips made here."""
+"""The stages annotate, contact and split, and reading them back, on a small store of clips made here."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,11 +18,11 @@ from hoidata.objects.sampling import sample_points
 from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack
 from hoidata.schema.annotated import AnnotatedStore, load_annotated
 from hoidata.schema.info import generated_info
-from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import open_store, write_store
+from hoidata.splits import split_store
 
 FRAMES = 6
-RULE = SplitRule(validation=("s2",), test=("s3",))
+RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
 
 
 def box_model() -> ObjectModel:
@@ -70,8 +70,9 @@ def clips() -> list[Clip]:
 
 def write_all(root: Path, made: list[Clip]) -> Path:
     write_store(root / "clips", made, generated_info("toy"))
-    annotate_store(root / "clips", root / "annotation", encoder="hash", split=RULE)
+    annotate_store(root / "clips", root / "annotation", encoder="hash")
     contact_store(root / "clips", root / "contact")
+    split_store(root / "clips", root / "annotation", root / "splits", RULE)
     return root
 
 
@@ -163,7 +164,7 @@ def test_both_hands_are_told_apart_in_the_distances(annotated: AnnotatedStore) -
 
 def test_the_same_clips_give_the_same_bytes(root: Path, tmp_path: Path) -> None:
     again = write_all(tmp_path, clips())
-    for folder in ("annotation", "contact"):
+    for folder in ("annotation", "contact", "splits"):
         names = sorted(path.name for path in (root / folder).iterdir())
         assert names == sorted(path.name for path in (again / folder).iterdir())
         for name in names:
@@ -177,7 +178,7 @@ def test_an_empty_store_gives_an_empty_annotation(tmp_path: Path) -> None:
 
 def test_the_threshold_decides_who_acts(root: Path, tmp_path: Path) -> None:
     """Below 5 mm only the notebook's cover is left: it turns up into the hands."""
-    annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", split=RULE, threshold_m=0.005)
+    annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", threshold_m=0.005)
     text = pd.read_parquet(tmp_path / "annotation" / "text.parquet")
     assert set(text["clip_id"]) == {"toy/s3/3"}
 
@@ -190,6 +191,20 @@ def test_a_folder_of_another_conversion_is_refused(root: Path, tmp_path: Path) -
 
 
 def test_a_missing_stage_is_named(root: Path, tmp_path: Path) -> None:
-    (tmp_path / "clips").mkdir()
-    with pytest.raises(MissingResource, match="stage 'annotate'"):
-        load_annotated(tmp_path)
+    for folder, stage in (("clips", "annotate"), ("annotation", "contact"), ("contact", "split")):
+        (tmp_path / folder).mkdir()
+        with pytest.raises(MissingResource, match=f"stage '{stage}'"):
+            load_annotated(tmp_path)
+
+
+def test_a_clip_that_failed_quality_control_has_its_reason_and_no_sentence(root: Path, tmp_path: Path) -> None:
+    (tmp_path / "clips").symlink_to(root / "clips")
+    failed = {"toy/s1/1": "left out by quality control: a jump"}
+    counts = annotate_store(tmp_path / "clips", tmp_path / "annotation", encoder="hash", left_out=failed)
+    (tmp_path / "contact").symlink_to(root / "contact")
+    split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "splits", RULE)
+    left = load_annotated(tmp_path)
+    assert left.ids() == ["toy/s2/2", "toy/s3/3"]
+    assert left.hand_types.at["toy/s1/1", "reason"] == failed["toy/s1/1"]
+    assert left.splits["toy/s1/1"] is None
+    assert counts["left_out"] == 2

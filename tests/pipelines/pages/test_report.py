@@ -9,8 +9,8 @@ from hoidata.annotation.stage import annotate_store
 from hoidata.contact.stage import contact_store
 from hoidata.schema.info import generated_info
 from hoidata.schema.quarantine import Quarantined
-from hoidata.schema.splits import SplitRule
 from hoidata.schema.store import write_store
+from hoidata.splits import split_store
 from models.training import UPSTREAM, train_model
 from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
@@ -18,6 +18,7 @@ from pipelines.pages.metrics_table import metrics_tables, number
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
 
+HELD_OUT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
 DIFFUSION = {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90}
 
 
@@ -30,8 +31,9 @@ def folders(hands, page_clip, tmp_path):
     left_out = Quarantined("test/s1/mug", "s1/mug.npz", "finite numbers", "NaN in <frame 3>", "download it again")
     root = folders.data / "grab"
     write_store(root / "clips", [*clips, left_out], generated_info("grab", hands))
-    annotate_store(root / "clips", root / "annotation", encoder="hash", split=SplitRule(test=("s2",)), threshold_m=0.2)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=0.2)
     contact_store(root / "clips", root / "contact", threshold_m=0.2)
+    split_store(root / "clips", root / "annotation", root / "splits", HELD_OUT)
     (folders.data / "arctic" / "clips").mkdir(parents=True)
     (folders.data / "arctic" / "clips" / "empty.json").write_text('{"reason": "arctic is not present"}')
     log = folders.checkpoints / "grab" / "contact" / "log.csv"

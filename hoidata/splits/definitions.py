@@ -1,0 +1,101 @@
+"""Named splits, kept as data: ``definitions/<name>.json`` says where a split is from, its version and its rules."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import orjson
+
+from hoidata.errors import BadInput
+from hoidata.splits.leaks import PROMISES, Promise
+from hoidata.splits.rules import KINDS, SplitRule
+
+FOLDER = Path(__file__).with_name("definitions")
+OWN = "params.yaml"
+OWN_SOURCE = "a rule of this project's params.yaml"
+RULE_KEYS = tuple(field.name for field in fields(SplitRule))
+# What a rule keeps apart when it does not say: clips of one sequence stay together unless they are cut in time.
+USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
+    "subject": ("subject", "sequence", "file"),
+    "object": ("object",),
+    "sequence": ("sequence", "file"),
+    "prefix": ("sequence", "file"),
+    "time": (),
+    "rounds": (),
+}
+
+
+@dataclass(frozen=True)
+class Definition:
+    """One dataset's part of a named split. version counts changes of the definition; source says whose split it is."""
+
+    name: str
+    version: int
+    source: str
+    rule: SplitRule
+    promises: tuple[Promise, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        facts = {"name": self.name, "version": self.version, "source": self.source}
+        return facts | {"rule": self.rule.as_json(), "promises": list(self.promises)}
+
+
+def definition_names() -> list[str]:
+    """All named splits."""
+    return sorted(path.stem for path in FOLDER.glob("*.json"))
+
+
+def definitions_for(dataset: str) -> dict[str, Definition]:
+    """The named splits a dataset has, by name."""
+    found = {name: _read(name) for name in definition_names()}
+    return {name: rules[dataset] for name, rules in found.items() if dataset in rules}
+
+
+def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
+    """The split params.yaml chooses for a dataset: a name, or a rule of the user's own (a mapping, see ``SplitRule``).
+
+    Raises BadInput that lists the known names, or the known keys of a rule.
+    """
+    where, known = f"params.yaml: split.{dataset}", definitions_for(dataset)
+    names = ", ".join(known) or "none for this dataset"
+    if isinstance(wanted, Mapping):
+        return _own(where, wanted)
+    if wanted not in known:
+        got = "nothing" if wanted is None else repr(wanted)
+        remedy = "correct it, or write a rule: {by: subject, train: rest, validation: [s9], test: [s10]}"
+        raise BadInput(where, f"one of: {names}", got, remedy)
+    return known[wanted]
+
+
+def _own(where: str, values: Mapping[str, Any]) -> Definition:
+    return Definition(OWN, 0, OWN_SOURCE, *_rule_and_promises(where, values))
+
+
+def _rule_and_promises(where: str, values: Mapping[str, Any]) -> tuple[SplitRule, tuple[Promise, ...]]:
+    unknown = sorted(map(str, values.keys() - {*RULE_KEYS, "promises"}))
+    if unknown or "by" not in values:
+        got = ", ".join(unknown) or "no `by`"
+        raise BadInput(
+            where, f"keys among: {', '.join(RULE_KEYS)}, promises; by: {', '.join(KINDS)}", got, "correct it"
+        )
+    try:
+        rule = SplitRule(**{key: value for key, value in values.items() if key != "promises"})
+    except TypeError as error:
+        raise BadInput(where, "shares as numbers", str(error), "correct it") from error
+    promises = values.get("promises", USUAL_PROMISES[rule.by])
+    if not isinstance(promises, list | tuple) or not set(promises) <= set(PROMISES):
+        raise BadInput(f"{where}.promises", f"a list of: {', '.join(PROMISES)}", repr(promises), "correct it")
+    return rule, tuple(promises)
+
+
+@lru_cache
+def _read(name: str) -> dict[str, Definition]:
+    """The rules of one named split, by dataset."""
+    path = FOLDER / f"{name}.json"
+    values = orjson.loads(path.read_bytes())
+    return {
+        dataset: Definition(name, values["version"], values["source"], *_rule_and_promises(f"{path}: {dataset}", rule))
+        for dataset, rule in values["datasets"].items()
+    }

@@ -1,0 +1,41 @@
+"""What the makers of a dataset publish about its sequences: names and counts, kept as data in ``published/``."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import orjson
+
+FOLDER = Path(__file__).with_name("published")
+
+
+@dataclass(frozen=True)
+class Published:
+    """sequences: all names, empty where no list is published. without_ground_truth: beginnings of withheld ones.
+
+    motion_files: patterns of the raw files that hold motion; other raw files (meshes, templates) serve many sequences.
+    segments, frames: per sequence, where the source tells.
+    """
+
+    source: str
+    sequences: tuple[str, ...] = ()
+    without_ground_truth: tuple[str, ...] = ()
+    motion_files: tuple[str, ...] = ()
+    segments: tuple[int, ...] = ()
+    frames: tuple[int, ...] = ()
+
+    @property
+    def usable(self) -> tuple[str, ...]:
+        """The sequences whose ground truth is published."""
+        return tuple(name for name in self.sequences if not name.startswith(self.without_ground_truth))
+
+
+@lru_cache
+def published(dataset: str) -> Published:
+    """What is known of a dataset; nothing (an empty ``source``) of one that is not listed here."""
+    path = FOLDER / f"{dataset}.json"
+    if not path.is_file():
+        return Published("")
+    values = orjson.loads(path.read_bytes())
+    lists = {key: tuple(value) for key, value in values.items() if key != "source"}
+    return Published(values["source"], **lists)

@@ -1,0 +1,152 @@
+"""Which clips train, which validate, which test: a rule over the columns of a store's ``sequences``."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import pandas as pd
+
+from hoidata.errors import BadInput
+
+Part = Literal["train", "validation", "test"]
+Kind = Literal["subject", "object", "sequence", "prefix", "time", "rounds"]
+PARTS: tuple[Part, ...] = get_args(Part)
+KINDS: tuple[Kind, ...] = get_args(Kind)
+IN_TIME = ("time", "rounds")
+REST = "rest"
+ROUND: tuple[Part, ...] = ("train", "train", "train", "validation", "test")
+REMEDY = "mend params.yaml"
+
+
+@dataclass(frozen=True)
+class SplitRule:
+    """How one dataset is split. A clip that no part covers is left out: it never trains silently.
+
+    by "subject", "object", "sequence": the parts list names of that column. by "prefix": they list beginnings of
+    sequence names (``subject3/k2/``). ``train`` is such a list, or "rest" for all clips the other two do not name.
+    by "object": a clip that also shows an object of another part is left out.
+    by "time": in every source sequence the last ``test_share`` of its clips test, the ``validation_share`` before
+    them validate (rounded, at least one clip each where a sequence has three or more).
+    by "rounds": in time order of every source sequence, of five successive clips three train, one validates, one tests
+    (the shares are not used). For recordings whose end shows other actions than their beginning.
+    """
+
+    by: Kind = "subject"
+    train: tuple[str, ...] | Literal["rest"] = ()
+    validation: tuple[str, ...] = ()
+    test: tuple[str, ...] = ()
+    validation_share: float = 0.15
+    test_share: float = 0.15
+
+    def __post_init__(self) -> None:
+        for part in PARTS:
+            value = getattr(self, part)
+            object.__setattr__(self, part, value if value == REST and part == "train" else _names(part, value))
+        if self.by not in KINDS:
+            raise BadInput("split rule: by", ", ".join(KINDS), repr(self.by), REMEDY)
+        if self.by in IN_TIME:
+            self._check_shares()
+        elif not self.train:
+            raise BadInput("split rule: train", f"a list of names, or `{REST}` for all others", "nothing", REMEDY)
+        else:
+            self._check_parts_apart()
+
+    def names(self, part: Part) -> tuple[str, ...]:
+        """The names listed for a part; none for a train part that is the rest."""
+        value = getattr(self, part)
+        return () if value == REST else value
+
+    def as_json(self) -> dict[str, Any]:
+        """The rule as params.yaml and the definitions write it."""
+        if self.by == "rounds":
+            return {"by": self.by}
+        if self.by == "time":
+            return {"by": self.by, "validation_share": self.validation_share, "test_share": self.test_share}
+        lists = {part: list(self.names(part)) for part in PARTS}
+        return {"by": self.by, **lists, **({"train": REST} if self.train == REST else {})}
+
+    def _check_shares(self) -> None:
+        shares = (self.validation_share, self.test_share)
+        if min(shares) < 0 or sum(shares) >= 1:
+            raise BadInput("split rule", "shares of 0 or more that sum to less than 1", str(shares), REMEDY)
+
+    def _check_parts_apart(self) -> None:
+        listed = [(name, part) for part in PARTS for name in self.names(part)]
+        for name, part in listed:
+            for other, other_part in listed:
+                covered = other.startswith(name) if self.by == "prefix" else other == name
+                if part != other_part and covered:
+                    raise BadInput("split rule", f"no {self.by} in two parts", f"{other} in several", REMEDY)
+
+
+def _names(part: str, value: Any) -> tuple[str, ...]:
+    if isinstance(value, str) or not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
+        raise BadInput(f"split rule: {part}", "a list of names", repr(value), REMEDY)
+    return tuple(value)
+
+
+def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
+    """ "train", "validation", "test", or None for a clip left out, under the index of a store's ``sequences``.
+
+    Uses the columns clip_id, subject, object, other_objects, sequence and first_source_frame, as far as the rule needs
+    them. Does not depend on the order of the rows.
+    """
+    rows = sequences.reset_index(drop=True)
+    if rule.by in IN_TIME:
+        parts = _in_time(rows, rule)
+    elif rule.by == "prefix":
+        parts = [_by_prefix(name, rule) for name in rows["sequence"]]
+    elif rule.by == "object":
+        parts = _by_object(rows, rule)
+    else:
+        part_of = _part_of(rule)
+        parts = [_listed(name, part_of, rule) for name in rows[rule.by]]
+    return pd.Series(parts, index=sequences.index, name="split", dtype=object)
+
+
+def _part_of(rule: SplitRule) -> dict[str, Part]:
+    return {name: part for part in PARTS for name in rule.names(part)}
+
+
+def _listed(name: str, part_of: Mapping[str, Part], rule: SplitRule) -> Part | None:
+    return part_of[name] if name in part_of else _otherwise(rule)
+
+
+def _otherwise(rule: SplitRule) -> Part | None:
+    return "train" if rule.train == REST else None
+
+
+def _by_prefix(sequence: str, rule: SplitRule) -> Part | None:
+    found: list[Part] = [part for part in PARTS if sequence.startswith(rule.names(part))]
+    return found[0] if found else _otherwise(rule)
+
+
+def _by_object(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
+    part_of = _part_of(rule)
+    parts: list[Part | None] = []
+    for name, others in zip(rows["object"], rows["other_objects"], strict=True):
+        found: list[Part | None] = [_listed(key, part_of, rule) for key in (name, *others)]
+        parts.append(found[0] if len(set(found)) == 1 else None)
+    return parts
+
+
+def _in_time(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
+    parts: list[Part | None] = [None] * len(rows)
+    ordered = rows.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
+    for _, group in ordered.groupby("sequence"):
+        found = _by_rounds(len(group)) if rule.by == "rounds" else _by_time(len(group), rule)
+        for row, part in zip(group.index, found, strict=True):
+            parts[row] = part
+    return parts
+
+
+def _by_time(n_clips: int, rule: SplitRule) -> Sequence[Part]:
+    """Parts of the clips of one sequence, in time order."""
+    least = 1 if n_clips >= 3 else 0
+    test = max(least, round(rule.test_share * n_clips)) if rule.test_share else 0
+    validation = max(least, round(rule.validation_share * n_clips)) if rule.validation_share else 0
+    return (*["train"] * (n_clips - validation - test), *["validation"] * validation, *["test"] * test)  # type: ignore[return-value]
+
+
+def _by_rounds(n_clips: int) -> Sequence[Part]:
+    return [ROUND[place % len(ROUND)] for place in range(n_clips)]

@@ -1,0 +1,145 @@
+"""Stage split: every named split of a dataset, the chosen one, what they promise, and the training statistics.
+
+    splits.parquet    clip_id, one column per named split the dataset has, and `split`, the chosen one: train,
+                      validation, test, or null for a clip without sentences or that no part covers; one row per clip
+    info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is
+    statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
+
+``hoidata.schema.annotated`` reads the chosen split from here.
+"""
+
+import hashlib
+import json
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pyarrow as pa
+
+from hoidata.errors import BadInput
+from hoidata.files import atomic_folder
+from hoidata.files.tables import write_table
+from hoidata.schema.clip import SIDES, Clip
+from hoidata.schema.store import Store, open_store
+from hoidata.splits.definitions import Definition, choose, definitions_for
+from hoidata.splits.leaks import Leaks, find_leaks
+from hoidata.splits.published import published
+from hoidata.splits.rules import PARTS, assign_split
+from hoidata.splits.statistics import training_statistics
+
+CHOSEN = "split"
+Assignment = dict[str, str | None]
+
+
+def split_store(
+    clips_folder: str | Path,
+    annotation_folder: str | Path,
+    out_folder: str | Path,
+    wanted: str | Mapping[str, Any] | None,
+) -> dict[str, int]:
+    """Split the annotated clips of a store; the folder appears whole or not at all.
+
+    wanted: the name of a split, or a rule of the user's own (see ``choose``). Parts are counted over the clips that
+    have sentences, so that none runs empty through clips nobody uses.
+    Returns clips per part of the chosen split. Raises BadInput when it breaks one of its promises.
+    """
+    store = open_store(clips_folder)
+    hand_types, used = _annotated_clips(store, Path(annotation_folder))
+    dataset = str(store.info["dataset"])
+    chosen, named = choose(dataset, wanted), definitions_for(dataset)
+    rows, digests = store.sequences.loc[used], {clip_id: motion_digest(store.clip(clip_id)) for clip_id in used}
+    parts = {definition: _assign(rows, definition) for definition in (*named.values(), chosen)}
+    leaks = {definition: _leaks(store, parts[definition], definition, digests) for definition in parts}
+    _refuse_leaks(chosen, leaks[chosen])
+    records = {name: _record(store, parts[item], item, leaks[item]) for name, item in named.items()}
+    info = {
+        "dataset": dataset,
+        "chosen": _record(store, parts[chosen], chosen, leaks[chosen]),
+        "splits": records,
+        "without_sentences": len(store) - len(used),
+        "published": _completeness(store, dataset),
+    }
+    train = [clip_id for clip_id in used if parts[chosen][clip_id] == "train"]
+    statistics = {"dataset": dataset, "split": chosen.name, **training_statistics(store, train, hand_types)}
+    with atomic_folder(out_folder) as folder:
+        columns = {name: parts[item] for name, item in named.items()} | {CHOSEN: parts[chosen]}
+        _write_parts(folder / "splits.parquet", store.ids, columns)
+        _write_json(folder / "info.json", info)
+        _write_json(folder / "statistics.json", statistics)
+    return info["chosen"]["clips"]
+
+
+def motion_digest(clip: Clip) -> str:
+    """SHA-256 of the numbers that move: equal for a copy under another name, whoever and whatever it is said to be."""
+    digest = hashlib.sha256()
+    for side in SIDES:
+        track = clip.hands[side]
+        for array in (track.wrist_m, track.global_orient, track.hand_pose, track.valid):
+            digest.update(array.tobytes())
+    for array in (clip.object.translation_m, clip.object.rotvec, clip.object.hinge_rad):
+        digest.update(b"" if array is None else array.tobytes())
+    return digest.hexdigest()
+
+
+def _annotated_clips(store: Store, annotation: Path) -> tuple[pd.DataFrame, list[str]]:
+    """The annotation's table of hands, and the clips that have sentences, in the store's order."""
+    hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
+    if list(hand_types["clip_id"]) != store.ids:
+        got = f"{len(hand_types)} clips of another conversion"
+        raise BadInput(annotation, f"the {len(store)} clips of {store.folder}", got, "run the stage 'annotate' again")
+    named = set(pd.read_parquet(annotation / "text.parquet", columns=["clip_id"])["clip_id"])
+    return hand_types, [clip_id for clip_id in store.ids if clip_id in named]
+
+
+def _assign(rows: pd.DataFrame, definition: Definition) -> Assignment:
+    return dict(assign_split(rows, definition.rule).items())  # type: ignore[arg-type]
+
+
+def _leaks(store: Store, parts: Assignment, definition: Definition, digests: Mapping[str, str]) -> Leaks:
+    patterns = published(str(store.info["dataset"])).motion_files
+    paths = store.files["path"].tolist()
+    return find_leaks(store.sequences, parts, definition.promises, files=paths, motion_files=patterns, digests=digests)
+
+
+def _refuse_leaks(chosen: Definition, leaks: Leaks) -> None:
+    if leaks.broken:
+        kind = leaks.broken[0]
+        got = f"{len(leaks.shared[kind])} in several: {', '.join(leaks.shared[kind][:3])}"
+        raise BadInput(f"split {chosen.name}", f"no {kind} in two parts, as it promises", got, "choose another split")
+
+
+def _record(store: Store, parts: Assignment, definition: Definition, leaks: Leaks) -> dict[str, Any]:
+    counts, frames = Counter(parts.values()), Counter[str | None]()
+    for clip_id, length in store.sequences.loc[list(parts), "n_frames"].items():
+        frames[parts[str(clip_id)]] += int(length)
+    return definition.as_json() | {
+        "clips": {**{part: counts[part] for part in PARTS}, "left_out": counts[None]},
+        "frames": {**{part: frames[part] for part in PARTS}, "left_out": frames[None]},
+        "leaks": leaks.as_json(),
+        "keeps_its_promises": not leaks.broken,
+    }
+
+
+def _completeness(store: Store, dataset: str) -> dict[str, Any] | None:
+    """How many of the sequences the makers list gave a clip; None where no list is published."""
+    listed = published(dataset)
+    if not listed.sequences:
+        return None
+    here = set(listed.usable) & set(store.sequences["sequence"])
+    facts = {"sequences": len(listed.sequences), "usable": len(listed.usable), "with_clips": len(here)}
+    return {"source": listed.source, **facts}
+
+
+def _write_parts(path: Path, clip_ids: list[str], columns: dict[str, Assignment]) -> None:
+    schema = pa.schema([(name, pa.string()) for name in ("clip_id", *columns)])
+    rows = [
+        {"clip_id": clip_id, **{name: parts.get(clip_id) for name, parts in columns.items()}} for clip_id in clip_ids
+    ]
+    write_table(path, rows, schema)
+
+
+def _write_json(path: Path, values: Any) -> None:
+    text = json.dumps(values, indent=1, sort_keys=True, ensure_ascii=False, allow_nan=False)
+    path.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,186 @@
+"""The named splits: what the papers and the datasets' makers say, written down a second time by hand."""
+
+import hashlib
+from collections import Counter
+
+import pandas as pd
+import pytest
+
+from hoidata.adapters.h2o import ACTIONS
+from hoidata.errors import BadInput
+from hoidata.splits import assign_split, choose, definition_names, definitions_for, published
+
+H2O = tuple(f"subject{number}" for number in (1, 2, 3, 4))
+# Verb and object pairs of ARCTIC's descriptions (Text2HOI's word lists): any object but for the verbs named here.
+ARCTIC_OBJECTS = {"box", "capsulemachine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone", "scissors",
+                  "waffleiron"}  # fmt: skip
+ARCTIC_PAIRS = {
+    **dict.fromkeys(("grasp", "lift", "place"), ARCTIC_OBJECTS),
+    **dict.fromkeys(("open", "close"), ARCTIC_OBJECTS - {"scissors"}),
+    "cut": {"scissors"},
+    "operate": {"microwave"},
+    "point": {"notebook"},
+    "shake": {"ketchup"},
+    "sprinkle": {"ketchup"},
+    "type": {"laptop", "phone"},
+}
+
+
+def parts(dataset: str, name: str, sequences) -> dict[str, str | None]:
+    """Part of each of a dataset's sequences, whose names start with the subject (H2O, ARCTIC) or give the object."""
+    rows = [
+        {
+            "clip_id": sequence,
+            "sequence": sequence,
+            "subject": sequence.split("/")[0],
+            "object": sequence.split("/")[1].split("_")[0],
+            "other_objects": [],
+            "first_source_frame": 0,
+        }
+        for sequence in sequences
+    ]
+    table = pd.DataFrame(rows).set_index("clip_id", drop=False)
+    return dict(assign_split(table, definitions_for(dataset)[name].rule).items())
+
+
+def held_out(dataset: str, name: str) -> tuple[tuple[str, ...], ...]:
+    rule = definitions_for(dataset)[name].rule
+    return rule.names("validation"), rule.names("test")
+
+
+def test_text2hois_test_subjects_and_our_validation_subjects():
+    assert held_out("h2o", "text2hoi") == (("subject2",), ("subject3",))
+    assert held_out("grab", "text2hoi") == (("s9",), ("s10",))
+    assert held_out("arctic", "text2hoi") == (("s05",), ("s10",))
+    assert parts("h2o", "text2hoi", ["subject4/h1/0"]) == {"subject4/h1/0": None}
+    assert parts("arctic", "text2hoi", ["s03/box_use_01"]) == {"s03/box_use_01": None}
+
+
+def test_h2os_official_split_counts_sequences_segments_and_frames_as_its_lists_do():
+    listed = published("h2o")
+    found = parts("h2o", "official", listed.sequences)
+    assert Counter(found.values()) == {"train": 114, "validation": 24, "test": 46}
+    segments, frames = Counter(), Counter()
+    for sequence, n_segments, n_frames in zip(listed.sequences, listed.segments, listed.frames, strict=True):
+        segments[found[sequence]] += n_segments
+        frames[found[sequence]] += n_frames
+    assert segments == {"train": 569, "validation": 122, "test": 242}
+    assert frames == {"train": 68929, "validation": 14676, "test": 30724}
+
+
+def test_grabs_official_split_is_by_object():
+    validation, test = held_out("grab", "official")
+    assert set(test) == {"mug", "wineglass", "camera", "binoculars", "fryingpan", "toothpaste"}
+    assert set(validation) == {"apple", "toothbrush", "elephant", "hand"}
+    assert parts("grab", "official", ["s1/banana_eat_1"]) == {"s1/banana_eat_1": "train"}
+
+
+@pytest.mark.parametrize("protocol", ["p1", "p2"])
+def test_arctics_protocols_hold_out_s05_and_the_withheld_s03(protocol):
+    found = parts("arctic", protocol, published("arctic").sequences)
+    assert Counter(found.values()) == {"train": 267, "validation": 34, "test": 38}
+    assert {name.split("/")[0] for name, part in found.items() if part == "validation"} == {"s05"}
+    assert {name.split("/")[0] for name, part in found.items() if part == "test"} == {"s03"}
+
+
+def test_bimart_tests_on_one_grab_and_three_use_sequences_of_each_of_eleven_objects():
+    """BimArt, section 4: 257 training and 44 test sequences, four per object, one of them grasping and relocation."""
+    found = parts("arctic", "bimart", published("arctic").usable)
+    assert Counter(found.values()) == {"train": 257, "test": 44}
+    kinds = Counter(tuple(name.split("/")[1].split("_")[:2]) for name, part in found.items() if part == "test")
+    objects = {name.split("/")[1].split("_")[0] for name in published("arctic").sequences}
+    assert kinds == {(name, kind): count for name in objects for kind, count in (("grab", 1), ("use", 3))}
+    assert len(objects) == 11
+
+
+def test_bimarts_committed_list_follows_its_rule():
+    def order(name: str) -> str:
+        return hashlib.sha256(name.encode()).hexdigest()
+
+    in_order = sorted(published("arctic").usable, key=order)
+    chosen = set()
+    for thing in {name.split("/")[1].split("_")[0] for name in in_order}:
+        chosen |= set([name for name in in_order if f"/{thing}_grab_" in name][:1])
+        chosen |= set([name for name in in_order if f"/{thing}_use_" in name][:3])
+    assert set(definitions_for("arctic")["bimart"].rule.test) == chosen
+
+
+def test_bimart_with_a_validation_part_tests_on_the_same_and_validates_on_two_of_each_object():
+    plain, validated = (definitions_for("arctic")[name].rule for name in ("bimart", "bimart-validated"))
+    assert set(validated.test) == set(plain.test)
+    assert set(validated.train) | set(validated.validation) == set(plain.train)
+    assert Counter(name.split("/")[1].split("_")[0] for name in validated.validation) == dict.fromkeys(
+        ARCTIC_OBJECTS | {"espressomachine"}, 2
+    )
+
+
+@pytest.mark.parametrize("dataset", ["h2o", "grab", "arctic", "manipnet"])
+def test_held_out_objects_are_apart_from_training_and_each_part_has_some(dataset):
+    validation, test = held_out(dataset, "unseen-object")
+    assert validation
+    assert test
+    assert definitions_for(dataset)["unseen-object"].rule.train == "rest"
+    assert "object" in definitions_for(dataset)["unseen-object"].promises
+
+
+def test_every_verb_of_a_held_out_object_is_also_done_with_a_training_object():
+    pairs = {"h2o": {}, "arctic": ARCTIC_PAIRS}
+    for verb, noun in ACTIONS[1:]:
+        pairs["h2o"].setdefault(verb, set()).add(noun)
+    for dataset, objects_of in pairs.items():
+        held = {name for part in held_out(dataset, "unseen-object") for name in part}
+        assert all(objects - held for objects in objects_of.values()), dataset
+        assert held <= set.union(*objects_of.values()), dataset
+
+
+@pytest.mark.parametrize("name", definition_names())
+def test_every_definition_says_its_source_its_version_and_its_promises(name):
+    found = {dataset: definitions_for(dataset).get(name) for dataset in ("h2o", "grab", "arctic", "manipnet")}
+    assert any(found.values())
+    for definition in filter(None, found.values()):
+        assert definition.version >= 1
+        assert len(definition.source) > 40
+        if definition.rule.by in ("subject", "object"):
+            assert definition.rule.by in definition.promises
+            assert definition.rule.validation
+            assert definition.rule.test
+        if definition.rule.by in ("sequence", "prefix"):
+            assert "sequence" in definition.promises
+
+
+def test_manipnet_has_the_splits_in_time_and_no_split_by_its_only_subject():
+    assert set(definitions_for("manipnet")) == {"rounds", "time", "unseen-object"}
+
+
+def test_an_unknown_name_lists_the_splits_of_that_dataset():
+    with pytest.raises(
+        BadInput, match="bimart, bimart-validated, p1, p2, text2hoi, unseen-object, unseen-subject, got"
+    ):
+        choose("arctic", "rounds")
+    with pytest.raises(BadInput, match="rounds, time, unseen-object, got nothing"):
+        choose("manipnet", None)
+    with pytest.raises(BadInput, match="none for this dataset"):
+        choose("mydata", "text2hoi")
+
+
+def test_a_rule_of_the_users_own_needs_no_name():
+    own = choose("mydata", {"by": "subject", "train": "rest", "test": ["p7"]})
+    assert own.rule.as_json() == {"by": "subject", "train": "rest", "validation": [], "test": ["p7"]}
+    assert own.promises == ("subject", "sequence", "file")
+    assert choose("h2o", {"by": "rounds", "promises": ["subject"]}).promises == ("subject",)
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"by": "subject", "tset": ["s1"]}, "keys among: by, train, validation, test, .*got tset"),
+        ({"train": "rest"}, "no `by`"),
+        ({"by": "time", "test_share": "much"}, "shares as numbers"),
+        ({"by": "subject", "train": "rest", "promises": ["object", "luck"]}, "a list of: subject, object"),
+        ({"by": "subject", "train": "rest", "promises": "object"}, "a list of: subject, object"),
+        ({"by": "subject", "train": "rest", "test": "s1"}, "a list of names"),
+    ],
+)
+def test_a_wrong_rule_says_what_it_may_hold(rule, message):
+    with pytest.raises(BadInput, match=message):
+        choose("grab", rule)

@@ -1,0 +1,120 @@
+"""Rules put clips into parts, by names or in time; what no part names is left out, never trained on."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hoidata.errors import BadInput
+from hoidata.splits import SplitRule, assign_split
+
+COLUMNS = ["clip_id", "subject", "sequence", "first_source_frame", "last_source_frame", "object", "other_objects"]
+
+
+def table(rows) -> pd.DataFrame:
+    """Rows of the first five columns, or of all."""
+    full = [(*row, "box", [])[: len(COLUMNS)] if len(row) == 5 else row for row in rows]
+    return pd.DataFrame(full, columns=COLUMNS).set_index("clip_id", drop=False).rename_axis(None)
+
+
+def one_sequence(n_clips: int, name: str = "cyl") -> list[tuple]:
+    return [(f"{name}/{i}", "p1", name, 100 * i, 100 * i + 90) for i in range(n_clips)]
+
+
+def of_objects(*objects: tuple[str, list[str]]) -> pd.DataFrame:
+    return table([(f"clip{i}", "p1", f"seq{i}", 0, 9, name, others) for i, (name, others) in enumerate(objects)])
+
+
+def test_a_rule_by_subject_puts_every_clip_of_a_subject_in_one_part():
+    rows = [(f"{subject}/{i}", subject, f"{subject}/x", i, i) for subject in ("s1", "s9", "s10") for i in range(3)]
+    split = assign_split(table(rows), SplitRule(train=("s1",), validation=("s9",), test=("s10",)))
+    assert split.groupby(split.index.str.split("/").str[0]).unique().map(list).to_dict() == {
+        "s1": ["train"],
+        "s9": ["validation"],
+        "s10": ["test"],
+    }
+
+
+@pytest.mark.parametrize(("train", "part"), [(("s1",), None), ("rest", "train")])
+def test_a_clip_that_no_part_names_is_left_out_unless_the_rest_trains(train, part):
+    rows = table([("a", "s1", "x", 0, 9), ("b", "s4", "y", 0, 9)])
+    split = assign_split(rows, SplitRule(train=train, test=("s10",)))
+    assert split.to_dict() == {"a": "train", "b": part}
+
+
+def test_a_rule_by_object_looks_at_the_object_that_is_moved():
+    split = assign_split(
+        of_objects(("cup", []), ("box", []), ("mug", [])),
+        SplitRule("object", train="rest", validation=("box",), test=("mug",)),
+    )
+    assert split.tolist() == ["train", "validation", "test"]
+
+
+def test_a_training_clip_that_shows_a_held_out_object_is_left_out():
+    rule = SplitRule("object", train="rest", test=("mug",))
+    split = assign_split(of_objects(("cup", ["mug"]), ("cup", ["pot"]), ("mug", ["cup"])), rule)
+    assert split.tolist() == [None, "train", None]
+
+
+def test_a_rule_by_sequence_wants_the_whole_name_and_one_by_prefix_its_beginning():
+    rows = table([("a", "s3", "s3/k1/0", 0, 9), ("b", "s3", "s3/k2/0", 0, 9), ("c", "s3", "s3/k2/01", 0, 9)])
+    by_name = SplitRule("sequence", train=("s3/k1/0",), test=("s3/k2/0",))
+    assert assign_split(rows, by_name).tolist() == ["train", "test", None]
+    by_prefix = SplitRule("prefix", train=("s3/k1/",), test=("s3/k2/",))
+    assert assign_split(rows, by_prefix).tolist() == ["train", "test", "test"]
+
+
+def test_a_rule_by_time_tests_on_the_end_of_every_sequence():
+    rows = one_sequence(20) + one_sequence(4, "mug")
+    split = assign_split(table(rows), SplitRule(by="time"))
+    assert split.tolist()[:20] == ["train"] * 14 + ["validation"] * 3 + ["test"] * 3
+    assert split.tolist()[20:] == ["train", "train", "validation", "test"]
+
+
+def test_a_rule_by_rounds_spreads_the_held_out_clips_over_every_sequence():
+    rows = one_sequence(11) + one_sequence(3, "mug")
+    split = assign_split(table(rows), SplitRule(by="rounds"))
+    assert [i for i, part in enumerate(split[:11]) if part == "test"] == [4, 9]
+    assert [i for i, part in enumerate(split[:11]) if part == "validation"] == [3, 8]
+    assert split.tolist()[11:] == ["train"] * 3
+
+
+@pytest.mark.parametrize("rule", [SplitRule("time"), SplitRule("rounds"), SplitRule("object", "rest", (), ("mug",))])
+def test_the_split_does_not_depend_on_the_order_of_the_rows(rule):
+    rows = table(one_sequence(20) + one_sequence(9, "mug"))
+    shuffled = rows.sample(frac=1, random_state=np.random.RandomState(3))
+    assert assign_split(shuffled, rule).sort_index().to_dict() == assign_split(rows, rule).sort_index().to_dict()
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 60), st.floats(0, 0.45), st.floats(0, 0.45))
+def test_parts_follow_each_other_in_time(n_clips, validation, test):
+    rule = SplitRule(by="time", validation_share=validation, test_share=test)
+    order = [("train", "validation", "test").index(part) for part in assign_split(table(one_sequence(n_clips)), rule)]
+    assert order == sorted(order)
+    assert len(order) == n_clips
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        ({"train": ("s2",), "validation": ("s1",), "test": ("s1", "s2")}, "no subject in two parts, got s2"),
+        ({"train": ("s1",), "validation": ("s9",), "test": ("s9",)}, "no subject in two parts, got s9"),
+        ({"by": "prefix", "train": ("s1/",), "test": ("s1/k2/",)}, "no prefix in two parts"),
+        ({"by": "time", "validation_share": 0.6, "test_share": 0.5}, "less than 1"),
+        ({"validation": ("s9",), "test": ("s10",)}, "`rest` for all others"),
+        ({"by": "colour", "train": "rest"}, "subject, object, sequence, prefix, time, rounds"),
+        ({"train": "s1"}, "a list of names"),
+        ({"train": "rest", "test": "rest"}, "a list of names"),
+        ({"train": "rest", "test": (10,)}, "a list of names"),
+    ],
+)
+def test_a_rule_that_contradicts_itself_is_refused(rule, message):
+    with pytest.raises(BadInput, match=message):
+        SplitRule(**rule)
+
+
+@pytest.mark.parametrize("by", ["subject", "object", "sequence", "prefix", "time", "rounds"])
+def test_an_empty_table_has_an_empty_split(by):
+    assert assign_split(table([]), SplitRule(by, "rest")).tolist() == []
