@@ -49,6 +49,7 @@ from hoidata.schema.clip import (
 from hoidata.schema.fields import SCHEMA_VERSION, SEQUENCES, TABLES
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.quarantine import Quarantined
+from hoidata.schema.reading import FrameShard, clip_rows
 from hoidata.schema.versions import checked_version, filled_info, filled_table
 from hoidata.schema.writing import write_store
 
@@ -111,12 +112,13 @@ class Store:
     hands: HandPair | None = None
     _arrays: dict[str, dict[str, np.ndarray]] = field(default_factory=dict, repr=False)
     _models: dict[str, ObjectModel] = field(default_factory=dict, repr=False)
+    _shards: dict[int, FrameShard] = field(default_factory=dict, repr=False)
     _rows: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False)
     _sources: list[SourceFile] = field(default_factory=list, repr=False)
 
     def __getstate__(self) -> dict[str, Any]:
         """Workers open the array files anew: a pickled memory map would carry the whole dataset."""
-        return {**self.__dict__, "_arrays": {}, "_models": {}, "_rows": {}, "_sources": []}
+        return {**self.__dict__, "_arrays": {}, "_models": {}, "_shards": {}, "_rows": {}, "_sources": []}
 
     def __len__(self) -> int:
         return len(self.sequences)
@@ -129,19 +131,19 @@ class Store:
         """The clip as it was written, float32. Raises KeyError when there is none of that id."""
         row = self._row(clip_id)
         frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
-        shard = self._file(f"frames-{row['shard']:05d}")
+        shard, gravity = self._frames(row["shard"]), row["gravity"]
         return Clip(
             hands={side: self._hand(row, side) for side in SIDES},
-            object=self._object(row["object"], shard, "object", frames),
-            other_objects=tuple(self._other_objects(row, shard)),
-            source_frames=shard["source_frames"][frames].copy(),
-            gravity=None if row["gravity"] is None else np.array(row["gravity"]),
-            source_from_world=np.array(row["source_from_world"]).reshape(4, 4),
+            object=self._object(row["object"], shard.object, frames),
+            other_objects=self._other_objects(row, shard) if row["other_objects"] else (),
+            source_frames=shard.source_frames[frames].copy(),
+            gravity=None if gravity is None else gravity.copy(),
+            source_from_world=row["source_from_world"].copy(),
             sources=self._sources_of(row),
             camera=self._camera(row, shard),
             body=self._body(row),
             source_contact=self._source_contact(row),
-            **{name: row[name] for name in _PLAIN},
+            **row["facts"],
         )
 
     def joints(self, clip_id: str, side: Side) -> np.ndarray:
@@ -175,14 +177,16 @@ class Store:
         return self._models[name]
 
     def _row(self, clip_id: str) -> dict[str, Any]:
-        """Columns are made plain Python values once: a row of a pandas table costs more than reading the clip."""
-        if not self._rows and len(self):
-            columns = {str(name): _plain_column(column) for name, column in self.sequences.items()}
-            rows = (dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True))
-            self._rows = {row["clip_id"]: row for row in rows}
+        if not self._rows:
+            self._rows = clip_rows(self.sequences)
         if clip_id not in self._rows:
             raise KeyError(f"no clip {clip_id!r} in {self.folder}, which has {len(self)} clips")
         return self._rows[clip_id]
+
+    def _frames(self, number: int) -> FrameShard:
+        if number not in self._shards:
+            self._shards[number] = FrameShard.open(self.folder / "arrays" / f"frames-{number:05d}.npz")
+        return self._shards[number]
 
     def _file(self, name: str) -> dict[str, np.ndarray]:
         if name not in self._arrays:
@@ -190,45 +194,37 @@ class Store:
         return self._arrays[name]
 
     def _hand(self, row: dict[str, Any], side: Side) -> HandTrack:
-        shard = self._file(f"frames-{row['shard']:05d}")
+        wrist_m, global_orient, hand_pose, betas, valid = self._frames(row["shard"]).hands[side]
         frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
-        betas, template = row[f"{side}_betas_row"], row[f"{side}_template"]
+        first, template = row[f"{side}_betas_row"], row[f"{side}_template"]
         return HandTrack(
-            wrist_m=shard[f"{side}_wrist_m"][frames].copy(),
-            global_orient=shard[f"{side}_global_orient"][frames].copy(),
-            hand_pose=shard[f"{side}_hand_pose"][frames].copy(),
-            betas=shard[f"{side}_betas"][betas : betas + row[f"{side}_betas_count"]].copy(),
-            valid=shard[f"{side}_valid"][frames].copy(),
+            wrist_m=wrist_m[frames].copy(),
+            global_orient=global_orient[frames].copy(),
+            hand_pose=hand_pose[frames].copy(),
+            betas=betas[first : first + row[f"{side}_betas_count"]].copy(),
+            valid=valid[frames].copy(),
             template_m=None if template is None else self._file("templates")[template].copy(),
         )
 
-    def _object(self, name: str, shard: dict[str, np.ndarray], prefix: str, rows: slice) -> ObjectTrack:
+    def _object(self, name: str, pose: tuple[np.ndarray, ...], rows: slice) -> ObjectTrack:
         model = self.object_model(name)
-        return ObjectTrack(
-            model,
-            rotvec=shard[f"{prefix}_rotvec"][rows].copy(),
-            translation_m=shard[f"{prefix}_translation_m"][rows].copy(),
-            hinge_rad=shard[f"{prefix}_hinge_rad"][rows].copy() if model.is_articulated else None,
-        )
+        rotvec, translation_m, hinge_rad = pose
+        hinge = hinge_rad[rows].copy() if model.is_articulated else None
+        return ObjectTrack(model, rotvec[rows].copy(), translation_m[rows].copy(), hinge)
 
-    def _other_objects(self, row: dict[str, Any], shard: dict[str, np.ndarray]) -> list[ObjectTrack]:
+    def _other_objects(self, row: dict[str, Any], shard: FrameShard) -> tuple[ObjectTrack, ...]:
         first, length = row["other_row"], row["n_frames"]
         starts = range(first, first + length * len(row["other_objects"]), length)
         pairs = zip(row["other_objects"], starts, strict=True)
-        return [self._object(name, shard, "other", slice(start, start + length)) for name, start in pairs]
+        return tuple(self._object(name, shard.other, slice(start, start + length)) for name, start in pairs)
 
-    def _camera(self, row: dict[str, Any], shard: dict[str, np.ndarray]) -> CameraTrack | None:
-        first = row["camera_row"]
+    def _camera(self, row: dict[str, Any], shard: FrameShard) -> CameraTrack | None:
+        first, intrinsics = row["camera_row"], row["camera_intrinsics"]
         if first < 0:
             return None
-        arrays = {
-            name: shard[f"camera_{name}"][first : first + row["n_frames"]].copy()
-            for name in ("rotvec", "position_m", "images")
-        }
-        intrinsics = row["camera_intrinsics"]
-        return CameraTrack(
-            row["camera_name"], **arrays, intrinsics=None if intrinsics is None else np.array(intrinsics)
-        )
+        rotvec, position_m, images = (array[first : first + row["n_frames"]].copy() for array in shard.camera)
+        intrinsics = None if intrinsics is None else np.array(intrinsics)
+        return CameraTrack(row["camera_name"], rotvec, position_m, images, intrinsics)
 
     def _body(self, row: dict[str, Any]) -> BodyTrack | None:
         if row["body_row"] < 0:
@@ -255,31 +251,3 @@ class Store:
             columns = (self.files[name].tolist() for name in ("path", "size", "sha256"))
             self._sources = [SourceFile(*values) for values in zip(*columns, strict=True)]
         return tuple(self._sources[number] for number in row["source_files"])
-
-
-_PLAIN = (
-    "clip_id",
-    "dataset",
-    "subject",
-    "sequence",
-    "verb",
-    "object_words",
-    "labelled_hand",
-    "source_fps",
-    "synthetic",
-    "gravity_note",
-    "hands_from",
-    "fit_error_m",
-)
-
-
-def _plain_column(column: pd.Series) -> list[Any]:
-    """Python values; a missing one (pandas has three kinds) is None."""
-    values = column.tolist()
-    if column.dtype.kind in "biu":
-        return values
-    return [value.tolist() if isinstance(value, np.ndarray) else _plain(value) for value in values]
-
-
-def _plain(value: Any) -> Any:
-    return None if value is None or value is pd.NA or value != value else value

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from hoidata.errors import BadInput
+from hoidata.schema import BodyTrack, CameraTrack, SourceContact
 from hoidata.schema.validation import check_clip
 
 
@@ -18,6 +19,22 @@ def with_object(clip, **changes):
 def with_mesh(clip, scale):
     model = clip.object.model
     return with_object(clip, model=replace(model, vertices_m=model.vertices_m * scale))
+
+
+def with_camera(clip, **changes):
+    numbers = np.zeros((30, 3), np.float32)
+    camera = CameraTrack("cam4", numbers, numbers, np.arange(30, dtype=np.int32), np.ones(6))
+    return replace(clip, camera=replace(camera, **changes))
+
+
+def with_body(clip, **changes):
+    arrays = [np.zeros((30, columns), np.float32) for columns in (3, 3, 63, 9, 10)]
+    return replace(clip, body=replace(BodyTrack(*arrays), **changes))
+
+
+def with_contact(clip, frame, vertex, label=(21, 22)):
+    arrays = np.array(frame, np.int32), np.array(vertex, np.int32), np.array(label, np.int64)
+    return replace(clip, source_contact=SourceContact(*arrays))
 
 
 BROKEN = {
@@ -36,12 +53,39 @@ BROKEN = {
     "frames that go back": (lambda c: replace(c, source_frames=c.source_frames[::-1]), "source_frames"),
     "no left hand": (lambda c: replace(c, hands={"right": c.hands["right"]}), "hands"),
     "a long gravity": (lambda c: replace(c, gravity=np.array([0, 0, -9.81])), "gravity"),
+    "a flat gravity": (lambda c: replace(c, gravity=np.array([0.0, -1.0])), "gravity"),
+    "no gravity and no reason": (lambda c: replace(c, gravity=None), "gravity_note"),
+    "a flat transform": (lambda c: replace(c, source_from_world=np.diag([1.0, 1, 0, 1])), "source_from_world"),
+    "a perspective": (lambda c: replace(c, source_from_world=np.diag([1.0, 1, 1, 2])), "source_from_world"),
+    "a transform of 9 numbers": (lambda c: replace(c, source_from_world=np.eye(3)), "source_from_world"),
+    "hands from nowhere": (lambda c: replace(c, hands_from="guesses"), "hands_from"),
+    "a fit without its error": (lambda c: replace(c, hands_from="keypoints"), "fit_error_m"),
+    "an error without a fit": (lambda c: replace(c, fit_error_m=0.01), "fit_error_m"),
+    "an error of NaN": (lambda c: replace(c, hands_from="keypoints", fit_error_m=float("nan")), "fit_error_m"),
+    "no rate": (lambda c: replace(c, source_fps=0.0), "source_fps"),
+    "a camera of fewer frames": (lambda c: with_camera(c, rotvec=np.zeros((29, 3))), "camera.rotvec"),
+    "a camera in millimetres": (lambda c: with_camera(c, position_m=np.full((30, 3), 900.0)), "camera.position_m"),
+    "images that are no numbers": (lambda c: with_camera(c, images=np.zeros(30)), "camera.images"),
+    "a focal length of NaN": (lambda c: with_camera(c, intrinsics=np.full(6, np.nan)), "camera.intrinsics"),
+    "a body with hands": (lambda c: with_body(c, body_pose=np.zeros((30, 153))), "body.body_pose"),
+    "50 expressions": (lambda c: with_body(c, expression=np.zeros((30, 50))), "body.expression"),
+    "a body in millimetres": (lambda c: with_body(c, transl_m=np.full((30, 3), 900.0)), "body.transl_m"),
+    "a contact after the end": (lambda c: with_contact(c, (3, 30), (1, 2)), "source_contact.frame"),
+    "a contact with no vertex": (lambda c: with_contact(c, (3, 4), (1, 8)), "source_contact.vertex"),
+    "a label too large": (lambda c: with_contact(c, (3, 4), (1, 2), (21, 256)), "source_contact.label"),
+    "contacts of unequal lengths": (lambda c: with_contact(c, (3, 4), (1,)), "source_contact.vertex"),
+    "contacts out of order": (lambda c: with_contact(c, (3, 3), (2, 1)), "source_contact"),
+    "a contact twice": (lambda c: with_contact(c, (3, 3), (2, 2)), "source_contact"),
 }
 
 
 def test_a_sound_clip_passes_and_comes_back(make_clip):
-    clip = make_clip(articulated=True)
+    clip = with_contact(with_body(with_camera(make_clip(articulated=True))), (3, 3), (1, 2))
     assert check_clip(clip) is clip
+    bare = with_camera(
+        with_body(replace(clip, gravity=None, gravity_note="not said"), expression=None), intrinsics=None
+    )
+    assert check_clip(bare) is bare
 
 
 @pytest.mark.parametrize("name", BROKEN)
