@@ -83,7 +83,8 @@ class FinishedWork:
     def holds(self, key: SequenceKey) -> bool:
         """Whether the sequence was finished, and its sources are still as they were then."""
         try:
-            with np.load(self._file(key), allow_pickle=False) as archive:
+            # Opened here: NumPy leaves the file open when it is no archive.
+            with open(self._file(key), "rb") as stream, np.load(stream, allow_pickle=False) as archive:
                 stated = json.loads(archive["sources"].tobytes())
             if stated["state"] is None or not all(self._shared_file(name).is_file() for name in stated["shared"]):
                 return False
