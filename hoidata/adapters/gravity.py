@@ -2,7 +2,8 @@
 
 An object out of reach stands on one of its stable sides, so each such stretch leaves a few directions. Of these the
 one is kept that a head-worn camera, upright and looking ahead or down, can have below it, and below which no hand
-reaches and the object never sinks while it is moved. Several stretches must agree; otherwise gravity stays unknown.
+reaches and the object never sinks while it is moved. Stretches of different objects, or of one turned about, must
+agree; otherwise gravity stays unknown.
 """
 
 from collections.abc import Sequence
@@ -25,9 +26,9 @@ HANDS_BELOW = 0.02  # share of joints
 BELOW_M = 0.015  # joints and objects this far below the support have gone through it
 LIFTED_M = 0.03
 CAMERA_CONE_RAD = np.deg2rad(50)
-AGREEMENT_RAD = np.deg2rad(5)
+AGREEMENT_RAD = np.deg2rad(7)
 AGREEING_SHARE = 0.75
-MOVED_M = 0.02  # a corner that lies so far from where it was: the object stands in another place
+TURNED_M = 0.01  # a corner so far from where it was, the object's middle apart: another object, or it was turned
 
 
 @dataclass(frozen=True)
@@ -76,8 +77,8 @@ def estimate_gravity(
     clear = [rest for rest in rests if len(rest.ways) == 1]
     if not rests:
         return GravityEstimate(None, "unknown: no object stands still with the hands away")
-    if len(_places(clear)) < 2:
-        return GravityEstimate(None, "unknown: fewer than two resting places show on which side the object stands")
+    if _different(clear) < 2:
+        return GravityEstimate(None, "unknown: no two objects, or turns of one, show on which side they stand")
     if not any(rest.lifted for rest in clear):
         return GravityEstimate(None, "unknown: no object is lifted from where it rests")
     return _agreed(clear)
@@ -89,7 +90,7 @@ def _agreed(rests: list[_Rest]) -> GravityEstimate:
     near = downs @ downs.T >= np.cos(AGREEMENT_RAD)
     agree = near[int(near.sum(axis=1).argmax())]
     chosen = [rest for rest, agrees in zip(rests, agree, strict=True) if agrees]
-    if agree.mean() < AGREEING_SHARE or len(_places(chosen)) < 2:
+    if agree.mean() < AGREEING_SHARE or _different(chosen) < 2:
         return GravityEstimate(None, f"unknown: only {agree.sum()} of {len(rests)} resting stretches agree")
     # Rounded, so that the last bits of a sum do not depend on the machine.
     mean = np.round(downs[agree].mean(axis=0), 6) + 0.0
@@ -168,10 +169,11 @@ def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _places(rests: Sequence[_Rest]) -> list[np.ndarray]:
-    """The corners of each place an object stands in; a stretch in the same place as another adds none."""
-    places: list[np.ndarray] = []
+def _different(rests: Sequence[_Rest]) -> int:
+    """How many stretches differ in the object or its orientation: one that leans the same way twice proves nothing."""
+    kept: list[np.ndarray] = []
     for rest in rests:
-        if all(np.linalg.norm(rest.corners - other, axis=1).max() > MOVED_M for other in places):
-            places.append(rest.corners)
-    return places
+        shape = rest.corners - rest.corners.mean(axis=0)
+        if all(np.linalg.norm(shape - other, axis=1).max() > TURNED_M for other in kept):
+            kept.append(shape)
+    return len(kept)

@@ -1,5 +1,6 @@
 """H2O: a tree of text files written here by hand, and what its numbers must mean."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -210,7 +211,21 @@ BAD_FILES = {
     "a truncated frame": ("hand_pose_mano/000007.txt", lambda path: path.write_text(path.read_text()[:300]), "124"),
     "too many columns": ("obj_pose_rt/000007.txt", lambda path: path.write_text(path.read_text() + " 1.0"), "17"),
     "NaN in a pose": ("cam_pose/000007.txt", _put(" ".join(["nan"] * 16)), "finite"),
+    "infinity in a pose": ("obj_pose_rt/000007.txt", _put(" ".join(["1e400"] * 17)), "finite"),
+    "an empty file": ("obj_pose_rt/000007.txt", _put(""), "17 numbers 0"),
+    "an empty first line": (
+        "cam_pose/000007.txt",
+        lambda path: path.write_text("\n" + path.read_text()),
+        "16 numbers 0",
+    ),
+    "text that is not UTF-8": ("cam_pose/000007.txt", lambda path: path.write_bytes(b"\xff\xfe " * 16), "16 numbers"),
+    "a binary file": ("hand_pose_mano/000007.txt", lambda path: path.write_bytes(bytes(range(256))), "124 numbers"),
+    "JSON": ("action_label/000007.txt", _put("[26]"), "1 numbers"),
+    "a frame too many": ("cam_pose/000027.txt", lambda path: write_text(path, camera(27)), "each of 28 frames"),
     "no numbers": ("action_label/000007.txt", _put("milk"), "1 numbers"),
+    "a label that is no whole number": ("action_label/000007.txt", _put("26.5"), "0 to 36"),
+    "an unknown object": ("obj_pose_rt/000007.txt", lambda path: write_text(path, [9, *np.eye(4).ravel()]), "0 to 8"),
+    "broken intrinsics": ("cam_intrinsics.txt", _put("636.6 636.3"), "6 numbers 2"),
     "an unknown label": ("action_label/000007.txt", _put("37"), "0 to 36"),
     "a matrix that is no rotation": ("cam_pose/000007.txt", _put(" ".join(["0.5"] * 16)), "rotation"),
     "a matrix by columns": ("cam_pose/000007.txt", lambda path: write_text(path, camera(7).T), "row 0 0 0 1"),
@@ -228,7 +243,8 @@ def test_a_bad_frame_file_is_named_with_what_was_expected(root, load_all, name):
     spoil(root / "subject2/k1/3/cam4" / file)
     with pytest.raises(BadInput) as caught:
         load_all(H2OAdapter(), root)
-    assert file.split("/")[0] in caught.value.where
+    assert Path(file).stem in caught.value.where
+    assert file.split("/")[0] in caught.value.where or name == "a frame too many"
     assert expected in f"{caught.value.expected} {caught.value.got}"
 
 
@@ -241,11 +257,59 @@ def test_a_bad_object_pose_is_named_by_its_file_also_behind_frames_without_objec
         load_all(H2OAdapter(), root)
 
 
-def test_a_sequence_without_action_labels_says_so(root, load_all):
-    for path in sorted((root / "subject2/k1/3/cam4/action_label").iterdir()):
-        path.unlink()
-    with pytest.raises(BadInput, match=r"action_label.*subject4.*withheld"):
+@pytest.mark.parametrize("folder", ["cam_pose", "hand_pose_mano", "obj_pose_rt"])
+def test_a_folder_that_is_not_there_is_named(root, load_all, folder):
+    shutil.rmtree(root / "subject2/k1/3/cam4" / folder)
+    with pytest.raises(BadInput, match=rf"cam4/{folder}: expected a folder of NNNNNN\.txt files.*pose archive"):
         load_all(H2OAdapter(), root)
+
+
+BAD_MESHES = {
+    "none": (lambda path: path.unlink(), "the object's mesh", "nothing there"),
+    "empty": (_put(""), "vertices", "shape"),
+    "without faces": (_put("v 0 0 0\nv 1 0 0\nv 0 1 0\n"), "faces", "no face"),
+    "of faces without area": (_put("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n"), "faces with area", "without"),
+    "with a corner that is not there": (_put("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n"), "face corners", "3"),
+    "with NaN": (_put("v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"), "finite", "NaN"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_MESHES)
+def test_a_bad_mesh_is_named_with_what_was_expected(root, load_all, name):
+    spoil, expected, got = BAD_MESHES[name]
+    spoil(root / "object/chips/chips.obj")
+    with pytest.raises(BadInput) as caught:
+        load_all(H2OAdapter(), root)
+    assert caught.value.where.endswith("object/chips/chips.obj")
+    assert expected in caught.value.expected
+    assert got in caught.value.got
+
+
+def test_a_frame_file_that_links_out_of_the_raw_folder_is_refused(root, load_all, tmp_path_factory):
+    path = root / "subject2/k1/3/cam4/action_label/000007.txt"
+    outside = tmp_path_factory.mktemp("outside") / "secret.txt"
+    path.rename(outside)
+    path.symlink_to(outside)
+    with pytest.raises(BadInput, match=r"action_label/000007\.txt.*leaves"):
+        load_all(H2OAdapter(), root)
+
+
+def test_the_camera_that_saw_each_frame_comes_with_the_clip(root, load_all):
+    (clip,) = load_all(H2OAdapter(), root)
+    assert clip.camera.name == "cam4"
+    assert clip.camera.images.tolist() == clip.source_frames.tolist() == list(range(3, 25))
+    assert clip.camera.intrinsics is None
+    turns = Rotation.from_rotvec(clip.camera.rotvec).as_matrix()
+    for at, frame in enumerate(range(3, 25)):
+        np.testing.assert_allclose(turns[at], camera(frame)[:3, :3], atol=1e-6)
+        np.testing.assert_allclose(clip.camera.position_m[at], camera(frame)[:3, 3], atol=1e-6)
+
+
+def test_intrinsics_are_read_where_they_are(root, load_all):
+    (root / "subject2/k1/3/cam4/cam_intrinsics.txt").write_text("636.6593 636.2520 635.2839 366.8740 1280 720\n")
+    (clip,) = load_all(H2OAdapter(), root)
+    assert clip.camera.intrinsics.tolist() == [636.6593, 636.2520, 635.2839, 366.8740, 1280.0, 720.0]
+    assert "subject2/k1/3/cam4/cam_intrinsics.txt" in [source.path for source in clip.sources]
 
 
 def test_a_frame_file_too_big_to_be_one_is_refused_without_reading_it(root, load_all):
