@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel, articulate, place
 from hoidata.objects.sampling import sample_points
@@ -14,7 +15,7 @@ from hoidata.quality.meshes import SurfaceFacts, part_faces, part_facts
 from hoidata.quality.penetration import depths_m, object_frame
 from hoidata.quality.shape import largest_beta
 from hoidata.quality.thresholds import Thresholds
-from hoidata.quality.timing import time_offset
+from hoidata.quality.timing import ObjectMotion, time_offset
 from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 
 NAN = float("nan")
@@ -89,6 +90,19 @@ def placed(track: ObjectTrack, points_m: np.ndarray, part: np.ndarray) -> np.nda
     """(frame, point, 3) world places of object-frame points (point, 3) of the given parts, metres."""
     moved = articulate(points_m, part, track.model.hinge, track.hinge_rad)
     return place(moved, np.asarray(track.rotvec, np.float64), np.asarray(track.translation_m, np.float64))
+
+
+def object_motion(track: ObjectTrack, facts: ObjectFacts) -> ObjectMotion:
+    """World poses of the object's parts, and its points."""
+    rotmats = rotvec_to_rotmat(np.asarray(track.rotvec, np.float64))[None]
+    places = np.asarray(track.translation_m, np.float64)[None]
+    hinge = track.model.hinge
+    if hinge is not None and track.hinge_rad is not None:
+        turn = rotvec_to_rotmat(hinge.axis[None] * np.asarray(track.hinge_rad, np.float64)[:, None])
+        shift = hinge.origin_m - turn @ hinge.origin_m
+        rotmats = np.concatenate([rotmats, rotmats @ turn])
+        places = np.concatenate([places, places + np.einsum("fij,fj->fi", rotmats[0], shift)[None]])
+    return ObjectMotion(placed(track, facts.points_m, facts.part), facts.part, rotmats, places)
 
 
 def _box_corners(vertices_m: np.ndarray) -> np.ndarray:
@@ -194,8 +208,10 @@ def _hand_depths(clip: Clip, side: Side, frames: np.ndarray, facts: ObjectFacts,
 
 
 def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Thresholds) -> dict[str, float]:
-    points = placed(clip.object, facts.points_m, facts.part)
-    found = time_offset([(places, clip.hands[side].valid) for side, places in joints.items()], points)
+    found = time_offset(
+        [(places.astype(np.float64), clip.hands[side].valid) for side, places in joints.items()],
+        object_motion(clip.object, facts),
+    )
     sure = found.confidence >= thresholds.offset_confidence
     return {
         "time_offset_frames": found.frames if sure else NAN,

@@ -1,8 +1,9 @@
 """Do hand and object tell the same time? A held object moves as the hand does; a lag between them shows as an offset.
 
-For a joint near the object, its velocity is compared with that of the object's nearest point, both as vectors, at every
-lag: the normalised cross-correlation of velocities. Unlike speeds, velocities disagree about direction too, which
-makes the peak sharp.
+For the joint nearest to the object, its velocity is compared with the one it would have if it were fixed to the object,
+both as vectors, at every lag: the normalised cross-correlation of velocities. Unlike speeds, velocities disagree about
+direction too, which makes the peak sharp. A lag so large that the hand is away from where the object was is not found:
+there is no sample.
 """
 
 from collections.abc import Sequence
@@ -31,6 +32,19 @@ class TimeOffset(NamedTuple):
     samples: int
 
 
+class ObjectMotion(NamedTuple):
+    """An object for this purpose. points_m: (frame, point, 3) spread over its surface, world, metres; part: (point,).
+
+    rotmats: (part, frame, 3, 3) and places_m: (part, frame, 3), each part's world pose; the parts share no frame of
+    reference but the world.
+    """
+
+    points_m: np.ndarray
+    part: np.ndarray
+    rotmats: np.ndarray
+    places_m: np.ndarray
+
+
 class Pairs(NamedTuple):
     """What one hand adds. object_m_s: (sample, 3); hand_m_s: (lag, sample, 3), the joint's velocity at each lag."""
 
@@ -38,15 +52,15 @@ class Pairs(NamedTuple):
     hand_m_s: np.ndarray
 
 
-def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], object_points_m: np.ndarray) -> TimeOffset:
+def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], thing: ObjectMotion) -> TimeOffset:
     """The lag in -10 to 10 frames at which the hands' velocities agree best with the object's.
 
-    hands: of each, joints (frame, 21, 3), metres, and usable (frame,) bool. object_points_m: (frame, point, 3) points
-    fixed to the object (or to its parts), spread over its surface. Samples are frames in which a joint is within 5 cm
-    of such a point that moves at 5 cm/s or more; fewer than 15 of them tell nothing. At lag ``L``:
-    ``sum u(t) . v(t + L) / sqrt(sum |u(t)|^2 sum |v(t + L)|^2)``, u of the point, v of the joint, central differences.
+    hands: of each, joints (frame, 21, 3), metres, and usable (frame,) bool. Samples are frames in which a joint is
+    within 5 cm of one of the object's points and the object moves there at 5 cm/s or more; fewer than 15 of them tell
+    nothing. At lag ``L``: ``sum u(t) . v(t + L) / sqrt(sum |u(t)|^2 sum |v(t + L)|^2)``, v of the joint, u of the point
+    of the object (or of its part) that lies where the joint is at t; central differences.
     """
-    pairs = [near_pairs(joints, usable, object_points_m) for joints, usable in hands]
+    pairs = [near_pairs(joints, usable, thing) for joints, usable in hands]
     samples = sum(len(pair.object_m_s) for pair in pairs)
     if samples < FEWEST_SAMPLES:
         return TimeOffset(float("nan"), float("nan"), samples)
@@ -58,17 +72,18 @@ def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], object_points_m:
     return TimeOffset(float(best - LARGEST_LAG), float(score[best]), samples)
 
 
-def near_pairs(joints_m: np.ndarray, usable: np.ndarray, object_points_m: np.ndarray) -> Pairs:
-    """Velocities of the nearest joint and object point in the frames in which the hand is near a moving object."""
+def near_pairs(joints_m: np.ndarray, usable: np.ndarray, thing: ObjectMotion) -> Pairs:
+    """Velocities of the nearest joint, and of the object there, in the frames in which it is near a moving object."""
     n_frames, margin = len(joints_m), LARGEST_LAG + 1
-    lags = np.arange(-LARGEST_LAG, LARGEST_LAG + 1)
     # Every lag sees the same frames, so that none wins by leaving out those that disagree.
     whole = [frame for frame in range(margin, n_frames - margin) if usable[frame - margin : frame + margin + 1].all()]
-    kept, joint, point = _nearest(joints_m, object_points_m, whole)
-    object_m_s, hand_m_s = _velocities(object_points_m), _velocities(joints_m)
-    moving = np.linalg.norm(object_m_s[kept, point], axis=-1) >= MOVING_M_S
-    kept, joint, point = kept[moving], joint[moving], point[moving]
-    return Pairs(object_m_s[kept, point], hand_m_s[kept[None] + lags[:, None], joint[None]])
+    frame, joint, point = _nearest(joints_m, thing.points_m, whole)
+    object_m_s = _carried_velocity(thing, thing.part[point], frame, joints_m[frame, joint])
+    moving = np.linalg.norm(object_m_s, axis=-1) >= MOVING_M_S
+    frame, joint = frame[moving], joint[moving]
+    then = frame[None] + np.arange(-LARGEST_LAG, LARGEST_LAG + 1)[:, None]
+    hand_m_s = (joints_m[then + 1, joint] - joints_m[then - 1, joint]) * (FPS / 2)
+    return Pairs(object_m_s[moving], hand_m_s)
 
 
 def _nearest(
@@ -85,7 +100,11 @@ def _nearest(
     return columns[0], columns[1], columns[2]
 
 
-def _velocities(points_m: np.ndarray) -> np.ndarray:
-    """(frame, point, 3) m/s by central differences; one-sided at both ends."""
-    points = np.asarray(points_m, dtype=np.float64)
-    return np.gradient(points, 1 / FPS, axis=0) if len(points) > 1 else np.zeros_like(points)
+def _carried_velocity(thing: ObjectMotion, part: np.ndarray, frame: np.ndarray, places_m: np.ndarray) -> np.ndarray:
+    """(sample, 3) m/s of points fixed to a part that lie at ``places_m (sample, 3)`` in ``frame (sample,)``."""
+    fixed = np.einsum("sij,si->sj", thing.rotmats[part, frame], places_m - thing.places_m[part, frame])
+    before, after = (
+        np.einsum("sij,sj->si", thing.rotmats[part, then], fixed) + thing.places_m[part, then]
+        for then in (frame - 1, frame + 1)
+    )
+    return (after - before) * (FPS / 2)

@@ -1,0 +1,121 @@
+"""Unlikely hand shapes, and meshes with holes, nothing inside, several shells, triangles without area."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.quality.meshes import part_facts, surface_facts
+from hoidata.quality.penetration import depths_m, object_frame
+from hoidata.quality.shape import distances_to_others, largest_beta
+
+BOX = trimesh.creation.box((0.1, 0.2, 0.3))
+
+
+def test_largest_beta_counts_either_way():
+    assert largest_beta(np.array([[0.5, -2.5, 1.0]])) == 2.5
+    assert largest_beta(np.zeros((1, 10))) == 0
+
+
+def test_clip_of_another_shape_than_its_subjects_other_clips_stands_out():
+    betas = {f"clip{number}": np.full((1, 10), 0.1) for number in range(4)}
+    betas["odd"] = np.full((1, 10), 0.1)
+    betas["odd"][0, 3] = -1.9
+    assert distances_to_others(betas) == pytest.approx({**dict.fromkeys(betas, 0.0), "odd": 2.0})
+
+
+def test_betas_per_frame_count_by_their_median():
+    frames = np.zeros((11, 10))
+    frames[0] = 9.0
+    assert distances_to_others({"a": frames, "b": np.zeros((1, 10)), "c": np.zeros((1, 10))})["a"] == 0
+
+
+def test_two_clips_do_not_tell_which_of_them_is_wrong():
+    assert np.isnan(list(distances_to_others({"a": np.zeros((1, 10)), "b": np.ones((1, 10))}).values())).all()
+    assert distances_to_others({}) == {}
+
+
+def test_box_is_solid_and_its_volume_its_own():
+    facts = surface_facts(BOX.vertices, BOX.faces)
+    assert facts.volume_m3 == pytest.approx(0.006)
+    assert facts.hull_m3 == pytest.approx(0.006)
+    assert (facts.open_edge_share, facts.shells, facts.degenerate_share) == (0, 1, 0)
+    assert facts.is_solid
+    assert facts.unfilled_share == pytest.approx(0, abs=1e-9)
+
+
+def test_vertices_split_along_seams_do_not_open_a_surface():
+    facts = surface_facts(BOX.vertices[BOX.faces].reshape(-1, 3), np.arange(36).reshape(12, 3))
+    assert facts.open_edge_share == 0
+    assert facts.shells == 1
+
+
+def test_missing_triangle_opens_three_edges():
+    facts = surface_facts(BOX.vertices, BOX.faces[1:])
+    assert facts.open_edge_share == pytest.approx(3 / 33)
+    assert not facts.is_solid
+
+
+def test_triangle_turned_round_leaves_three_pairs_of_edges_without_an_opposite():
+    turned = BOX.faces.copy()
+    turned[0] = turned[0, ::-1]
+    assert surface_facts(BOX.vertices, turned).open_edge_share == pytest.approx(6 / 36)
+
+
+def test_inside_out_and_empty_surfaces_are_told_apart_from_filled_ones():
+    inside_out = surface_facts(BOX.vertices, BOX.faces[:, ::-1])
+    both = surface_facts(BOX.vertices, np.concatenate([BOX.faces, BOX.faces[:, ::-1]]))
+    flat = surface_facts(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]]))
+    assert inside_out.unfilled_share == pytest.approx(2)
+    assert inside_out.is_solid
+    assert both.unfilled_share == pytest.approx(1)
+    assert not both.is_solid
+    assert flat.unfilled_share == 1
+    assert not flat.is_solid
+
+
+def test_separate_pieces_are_shells():
+    far = trimesh.util.concatenate([BOX, BOX.copy().apply_translation((1, 0, 0))])
+    assert surface_facts(far.vertices, far.faces).shells == 2
+
+
+def test_collapsed_and_needle_triangles_are_degenerate():
+    vertices = np.concatenate([BOX.vertices, [[0, 0, 0], [1, 0, 0], [0.5, 1e-8, 0]]])
+    faces = np.concatenate([BOX.faces, [[0, 0, 1], [8, 9, 10]]])
+    assert surface_facts(vertices, faces).degenerate_share == pytest.approx(2 / 14)
+
+
+def hinged() -> ObjectModel:
+    """A base box and a lid that lies on it, turning about the y axis through the lid's edge."""
+    base, lid = trimesh.creation.box((0.2, 0.2, 0.1)), trimesh.creation.box((0.2, 0.2, 0.02))
+    lid.apply_translation((0, 0, 0.06))
+    vertices, faces = np.concatenate([base.vertices, lid.vertices]), np.concatenate([base.faces, lid.faces + 8])
+    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([-0.1, 0.0, 0.05]))
+    return ObjectModel("hinged", vertices, faces, np.repeat(np.array([0, 1], np.uint8), 8), hinge)
+
+
+def test_every_part_is_a_surface_of_its_own():
+    model = hinged()
+    assert [facts.volume_m3 for facts in part_facts(model).values()] == pytest.approx([0.004, 0.0008])
+    whole = ObjectModel("rigid", model.vertices_m, model.faces, np.zeros(16, np.uint8))
+    assert [facts.shells for facts in part_facts(whole).values()] == [2]
+
+
+def test_depth_is_the_way_out_of_the_box_for_the_deepest_point():
+    model = ObjectModel("box", np.asarray(BOX.vertices), np.asarray(BOX.faces), np.zeros(8, np.uint8))
+    points = np.array([[[0.0, 0.0, 0.0], [0.03, 0, 0]], [[0.2, 0, 0], [0, 0.09, 0]], [[1, 1, 1], [0.051, 0, 0]]])
+    assert depths_m(model, None, points, [0]) == pytest.approx([0.05, 0.01, 0])
+
+
+def test_moving_part_is_met_where_its_hinge_has_taken_it():
+    model, quarter = hinged(), np.array([0.0, -np.pi / 2])
+    # Lid upright after a quarter turn: it stands over the hinge, from z = 0.05 to 0.25, x from -0.12 to -0.1.
+    points = np.tile([[-0.11, 0.0, 0.15]], (2, 1, 1))
+    assert depths_m(model, quarter, points, [0, 1]) == pytest.approx([0, 0.01])
+    assert depths_m(model, quarter, points, [0]) == pytest.approx([0, 0])
+
+
+def test_world_points_reach_the_object_frame():
+    rotvec, place = np.array([[0, 0, np.pi / 2]]), np.array([[1.0, 2.0, 3.0]])
+    # A quarter turn about z takes the object's x axis to the world's y axis.
+    assert object_frame(np.array([[[1.0, 3.0, 3.0]]]), rotvec, place) == pytest.approx(np.array([[[1.0, 0, 0]]]))
