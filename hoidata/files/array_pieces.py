@@ -6,6 +6,7 @@ long byte string is skipped and replaced by a name for its place in the stream, 
 numbers. Nothing of the file is executed, and no length it states is allocated.
 """
 
+import codecs
 import io
 import math
 import pickletools
@@ -26,12 +27,14 @@ from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
 
 MOST_MEMBERS = 256
 MOST_MEMBER_BYTES = 8 << 30
-_REST_BYTES = 1 << 20  # what a dict of arrays takes without their data
+_REST_BYTES = 1 << 16  # what a dict of arrays takes without their data
 _LONG_BYTES = 4096
 _PIECE_BYTES = 4 << 20
 _OPCODES = {opcode.code: opcode for opcode in pickletools.opcodes}
-# Opcodes whose argument is a byte string, and how its length is written before it.
+# Opcodes whose argument can be the data of an array, and how its length is written before it.
 _BYTE_STRINGS = {"BINBYTES": "<I", "BINBYTES8": "<Q", "BYTEARRAY8": "<Q"}
+_TEXTS = {"BINUNICODE": "<I", "BINUNICODE8": "<Q"}
+_LONG_STRINGS = {**_BYTE_STRINGS, **_TEXTS}
 _NUMBERS = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248])")
 _PLACE = "hoidata place in the stream"
 
@@ -72,7 +75,7 @@ class StoredArray:
             return
         with zipfile.ZipFile(self.path) as archive, archive.open(f"{self.member}.npy") as stream:
             _skip(stream, self.data.start)
-            yield stream
+            yield _BytesOfText(stream, self.data.length) if self.data.is_text else stream
 
 
 def npz_members(path: str | Path) -> set[str]:
@@ -106,10 +109,35 @@ def locate_arrays(path: str | Path, member: str) -> dict[str, StoredArray]:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where the bytes of an array lie in the unpacked member."""
+    """Where the bytes of an array lie in the unpacked member.
+
+    is_text: as text of one character per byte, in UTF-8; so Python 3 writes bytes by protocol 2 (NumPy before 1.17).
+    """
 
     start: int
     length: int
+    is_text: bool = False
+
+    def may_hold(self, size: int) -> bool:
+        """Whether so many bytes can lie there; a byte from 128 on takes two of UTF-8."""
+        return size <= self.length <= 2 * size if self.is_text else self.length == size
+
+
+class _BytesOfText:
+    """Reads the bytes that a text of the stream stands for. length: of the text in the stream."""
+
+    def __init__(self, stream: Any, length: int) -> None:
+        self.stream, self.left, self.bytes = stream, length, bytearray()
+        self.decoder = codecs.getincrementaldecoder("utf-8")()
+
+    def read(self, size: int) -> bytes:
+        while len(self.bytes) < size and self.left:
+            data = self.stream.read(min(self.left, _PIECE_BYTES))
+            self.left = self.left - len(data) if data else 0
+            self.bytes += self.decoder.decode(data).encode("latin1")
+        data = bytes(self.bytes[:size])
+        del self.bytes[:size]
+        return data
 
 
 class _Counted:
@@ -168,12 +196,12 @@ def _without_long_strings(stream: _Counted, where: str) -> tuple[bytes, list[_Pl
         if opcode is None:
             raise BadInput(where, "a whole pickle", "its end" if not code else f"the unknown opcode {code!r}")
         argument = b""
-        if opcode.name in _BYTE_STRINGS:
-            argument = _exactly(stream, struct.calcsize(_BYTE_STRINGS[opcode.name]))
-            (length,) = struct.unpack(_BYTE_STRINGS[opcode.name], argument)
+        if opcode.name in _LONG_STRINGS:
+            argument = _exactly(stream, struct.calcsize(_LONG_STRINGS[opcode.name]))
+            (length,) = struct.unpack(_LONG_STRINGS[opcode.name], argument)
             if length > _LONG_BYTES:
                 rest += f"c{_PLACE}\n{len(places)}\n".encode()
-                places.append(_Place(stream.place, length))
+                places.append(_Place(stream.place, length, opcode.name in _TEXTS))
                 stream.skip(length)
                 continue
             argument += _exactly(stream, length)
@@ -240,12 +268,19 @@ def _buffer_record(raw: Any, dtype: Any, shape: Any, order: Any) -> _ArrayRecord
     return record
 
 
+def _encoded(text: Any, encoding: Any = None) -> Any:
+    """Python 3's way to write bytes by protocol 2; the place of a long text stays a place."""
+    if isinstance(text, _Place) and encoding in ("latin1", "latin-1"):
+        return text
+    return ARRAYS["_codecs", "encode"](text, encoding)
+
+
 def _allowed(places: list[_Place]) -> dict[tuple[str, str], Any]:
     cores = ("numpy.core", "numpy._core")
-    arrays = {(f"{core}.multiarray", "_reconstruct"): _array_record for core in cores}
+    arrays = {(f"{core}.multiarray", name): _array_record for core in cores for name in ("_reconstruct", "scalar")}
     buffers = {(f"{core}.numeric", "_frombuffer"): _buffer_record for core in cores}
-    dtypes = {("numpy", "dtype"): _dtype_record}
-    return {**ARRAYS, **dtypes, **arrays, **buffers, **{(_PLACE, str(at)): place for at, place in enumerate(places)}}
+    others = {("numpy", "dtype"): _dtype_record, ("_codecs", "encode"): _encoded}
+    return {**ARRAYS, **others, **arrays, **buffers, **{(_PLACE, str(at)): place for at, place in enumerate(places)}}
 
 
 def _dict_of(where: str, record: Any) -> dict[Any, Any]:
@@ -266,9 +301,14 @@ def _stored(where: str, path: Path, member: str, record: Any) -> StoredArray | N
     dtype = _number_type(where, dtype)
     if not isinstance(shape, tuple) or len(shape) != 2 or not all(isinstance(n, int) and n >= 0 for n in shape):
         raise BadInput(where, "an array of rows and columns", f"shape {shape}")
-    length = raw.length if isinstance(raw, _Place) else len(raw) if isinstance(raw, bytes | bytearray) else -1
-    if length != math.prod(shape) * dtype.itemsize:
-        raise BadInput(where, f"{math.prod(shape) * dtype.itemsize} bytes for shape {shape}", f"{max(length, 0)}")
+    size = math.prod(shape) * dtype.itemsize
+    if isinstance(raw, _Place):
+        fits, length = raw.may_hold(size), raw.length
+    else:
+        length = len(raw) if isinstance(raw, bytes | bytearray) else 0
+        fits = length == size
+    if not fits:
+        raise BadInput(where, f"{size} bytes for shape {shape}", f"{length}")
     data = raw if isinstance(raw, _Place) else bytes(raw)
     return StoredArray(where, path, member, shape, dtype, data, bool(by_columns))
 
