@@ -1,6 +1,5 @@
 """NPZ files: stored (not compressed, so one array can be read alone), equal arrays give equal bytes, no pickles."""
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import atomic_file
+from hoidata.files.numpy_files import load_npz_arrays
 
 
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
@@ -27,8 +27,6 @@ def read_npz(path: str | Path) -> dict[str, np.ndarray]:
     if not Path(path).is_file():
         raise BadInput(path, "an NPZ file", "nothing", "run the stage that writes it")
     try:
-        # Opened here: NumPy leaves the file open when it is no archive.
-        with open(path, "rb") as stream, np.load(stream, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise BadInput(path, "an NPZ file of plain arrays", str(error), "write it again") from error
+        return load_npz_arrays(path)
+    except BadInput as error:
+        raise BadInput(error.where, "an NPZ file of plain arrays", error.got, "write it again") from error

@@ -1,19 +1,19 @@
 """``.npy`` and ``.npz`` files of others, read without ``allow_pickle``; objects go through ``restricted_load``."""
 
-import io
-import math
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
-from numpy.lib import format as npy
 
 from hoidata.errors import BadInput
-from hoidata.files.restricted_pickle import ARRAYS, MAX_BYTES, restricted_load
+from hoidata.files.npy_header import read_npy_header, read_plain_array
+from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 
 _MAX_MEMBERS = 256
+_MAX_BYTES = 1 << 30
 _FORMAT = "a NumPy file"
 
 
@@ -32,19 +32,42 @@ def load_npy_object(path: str | Path) -> Any:
 def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -> dict[str, Any]:
     """All members of an ``.npz`` (or only those named), 0-d ones as their item: GRAB's sequence files.
 
-    BadInput if a named member is absent, on more than 256 members, or on more than 2 GiB when unpacked.
+    BadInput if a named member is absent, on more than 256 members, or on more than 1 GiB when unpacked.
     """
+    with _archive(path) as archive:
+        chosen = _chosen_members(path, archive, members)
+        return {name: _item(_read_member(path, archive, info, True)) for name, info in chosen.items()}
+
+
+def load_npz_arrays(path: str | Path) -> dict[str, np.ndarray]:
+    """All members of an ``.npz`` of plain arrays, by name: a file of ours, of any size.
+
+    BadInput on Python objects, and where it unpacks to more than 1 GiB and more than its own size.
+    """
+    with _archive(path) as archive:
+        infos = archive.infolist()
+        _check_size(path, infos, max(_MAX_BYTES, Path(path).stat().st_size))
+        return {info.filename.removesuffix(".npy"): _read_member(path, archive, info, False) for info in infos}
+
+
+@contextmanager
+def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
-            chosen = _chosen_members(path, archive, members)
-            return {
-                name: _item(_read(io.BytesIO(archive.read(info)), f"{path}: {name}", allow_objects=True))
-                for name, info in chosen.items()
-            }
+            yield archive
     except BadInput:
         raise
     except Exception as error:  # OSError, BadZipFile, zlib.error and the like have no common base
         raise BadInput(path, "a whole .npz file", f"{type(error).__name__}: {error}") from None
+
+
+def _read_member(path: str | Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, allow_objects: bool) -> np.ndarray:
+    where = f"{path}: {info.filename.removesuffix('.npy')}"
+    with archive.open(info) as stream:
+        array = _read(stream, where, info.file_size, allow_objects)
+        if stream.read(1):  # at the end the checksum is compared, too
+            raise BadInput(where, "nothing behind the array", "more bytes")
+    return array
 
 
 def _chosen_members(
@@ -58,53 +81,35 @@ def _chosen_members(
         if absent:
             raise BadInput(path, f"members {sorted(members)}", f"a file without {absent}")
         infos = {name: info for name, info in infos.items() if name in members}
-    size = sum(info.file_size for info in infos.values())
-    if size > MAX_BYTES:
-        raise BadInput(path, f"at most {MAX_BYTES} bytes when unpacked", str(size))
+    _check_size(path, infos.values(), _MAX_BYTES)
     return infos
+
+
+def _check_size(path: str | Path, infos: Iterable[zipfile.ZipInfo], most: int) -> None:
+    size = sum(info.file_size for info in infos)
+    if size > most:
+        raise BadInput(path, f"at most {most} bytes when unpacked", str(size))
 
 
 def _load(path: str | Path, allow_objects: bool) -> np.ndarray:
     try:
         with open(path, "rb") as stream:
-            return _read(stream, path, allow_objects)
+            return _read(stream, path, Path(path).stat().st_size, allow_objects)
     except OSError as error:
         raise BadInput(path, _FORMAT, f"{type(error).__name__}: {error.strerror}") from None
 
 
-def _read(stream: BinaryIO, where: str | Path, allow_objects: bool) -> np.ndarray:
-    try:
-        shape, dtype = _read_header(stream)
-    except (ValueError, EOFError, SyntaxError, TypeError) as error:
-        raise BadInput(where, _FORMAT, f"{type(error).__name__}: {error}") from None
-    if not dtype.hasobject:
-        return _read_plain(stream, where, shape, dtype)
+def _read(stream: Any, where: str | Path, size: int, allow_objects: bool) -> np.ndarray:
+    """The array in a stream of ``size`` bytes."""
+    header = read_npy_header(stream, where)
+    if not header.dtype.hasobject:
+        return read_plain_array(stream, header, size - stream.tell(), where)
     if not allow_objects:
         raise BadInput(where, "an array of numbers", "Python objects")
     value = restricted_load(stream, ARRAYS, where=where)
     if not isinstance(value, np.ndarray):
         raise BadInput(where, "a pickled array", type(value).__name__)
     return value
-
-
-def _read_header(stream: BinaryIO) -> tuple[tuple[int, ...], np.dtype]:
-    version = npy.read_magic(stream)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    return shape, dtype
-
-
-def _read_plain(stream: BinaryIO, where: str | Path, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    # Compared before reading, or a header could make NumPy allocate any amount.
-    start, end = stream.tell(), stream.seek(0, io.SEEK_END)
-    wanted = math.prod(shape) * dtype.itemsize
-    if end - start < wanted:
-        raise BadInput(where, f"{wanted} bytes of data for shape {shape}", f"{end - start} bytes")
-    stream.seek(0)
-    try:
-        return npy.read_array(stream, allow_pickle=False)
-    except (ValueError, EOFError, OSError, MemoryError) as error:
-        raise BadInput(where, "a whole array", f"{type(error).__name__}: {error}") from None
 
 
 def _item(value: np.ndarray) -> Any:

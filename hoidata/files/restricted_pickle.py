@@ -7,9 +7,7 @@ its arguments; everything else is refused before it is looked up. Every problem 
 import io
 import math
 import pickle
-import pickletools
-import re
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
 from typing import Any, BinaryIO
@@ -17,17 +15,13 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.files.npy_header import check_text, plain_dtype
+from hoidata.files.pickle_check import check_opcodes
 
 MAX_BYTES = 2 << 30
 Allow = Mapping[tuple[str, str], Any]
 
 _REMEDY = "download it again from the dataset's own site; it is not opened otherwise, because it could run code"
-# Never written by the tools we read from, or able to reach beyond the allow-list.
-REFUSED_OPCODES = frozenset(
-    {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"}
-)
-_MEMO_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
-_DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}|O8?)")
 
 
 def restricted_load(
@@ -92,15 +86,6 @@ class _Callable(StandIn):
         return self._function(*arguments)
 
 
-def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES) -> None:
-    """Refuse opcodes we never need, and memo indices beyond the file's length (they would allocate at will)."""
-    for opcode, argument, _ in pickletools.genops(data):
-        if opcode.name in refused:
-            raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
-        if opcode.name in _MEMO_OPCODES and isinstance(argument, int) and argument > len(data):
-            raise pickle.UnpicklingError(f"it stores memo entry {argument} in {len(data)} bytes")
-
-
 def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
     """The same value with our array class replaced by ``numpy.ndarray``.
 
@@ -155,7 +140,9 @@ class CheckedArray(np.ndarray):
             raise pickle.UnpicklingError(f"an array of shape {shape}")
         if kind.hasobject and not isinstance(raw, list):
             raise pickle.UnpicklingError("an object array without a list of its items")
-        raw = raw if kind.hasobject else _as_bytes(raw)
+        if not kind.hasobject:
+            raw = _as_bytes(raw)
+            check_text(raw, kind)
         # NumPy trusts the length of an object array's list and reads past its end.
         wanted = math.prod(shape) * (1 if kind.hasobject else kind.itemsize)
         if len(raw) != wanted:
@@ -166,8 +153,8 @@ class CheckedArray(np.ndarray):
 class _DtypeRecord:
     """A dtype built from a checked string; its state may only set the byte order."""
 
-    def __init__(self, text: str) -> None:
-        self.dtype = np.dtype(text)
+    def __init__(self, dtype: np.dtype) -> None:
+        self.dtype = dtype
 
     def __setstate__(self, state: tuple) -> None:
         order, structure = state[1], state[2:5]
@@ -187,9 +174,7 @@ _NDARRAY = _NdarrayType()
 
 def _dtype(text: Any, align: Any = False, copy: Any = False) -> _DtypeRecord:
     text = text.decode("latin1") if isinstance(text, bytes) else text
-    if not isinstance(text, str) or not _DTYPE.fullmatch(text):
-        raise pickle.UnpicklingError(f"dtype {text!r}, which is not allowed")
-    return _DtypeRecord(text)
+    return _DtypeRecord(plain_dtype(text))
 
 
 def _checked_dtype(value: Any) -> np.dtype:
@@ -220,6 +205,7 @@ def _scalar(dtype: Any, raw: Any = b"") -> Any:
     data = _as_bytes(raw)
     if len(data) != kind.itemsize:
         raise pickle.UnpicklingError(f"a scalar of {len(data)} bytes for dtype {kind}")
+    check_text(data, kind)
     return np.frombuffer(data, kind)[0] if data else kind.type()
 
 
@@ -227,7 +213,9 @@ def _frombuffer(raw: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
     kind = _checked_dtype(dtype)
     if kind.hasobject or order not in ("C", "F"):
         raise pickle.UnpicklingError("a buffer of objects or unknown order, which is not allowed")
-    return np.frombuffer(bytearray(_as_bytes(raw)), kind).reshape(shape, order=order).view(CheckedArray)
+    data = bytearray(_as_bytes(raw))
+    check_text(data, kind)
+    return np.frombuffer(data, kind).reshape(shape, order=order).view(CheckedArray)
 
 
 def _encode(text: Any, encoding: Any = None) -> bytes:
@@ -244,7 +232,14 @@ def _empty_bytes() -> bytes:
 def _set(items: Any = ()) -> set:
     if not isinstance(items, list | tuple):
         raise pickle.UnpicklingError(f"a set of a {type(items).__name__}")
-    return set(items)
+    return set(checked_keys(items))
+
+
+def checked_keys(items: Sequence[Any]) -> Sequence[Any]:
+    """The items, known not to be tuples: hashing those can take for ever (see pickle_check)."""
+    if any(isinstance(item, tuple) for item in items):
+        raise pickle.UnpicklingError("a tuple as a key, which is not allowed")
+    return items
 
 
 def _numpy_globals() -> dict[tuple[str, str], Any]:

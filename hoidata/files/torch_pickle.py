@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.files.pickle_check import REFUSED_OPCODES, check_opcodes
 from hoidata.files.restricted_pickle import (
-    REFUSED_OPCODES,
     Allow,
     CheckedArray,
     StandIn,
-    check_opcodes,
+    checked_keys,
     restricted_load,
 )
 
@@ -136,6 +136,7 @@ def _rebuild_parameter(tensor: Any, _requires_grad: Any = False, hooks: Any = No
 def _ordered_dict(items: Any = ()) -> dict:
     if not isinstance(items, list | tuple):
         raise pickle.UnpicklingError(f"an ordered dictionary of a {type(items).__name__}")
+    checked_keys([key for key, _ in items])
     return dict(items)
 
 

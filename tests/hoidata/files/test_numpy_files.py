@@ -104,7 +104,7 @@ def test_header_that_promises_more_than_the_file_holds_is_refused_before_reading
 
 
 def test_zip_bomb_is_refused_by_its_declared_size(tmp_path, monkeypatch):
-    monkeypatch.setattr("hoidata.files.numpy_files.MAX_BYTES", 10_000)
+    monkeypatch.setattr("hoidata.files.numpy_files._MAX_BYTES", 10_000)
     np.savez_compressed(tmp_path / "a.npz", a=np.zeros(100_000))
     with pytest.raises(BadInput, match="at most 10000 bytes"):
         load_npz_objects(tmp_path / "a.npz")

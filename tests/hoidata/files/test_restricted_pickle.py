@@ -195,3 +195,38 @@ def test_every_flipped_byte_is_read_or_refused_but_never_runs_wild():
 def test_larger_than_the_cap_is_refused():
     with pytest.raises(BadInput, match="at most 100 bytes"):
         restricted_load(io.BytesIO(pickle.dumps(np.zeros(100))), ARRAYS, max_bytes=100)
+
+
+DEEP = b"\x80\x02})" + b"\x85" * 500_000 + b"Ns."
+DOUBLED = b"\x80\x02})q\x00" + b"".join(b"h\x00h\x00\x86q\x00" for _ in range(60)) + b"Ns."
+IN_A_SET = b"\x80\x02cbuiltins\nset\n])" + b"\x85" * 500_000 + b"a\x85R."
+AS_ITEMS = b"\x80\x04\x8f(" + b")" + b"\x85" * 500_000 + b"\x90."
+DOUBLED_AT_ONCE = b"\x80\x02})" + b"2\x86" * 60 + b"Ns."
+
+
+@pytest.mark.parametrize("data", [DEEP, DOUBLED, IN_A_SET, AS_ITEMS, DOUBLED_AT_ONCE], ids=range(5))
+def test_keys_that_would_overflow_the_stack_or_take_for_ever_to_hash_are_refused(data):
+    """500,000 nested tuples used to end the process; 60 tuples of two used to take 2^60 steps."""
+    with pytest.raises(BadInput, match="not allowed"):
+        restricted_load(data, ARRAYS)
+
+
+def test_a_huge_integer_is_refused():
+    """Hashing one of a megabyte a million times takes minutes; no dataset has one."""
+    with pytest.raises(BadInput, match="LONG4"):
+        restricted_load(pickle.dumps(1 << 4000), ARRAYS)
+
+
+def test_text_of_impossible_characters_is_refused():
+    """Python raises a SystemError when such text is turned into a string, long after the file was read."""
+    data = pickle.dumps(np.array(["cup"]), 5)
+    spoilt = data.replace(b"c\0\0\0u\0\0\0", b"c\0\x11\xffu\0\0\0")
+    assert spoilt != data
+    with pytest.raises(BadInput, match="impossible characters"):
+        restricted_load(spoilt, ARRAYS)
+
+
+@pytest.mark.parametrize("data", [b"cnumpy\nndarray\n.", b"]cbuiltins\nset\na.", b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR."])
+def test_no_result_holds_a_stand_in_of_the_reader(data):
+    with pytest.raises(BadInput, match="by itself"):
+        restricted_load(data, ARRAYS)

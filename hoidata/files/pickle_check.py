@@ -1,0 +1,100 @@
+"""A look at a pickle's opcodes before any of them is executed: a walk over its stack that notes what lies there.
+
+An allow-list of names does not stop a small file from ending the process or from keeping it busy for ever: tuples
+nested 500,000 deep as a key of a dictionary overflow the C stack when they are hashed, tuples that hold the one before
+twice take 2^depth steps, a memo index may ask for any amount of memory. So no key is a tuple, and indices are small.
+"""
+
+import pickle
+import pickletools
+from collections.abc import Set
+from typing import Any
+
+# Never written by the tools we read from, or able to reach beyond the allow-list; LONG4 holds numbers over 2^2000.
+REFUSED_OPCODES = frozenset(
+    {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"} | {"DUP", "LONG4"}
+)
+_PUT_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
+_GET_OPCODES = {"GET", "BINGET", "LONG_BINGET"}
+_TUPLES = {"TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_TUPLE"}
+_TUPLE = "tuple"
+_OTHER = "other"
+_MARK = "mark"
+
+
+def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES) -> None:
+    """Refuse opcodes we never need, memo indices beyond the file's length, and tuples as keys or in sets.
+
+    Raises UnpicklingError, or what pickletools raises on something that is no pickle.
+    """
+    walk = _Walk()
+    for opcode, argument, _ in pickletools.genops(data):
+        if opcode.name in refused:
+            raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
+        if opcode.name in _PUT_OPCODES and isinstance(argument, int) and argument > len(data):
+            raise pickle.UnpicklingError(f"it stores memo entry {argument} in {len(data)} bytes")
+        walk.step(opcode, argument)
+
+
+class _Walk:
+    """The stack of an unpickler with, in the place of each value, whether it is a tuple."""
+
+    def __init__(self) -> None:
+        self.stack: list[str] = []
+        self.memo: dict[int, str] = {}
+
+    def step(self, opcode: Any, argument: Any) -> None:
+        name = opcode.name
+        if name in _PUT_OPCODES or name == "MEMOIZE":
+            self.memo[len(self.memo) if name == "MEMOIZE" else argument] = self._top()
+        elif name in _GET_OPCODES:
+            self.stack.append(self.memo.get(argument, _OTHER))
+        elif name == "MARK":
+            self.stack.append(_MARK)
+        elif name == "POP":
+            self._top()
+            self.stack.pop()
+        else:
+            self._replace(opcode)
+
+    def _replace(self, opcode: Any) -> None:
+        """Take what an opcode takes, check the keys among it, and leave what it leaves."""
+        taken = self._taken(opcode)
+        if any(key is _TUPLE for key in _hashed(opcode.name, taken)):
+            raise pickle.UnpicklingError("a tuple as a key, which is not allowed")
+        self.stack += [_TUPLE if opcode.name in _TUPLES else _OTHER] * len(opcode.stack_after)
+
+    def _taken(self, opcode: Any) -> list[str]:
+        wanted = opcode.stack_before
+        if pickletools.markobject not in wanted:
+            count = len(wanted)
+        else:
+            below = wanted.index(pickletools.markobject)
+            count = below + len(self.stack) - self._last_mark()
+        if count > len(self.stack):
+            raise pickle.UnpicklingError("it takes more than there is")
+        taken = self.stack[len(self.stack) - count :]
+        del self.stack[len(self.stack) - count :]
+        return taken
+
+    def _last_mark(self) -> int:
+        for place in range(len(self.stack) - 1, -1, -1):
+            if self.stack[place] is _MARK:
+                return place
+        raise pickle.UnpicklingError("it takes all since a mark that is not there")
+
+    def _top(self) -> str:
+        if not self.stack:
+            raise pickle.UnpicklingError("it takes more than there is")
+        return self.stack[-1]
+
+
+def _hashed(name: str, taken: list[str]) -> list[str]:
+    """Which of the values an opcode takes become keys or members of a set."""
+    if name == "SETITEM":
+        return taken[1:2]
+    if name in ("SETITEMS", "DICT"):
+        return taken[taken.index(_MARK) + 1 :: 2]
+    if name in ("ADDITEMS", "FROZENSET"):
+        return taken[taken.index(_MARK) + 1 :]
+    return []
