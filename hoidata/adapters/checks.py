@@ -13,7 +13,10 @@ def table(where: str, value: Any, columns: int, rows: int | None = None, row: st
 
     rows: how many are expected, None for any number from 1. row: what they are called in errors.
     """
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except ValueError as error:  # nested lists of unequal lengths
+        raise BadInput(where, "rows of equal length", str(error)[:80]) from error
     if array.dtype.kind not in "fiu":
         raise BadInput(where, "numbers", f"an array of type {array.dtype}")
     if array.ndim != 2 or array.shape[1] != columns:
