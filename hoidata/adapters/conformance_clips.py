@@ -145,9 +145,9 @@ def _way_back(adapter: Adapter, clip: Clip) -> list[str]:
 
 
 def _hands_from(adapter: Adapter, clip: Clip) -> list[str]:
-    fitted = adapter.hand_convention.shape == "fitted"
-    if (clip.hands_from == "keypoints") != fitted:
-        return [f"hands_from is {clip.hands_from!r}, the declared shape {adapter.hand_convention.shape!r}"]
+    fitted = clip.hands_from == "keypoints"  # a setting may ask for it where a source has parameters too
+    if adapter.hand_convention.shape == "fitted" and not fitted:
+        return [f"hands_from is {clip.hands_from!r}, the declared shape 'fitted'"]
     if (clip.fit_error_m is None) == fitted:
         return ["fit_error_m is to be stated where hands are fitted, and only there"]
     if clip.fit_error_m is not None and not 0 <= clip.fit_error_m <= LARGEST_FIT_ERROR_M:

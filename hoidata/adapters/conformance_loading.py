@@ -101,7 +101,8 @@ def opened_files(root: Path) -> Iterator[set[str]]:
     finally:
         opened, _opened = _opened, before
         for place in (os.path.abspath(root), os.path.realpath(root)):
-            result |= {os.path.relpath(path, place) for path in opened if path.startswith(place + os.sep)}
+            below = [path for path in opened if path.startswith(place + os.sep) and os.path.isfile(path)]
+            result |= {os.path.relpath(path, place) for path in below}
 
 
 _opened: list[str] | None = None

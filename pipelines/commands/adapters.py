@@ -29,12 +29,13 @@ def list_adapters() -> None:
 
     from hoidata.adapters.registry import registered_adapters
 
-    table = Table("name", "version", "licence", "may be shared", "from", "settings")
+    table = Table("name", "version", "licence", "may be shared", "from", show_lines=True)
+    table.add_column("settings", overflow="fold")
     for row in registered_adapters():
         if row.adapter is None:
             table.add_row(row.name, "", f"[bold red]{escape(row.problem)}", "", escape(row.origin), "")
             continue
-        facts, settings = row.adapter, ", ".join(f"{key}={value!r}" for key, value in row.settings.items())
+        facts, settings = row.adapter, "\n".join(f"{key}={value!r}" for key, value in row.settings.items())
         shared = "yes" if facts.may_be_shared else "no"
         table.add_row(*map(escape, (row.name, facts.version, facts.licence, shared, row.origin, settings)))
     Console().print(table)
