@@ -1,0 +1,258 @@
+"""A fault planted into a good clip raises its own measure over its limit, and the others stay where they were."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import ObjectModel
+from hoidata.quality.measures import ObjectFacts, clip_row, object_row
+from hoidata.quality.thresholds import (
+    CLIP_MEASURES,
+    DEFAULT_LIMITS,
+    MESH_MEASURES,
+    Finding,
+    Limit,
+    Measure,
+    Thresholds,
+    findings,
+    reasons_of,
+    verdict_of,
+)
+from hoidata.schema import Clip
+
+FRAMES = 60
+HANDS = load_embedded_hands()
+NAMES = [measure.name for measure in CLIP_MEASURES if measure.name != "beta_distance"]
+
+
+def row(clip: Clip, thresholds: Thresholds | None = None) -> dict:
+    return clip_row(clip, ObjectFacts.of(clip.object.model), HANDS, thresholds or Thresholds())
+
+
+def over_limit(measured: dict) -> dict[str, str]:
+    """Verdict by measure, of those over a limit."""
+    found = {}
+    for measure in CLIP_MEASURES:
+        for finding in findings({**measured, "beta_distance": np.nan}, [measure], DEFAULT_LIMITS):
+            found[measure.name] = finding.verdict
+    return found
+
+
+def with_hand(clip: Clip, **changes) -> Clip:
+    return replace(clip, hands={**clip.hands, "right": replace(clip.hands["right"], **changes)})
+
+
+def with_object(clip: Clip, **changes) -> Clip:
+    return replace(clip, object=replace(clip.object, **changes))
+
+
+@pytest.fixture
+def good(make_clip) -> Clip:
+    return make_clip(n_frames=FRAMES, seed=3)
+
+
+def noise(sigma: float, *shape: int) -> np.ndarray:
+    return np.random.default_rng(0).normal(0, sigma, shape).astype(np.float32)
+
+
+def shaking_wrist(clip: Clip) -> Clip:
+    return with_hand(clip, wrist_m=clip.hands["right"].wrist_m + noise(0.03, FRAMES, 3))
+
+
+def shaking_fingers(clip: Clip) -> Clip:
+    return with_hand(clip, hand_pose=clip.hands["right"].hand_pose + noise(1.2, FRAMES, 45))
+
+
+def shaking_object(clip: Clip) -> Clip:
+    return with_object(clip, translation_m=clip.object.translation_m + noise(0.03, FRAMES, 3))
+
+
+def turning_object(clip: Clip) -> Clip:
+    rotvec = clip.object.rotvec.copy()
+    rotvec[30:] = 0, 0, 3.1
+    return with_object(clip, rotvec=rotvec)
+
+
+def jumping_hand(clip: Clip) -> Clip:
+    wrist = clip.hands["right"].wrist_m.copy()
+    wrist[30:] += 0.5
+    return with_hand(clip, wrist_m=wrist)
+
+
+def jumping_object(clip: Clip) -> Clip:
+    place = clip.object.translation_m.copy()
+    place[30:] += 0.5
+    return with_object(clip, translation_m=place)
+
+
+def lost_hand(clip: Clip) -> Clip:
+    valid = np.ones(FRAMES, bool)
+    valid[5:50] = False
+    return with_hand(clip, valid=valid)
+
+
+def no_hand(clip: Clip) -> Clip:
+    lost = {side: replace(track, valid=np.zeros(FRAMES, bool)) for side, track in clip.hands.items()}
+    return replace(clip, hands=lost)  # pyright: ignore[reportArgumentType]
+
+
+def giant_betas(clip: Clip) -> Clip:
+    return with_hand(clip, betas=np.full((1, 10), -11.0, np.float32))
+
+
+def sunken_hand(clip: Clip) -> Clip:
+    return with_hand(clip, wrist_m=clip.object.translation_m.copy())
+
+
+FAULTS: list[tuple[Callable[[Clip], Clip], dict[str, str]]] = [
+    (shaking_wrist, {"wrist_acceleration_m_s2": "left out", "shaking_share": "left out"}),
+    (shaking_fingers, {"finger_acceleration_m_s2": "left out"}),
+    (shaking_object, {"object_acceleration_m_s2": "left out", "shaking_share": "left out"}),
+    (jumping_hand, {"hand_jump_m": "left out"}),
+    (jumping_object, {"object_jump_m": "left out"}),
+    (turning_object, {"object_jump_m": "warned"}),
+    (lost_hand, {"gap_share": "left out"}),
+    (no_hand, {"handless_share": "left out"}),
+    (giant_betas, {"largest_beta": "left out"}),
+    (sunken_hand, {"penetration_m": "warned", "penetration_share": "warned"}),
+]
+
+
+def test_good_clip_is_over_no_limit(good):
+    measured = row(good)
+    assert over_limit(measured) == {}
+    assert all(np.isfinite(measured[name]) for name in NAMES)
+    assert measured["time_offset_frames"] == 0
+
+
+@pytest.mark.parametrize(("plant", "expected"), FAULTS, ids=[plant.__name__ for plant, _ in FAULTS])
+def test_planted_fault_is_found(good, plant, expected):
+    found = over_limit(row(plant(good)))
+    assert expected.items() <= found.items()
+
+
+def test_fault_does_not_raise_what_it_does_not_concern(good):
+    assert set(over_limit(row(giant_betas(good)))) <= {"largest_beta", "penetration_m", "penetration_share"}
+    assert set(over_limit(row(no_hand(good)))) == {"handless_share"}
+    assert set(over_limit(row(jumping_object(good)))) <= {"object_jump_m"}
+
+
+def test_jump_says_between_which_frames_it_is(good):
+    measured = row(jumping_hand(good))
+    assert measured["hand_jump_frame"] == 29
+    assert measured["object_jump_frame"] == -1
+    (finding,) = findings(measured, [CLIP_MEASURES[4]], DEFAULT_LIMITS)
+    assert finding.reason.startswith("largest sudden step of a joint: 0.8")
+    assert finding.reason.endswith("m at frame 29, above 0.3 m")
+
+
+@pytest.mark.parametrize(("frozen", "expected"), [("hand", (20, 0)), ("all", (0, 20))])
+def test_one_frozen_hand_and_a_frozen_recording_are_told_apart(good, frozen, expected):
+    held = np.clip(np.arange(FRAMES), None, 9)
+    held[29:] = np.arange(29, FRAMES)
+    if frozen == "all":
+        clip = replace(
+            with_object(good, rotvec=good.object.rotvec[held], translation_m=good.object.translation_m[held]),
+            hands={side: _held(track, held) for side, track in good.hands.items()},
+        )
+    else:
+        clip = replace(good, hands={**good.hands, "right": _held(good.hands["right"], held)})
+    measured = row(clip)
+    assert (measured["frozen_hand_frames"], measured["frozen_all_frames"]) == expected
+
+
+def _held(track, held):
+    names = ("wrist_m", "global_orient", "hand_pose")
+    return replace(track, **{name: getattr(track, name)[held] for name in names})
+
+
+def test_late_hands_are_found_with_their_lag(make_clip):
+    clip = make_clip(n_frames=FRAMES, seed=1)
+    seconds = np.arange(FRAMES, dtype=np.float32)[:, None] / 30
+    sway = 0.1 * np.sin(5 * seconds) * np.array([[1, 0.5, 0]], np.float32)
+    late = 0.1 * np.sin(5 * (seconds - 3 / 30)) * np.array([[1, 0.5, 0]], np.float32)
+    still = {"rotvec": np.zeros((FRAMES, 3), np.float32), "translation_m": sway}
+    start = clip.hands["right"].wrist_m[:1] - clip.object.translation_m[:1]
+    orient = clip.hands["right"].global_orient[:1].repeat(FRAMES, axis=0)
+    moved = with_hand(with_object(clip, **still), wrist_m=start + late, global_orient=orient)
+    assert abs(row(moved)["time_offset_frames"] - 3) <= 1
+
+
+def test_penetration_is_not_claimed_where_the_mesh_is_open(good):
+    model = replace(good.object.model, faces=good.object.model.faces[1:])
+    measured = row(with_object(sunken_hand(good), model=model))
+    assert np.isnan(measured["penetration_m"])
+    assert np.isnan(measured["penetration_share"])
+    assert measured["note"] == "penetration not measured: the mesh of box is not solid"
+
+
+def test_penetration_is_the_depth_of_the_deepest_vertex(make_clip):
+    """A wrist at the centre of a box of 10 x 8 x 6 cm: its vertices lie up to 3 cm deep, never deeper."""
+    measured = row(sunken_hand(make_clip(n_frames=6)))
+    assert 0.025 < measured["penetration_m"] <= 0.03
+    assert measured["penetration_share"] == 1
+
+
+def test_penetration_looks_at_every_nth_frame_from_the_first_on(good):
+    wrist = good.hands["right"].wrist_m.copy()
+    wrist[7] = good.object.translation_m[7]
+    clip = with_hand(good, wrist_m=wrist)
+    depths = [row(clip, Thresholds(penetration_every=every))["penetration_m"] for every in (7, 2)]
+    assert depths[0] > 0.02
+    assert depths[1] < 0.01
+
+
+def test_object_measures_are_those_of_its_worst_part(make_clip):
+    model = make_clip(articulated=True).object.model
+    measured = object_row(ObjectFacts.of(replace(model, faces=model.faces[:-1])))
+    assert measured["open_edge_share"] == pytest.approx(3 / 33)
+    assert (measured["parts"], measured["watertight"], measured["solid"]) == (2, False, False)
+    assert measured["size_m"] == pytest.approx(0.1)
+    assert [finding.verdict for finding in findings(measured, MESH_MEASURES, DEFAULT_LIMITS)] == ["warned"]
+
+
+def test_object_as_large_as_a_room_is_left_out():
+    box = trimesh.creation.box((4.0, 1, 1))
+    model = ObjectModel("room", np.asarray(box.vertices), np.asarray(box.faces), np.zeros(8, np.uint8))
+    (finding,) = findings(object_row(ObjectFacts.of(model)), MESH_MEASURES, DEFAULT_LIMITS)
+    assert finding == ("left out", "longest side of the bounding box: 4 m, above 3 m")
+
+
+SIZE = Measure("size", "m", "size")
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "expected"),
+    [
+        (2.0, Limit(1.0, 3.0), "warned"),
+        (4.0, Limit(1.0, 3.0), "left out"),
+        (-4.0, Limit(1.0, 3.0), "left out"),
+        (1.0, Limit(1.0, 3.0), "ok"),
+        (4.0, Limit(1.0, None), "warned"),
+        (4.0, Limit(None, None), "ok"),
+        (float("nan"), Limit(1.0, 3.0), "ok"),
+    ],
+)
+def test_verdict_follows_from_the_limits(value, limit, expected):
+    assert verdict_of(findings({"size": value}, [SIZE], {"size": limit})) == expected
+
+
+def test_reasons_are_those_of_the_verdict():
+    found = [Finding("warned", "a"), Finding("left out", "b"), Finding("left out", "c")]
+    assert reasons_of(found) == "b; c"
+    assert reasons_of(found[:1]) == "a"
+    assert reasons_of([]) == ""
+
+
+def test_limit_of_an_unknown_measure_is_refused():
+    with pytest.raises(BadInput, match="wrist_jerk"):
+        Thresholds(limits={**DEFAULT_LIMITS, "wrist_jerk": Limit(1, 2)})
+    with pytest.raises(BadInput, match="size_m"):
+        Thresholds(limits={name: limit for name, limit in DEFAULT_LIMITS.items() if name != "size_m"})
+    with pytest.raises(BadInput, match="penetration_every"):
+        Thresholds(penetration_every=0)
