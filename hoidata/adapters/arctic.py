@@ -181,8 +181,8 @@ def _found(raw: RawTree, path: str) -> str:
 def _read_descriptions(
     raw: RawTree, where: str, key: SequenceKey
 ) -> tuple[list[Description], list[Clip | Quarantined]]:
-    if key.subject == WITHHELD_SUBJECT or not raw.has(where):
-        _refuse_withheld(raw, key)
+    _refuse_withheld(raw, key)
+    if not raw.has(where):
         remedy = "nothing to do where none was published (espressomachine); else add Text2HOI's description files"
         raise BadInput(where, "a description of the sequence's segments", "no file", remedy)
     described, problems = parse_descriptions(raw.read(where), where)
