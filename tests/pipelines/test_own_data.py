@@ -70,7 +70,8 @@ def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
 
 def test_places_of_two_profiles_never_meet():
     embedded, own = Place("embedded", "grab", "contact"), Place("own", "grab", "contact")
-    for name in ("clips", "annotation", "contact", "checkpoint", "metrics", "report", "manifest", "hand_manifest"):
+    data = ("clips", "annotation", "contact", "splits")
+    for name in (*data, "checkpoint", "metrics", "report", "manifest", "hand_manifest"):
         assert getattr(embedded, name) != getattr(own, name)
 
 
