@@ -5,7 +5,7 @@ import sys
 import typer
 
 from hoidata.errors import HoidataError
-from pipelines.commands import adapters, generate, graph, inspect, raw, share, synth
+from pipelines.commands import adapters, generate, graph, inspect, raw, share, store, synth
 
 app = typer.Typer(
     name="hoidata",
@@ -21,6 +21,8 @@ app.command("repro")(graph.repro)
 app.command("up")(graph.up)
 app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
+app.command("validate")(store.validate)
+app.command("migrate")(store.migrate)
 app.command("lineage")(inspect.lineage)
 app.command("share")(share.share)
 app.command("generate")(generate.generate)

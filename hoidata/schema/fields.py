@@ -86,7 +86,7 @@ def _angles(name: str, rows: str, joints: int, meaning: str, since: Version = (1
 
 
 def _hand(side: str) -> tuple[Field, ...]:
-    betas = Field(f"{side}_betas", "float32", "MANO shape", ("betas row", 10), ("betas row", "component"))
+    betas = Field(f"{side}_betas", "float32", "MANO shape", (f"{side} betas row", 10), ("betas row", "component"))
     return (
         _point(f"{side}_wrist_m", "frame", f"where joint 0 of the {side} hand is; not MANO's transl"),
         _rotvec(f"{side}_global_orient", "frame", f"the {side} hand turns about its wrist joint"),

@@ -1,6 +1,5 @@
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -8,83 +7,10 @@ import pytest
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.schema import SIDES, BodyTrack, CameraTrack, SourceContact, SourceFile
+from hoidata.schema import SIDES
+from hoidata.schema.checking import check_store
 from hoidata.schema.info import generated_info
-from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import open_store, write_store
-
-LEFT_OUT = Quarantined("test/s9/bad_1", "bad_1.npz", "7 columns", "6", "download it again")
-
-
-INFO = generated_info("test")
-
-
-@pytest.fixture
-def clips(make_clip):
-    """Rigid and articulated, invalid frames, betas per frame, a personal template, a second object, no label.
-
-    Camera, body and contact labels in some; some frames without, an empty list of contacts, no expression.
-    """
-    plain = replace(
-        make_clip(seed=1, clip_id="test/s1/a", gravity=None),
-        gravity_note="estimated from nothing",
-        hands_from="keypoints",
-        fit_error_m=0.0042,
-        source_contact=contact(0, 30),
-    )
-    hinged = make_clip(40, "both", articulated=True, seed=2, clip_id="test/s2/b", verb=None)
-    left = hinged.hands["left"]
-    rng = np.random.default_rng(5)
-    valid = left.valid.copy()
-    valid[3:6] = False
-    odd_left = replace(left, valid=valid, betas=rng.normal(size=(40, 10)).astype(np.float32))
-    template = load_embedded_hands().right.template_m.astype(np.float32) * np.float32(1.1)
-    odd_right = replace(hinged.hands["right"], template_m=template)
-    odd = replace(
-        hinged,
-        hands={"left": odd_left, "right": odd_right},
-        other_objects=(plain.cut(0, 30).object, hinged.object),
-        labelled_hand="left",
-        source_frames=np.arange(7, 167, 4, dtype=np.int32),
-        source_from_world=np.diag([10.0, -10.0, 10.0, 1.0]),
-        sources=(SourceFile("s2/b.npz", 12, "ab" * 32), SourceFile("mesh.obj", 3, "cd" * 32)),
-        source_fps=120.0,
-    )
-    moved = replace(hinged.object, translation_m=hinged.object.translation_m + np.float32(0.5))
-    longer = replace(odd, other_objects=(hinged.object, moved))
-    longer = replace(
-        longer,
-        camera=camera(40, np.array([600.0, 600, 320, 240, 640, 480])),
-        body=body(40, True),
-        gravity_note="fitted",
-    )
-    last = make_clip(20, "left", seed=3, clip_id="test/s1/c")
-    return [plain, longer, replace(last, camera=camera(20), body=body(20, False), source_contact=contact(57, 20))]
-
-
-def camera(n_frames: int, intrinsics: np.ndarray | None = None) -> CameraTrack:
-    rng = np.random.default_rng(n_frames)
-    rotvec, position = rng.normal(size=(2, n_frames, 3)).astype(np.float32)
-    return CameraTrack("cam4", rotvec, position, np.arange(n_frames, dtype=np.int32) * 2, intrinsics)
-
-
-def body(n_frames: int, expression: bool) -> BodyTrack:
-    rng = np.random.default_rng(n_frames)
-    arrays = [rng.normal(size=(n_frames, columns)).astype(np.float32) for columns in (3, 3, 63, 9, 10)]
-    return BodyTrack(*arrays[:4], expression=arrays[4] if expression else None)
-
-
-def contact(count: int, n_frames: int) -> SourceContact:
-    rng = np.random.default_rng(count)
-    rows = np.unique(np.stack((rng.integers(0, n_frames, count), rng.integers(0, 8, count)), axis=1), axis=0)
-    frame, vertex = rows.T.astype(np.int32)
-    return SourceContact(frame, vertex, rng.integers(21, 56, len(rows)).astype(np.uint8))
-
-
-@pytest.fixture
-def folder(tmp_path: Path, clips) -> Path:
-    write_store(tmp_path / "clips", [clips[0], LEFT_OUT, *clips[1:]], INFO)
-    return tmp_path / "clips"
 
 
 def assert_equal_values(one, two) -> None:
@@ -134,16 +60,16 @@ def test_joints_are_those_of_the_clip(folder, clips):
             np.testing.assert_array_equal(store.joints(clip.clip_id, side), expected)
 
 
-def test_the_same_clips_give_the_same_bytes(folder, clips, tmp_path):
-    write_store(tmp_path / "again", [clips[0], LEFT_OUT, *clips[1:]], INFO)
+def test_the_same_clips_give_the_same_bytes(folder, clips, left_out, tmp_path):
+    write_store(tmp_path / "again", [clips[0], left_out, *clips[1:]], generated_info("test"))
     for path in sorted(folder.rglob("*.*")):
         assert path.read_bytes() == (tmp_path / "again" / path.relative_to(folder)).read_bytes(), path.name
 
 
-def test_what_is_read_from_a_store_writes_the_same_store(folder, tmp_path):
+def test_what_is_read_from_a_store_writes_the_same_store(folder, left_out, tmp_path):
     store = open_store(folder)
     again = [store.clip(clip_id) for clip_id in store.ids]
-    write_store(tmp_path / "again", [again[0], LEFT_OUT, *again[1:]], INFO)
+    write_store(tmp_path / "again", [again[0], left_out, *again[1:]], generated_info("test"))
     for path in sorted(folder.rglob("*.*")):
         assert path.read_bytes() == (tmp_path / "again" / path.relative_to(folder)).read_bytes(), path.name
 
@@ -158,23 +84,23 @@ def test_plain_numpy_and_pandas_can_read_it(folder, clips):
 def test_many_clips_go_to_several_shards(tmp_path, make_clip, monkeypatch):
     monkeypatch.setattr("hoidata.schema.shards.FRAMES_PER_SHARD", 50)
     clips = [make_clip(30, seed=number, clip_id=f"test/s1/{number}") for number in range(5)]
-    write_store(tmp_path / "clips", clips, INFO)
+    write_store(tmp_path / "clips", clips, generated_info("test"))
     store = open_store(tmp_path / "clips")
     assert store.sequences["shard"].tolist() == [0, 0, 1, 1, 2]
     for clip in clips:
         np.testing.assert_array_equal(store.clip(clip.clip_id).object.rotvec, clip.object.rotvec)
 
 
-def test_the_tables_say_what_was_left_out_and_what_was_read(folder):
+def test_the_tables_say_what_was_left_out_and_what_was_read(folder, left_out):
     store = open_store(folder)
-    assert store.quarantine.to_dict("records") == [vars(LEFT_OUT)]
+    assert store.quarantine.to_dict("records") == [vars(left_out)]
     assert store.files["path"].tolist() == ["s2/b.npz", "mesh.obj"]
     assert store.objects["object"].tolist() == ["box", "hinged_box"]
     assert store.info["counts"] == {"clips": 3, "frames": 90, "objects": 2, "files": 2, "quarantined": 1}
 
 
 def test_an_empty_store_opens_and_has_all_columns(tmp_path, folder):
-    write_store(tmp_path / "empty", [], INFO)
+    write_store(tmp_path / "empty", [], generated_info("test"))
     store = open_store(tmp_path / "empty")
     assert store.ids == []
     assert list(store.sequences.columns) == list(open_store(folder).sequences.columns)
@@ -220,13 +146,13 @@ def test_a_truncated_array_file_is_named(folder):
 def test_a_clip_that_breaks_the_rules_is_refused(tmp_path, clips):
     millimetres = replace(clips[0].object, translation_m=clips[0].object.translation_m * 1000)
     with pytest.raises(BadInput, match="unit"):
-        write_store(tmp_path / "clips", [replace(clips[0], object=millimetres)], INFO)
+        write_store(tmp_path / "clips", [replace(clips[0], object=millimetres)], generated_info("test"))
     assert not (tmp_path / "clips").exists()
 
 
 def test_the_second_clip_of_one_id_is_left_out_and_listed(tmp_path, clips, folder):
     second = replace(clips[2], clip_id=clips[0].clip_id)
-    counts = write_store(tmp_path / "twice", [clips[0], second, *clips[1:]], INFO)
+    counts = write_store(tmp_path / "twice", [clips[0], second, *clips[1:]], generated_info("test"))
     assert counts["clips"] == 3
     store = open_store(tmp_path / "twice")
     np.testing.assert_array_equal(store.clip("test/s1/a").object.rotvec, clips[0].object.rotvec)
@@ -235,6 +161,60 @@ def test_the_second_clip_of_one_id_is_left_out_and_listed(tmp_path, clips, folde
     assert "a second one, frames 0 to 19 of s1/c" in row["got"]
     frames = "arrays/frames-00000.npz"
     assert (tmp_path / "twice" / frames).read_bytes() == (folder / frames).read_bytes()
+
+
+def with_mesh(clip, clip_id, scale):
+    model = replace(clip.object.model, vertices_m=np.array(clip.object.model.vertices_m) * scale)
+    return replace(clip, clip_id=clip_id, object=replace(clip.object, model=model))
+
+
+def test_different_meshes_of_one_name_are_kept_apart_whatever_their_order(tmp_path, clips):
+    small, large = with_mesh(clips[2], "test/s1/small", 1.0), with_mesh(clips[2], "test/s1/large", 1.5)
+    other = clips[1]
+    write_store(tmp_path / "one", [small, large, other], generated_info("test"))
+    write_store(tmp_path / "two", [other, large, small], generated_info("test"))
+    one, two = open_store(tmp_path / "one"), open_store(tmp_path / "two")
+    assert check_store(tmp_path / "one") == []
+    pd.testing.assert_frame_equal(one.objects, two.objects)
+    names = set(one.objects["object"])
+    assert "hinged_box" in names
+    assert {name.split("#")[0] for name in names - {"hinged_box"}} == {"box"}
+    for store in (one, two):
+        for clip in (small, large):
+            found = store.clip(clip.clip_id).object.model
+            assert found.name == f"box#{store.objects.set_index('object').at[found.name, 'digest'][:8]}"
+            np.testing.assert_array_equal(found.vertices_m, clip.object.model.vertices_m)
+    again = [one.clip(clip_id) for clip_id in one.ids]
+    write_store(tmp_path / "again", again, generated_info("test"))
+    assert open_store(tmp_path / "again").objects["object"].tolist() == one.objects["object"].tolist()
+
+
+@pytest.mark.parametrize(
+    "key", ["dataset_version", "frame", "hand_convention", "licence", "may_be_shared", "source_fps", "hand_model"]
+)
+def test_a_store_without_a_required_fact_is_refused_before_anything_is_written(tmp_path, clips, key):
+    info = generated_info("test")
+    with pytest.raises(BadInput, match=f"info.json: {key}"):
+        write_store(tmp_path / "clips", clips, {name: info[name] for name in info if name != key})
+    assert not list(tmp_path.iterdir())
+
+
+def test_facts_of_the_wrong_kind_are_refused(tmp_path):
+    frame = generated_info("test")["frame"]
+    for further in ({"frame": frame | {"handedness": "left"}}, {"may_be_shared": "yes"}, {"source_fps": True}):
+        with pytest.raises(BadInput, match=f"info.json: {next(iter(further))}"):
+            write_store(tmp_path / "clips", [], generated_info("test", **further))
+
+
+def test_many_contact_labels_fill_a_shard(tmp_path, clips, monkeypatch):
+    monkeypatch.setattr("hoidata.schema.shards.CONTACTS_PER_SHARD", 40)
+    touched = [replace(clips[2], clip_id=f"test/s1/{number}") for number in range(3)]
+    assert len(touched[0].source_contact.frame) >= 40
+    write_store(tmp_path / "clips", touched, generated_info("test"))
+    store = open_store(tmp_path / "clips")
+    assert store.sequences["shard"].tolist() == [0, 1, 2]
+    for clip in touched:
+        assert_equal_values(store.clip(clip.clip_id).source_contact, clip.source_contact)
 
 
 def test_a_store_survives_pickling_without_carrying_its_arrays(folder):
