@@ -1,0 +1,109 @@
+import struct
+import time
+
+import numpy as np
+import pytest
+
+from hoidata.objects.ply import parse_ply
+
+HEAD = """ply
+format {} 1.0
+comment by hand
+element vertex {}
+property float x
+property uchar red
+property double y
+property int z
+element face {}
+property uchar flags
+property list uchar {} vertex_indices
+property list ushort float texcoord
+end_header
+"""
+VERTICES = [(0.5, 7, 0.1, 0), (1.0, 7, 0.2, -3), (0.0, 7, 1e-9, 2), (0.25, 7, 5.0, 1), (0.75, 7, 0.0, 4)]
+FACES = [(0, 1, 2), (2, 1, 3), (4, 0, 1, 2), (0, 1, 2, 3, 4), (3, 2, 1)]
+FANS = [[0, 1, 2], [2, 1, 3], [4, 0, 1], [4, 1, 2], [0, 1, 2], [0, 2, 3], [0, 3, 4], [3, 2, 1]]
+
+
+def text(n_vertices=5, n_faces=5) -> bytes:
+    rows = [" ".join(map(str, row)) for row in VERTICES]
+    rows += [" ".join(map(str, (1, len(face), *face, 2, 0.5, 0.25))) for face in FACES]
+    return (HEAD.format("ascii", n_vertices, n_faces, "int") + "\n".join(rows) + "\n").encode()
+
+
+def binary(order="<", n_vertices=5, n_faces=5, corner="uint") -> bytes:
+    name = {"<": "binary_little_endian", ">": "binary_big_endian"}[order]
+    letter = {"uint": "I", "short": "h", "uchar": "B", "float": "f"}[corner]
+    body = b"".join(struct.pack(f"{order}fBdi", *row) for row in VERTICES)
+    for face in FACES:
+        body += struct.pack(f"{order}BB{len(face)}{letter}Hff", 1, len(face), *face, 2, 0.5, 0.25)
+    return HEAD.format(name, n_vertices, n_faces, corner).encode() + body
+
+
+FILES = {"text": text(), "little": binary("<"), "big": binary(">", corner="short"), "bytes": binary(corner="uchar")}
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_mixed_polygons_among_other_properties_are_read_as_stored_and_become_fans(kind):
+    vertices, faces = parse_ply(FILES[kind])
+    expected = np.array([[x, y, z] for x, _, y, z in VERTICES])
+    np.testing.assert_array_equal(vertices, expected)
+    assert faces.tolist() == FANS
+    assert (vertices.dtype, faces.dtype) == (np.float64, np.int64)
+
+
+@pytest.mark.parametrize("kind", FILES)
+def test_every_shorter_file_is_refused(kind):
+    data = FILES[kind]
+    for length in range(len(data) - 12):
+        with pytest.raises(ValueError, match=r"."):
+            parse_ply(data[:length])
+
+
+@pytest.mark.parametrize(
+    "data",
+    [text(n_vertices=10**9), text(n_faces=10**9), binary(n_vertices=10**9), binary(n_faces=10**10)],
+    ids=["text vertices", "text faces", "vertices", "faces"],
+)
+def test_a_billion_declared_rows_are_refused_at_once(data):
+    start = time.perf_counter()
+    with pytest.raises(ValueError, match="ends within"):
+        parse_ply(data)
+    assert time.perf_counter() - start < 0.5
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"ply\n", b"plx\n"),
+        (b"end_header", b"end_heade"),
+        (b"format ascii", b"format other"),
+        (b"element vertex 5", b"element vertex -5"),
+        (b"element vertex", b"element point"),
+        (b"element face", b"element vertex"),
+        (b"property float x", b"property float w"),
+        (b"property float x", b"property list uchar float x"),
+        (b"property float x", b"property huge x"),
+        (b"vertex_indices", b"corners"),
+        (b"1 3 0 1 2", b"1 3 0 1 1.5"),
+        (b"1 3 0 1 2", b"1 3 0 1 nan"),
+        (b"1 3 0 1 2", b"1 2 0 1"),
+        (b"1 3 0 1 2", b"1 -3 0 1 2"),
+        (b"0.5 7", b"half 7"),
+        (b"0.5 7", b"0." + b"5" * 100 + b" 7"),
+    ],
+    ids=range(16),
+)
+def test_headers_and_rows_that_make_no_mesh_are_refused(old, new):
+    assert old in FILES["text"]
+    with pytest.raises(ValueError, match=r"."):
+        parse_ply(FILES["text"].replace(old, new, 1))
+
+
+def test_triangles_and_quads_by_turns_take_linear_time():
+    rows = b"".join(struct.pack(f"<B{3 + i % 2}i", 3 + i % 2, *range(3 + i % 2)) for i in range(20_000))
+    head = b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+    head += b"property float z\nelement face 20000\nproperty list uchar int vertex_index\nend_header\n"
+    start = time.perf_counter()
+    assert len(parse_ply(head + bytes(48) + rows)[1]) == 30_000
+    assert time.perf_counter() - start < 3
