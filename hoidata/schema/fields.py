@@ -288,7 +288,7 @@ QUARANTINE = StoreFile(
 
 INFO = StoreFile(
     "meta/info.json",
-    "facts of the whole store; a dot means a key inside; further keys are free",
+    "facts of the whole store; a dot means a key inside; further keys are free, conversions add some",
     "keys by name",
     (
         Field("schema_version", "string", "major.minor.patch"),

@@ -1,4 +1,4 @@
-"""A store written by the code of schema 1.0.0 (commit f4768a6: two boxes, random poses) is read and brought up to date."""
+"""A store written by the code of schema 1.0.0 (commit f4768a6: boxes, random poses) is read and brought up to date."""
 
 import json
 import shutil
