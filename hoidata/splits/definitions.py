@@ -10,6 +10,7 @@ import orjson
 
 from hoidata.errors import BadInput
 from hoidata.splits.leaks import PROMISES, Promise
+from hoidata.splits.published import published
 from hoidata.splits.rules import KINDS, SplitRule
 
 FOLDER = Path(__file__).with_name("definitions")
@@ -61,7 +62,7 @@ def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
     where, known = f"params.yaml: split.{dataset}", definitions_for(dataset)
     names = ", ".join(known) or "none for this dataset"
     if isinstance(wanted, Mapping):
-        return _own(where, wanted)
+        return _own(where, dataset, wanted)
     if wanted not in known:
         got = "nothing" if wanted is None else repr(wanted)
         remedy = "correct it, or write a rule: {by: subject, train: rest, validation: [s9], test: [s10]}"
@@ -69,8 +70,14 @@ def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
     return known[wanted]
 
 
-def _own(where: str, values: Mapping[str, Any]) -> Definition:
-    return Definition(OWN, 0, OWN_SOURCE, *_rule_and_promises(where, values))
+def _own(where: str, dataset: str, values: Mapping[str, Any]) -> Definition:
+    rule, promises = _rule_and_promises(where, values)
+    motion_files = published(dataset).motion_files
+    if not motion_files and "file" in values.get("promises", ()):
+        remedy = f"take it out: which raw files of {dataset} hold motion is not known here"
+        raise BadInput(f"{where}.promises", "promises that can be checked", "file", remedy)
+    checked: list[Promise] = [promise for promise in promises if promise != "file" or motion_files]
+    return Definition(OWN, 0, OWN_SOURCE, rule, tuple(checked))
 
 
 def _rule_and_promises(where: str, values: Mapping[str, Any]) -> tuple[SplitRule, tuple[Promise, ...]]:

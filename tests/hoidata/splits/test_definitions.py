@@ -164,10 +164,19 @@ def test_an_unknown_name_lists_the_splits_of_that_dataset():
 
 
 def test_a_rule_of_the_users_own_needs_no_name():
-    own = choose("mydata", {"by": "subject", "train": "rest", "test": ["p7"]})
-    assert own.rule.as_json() == {"by": "subject", "train": "rest", "validation": [], "test": ["p7"]}
+    values = {"by": "subject", "train": "rest", "test": ["p7"]}
+    own = choose("grab", values)
+    assert own.rule.as_json() == {**values, "validation": []}
     assert own.promises == ("subject", "sequence", "file")
     assert choose("h2o", {"by": "rounds", "promises": ["subject"]}).promises == ("subject",)
+
+
+def test_no_promise_is_made_that_cannot_be_checked():
+    """Which raw files of an unknown dataset hold motion, and which are meshes that all may share, is not known."""
+    values = {"by": "subject", "train": "rest", "test": ["p7"]}
+    assert choose("mydata", values).promises == ("subject", "sequence")
+    with pytest.raises(BadInput, match="promises that can be checked, got file"):
+        choose("mydata", values | {"promises": ["file"]})
 
 
 @pytest.mark.parametrize(
