@@ -159,12 +159,14 @@ def test_a_store_without_annotated_clips_has_an_empty_split(clips, tmp_path):
 
 
 def test_how_complete_a_dataset_is_is_told_where_its_makers_list_the_sequences(make_clip, tmp_path):
-    clip = replace(make_clip(clip_id="arctic/s01/box_use_01/0001-0030"), sequence="s01/box_use_01")
-    write_store(tmp_path / "clips", [clip], generated_info("arctic"))
+    names = ("s01/box_use_01", "s01/box_use_02", "s01/of_my_own")
+    clips = [replace(make_clip(seed=seed, clip_id=f"arctic/{name}"), sequence=name) for seed, name in enumerate(names)]
+    write_store(tmp_path / "clips", clips, generated_info("arctic"))
     (tmp_path / "annotation").mkdir()
-    table = pd.DataFrame({"clip_id": [clip.clip_id], "min_left_m": [0.1], "min_right_m": [0.1]})
+    nearest = [0.1] * len(clips)
+    table = pd.DataFrame({"clip_id": [clip.clip_id for clip in clips], "min_left_m": nearest, "min_right_m": nearest})
     for name in ("hand_type", "text"):
         table.to_parquet(tmp_path / "annotation" / f"{name}.parquet")
     split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "splits", "bimart")
     told = json.loads((tmp_path / "splits" / "info.json").read_text())["published"]
-    assert (told["sequences"], told["usable"], told["with_clips"]) == (339, 301, 1)
+    assert (told["sequences"], told["usable"], told["with_clips"]) == (339, 301, 2)
