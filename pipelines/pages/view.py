@@ -7,7 +7,7 @@ import numpy as np
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.model import articulate, place
-from hoidata.schema.clip import FPS, Clip
+from hoidata.schema.clip import FPS, Clip, ObjectTrack
 from pipelines.pages.glb import upright_rotation
 from pipelines.pages.surface import ContactPaint
 
@@ -33,16 +33,18 @@ class View:
 def view_of(clip: Clip, hands: HandPair) -> View:
     """A camera that sees the whole motion of the object and of the hands that come near it, from the side.
 
-    The ground lies under the lowest point of the object and of all hands.
+    The ground lies under the lowest point of all objects (a table too) and of all hands.
     """
     upright = upright_rotation(clip.gravity).as_matrix()
-    object_points = _object_points(clip) @ upright.T
+    object_points = _object_points(clip.object) @ upright.T
+    others = [_object_points(track) @ upright.T for track in clip.other_objects]
     everyone = [(valid, joints @ upright.T) for valid, joints in _hand_joints(clip, hands)]
     hand_points = [joints[valid] for valid, joints in everyone if _comes_near(joints, valid, object_points)]
     shown = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
     centre = (shown.min(axis=0) + shown.max(axis=0)) / 2
     radius = float(np.linalg.norm(shown - centre, axis=1).max()) + _HAND_MARGIN_M
-    lowest = min(object_points[..., 1].min(), *(joints[valid, :, 1].min() for valid, joints in everyone), np.inf)
+    things = [points[..., 1].min() for points in (object_points, *others)]
+    lowest = min(*things, *(joints[valid, :, 1].min() for valid, joints in everyone), np.inf)
     return View(
         centre=_rounded(centre),
         radius_m=round(radius, 4),
@@ -55,7 +57,7 @@ def view_of(clip: Clip, hands: HandPair) -> View:
 
 def still_view(clip: Clip, look_from: np.ndarray) -> View:
     """A camera that sees the object of a one-frame clip from ``look_from`` (3,), at least a little from above."""
-    points = _object_points(clip)[0] @ upright_rotation(clip.gravity).as_matrix().T
+    points = _object_points(clip.object)[0] @ upright_rotation(clip.gravity).as_matrix().T
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     return View(
         centre=_rounded(centre),
@@ -75,9 +77,9 @@ def touched_side(clip: Clip, paint: ContactPaint) -> np.ndarray:
     return direction / np.linalg.norm(direction)
 
 
-def _object_points(clip: Clip) -> np.ndarray:
-    """(frame, point, 3) world points of the object, thinned evenly."""
-    model, track = clip.object.model, clip.object
+def _object_points(track: ObjectTrack) -> np.ndarray:
+    """(frame, point, 3) world points of an object, thinned evenly."""
+    model = track.model
     step = max(1, len(model.vertices_m) // _POINTS_FOR_VIEW)
     local = articulate(model.vertices_m[::step], model.part[::step], model.hinge, track.hinge_rad)
     return place(local, track.rotvec, track.translation_m)

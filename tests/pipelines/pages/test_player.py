@@ -6,6 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hoidata.objects.model import ObjectModel
+from hoidata.schema.clip import ObjectTrack
 from pipelines.pages.player import motion_player, three_javascript, write_motion_page
 from pipelines.pages.view import view_of
 
@@ -63,6 +65,16 @@ def test_idle_hand_far_away_does_not_widen_the_view(hands, page_clip):
     far = replace(clip.hands["left"], wrist_m=clip.hands["left"].wrist_m - (3.0, 0.0, 0.0))
     idle = replace(clip, hands={"left": far, "right": clip.hands["right"]})
     assert view_of(idle, hands).radius_m == view_of(page_clip(), hands).radius_m
+
+
+def test_the_ground_lies_under_a_table_which_does_not_widen_the_view(hands, page_clip):
+    clip = page_clip()
+    slab = np.array([[-0.5, -0.4, 0.0], [0.5, -0.4, 0.0], [0.5, 0.4, 0.0], [-0.5, 0.4, -0.3]])
+    model = ObjectModel("table", slab, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(4, np.uint8))
+    still = np.zeros((clip.n_frames, 3), np.float32)
+    with_table = view_of(replace(clip, other_objects=(ObjectTrack(model, still, still),)), hands)
+    assert with_table.ground_m == pytest.approx(-0.3)
+    assert replace(with_table, ground_m=None) == replace(view_of(clip, hands), ground_m=None)
 
 
 @pytest.mark.slow
