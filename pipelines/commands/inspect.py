@@ -7,6 +7,8 @@ import typer
 
 from pipelines.commands.project import enter_project
 
+SHOWN_ROWS = 12
+
 
 def doctor() -> None:
     """Say what is installed and which raw folders, hand, encoder and GPU were found; exit code 1 if one is broken."""
@@ -28,26 +30,41 @@ def doctor() -> None:
 
 def info(
     store: Annotated[Path, typer.Argument(help="A store of clips.", exists=True, file_okay=False, resolve_path=True)],
+    everything: Annotated[bool, typer.Option("--all", help="List all objects, verbs and what was left out.")] = False,
 ) -> None:
-    """Describe a store: its clips, frames, objects, and what was left out and why."""
+    """Describe a store: clips by object and verb, conventions, licence, and what was left out and why."""
     from rich.console import Console
-    from rich.table import Table
 
     from hoidata.schema.store import open_store
+    from pipelines.commands.store_facts import fact_rows, group_rows, left_out_rows
     from pipelines.stages.base import empty_reason
 
     if reason := empty_reason(store):
         typer.echo(f"{store}: empty, {reason}")
         return
     opened, console = open_store(store), Console()
-    table = Table("what", "value")
-    for key, value in opened.info.items():
-        table.add_row(str(key), str(value))
-    for key in ("sequences", "objects", "files", "quarantine"):
-        table.add_row(f"{key} (rows)", str(len(getattr(opened, key))))
+    shown = None if everything else SHOWN_ROWS
+    _print_rows(console, ("what", "value"), fact_rows(opened), None)
+    for column in ("object", "verb"):
+        _print_rows(console, (column, "clips", "frames"), group_rows(opened, column), shown)
+    _print_rows(console, ("left out", "where", "expected", "got"), left_out_rows(opened), shown)
+
+
+def _print_rows(console, heads: tuple[str, ...], rows: list[tuple[str, ...]], shown: int | None) -> None:
+    """A table with at most ``shown`` rows; says how many more there are."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    if not rows:
+        return
+    table = Table()
+    for head in heads:
+        table.add_column(head, justify="right" if head in ("clips", "frames") else "left", overflow="fold")
+    for row in rows[:shown]:
+        table.add_row(*map(escape, row))
     console.print(table)
-    for row in opened.quarantine.to_dict("records"):
-        console.print(f"left out {row['source_key']}: {row['where']}: expected {row['expected']}, got {row['got']}")
+    if shown is not None and len(rows) > shown:
+        console.print(f"and {len(rows) - shown:,} more (--all lists them)")
 
 
 def lineage(
