@@ -26,7 +26,7 @@ N_FRAMES = 40
 IS_WORKER = __name__ == "__mp_main__"  # how a spawned process names the program it belongs to
 
 
-def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES) -> None:
+def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES, fps: int = 120) -> None:
     """Sequences of two subjects and two objects in GRAB's format, in turn; the touch begins at frame 12."""
     meshes = root / "tools" / "meshes"
     meshes.mkdir(parents=True)
@@ -38,10 +38,10 @@ def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES) ->
         corners = f"v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nv 0 0 {size}\n"
         (meshes / f"{name}.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
     for number in range(n_sequences):
-        write_sequence(root, number, n_frames)
+        write_sequence(root, number, n_frames, fps)
 
 
-def write_sequence(root: Path, number: int, n_frames: int) -> None:
+def write_sequence(root: Path, number: int, n_frames: int, fps: int) -> None:
     rng, mesh = np.random.default_rng(number), ("mug", "bowl")[number % 2]
     path = root / "grab" / f"s{number % 2 + 1}" / f"{mesh}_lift_{number:03d}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -55,7 +55,7 @@ def write_sequence(root: Path, number: int, n_frames: int) -> None:
     touched = np.arange(n_frames) >= 12
     blocks["contact"] = {"object": np.repeat(touched[:, None], 4, axis=1).astype(np.int8)}
     objects = {key: np.array(block, dtype=object) for key, block in blocks.items()}
-    np.savez(path, obj_name=mesh, motion_intent="lift", framerate=120, n_frames=n_frames, **objects)
+    np.savez(path, obj_name=mesh, motion_intent="lift", framerate=fps, n_frames=n_frames, **objects)
 
 
 @dataclass(frozen=True)

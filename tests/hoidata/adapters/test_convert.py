@@ -1,9 +1,11 @@
 """A whole dataset: order, workers, bad sequences, manifests, absent data."""
 
 import hashlib
+import os
 import pickle
+import re
 import shutil
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 
 import numpy as np
@@ -89,14 +91,68 @@ def test_a_bad_sequence_is_left_out_with_its_reason_and_the_others_go_on(root, h
     assert (row["source_key"], row["where"]) == ("grab/s1/mug_lift", "grab/s1/mug_lift.npz")
 
 
+def values_of(value) -> object:
+    """Every number of a clip as bytes with its type and shape, whatever dataclasses it lies in."""
+    if is_dataclass(value):
+        return [(item.name, values_of(getattr(value, item.name))) for item in fields(value)]
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, dict):
+        return [(key, values_of(item)) for key, item in value.items()]
+    return [values_of(item) for item in value] if isinstance(value, tuple) else value
+
+
+# Where a clip's rows lie in the arrays, and the numbers of its files, follow from what else is in the store.
+PLACES = re.compile(r"shard|.*_row|source_files|.*_first|.*_start|.*_template")
+
+
+def rows_of(store) -> dict[str, str]:
+    columns = [name for name in store.sequences.columns if not PLACES.fullmatch(name)]
+    assert {"n_frames", "object", "verb", "gravity", "source_fps"} <= set(columns)
+    rows = store.sequences[columns].to_dict("records")
+    return {row["clip_id"]: repr([np.asarray(value).tolist() for value in row.values()]) for row in rows}
+
+
 def test_a_clip_is_the_same_whatever_else_there_is(root, hands, tmp_path):
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "all", progress=False)
-    shutil.rmtree(root / "grab" / "s1")
+    (root / "grab" / "s1" / "mug_drink_1.npz").unlink()
+    (root / "grab" / "s1" / "note.txt").write_text("not a sequence")
     convert_dataset(GrabAdapter(), root, hands, tmp_path / "part", progress=False)
     whole, part = open_store(tmp_path / "all"), open_store(tmp_path / "part")
-    assert part.ids == ["grab/s2/mug_pass_1"]
-    for side in ("left", "right"):
-        np.testing.assert_array_equal(part.joints(part.ids[0], side), whole.joints(part.ids[0], side))
+    assert part.ids == ["grab/s1/mug_lift", "grab/s2/mug_pass_1"]
+    assert rows_of(part) == {clip_id: row for clip_id, row in rows_of(whole).items() if clip_id in part.ids}
+    for clip_id in part.ids:
+        assert values_of(part.clip(clip_id)) == values_of(whole.clip(clip_id))
+        for side in ("left", "right"):
+            np.testing.assert_array_equal(part.joints(clip_id, side), whole.joints(clip_id, side))
+
+
+def test_the_order_in_which_the_system_lists_files_changes_no_byte(root, hands, tmp_path, monkeypatch):
+    convert_dataset(GrabAdapter(), root, hands, tmp_path / "one", progress=False)
+    listdir, scandir = os.listdir, os.scandir
+    listed = []
+
+    class Shuffled:
+        def __init__(self, path) -> None:
+            with scandir(path) as items:
+                self.items = sorted(items, key=lambda item: hashlib.sha256(item.name.encode()).digest())
+            listed.append(path)
+
+        def __enter__(self):
+            return iter(self.items)
+
+        def __exit__(self, *_) -> None:
+            pass
+
+        def __iter__(self):
+            return iter(self.items)
+
+    monkeypatch.setattr(os, "scandir", Shuffled)
+    monkeypatch.setattr(os, "listdir", lambda path=".": sorted(listdir(path), reverse=True))
+    convert_dataset(GrabAdapter(), root, hands, tmp_path / "two", progress=False)
+    monkeypatch.undo()
+    assert listed
+    assert digests(tmp_path / "one") == digests(tmp_path / "two")
 
 
 @dataclass(frozen=True)

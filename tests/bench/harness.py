@@ -1,0 +1,87 @@
+"""What the benchmarks share: alternating runs with medians, the memory of a process tree, a table."""
+
+import statistics
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from rich.console import Console
+from rich.table import Table
+
+RUNS = 5
+
+
+def medians(variants: Mapping[str, Callable[[], object]], runs: int = RUNS) -> dict[str, float]:
+    """Median seconds of each variant; they take turns, after one round that warms up and is not counted."""
+    times: dict[str, list[float]] = {name: [] for name in variants}
+    for run in range(runs + 1):
+        for name, work in variants.items():
+            start = time.perf_counter()
+            work()
+            if run:
+                times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """One table, the first column left-aligned, the others right-aligned."""
+    table = Table(title=title, title_justify="left")
+    for number, name in enumerate(columns):
+        table.add_column(name, justify="right" if number else "left")
+    for row in rows:
+        table.add_row(*row)
+    Console().print(table)
+
+
+class TreeMemory:
+    """Peak memory of a process and all below it, while the block runs, from /proc (Linux).
+
+    peak_at_once: the largest sum of resident memory seen at one moment (sampled 50 times a second). sum_of_peaks:
+    every process's own highest mark (VmHWM) added up, an upper bound of it. Pages processes share count for each.
+    """
+
+    def __init__(self, root: int) -> None:
+        self.root = root
+        self.peak_at_once = 0
+        self.peaks: dict[int, int] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> "TreeMemory":
+        self._thread.start()
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    @property
+    def sum_of_peaks(self) -> int:
+        return sum(self.peaks.values())
+
+    def _watch(self) -> None:
+        while not self._stop.wait(0.02):
+            now = {pid: _memory(pid) for pid in _tree(self.root)}
+            self.peak_at_once = max(self.peak_at_once, sum(resident for resident, _ in now.values()))
+            for pid, (_, highest) in now.items():
+                self.peaks[pid] = max(self.peaks.get(pid, 0), highest)
+
+
+def _tree(pid: int) -> list[int]:
+    try:
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    except OSError:
+        return []
+    return [pid, *(below for child in children for below in _tree(int(child)))]
+
+
+def _memory(pid: int) -> tuple[int, int]:
+    """Bytes resident now, and at most so far; none for a process that has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0, 0
+    found = {line.split(":")[0]: line.split()[1] for line in lines if line.startswith(("VmRSS", "VmHWM"))}
+    return int(found.get("VmRSS", 0)) * 1024, int(found.get("VmHWM", 0)) * 1024

@@ -1,0 +1,203 @@
+"""A corpus of the papers' size: time, memory and bytes of conversion, annotation and contact, and how they grow.
+
+``python -m tests.bench.scale [SHARE ...]`` (1 and 0.1 when none is given). The raw files are the embedded corpora's,
+repeated (see ``corpus``); nothing is read from a manifest. Each stage runs in processes of its own, so that its memory
+can be told apart; conversion on two workers, the others on one process, as the graph runs them.
+"""
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from hoidata.schema.mapped import map_npz
+from hoidata.schema.store import open_store
+from tests.bench.corpus import PAPER, embedded, replicate
+from tests.bench.harness import TreeMemory, show
+
+MEBI = 1 << 20
+PARTS = ("clips", "annotation", "contact")
+# What a clip's motion is made of; all else in the arrays is what a source offers besides (contact labels, cameras).
+PARAMETERS = (
+    *(f"{side}_{name}" for side in ("left", "right") for name in ("wrist_m", "global_orient", "hand_pose", "valid")),
+    *("left_betas", "right_betas", "source_frames", "object_rotvec", "object_translation_m", "object_hinge_rad"),
+)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """One stage over all datasets. processor_s counts all processes; the two peaks are those of ``TreeMemory``."""
+
+    wall_s: float
+    processor_s: float
+    peak_at_once: int
+    sum_of_peaks: int
+
+
+def convert(name: str, raw: Path, out: Path) -> None:
+    from hoidata.adapters import get_adapter
+    from hoidata.adapters.convert import convert_dataset
+    from hoidata.hands import load_embedded_hands
+
+    convert_dataset(get_adapter(name), raw / name, load_embedded_hands(), out / name / "clips", 2, synthetic=True)
+
+
+def annotate(name: str, raw: Path, out: Path) -> None:
+    from hoidata.annotation.stage import annotate_store
+
+    print(annotate_store(out / name / "clips", out / name / "annotation", encoder="hash"))
+
+
+def contact(name: str, raw: Path, out: Path) -> None:
+    from hoidata.contact.stage import contact_store
+
+    print(contact_store(out / name / "clips", out / name / "contact"))
+
+
+STAGES: dict[str, Callable[[str, Path, Path], None]] = {"convert": convert, "annotate": annotate, "contact": contact}
+
+
+def measured(stage: str, name: str, raw: Path, out: Path) -> Measured:
+    """Run one stage of one dataset in a process of its own."""
+    command = [sys.executable, "-m", "tests.bench.scale", "--stage", stage, name, str(raw), str(out)]
+    before, start = os.times(), time.perf_counter()
+    process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=sys.stderr)
+    with TreeMemory(process.pid) as memory:
+        code = process.wait()
+    if code:
+        raise RuntimeError(f"{stage} of {name} ended with exit code {code}")
+    wall, after = time.perf_counter() - start, os.times()
+    processor = after.children_user + after.children_system - before.children_user - before.children_system
+    found = Measured(wall, processor, memory.peak_at_once, memory.sum_of_peaks)
+    print(f"{stage} of {name}: {found}", file=sys.stderr)
+    return found
+
+
+def total(parts: list[Measured]) -> Measured:
+    """Datasets run one after another: times add up, peaks do not."""
+    return Measured(
+        sum(part.wall_s for part in parts),
+        sum(part.processor_s for part in parts),
+        max(part.peak_at_once for part in parts),
+        max(part.sum_of_peaks for part in parts),
+    )
+
+
+def run_share(source: Path, folder: Path, share: float, stages: tuple[str, ...] = tuple(STAGES)) -> dict:
+    """Make, convert, annotate and measure one corpus below ``folder``; figures as JSON values."""
+    raw, out = folder / "raw", folder / "out"
+    start = time.perf_counter()
+    wanted = replicate(source, raw, share)
+    made_s = time.perf_counter() - start
+    found = {stage: total([measured(stage, name, raw, out) for name in PAPER]) for stage in stages}
+    stores = {name: open_store(out / name / "clips") for name in PAPER}
+    clips = {name: len(store) for name, store in stores.items()}
+    if clips != wanted:
+        raise AssertionError(f"{clips} clips, wanted {wanted}")
+    frames = sum(int(store.sequences["n_frames"].sum()) for store in stores.values())
+    return {
+        "share": share,
+        "made_s": made_s,
+        "clips": sum(clips.values()),
+        "sequences": sum(store.sequences["sequence"].nunique() for store in stores.values()),
+        "frames": frames,
+        "parameter_bytes": sum(parameter_bytes(store.folder) for store in stores.values()),
+        "bytes": {
+            part: sum(folder_bytes(out / name / part) for name in PAPER) for part in ("clips", "annotation", "contact")
+        },
+        "stages": {stage: asdict(value) for stage, value in found.items()},
+    }
+
+
+def parameter_bytes(store: Path) -> int:
+    """Bytes of the arrays a clip's motion is made of."""
+    shards = sorted((store / "arrays").glob("frames-*.npz"))
+    return sum(array.nbytes for path in shards for name, array in map_npz(path).items() if name in PARAMETERS)
+
+
+def folder_bytes(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
+
+
+def report(figures: list[dict]) -> None:
+    rows = []
+    for name, line in LINES.items():
+        rows.append((name, *(line(figure) for figure in figures), *_growth(name, figures)))
+    columns = ["", *(f"share {figure['share']:g}" for figure in figures)]
+    show("Paper scale", [*columns, "per frame, first : last"] if len(figures) > 1 else columns, rows)
+
+
+def _growth(name: str, figures: list[dict]) -> tuple[str, ...]:
+    """How a figure per frame differs between the first share and the last: 1.0 is linear growth."""
+    if len(figures) < 2:
+        return ()
+    if name not in GROWING:
+        return ("",)
+    first, last = (GROWING[name](figure) / figure["frames"] for figure in (figures[0], figures[-1]))
+    return (f"{first / last:.2f}",)
+
+
+def _stage(stage: str, key: str) -> Callable[[dict], float]:
+    return lambda figure: figure["stages"][stage][key]
+
+
+def _seconds(stage: str) -> Callable[[dict], str]:
+    return lambda figure: f"{_stage(stage, 'wall_s')(figure):.1f} / {_stage(stage, 'processor_s')(figure):.1f} s"
+
+
+def _peak(stage: str) -> Callable[[dict], str]:
+    return lambda figure: (
+        f"{_stage(stage, 'peak_at_once')(figure) / MEBI:.0f} / {_stage(stage, 'sum_of_peaks')(figure) / MEBI:.0f} MiB"
+    )
+
+
+def _mebibytes(size: Callable[[dict], float]) -> Callable[[dict], str]:
+    return lambda figure: f"{size(figure) / MEBI:,.1f} MiB"
+
+
+GROWING: dict[str, Callable[[dict], float]] = {
+    **{f"{stage}: wall / processor": _stage(stage, "wall_s") for stage in STAGES},
+    "bytes of parameters": lambda figure: figure["parameter_bytes"],
+    **{
+        f"bytes of {part}": lambda figure, part=part: figure["bytes"][part]
+        for part in ("clips", "annotation", "contact")
+    },
+    "bytes of all": lambda figure: sum(figure["bytes"].values()),
+}
+LINES: dict[str, Callable[[dict], str]] = {
+    "clips / sequences": lambda figure: f"{figure['clips']:,} / {figure['sequences']:,}",
+    "frames": lambda figure: f"{figure['frames']:,}",
+    "making the raw folder (links)": lambda figure: f"{figure['made_s']:.1f} s",
+    **{f"{stage}: wall / processor": _seconds(stage) for stage in STAGES},
+    "convert: frames per second": lambda figure: f"{figure['frames'] / _stage('convert', 'wall_s')(figure):,.0f}",
+    **{f"{stage}: peak at once / sum of peaks": _peak(stage) for stage in STAGES},
+    "parameters per frame": lambda figure: f"{figure['parameter_bytes'] / figure['frames']:.1f} bytes",
+    **{
+        name: lambda figure, size=size: f"{size(figure) / MEBI:,.1f} MiB"
+        for name, size in GROWING.items()
+        if "bytes" in name
+    },
+    "all per frame": lambda figure: f"{sum(figure['bytes'].values()) / figure['frames']:.1f} bytes",
+}
+
+
+def main(shares: tuple[float, ...] = (1.0, 0.1), source: Path | None = None) -> None:
+    """Measure each share, one after another, and show them side by side."""
+    with tempfile.TemporaryDirectory(prefix="hoidata-bench-scale-") as folder:
+        corpora = embedded(source or Path(folder) / "embedded")
+        figures = [run_share(corpora, Path(folder) / f"share-{share:g}", share) for share in shares]
+    report(figures)
+    print(json.dumps(figures))
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--stage"]:
+        STAGES[sys.argv[2]](sys.argv[3], Path(sys.argv[4]), Path(sys.argv[5]))
+    else:
+        given = os.environ.get("HOIDATA_BENCH_CORPORA")
+        main(tuple(map(float, sys.argv[1:])) or (1.0, 0.1), Path(given) if given else None)
