@@ -58,7 +58,7 @@ class _Object(NamedTuple):
 
 
 class _Sequence(NamedTuple):
-    """Everything the clips of one sequence share. sources: the files behind all of them, meshes apart."""
+    """What the clips of one sequence share. sources: every file behind them; gravity depends on all the meshes."""
 
     key: SequenceKey
     frames: SequenceFrames
