@@ -190,6 +190,14 @@ def test_a_folder_of_another_conversion_is_refused(root: Path, tmp_path: Path) -
         load_annotated(tmp_path)
 
 
+def test_a_split_of_another_conversion_is_refused(root: Path, tmp_path: Path) -> None:
+    other = write_all(tmp_path / "other", clips()[:2])
+    for folder, source in (("clips", root), ("annotation", root), ("contact", root), ("splits", other)):
+        (tmp_path / folder).symlink_to(source / folder)
+    with pytest.raises(BadInput, match=r"splits: expected the 4 clips.*got 2.*run its stage again"):
+        load_annotated(tmp_path)
+
+
 def test_a_missing_stage_is_named(root: Path, tmp_path: Path) -> None:
     for folder, stage in (("clips", "annotate"), ("annotation", "contact"), ("contact", "split")):
         (tmp_path / folder).mkdir()
