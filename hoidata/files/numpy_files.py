@@ -74,6 +74,8 @@ def _chosen_members(
     path: str | Path, archive: zipfile.ZipFile, members: Collection[str] | None
 ) -> dict[str, zipfile.ZipInfo]:
     infos = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+    if len(infos) != len(archive.infolist()):
+        raise BadInput(path, "each member once", "one of them twice")
     if len(infos) > _MAX_MEMBERS:
         raise BadInput(path, f"at most {_MAX_MEMBERS} members", str(len(infos)))
     if members is not None:

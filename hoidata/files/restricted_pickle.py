@@ -19,6 +19,7 @@ from hoidata.files.npy_header import check_text, plain_dtype
 from hoidata.files.pickle_check import check_opcodes
 
 MAX_BYTES = 2 << 30
+_PIECE_BYTES = 1 << 20
 Allow = Mapping[tuple[str, str], Any]
 
 _REMEDY = "download it again from the dataset's own site; it is not opened otherwise, because it could run code"
@@ -36,7 +37,7 @@ def restricted_load(
     allow: (module, name) -> what stands for it; ``ARRAYS`` covers arrays in containers. encoding: "latin1" for files
     written by Python 2. Raises BadInput for anything malformed, oversized or not allowed.
     """
-    data = source if isinstance(source, bytes) else source.read(max_bytes + 1)
+    data = source if isinstance(source, bytes) else read_at_most(source, max_bytes + 1)
     if len(data) > max_bytes:
         raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
     try:
@@ -47,6 +48,15 @@ def restricted_load(
     except Exception as error:  # a malformed pickle can raise anything
         text = f"{type(error).__name__}: {error}"
         raise BadInput(where, "a pickle of arrays, containers, numbers and strings", text, _REMEDY) from None
+
+
+def read_at_most(stream: BinaryIO, size: int) -> bytes:
+    """As ``stream.read(size)``, which allocates ``size`` bytes before it looks how many there are."""
+    pieces, left = [], size
+    while left and (piece := stream.read(min(left, _PIECE_BYTES))):
+        pieces.append(piece)
+        left -= len(piece)
+    return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
 class _Unpickler(pickle.Unpickler):

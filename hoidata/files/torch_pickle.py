@@ -22,6 +22,7 @@ from hoidata.files.restricted_pickle import (
     CheckedArray,
     StandIn,
     checked_keys,
+    read_at_most,
     restricted_load,
 )
 
@@ -60,7 +61,7 @@ def load_torch_pickle(source: str | Path | bytes, where: str | Path) -> Any:
     except OSError as error:
         raise BadInput(where, "a pickle of tensors", f"{type(error).__name__}: {error.strerror}") from None
     with stream:
-        data = stream.read(MAX_FILE_BYTES + 1)
+        data = read_at_most(stream, MAX_FILE_BYTES + 1)
     return restricted_load(data, tensor_globals(where, len(data)), where=where, max_bytes=MAX_FILE_BYTES)
 
 

@@ -83,8 +83,8 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
 def _obj_index(word: str, n_vertices: int) -> int:
     """OBJ counts from 1; negative indices count back from the last vertex read."""
     index = int(word.split("/")[0])
-    if index == 0:
-        raise ValueError("corner 0")
+    if index == 0 or abs(index) >= 2**31:
+        raise ValueError(f"corner {word[:40]}")
     return index - 1 if index > 0 else n_vertices + index
 
 
