@@ -21,6 +21,7 @@ from hoidata.schema.quarantine import Quarantined
 __all__ = ["Adapter", "DatasetPart", "Quarantined", "RawTree", "SequenceKey"]
 
 _SMALL_BYTES = 65536
+_LARGEST_FILE = 256 << 20
 _LARGEST_FRAME_FILE = 1 << 20
 
 
@@ -128,8 +129,12 @@ class RawTree:
         return place
 
     def read(self, path: str) -> bytes:
-        """The bytes of one file, recorded and checked."""
-        data = self._inside(path).read_bytes()
+        """The bytes of one file of at most 256 MiB, recorded and checked."""
+        place = self._inside(path)
+        size = place.stat().st_size
+        if size > _LARGEST_FILE:
+            raise BadInput(path, f"a file of at most {_LARGEST_FILE} bytes", f"{size} bytes")
+        data = place.read_bytes()
         self._record(SourceFile(path, len(data), sha256_bytes(data)))
         return data
 
