@@ -4,6 +4,7 @@ import csv
 import io
 import math
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,12 +55,21 @@ class Panel:
 
 def panels_svg(panels: list[Panel], x_label: str, salt: str, panel_inches: tuple[float, float] = (2.9, 2.4)) -> str:
     """Charts side by side as one ``<svg>`` element; ``salt`` keeps the ids of several drawings on one page apart."""
-    style: dict[Any, Any] = {**_STYLE, "svg.hashsalt": salt}
-    with matplotlib.rc_context(style):
-        figure = Figure(figsize=(panel_inches[0] * len(panels), panel_inches[1]), layout="constrained")
-        FigureCanvasSVG(figure)
+
+    def draw(figure: Figure) -> None:
         for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
             _draw_panel(axes, panel, x_label)
+
+    return figure_svg((panel_inches[0] * len(panels), panel_inches[1]), salt, draw)
+
+
+def figure_svg(inches: tuple[float, float], salt: str, draw: Callable[[Figure], None]) -> str:
+    """What ``draw`` draws on an empty figure, in the style of the pages, as one ``<svg>`` element; salt as above."""
+    style: dict[Any, Any] = {**_STYLE, "svg.hashsalt": salt}
+    with matplotlib.rc_context(style):
+        figure = Figure(figsize=inches, layout="constrained")
+        FigureCanvasSVG(figure)
+        draw(figure)
         stream = io.StringIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None}, transparent=True)
     svg = re.sub(r"<metadata>.*?</metadata>", "", stream.getvalue(), flags=re.DOTALL)

@@ -74,7 +74,7 @@ def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, st
         (f"{rows['subject'].nunique():,}", "subjects"),
         (f"{rows['object'].nunique():,}", "objects"),
         (f"{rows['verb'].nunique():,}", "verbs"),
-        (f"{len(store.quarantine):,}", "left out"),
+        (f"{len(store.quarantine):,}", "not converted"),
     ]
     if annotated is not None:
         tiles.append((f"{len(annotated.text):,}", "sentences"))

@@ -15,6 +15,7 @@ from pipelines.pages.examples import contact_examples, generated_example, is_tra
 from pipelines.pages.generation_page import generated_contact, generation_facts
 from pipelines.pages.metrics_table import Table, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.view import touched_side
 
 MODELS = ("contact", "length", "diffusion", "refiner")
@@ -43,6 +44,7 @@ class Section:
     facts: DatasetFacts
     title: str
     shown: str = ""
+    quality: QualityFacts | None = None
     motions: list[Player] = field(default_factory=list)
     motion_facts: list[tuple[str, str]] = field(default_factory=list)
     contact: list[tuple[str, list[Player]]] = field(default_factory=list)
@@ -93,6 +95,7 @@ def _section(name: str, folders: ReportFolders, hands: HandPair, seed: int) -> S
         facts,
         title,
         shown=_what_is_shown(facts),
+        quality=read_quality(folders.data / name / "quality", name),
         motions=motions,
         motion_facts=motion_facts,
         contact=_contact_pairs(facts, checkpoints / "contact", seed),

@@ -46,7 +46,7 @@ def of_open_box(clip: Clip) -> Clip:
 def clips_folder(make_clip, tmp_path) -> Path:
     """Four clips of one subject, of which one jumps, one has another shape and one an open mesh."""
     clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(5)]
-    clips[1], clips[2], clips[3] = jumping(clips[1]), with_betas(clips[2], 2.3), of_open_box(clips[3])
+    clips[1], clips[2], clips[3] = jumping(clips[1]), with_betas(clips[2], -1.7), of_open_box(clips[3])
     write_store(tmp_path / "clips", clips, generated_info("test"))
     return tmp_path / "clips"
 

@@ -1,0 +1,159 @@
+"""Quality control of one dataset as the report shows it: a table, a chart of every measure, and what was left out."""
+
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from hoidata.quality.thresholds import CLIP_MEASURES, MESH_MEASURES, Measure
+from pipelines.pages.curves import COLOURS, figure_svg
+from pipelines.pages.metrics_table import number
+
+COLUMNS = 5
+BINS = 24
+WARN_COLOUR, LEAVE_OUT_COLOUR = "#c98a00", "#b5371f"
+# A limit farther away than this times what the clips show would leave the chart empty.
+FARTHEST = 2.5
+
+
+@dataclass(frozen=True)
+class MeasureRow:
+    """One measure over a dataset. worst_id: where it is; warn, leave_out: the limits as text, "" for none."""
+
+    words: str
+    unit: str
+    median: str
+    worst: str
+    worst_id: str
+    warn: str
+    leave_out: str
+    warned: int
+    left_out: int
+
+
+@dataclass(frozen=True)
+class QualityFacts:
+    """What quality control found. failed, warned, notes: (clip, why); meshes: objects that are not ok, with why."""
+
+    summary: str
+    clips: list[MeasureRow]
+    meshes: list[MeasureRow]
+    chart: Markup
+    failed: list[tuple[str, str]] = field(default_factory=list)
+    warned: list[tuple[str, str]] = field(default_factory=list)
+    unsound: list[tuple[str, str, str]] = field(default_factory=list)
+    notes: list[tuple[str, int]] = field(default_factory=list)
+
+
+def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
+    """What the stage left in ``folder``; None where it has not run, or found no clip."""
+    if not (folder / "clips.parquet").is_file():
+        return None
+    info = json.loads((folder / "info.json").read_text(encoding="utf-8"))
+    clips, meshes = (pd.read_parquet(folder / f"{name}.parquet") for name in ("clips", "meshes"))
+    if not len(clips):
+        return None
+    limits = info["thresholds"]["limits"]
+    return QualityFacts(
+        summary=_summary(info["counts"]),
+        clips=[_row(clips, "clip_id", measure, limits[measure.name]) for measure in CLIP_MEASURES],
+        meshes=[_row(meshes, "object", measure, limits[measure.name]) for measure in MESH_MEASURES],
+        chart=Markup(measures_svg(clips, CLIP_MEASURES, limits, f"{dataset} quality")),
+        failed=_listed(clips, "left out"),
+        warned=_listed(clips, "warned"),
+        unsound=_unsound(meshes),
+        notes=sorted(Counter(note for note in clips["note"].tolist() if note).items()),
+    )
+
+
+def measures_svg(
+    table: pd.DataFrame, measures: Sequence[Measure], limits: Mapping[str, dict[str, float | None]], salt: str
+) -> str:
+    """A histogram of each measure over the clips, with its limits as lines; one that was never taken is left out."""
+    sizes = {measure.name: np.abs(_values(table, measure)) for measure in measures}
+    shown = [measure for measure in measures if np.isfinite(sizes[measure.name]).any()]
+    rows = -(-len(shown) // COLUMNS)
+
+    def draw(figure: Figure) -> None:
+        grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
+        for axes, measure in zip(grid, shown, strict=False):
+            values = sizes[measure.name]
+            _draw_measure(axes, measure, values[np.isfinite(values)], limits[measure.name])
+        for axes in grid[len(shown) :]:
+            axes.set_axis_off()
+
+    return figure_svg((2.35 * COLUMNS, 1.55 * rows), salt, draw)
+
+
+def _draw_measure(axes: Axes, measure: Measure, values: np.ndarray, limit: dict[str, float | None]) -> None:
+    warn, leave_out = limit["warn"], limit["leave_out"]
+    seen = max(float(values.max()), warn or 0.0) or 1.0
+    right = seen if leave_out is None or leave_out > FARTHEST * seen else max(seen, leave_out)
+    axes.hist(values, bins=np.linspace(0, right * 1.04, BINS + 1).tolist(), color=COLOURS[0])
+    axes.set_xlim(0, right * 1.04)
+    for place, colour in ((warn, WARN_COLOUR), (leave_out, LEAVE_OUT_COLOUR)):
+        if place is not None and place <= right:
+            axes.axvline(place, color=colour, linewidth=1.4)
+    if leave_out is not None and leave_out > right:
+        axes.set_xlim(0, right * 1.3)
+        axes.annotate(f"{leave_out:g} →", (1, 0.86), xycoords="axes fraction", ha="right", color=LEAVE_OUT_COLOUR)
+    name = measure.name.removesuffix("_m_s2").removesuffix("_m").removesuffix("_frames").replace("_", " ")
+    axes.set_title(f"{name}, {measure.unit}" if measure.unit else name, loc="left", fontsize=8, color="#6a6f76")
+    axes.tick_params(labelsize=7, length=2)
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_locator(MaxNLocator(3, integer=True))
+
+
+def _row(table: pd.DataFrame, key: str, measure: Measure, limit: dict[str, float | None]) -> MeasureRow:
+    values = _values(table, measure)
+    sizes = np.abs(values[np.isfinite(values)])
+    warn, leave_out = limit["warn"], limit["leave_out"]
+    left_out = int((sizes > leave_out).sum()) if leave_out is not None else 0
+    above = int((sizes > warn).sum()) if warn is not None else 0
+    return MeasureRow(
+        words=measure.words,
+        unit=measure.unit,
+        median=_text(float(np.median(sizes))) if len(sizes) else "not measured",
+        worst=_text(values[np.nanargmax(np.abs(values))]) if len(sizes) else "",
+        # Where all are alike, none is the worst.
+        worst_id=str(table[key].tolist()[np.nanargmax(np.abs(values))]) if len(set(sizes)) > 1 else "",
+        warn="" if warn is None else f"{warn:g}",
+        leave_out="" if leave_out is None else f"{leave_out:g}",
+        warned=max(above - left_out, 0),
+        left_out=left_out,
+    )
+
+
+def _values(table: pd.DataFrame, measure: Measure) -> np.ndarray:
+    """(row,) the measure; NaN where it was not taken."""
+    return np.array(table[measure.name].tolist(), dtype=np.float64)
+
+
+def _text(value: float) -> str:
+    return f"{value:g}" if value == round(value) else number(value)
+
+
+def _summary(counts: Mapping[str, int]) -> str:
+    return (
+        f"Of {counts['clips']:,} clips {counts['ok']:,} are sound, {counts['warned']:,} are warned of and kept, "
+        f"{counts['left_out']:,} are left out of annotation, training and evaluation. Of {counts['objects']:,} meshes "
+        f"{counts['objects_warned']:,} are warned of and {counts['objects_left_out']:,} left out with their clips."
+    )
+
+
+def _listed(clips: pd.DataFrame, verdict: str) -> list[tuple[str, str]]:
+    rows = zip(clips["clip_id"].tolist(), clips["verdict"].tolist(), clips["reasons"].tolist(), strict=True)
+    return [(clip_id, reasons) for clip_id, found, reasons in rows if found == verdict]
+
+
+def _unsound(meshes: pd.DataFrame) -> list[tuple[str, str, str]]:
+    rows = zip(meshes["object"].tolist(), meshes["verdict"].tolist(), meshes["reasons"].tolist(), strict=True)
+    return [row for row in rows if row[1] != "ok"]

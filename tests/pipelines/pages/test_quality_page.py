@@ -1,0 +1,93 @@
+"""The report's section on quality control: every measure, its limits, and what was left out and why."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hoidata.quality.stage import quality_store
+from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, MESH_MEASURES
+from hoidata.schema.info import generated_info
+from hoidata.schema.store import write_store
+from pipelines.pages.quality import measures_svg, read_quality
+from pipelines.pages.report import ReportFolders, write_report
+
+LIMITS = {name: limit._asdict() for name, limit in DEFAULT_LIMITS.items()}
+
+
+@pytest.fixture
+def folders(hands, page_clip, tmp_path):
+    """A dataset of three clips: the second jumps, the third has an open mesh."""
+    clips = [replace(page_clip(frames=40), clip_id=f"test/s1/{number}") for number in range(3)]
+    place = clips[1].object.translation_m.copy()
+    place[20:] += 1.0
+    clips[1] = replace(clips[1], object=replace(clips[1].object, translation_m=place))
+    model = replace(clips[2].object.model, name="open box", faces=clips[2].object.model.faces[1:])
+    clips[2] = replace(clips[2], object=replace(clips[2].object, model=model))
+    folders = ReportFolders.of("embedded", tmp_path)
+    write_store(folders.data / "grab" / "clips", clips, generated_info("grab", hands))
+    quality_store(folders.data / "grab" / "clips", folders.data / "grab" / "quality", progress=False)
+    return folders
+
+
+def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
+    text = write_report(tmp_path / "report", "embedded", ["grab"], hands, folders).read_text()
+    assert "Of 3 clips 2 are sound, 0 are warned of and kept, 1 are left out of annotation" in text
+    why = "largest sudden step of a corner of the object: 1.74 m at frame 19, above 0.2 m"
+    assert re.search(rf"<td>test/s1/1</td><td>{why}</td>", text)
+    assert "<td>open box</td><td>warned</td><td>share of edges at a hole" in text
+    assert "penetration not measured: the mesh of open box is not solid (1 clip)." in text
+    assert text.count("<svg") == 1
+
+
+def test_page_repeats_byte_for_byte(folders, hands, tmp_path):
+    first, second = (write_report(tmp_path / name, "embedded", ["grab"], hands, folders) for name in "ab")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_every_measure_has_its_row_with_median_worst_and_counts(folders):
+    facts = read_quality(folders.data / "grab" / "quality", "grab")
+    assert facts is not None
+    assert [row.words for row in facts.clips] == [measure.words for measure in CLIP_MEASURES]
+    assert [row.words for row in facts.meshes] == [measure.words for measure in MESH_MEASURES]
+    jump = facts.clips[5]
+    assert (jump.median, jump.worst, jump.worst_id) == ("0", "1.74", "test/s1/1")
+    assert (jump.warn, jump.leave_out, jump.warned, jump.left_out) == ("0.05", "0.2", 0, 1)
+    hole = facts.meshes[0]
+    assert (hole.worst_id, hole.leave_out, hole.warned, hole.left_out) == ("open box", "", 1, 0)
+    assert facts.failed == [("test/s1/1", jump_reason(folders))]
+
+
+def jump_reason(folders) -> str:
+    rows = pd.read_parquet(folders.data / "grab" / "quality" / "clips.parquet")
+    return rows.loc[rows["clip_id"] == "test/s1/1", "reasons"].item()
+
+
+def test_dataset_without_quality_control_has_no_section(folders, hands, tmp_path):
+    assert read_quality(tmp_path / "nowhere", "grab") is None
+    write_store(folders.data / "h2o" / "clips", [], generated_info("h2o", hands))
+    quality_store(folders.data / "h2o" / "clips", folders.data / "h2o" / "quality", progress=False)
+    assert read_quality(folders.data / "h2o" / "quality", "h2o") is None
+
+
+def table(**columns: list[float]) -> pd.DataFrame:
+    return pd.DataFrame({measure.name: [np.nan, np.nan] for measure in CLIP_MEASURES} | columns)
+
+
+def test_chart_shows_limits_within_reach_as_lines_and_names_those_beyond():
+    wrist = [measure for measure in CLIP_MEASURES if measure.name == "wrist_acceleration_m_s2"]
+    near = measures_svg(table(wrist_acceleration_m_s2=[10.0, 40.0]), wrist, LIMITS, "a")
+    far = measures_svg(table(wrist_acceleration_m_s2=[1.0, 2.0]), wrist, LIMITS, "a")
+    assert "60 →" not in near
+    assert "#b5371f" in near
+    assert "60 →" in far
+    assert all("#c98a00" in chart for chart in (near, far))
+
+
+def test_measure_that_was_never_taken_is_not_drawn():
+    two = [measure for measure in CLIP_MEASURES if measure.name in ("penetration_m", "gap_share")]
+    chart = measures_svg(table(gap_share=[0.0, 0.1]), two, LIMITS, "a")
+    assert "gap share" in chart
+    assert "penetration" not in chart
