@@ -134,7 +134,11 @@ def test_a_camera_that_looks_up_from_below_does_not_turn_gravity_round():
 
 
 def test_a_side_is_not_what_an_object_stands_on_when_it_sinks_through_it():
-    assert "no two objects" in unknown(estimate_gravity(*scene(waves=1)))
+    objects, joints, camera = scene(waves=1)
+    lowest = np.concatenate([thing.poses[thing.frames, 2, 3] for thing in objects]) < 0.75
+    assert lowest.any()
+    joints[lowest] = np.nan  # the object alone must tell
+    assert "no two objects" in unknown(estimate_gravity(objects, joints, camera))
 
 
 def test_a_side_is_not_what_an_object_stands_on_when_a_hand_reaches_below_it():
