@@ -17,6 +17,7 @@ BUILT_IN = {
     "grab": "hoidata.adapters.grab:GrabAdapter",
     "arctic": "hoidata.adapters.arctic:ArcticAdapter",
     "manipnet": "hoidata.adapters.manipnet:ManipNetAdapter",
+    "taco": "hoidata.adapters.taco:TacoAdapter",
 }
 # What an adapter states about its dataset (see ``Adapter``); its other fields are settings.
 FACTS = (

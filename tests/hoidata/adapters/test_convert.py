@@ -219,7 +219,7 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     adapter = get_adapter(name)
     assert isinstance(adapter, Adapter)
     assert adapter.name == name
-    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic"))
+    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic", "taco"))
     assert adapter.licence
     assert adapter.where_to_register
     assert adapter.frame.note
