@@ -9,7 +9,7 @@ export PREFECT_SERVER_ANALYTICS_ENABLED := false
 export HF_HUB_OFFLINE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo install install-dev test test-fast lint types imports check clean
+.PHONY: demo install install-dev test test-fast lint types imports check bench clean
 
 demo: $(VENV)/.installed
 	dvc repro
@@ -43,6 +43,10 @@ imports: install-dev
 	lint-imports
 
 check: lint types imports test
+
+# Figures beside baselines of the same run; about half an hour. One part: python -m tests.bench adapters
+bench: install-dev
+	OMP_NUM_THREADS=1 python -m tests.bench
 
 # Removes what the graph made and the generated raw data; your own raw files are never touched.
 clean:

@@ -21,8 +21,13 @@ ARCTIC_SHORTEST, ARCTIC_RANGE = 150, 182  # frames of the sequences used, and of
 H2O_FOLDERS = ("cam_pose", "hand_pose_mano", "obj_pose_rt", "action_label")
 
 
-def embedded(folder: Path) -> Path:
-    """The embedded corpora below ``folder``, generated where they are not there yet (some minutes)."""
+def embedded_root() -> Path:
+    """The embedded corpora: of HOIDATA_BENCH_CORPORA, else those ``make demo`` wrote, else generated here once."""
+    given = os.environ.get("HOIDATA_BENCH_CORPORA")
+    made = Path(".hoidata", "raw", "embedded")
+    if given or all((made / name).is_dir() for name in PAPER):
+        return Path(given or made).resolve()
+    folder = Path(".hoidata", "bench", "embedded").resolve()
     for name in PAPER:
         if not (folder / name).is_dir():
             write_corpus(name, folder / name)
@@ -32,7 +37,7 @@ def embedded(folder: Path) -> Path:
 def replicate(source: Path, target: Path, share: float) -> dict[str, int]:
     """Raw folders of ``share`` times the paper's clips below ``target``; how many clips each should give.
 
-    source: of ``embedded``, on the same file system.
+    source: of ``embedded_root``, on the same file system.
     """
     wanted = {name: max(1, round(share * count)) for name, count in PAPER.items()}
     _replicate_h2o(source / "h2o", target / "h2o", wanted["h2o"])

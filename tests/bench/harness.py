@@ -6,23 +6,36 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
 RUNS = 5
+WIDTH = 140  # of tables written to a file
 
 
-def medians(variants: Mapping[str, Callable[[], object]], runs: int = RUNS) -> dict[str, float]:
-    """Median seconds of each variant; they take turns, after one round that warms up and is not counted."""
-    times: dict[str, list[float]] = {name: [] for name in variants}
-    for run in range(runs + 1):
+class Times(NamedTuple):
+    """Seconds. processor: of this process, steadier on a busy machine. first: the call that compiles and warms up, by
+    the clock; it does not count in the two medians."""
+
+    median: float
+    processor: float
+    first: float
+
+
+def medians(variants: Mapping[str, Callable[[], object]], runs: int = RUNS) -> dict[str, Times]:
+    """Times of each variant; they take turns."""
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in variants}
+    for _ in range(runs + 1):
         for name, work in variants.items():
-            start = time.perf_counter()
+            start = time.perf_counter(), time.process_time()
             work()
-            if run:
-                times[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in times.items()}
+            times[name].append((time.perf_counter() - start[0], time.process_time() - start[1]))
+    return {
+        name: Times(*(statistics.median(column) for column in zip(*values[1:], strict=True)), values[0][0])
+        for name, values in times.items()
+    }
 
 
 def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -32,7 +45,8 @@ def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> N
         table.add_column(name, justify="right" if number else "left")
     for row in rows:
         table.add_row(*row)
-    Console().print(table)
+    console = Console()
+    (console if console.is_terminal else Console(width=WIDTH)).print(table)
 
 
 class TreeMemory:

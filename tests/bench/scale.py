@@ -17,7 +17,7 @@ from pathlib import Path
 
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.store import open_store
-from tests.bench.corpus import PAPER, embedded, replicate
+from tests.bench.corpus import PAPER, embedded_root, replicate
 from tests.bench.harness import TreeMemory, show
 
 MEBI = 1 << 20
@@ -186,10 +186,11 @@ LINES: dict[str, Callable[[dict], str]] = {
 }
 
 
-def main(shares: tuple[float, ...] = (1.0, 0.1), source: Path | None = None) -> None:
+def main(shares: tuple[float, ...] = (1.0, 0.1)) -> None:
     """Measure each share, one after another, and show them side by side."""
-    with tempfile.TemporaryDirectory(prefix="hoidata-bench-scale-") as folder:
-        corpora = embedded(source or Path(folder) / "embedded")
+    corpora = embedded_root()
+    # Beside the corpora: hard links do not leave a file system.
+    with tempfile.TemporaryDirectory(prefix="bench-scale-", dir=corpora.parent) as folder:
         figures = [run_share(corpora, Path(folder) / f"share-{share:g}", share) for share in shares]
     report(figures)
     print(json.dumps(figures))
@@ -199,5 +200,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--stage"]:
         STAGES[sys.argv[2]](sys.argv[3], Path(sys.argv[4]), Path(sys.argv[5]))
     else:
-        given = os.environ.get("HOIDATA_BENCH_CORPORA")
-        main(tuple(map(float, sys.argv[1:])) or (1.0, 0.1), Path(given) if given else None)
+        main(tuple(map(float, sys.argv[1:])) or (1.0, 0.1))

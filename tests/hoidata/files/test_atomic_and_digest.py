@@ -1,10 +1,15 @@
 import hashlib
 import math
+import os
 import shutil
+import subprocess
+import sys
 
 import pytest
 
+from hoidata.errors import BadInput
 from hoidata.files import atomic_file, atomic_folder, canonical_json, sha256_bytes, sha256_file
+from hoidata.files.atomic import exclusive, remove_leftovers
 
 
 def write_half_a_file(target):
@@ -60,6 +65,65 @@ def test_a_folder_is_never_seen_half_deleted(tmp_path, monkeypatch):
     with atomic_folder(target) as part:
         (part / "new").write_text("2")
     assert seen == [(True, ["new"])]
+
+
+def test_leftovers_of_killed_writers_are_removed_and_nothing_else(tmp_path):
+    target = tmp_path / "clips"
+    target.mkdir()
+    for name in (".clips.abcd1234.part", ".clips.efgh5678.old"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "half").write_text("x")
+    (tmp_path / ".clips.file0000.part").write_text("half")
+    others = {".clips.work", ".clips.v2.abcd1234.part", ".clip.abcd1234.part", "clips.part", ".clipsX.abcd1234.old"}
+    for name in others:
+        (tmp_path / name).mkdir()
+    remove_leftovers(target)
+    assert {path.name for path in tmp_path.iterdir()} == {"clips", *others}
+    remove_leftovers(tmp_path / "nowhere" / "clips")
+
+
+def test_an_old_folder_that_was_moved_aside_goes_back_to_its_place(tmp_path):
+    aside = tmp_path / ".clips.abcd1234.old"
+    aside.mkdir()
+    (aside / "old").write_text("1")
+    (tmp_path / ".clips.abcd1234.part").mkdir()
+    remove_leftovers(tmp_path / "clips")
+    assert [path.name for path in tmp_path.iterdir()] == ["clips"]
+    assert (tmp_path / "clips" / "old").read_text() == "1"
+
+
+def test_only_one_may_write_and_the_lock_leaves_no_file(tmp_path):
+    target = tmp_path / "deep" / "clips"
+    taken = rf"process {os.getpid()} at work on it; wait for that run"
+    with exclusive(target), pytest.raises(BadInput, match=taken), exclusive(target, wait_s=0.1):
+        pass
+    with exclusive(target, wait_s=0.1), exclusive(tmp_path / "deep" / "other", wait_s=0.1):
+        pass
+    assert list(target.parent.iterdir()) == []
+
+
+HOLDER = """
+import fcntl, subprocess, sys, time
+lock = open(sys.argv[1], "w")
+fcntl.flock(lock, fcntl.LOCK_EX)
+subprocess.Popen(["sleep", "1"], pass_fds=[lock.fileno()])
+print("held", flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_lock_of_a_killed_process_is_free_when_the_last_of_its_workers_has_ended(tmp_path):
+    holder = subprocess.Popen([sys.executable, "-c", HOLDER, str(tmp_path / ".clips.lock")], stdout=subprocess.PIPE)
+    assert holder.stdout is not None
+    holder.stdout.readline()
+    holder.kill()
+    holder.wait()
+    holder.stdout.close()
+    with pytest.raises(BadInput, match="at work on it"), exclusive(tmp_path / "clips", wait_s=0.1):
+        pass
+    with exclusive(tmp_path / "clips"):
+        assert [path.name for path in tmp_path.iterdir()] == [".clips.lock"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_digests_of_file_and_bytes_agree(tmp_path):

@@ -1,0 +1,26 @@
+"""``python -m tests.bench [adapters] [store] [scale]``: the benchmarks named, or all, one after another.
+
+Every figure stands beside a named baseline of the same run; variants take turns and medians of at least five runs are
+shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the embedded raw corpora.
+"""
+
+import sys
+
+from tests.bench import adapters, scale, store
+
+BENCHMARKS = {"adapters": adapters.main, "store": store.main, "scale": scale.main}
+
+
+def main() -> int:
+    chosen = sys.argv[1:] or list(BENCHMARKS)
+    unknown = sorted(set(chosen) - set(BENCHMARKS))
+    if unknown:
+        print(f"no benchmark {', '.join(unknown)}; there are {', '.join(BENCHMARKS)}", file=sys.stderr)
+        return 1
+    for name in chosen:
+        BENCHMARKS[name]()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

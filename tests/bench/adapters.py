@@ -1,0 +1,196 @@
+"""Adapters beside naive readers: frames per second to joints and object poses, H2O's text, bytes per frame.
+
+``python -m tests.bench.adapters``. Both sides read the same sequences and give world joints of both hands and object
+poses of every frame of the clips; the values are compared. The adapters also digest every file, and read the frames
+around the clips.
+"""
+
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hoidata.adapters import Adapter, RawTree, SequenceKey, get_adapter
+from hoidata.adapters.h2o_files import parse_rows
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from hoidata.schema.clip import SIDES, Clip
+from hoidata.schema.hand_parameters import hands_for
+from hoidata.schema.info import generated_info
+from hoidata.schema.mapped import map_npz
+from hoidata.schema.store import write_store
+from tests.bench.corpus import embedded_root
+from tests.bench.harness import Times, medians, show
+from tests.bench.naive import READERS, NaiveHands, Poses
+
+SEQUENCES = {"h2o": 1, "grab": 3, "arctic": 2}
+TOLERANCE_M = 2e-6  # half of float32's step at some metres, over a chain of joints
+TEXT_COLUMNS = {"cam_pose": 16, "hand_pose_mano": 124, "obj_pose_rt": 17, "action_label": 1}
+NOT_PARAMETERS = ("source_contact", "camera", "body")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The first sequences of one dataset, and the source frames of each one's clips."""
+
+    adapter: Adapter
+    root: Path
+    hands: HandPair
+    frames: dict[SequenceKey, np.ndarray]
+
+    @property
+    def n_frames(self) -> int:
+        return sum(map(len, self.frames.values()))
+
+
+def sample(name: str, root: Path) -> Sample:
+    adapter = get_adapter(name)
+    hands = hands_for(adapter.hand_convention, load_embedded_hands())
+    keys = adapter.sequences(root)[: SEQUENCES[name]]
+    found = {key: _clips(adapter, root, hands, key) for key in keys}
+    frames = {key: np.concatenate([clip.source_frames for clip in clips]) for key, clips in found.items()}
+    return Sample(adapter, root, hands, frames)
+
+
+def _clips(adapter: Adapter, root: Path, hands: HandPair, key: SequenceKey) -> list[Clip]:
+    return [item for item in adapter.load(RawTree(root), key, hands) if isinstance(item, Clip)]
+
+
+def read_ours(chosen: Sample) -> Poses:
+    """Clips by the adapter, their joints and poses clip by clip."""
+    clips = [clip for key in chosen.frames for clip in _clips(chosen.adapter, chosen.root, chosen.hands, key)]
+    joints = [
+        np.stack([track_joints(clip.hands[side], chosen.hands[side]) for side in SIDES], axis=1) for clip in clips
+    ]
+    poses = np.tile(np.eye(4), (chosen.n_frames, 1, 1))
+    poses[:, :3, :3] = rotvec_to_rotmat(np.concatenate([clip.object.rotvec for clip in clips]))
+    poses[:, :3, 3] = np.concatenate([clip.object.translation_m for clip in clips])
+    return Poses(np.concatenate(joints), poses)
+
+
+def read_naive(chosen: Sample, naive: NaiveHands) -> Poses:
+    read = READERS[chosen.adapter.name]
+    parts = [read(chosen.root, key.name, frames, naive) for key, frames in chosen.frames.items()]
+    return Poses(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def largest_difference_m(ours: Poses, naive: Poses, valid: np.ndarray) -> float:
+    """Of joints of valid hands, and of points 10 cm from the object's origin."""
+    points = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
+    moved = [points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3] for pose in (ours[1], naive[1])]
+    joints = np.abs(ours.joints_m - naive.joints_m).max(axis=(2, 3))
+    return max(float(joints[valid].max()), float(np.abs(moved[0] - moved[1]).max()))
+
+
+def _valid(chosen: Sample) -> np.ndarray:
+    clips = [clip for key in chosen.frames for clip in _clips(chosen.adapter, chosen.root, chosen.hands, key)]
+    return np.concatenate([np.stack([clip.hands[side].valid for side in SIDES], axis=1) for clip in clips])
+
+
+def compare_readers(corpora: Path) -> None:
+    rows = []
+    for name in SEQUENCES:
+        chosen = sample(name, corpora / name)
+        naive = NaiveHands(chosen.hands)
+        difference = largest_difference_m(read_ours(chosen), read_naive(chosen, naive), _valid(chosen))
+        if difference > TOLERANCE_M * 10:
+            raise AssertionError(f"{name}: the naive reader differs by {difference} m")
+        times = medians({"naive": lambda c=chosen, n=naive: read_naive(c, n), "ours": lambda c=chosen: read_ours(c)})
+        speed = {kind: f"{chosen.n_frames / time.median:,.0f}" for kind, time in times.items()}
+        rows.append(
+            (
+                name,
+                str(chosen.n_frames),
+                *speed.values(),
+                *ratios(times["naive"], times["ours"]),
+                f"{difference * 1e6:.2f} um",
+                f"{times['ours'].first:.2f} s",
+            )
+        )
+    speeds = ("naive frames/s", "adapter frames/s", "ratio", "ratio, processor")
+    columns = ("dataset", "frames", *speeds, "largest difference", "first call")
+    show("Raw files to joints and poses, one process", columns, rows)
+
+
+def compare_text(corpora: Path) -> None:
+    """H2O's four files of every frame of one sequence: np.loadtxt per file, and ``parse_rows`` per folder."""
+    place = sorted(corpora.glob("h2o/subject*/*/*/cam4"))[0]
+    names = sorted(path.name for path in (place / "cam_pose").iterdir())
+    inside = {kind: (place / kind).relative_to(corpora / "h2o").as_posix() for kind in TEXT_COLUMNS}
+
+    def loadtxt() -> list[np.ndarray]:
+        return [np.array([np.loadtxt(place / kind / name, ndmin=1) for name in names]) for kind in TEXT_COLUMNS]
+
+    def ours() -> list[np.ndarray]:
+        tree = RawTree(corpora / "h2o")
+        return [
+            parse_rows(tree.read_folder(inside[kind], names), columns, inside[kind], names)
+            for kind, columns in TEXT_COLUMNS.items()
+        ]
+
+    if [rows.tobytes() for rows in loadtxt()] != [rows.tobytes() for rows in ours()]:
+        raise AssertionError("parse_rows and np.loadtxt differ")
+    times = medians({"np.loadtxt, four calls per frame": loadtxt, "read_folder with SHA-256, parse_rows": ours})
+    base = times["np.loadtxt, four calls per frame"]
+    rows = [(kind, f"{len(names) / time.median:,.0f}", *ratios(base, time)) for kind, time in times.items()]
+    columns = ("reader", "frames/s", "ratio", "ratio, processor")
+    show(f"H2O text, {len(names)} frames of 16, 124, 17 and 1 numbers, values bit-equal", columns, rows)
+
+
+def ratios(base: Times, time: Times) -> tuple[str, str]:
+    return f"{base.median / time.median:.1f}x", f"{base.processor / time.processor:.1f}x"
+
+
+def compare_bytes(corpora: Path) -> None:
+    """Bytes per frame of a store, beside the reference's layout: 6D features and joints of each clip in an NPZ."""
+    rows = []
+    for name in SEQUENCES:
+        chosen = sample(name, corpora / name)
+        clips = [clip for key in chosen.frames for clip in _clips(chosen.adapter, chosen.root, chosen.hands, key)]
+        with tempfile.TemporaryDirectory() as folder:
+            write_store(Path(folder) / "store", clips, generated_info(name))
+            shards = sorted((Path(folder) / "store" / "arrays").glob("frames-*.npz"))
+            arrays = {key: array.nbytes for path in shards for key, array in map_npz(path).items()}
+            for number, clip in enumerate(clips):
+                np.savez(Path(folder) / f"{number}.npz", **features(clip, chosen.hands))
+            reference = sum(path.stat().st_size for path in Path(folder).glob("*.npz"))
+        ours = sum(size for key, size in arrays.items() if not key.startswith(NOT_PARAMETERS))
+        figures = (reference / chosen.n_frames, ours / chosen.n_frames, sum(arrays.values()) / chosen.n_frames)
+        rows.append((name, *(f"{figure:.0f}" for figure in figures), f"{figures[0] / figures[1]:.1f}x"))
+    columns = (
+        "dataset",
+        "6D features and joints, NPZ",
+        "store: parameters",
+        "with what else the source gives",
+        "ratio",
+    )
+    show("Bytes per frame", columns, rows)
+
+
+def features(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
+    """What Text2HOI keeps of each frame: 99 numbers and 21 joints per hand, 10 numbers of the object, float32."""
+    found: dict[str, np.ndarray] = {}
+    for side in SIDES:
+        track = clip.hands[side]
+        rotvecs = np.concatenate([track.global_orient, track.hand_pose], axis=1).reshape(-1, 3)
+        six = Rotation.from_rotvec(rotvecs).as_matrix()[:, :, :2].reshape(clip.n_frames, 96)
+        found[f"{side}_hand"] = np.concatenate([track.wrist_m, six], axis=1).astype(np.float32)
+        found[f"{side}_joints"] = track_joints(track, hands[side])
+    six = Rotation.from_rotvec(clip.object.rotvec).as_matrix()[:, :, :2].reshape(clip.n_frames, 6)
+    hinge = np.zeros(clip.n_frames) if clip.object.hinge_rad is None else clip.object.hinge_rad
+    found["object"] = np.column_stack([clip.object.translation_m, six, hinge]).astype(np.float32)
+    return found
+
+
+def main(corpora: Path | None = None) -> None:
+    root = corpora or embedded_root()
+    compare_readers(root)
+    compare_text(root)
+    compare_bytes(root)
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:2]))
