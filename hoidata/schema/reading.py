@@ -19,18 +19,25 @@ _FURTHER_FACTS = ("synthetic", "gravity_note", "hands_from", "fit_error_m")
 def clip_rows(sequences: pd.DataFrame) -> dict[str, dict[str, Any]]:
     """The row of every clip by its id, as Python values; a row of a pandas table costs more than reading the clip.
 
-    ``facts`` are the fields of ``Clip`` that stand in the row as they are; gravity (3,) and source_from_world (4, 4)
-    are arrays.
+    Added: ``frames``, the rows of its shard; ``hands``, per side the rows of its betas and its template; ``facts``, the
+    fields of ``Clip`` that stand in the row as they are. gravity (3,) and source_from_world (4, 4) become arrays.
     """
     columns = {str(name): _plain_column(column) for name, column in sequences.items()}
     rows = {}
     for values in zip(*columns.values(), strict=True):
         row = dict(zip(columns, values, strict=True))
+        row["frames"] = slice(row["first_row"], row["first_row"] + row["n_frames"])
+        row["hands"] = {side: _hand_rows(row, side) for side in SIDES}
         row["facts"] = {name: row[name] for name in (*_FACTS, *_FURTHER_FACTS)}
         row["gravity"] = None if row["gravity"] is None else np.array(row["gravity"])
         row["source_from_world"] = np.array(row["source_from_world"]).reshape(4, 4)
         rows[row["clip_id"]] = row
     return rows
+
+
+def _hand_rows(row: dict[str, Any], side: Side) -> tuple[slice, str | None]:
+    first = row[f"{side}_betas_row"]
+    return slice(first, first + row[f"{side}_betas_count"]), row[f"{side}_template"]
 
 
 def _plain_column(column: pd.Series) -> list[Any]:

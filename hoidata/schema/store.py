@@ -67,7 +67,10 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     info = read_info(folder)
     path = folder / "meta" / "info.json"
     version = checked_version(folder, info["schema_version"])
-    written = info.get("hand_model", {}).get("digest")
+    model = info.get("hand_model", {})
+    if not isinstance(model, dict):
+        raise BadInput(path, "a hand_model with name and digest", repr(model)[:80], "run the conversion again")
+    written = model.get("digest")
     if hands is not None and written and hands.digest != written:
         remedy = "open it with the hands it was converted with"
         raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
@@ -87,7 +90,7 @@ def read_info(folder: str | Path) -> dict[str, Any]:
     try:
         info = orjson.loads(path.read_bytes())
         _ = info["schema_version"]
-    except (orjson.JSONDecodeError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OSError) as error:
         raise BadInput(path, "JSON with a schema_version", str(error), "run the conversion again") from error
     return info
 
@@ -130,8 +133,7 @@ class Store:
     def clip(self, clip_id: str) -> Clip:
         """The clip as it was written, float32. Raises KeyError when there is none of that id."""
         row = self._row(clip_id)
-        frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
-        shard, gravity = self._frames(row["shard"]), row["gravity"]
+        frames, shard, gravity = row["frames"], self._frames(row["shard"]), row["gravity"]
         return Clip(
             hands={side: self._hand(row, side) for side in SIDES},
             object=self._object(row["object"], shard.object, frames),
@@ -195,15 +197,14 @@ class Store:
 
     def _hand(self, row: dict[str, Any], side: Side) -> HandTrack:
         wrist_m, global_orient, hand_pose, betas, valid = self._frames(row["shard"]).hands[side]
-        frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
-        first, template = row[f"{side}_betas_row"], row[f"{side}_template"]
+        frames, (betas_rows, template) = row["frames"], row["hands"][side]
         return HandTrack(
-            wrist_m=wrist_m[frames].copy(),
-            global_orient=global_orient[frames].copy(),
-            hand_pose=hand_pose[frames].copy(),
-            betas=betas[first : first + row[f"{side}_betas_count"]].copy(),
-            valid=valid[frames].copy(),
-            template_m=None if template is None else self._file("templates")[template].copy(),
+            wrist_m[frames].copy(),
+            global_orient[frames].copy(),
+            hand_pose[frames].copy(),
+            betas[betas_rows].copy(),
+            valid[frames].copy(),
+            None if template is None else self._file("templates")[template].copy(),
         )
 
     def _object(self, name: str, pose: tuple[np.ndarray, ...], rows: slice) -> ObjectTrack:
