@@ -149,3 +149,21 @@ def test_a_side_is_not_what_an_object_stands_on_when_a_hand_reaches_below_it():
 def test_no_object_gives_no_gravity():
     _, joints, camera = scene()
     assert "no object" in unknown(estimate_gravity([], joints, camera))
+
+
+def test_a_body_with_one_way_to_stand_tells_by_the_side_it_stands_on():
+    objects, joints, camera = scene()
+    base_only = [replace(t, footing=replace(t.footing, downs=np.array([[0.0, 0.0, -1.0]]))) for t in objects]
+    assert off_deg(estimate_gravity(base_only, joints, camera), (0, 0, -1)) < 1e-3
+    top_only = [replace(t, footing=replace(t.footing, downs=np.array([[0.0, 0.0, 1.0]]))) for t in objects]
+    assert estimate_gravity(top_only, joints, camera).direction is None
+
+
+def test_one_leaning_object_does_not_outvote_the_others_by_resting_often():
+    """Four usable stretches of a box that always leans the same way, one of a can."""
+    objects, joints, camera = scene(lean=Rotation.from_rotvec((0.2, 0, 0)), yaw=0.0)
+    n = len(joints) // 2
+    order = np.concatenate((np.tile(np.arange(n), 4), np.arange(n, n + STILL_STRETCH)))
+    again = [replace(thing, frames=thing.frames[order], poses=thing.poses[order]) for thing in objects]
+    again[0].frames[[n, 2 * n, 3 * n]] = False  # each time the box is there anew
+    assert "4 of 5" in unknown(estimate_gravity(again, joints[order], camera[order]))
