@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hoidata.adapters import checks
 from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.adapters.bvh import BvhMotion, parse_bvh, unpack_text
 from hoidata.adapters.manipnet_segments import (
@@ -149,6 +150,9 @@ class ManipNetAdapter:
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
+
+    def __post_init__(self) -> None:
+        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per folder below ``sequences``; all recordings are of one subject."""

@@ -54,12 +54,15 @@ def check(
 
     Nothing below ROOT is written to; altered copies are hard links in a temporary folder.
     """
+    from rich.console import Console
+
     from hoidata.adapters.conformance import check_adapter
     from hoidata.adapters.registry import get_adapter
 
     adapter = get_adapter(name, **_settings(setting or []))
     hands, note = _hands(hand, adapter.needs_mano)
-    findings = check_adapter(adapter, root, hands, sequences)
+    with Console(stderr=True).status(f"loading up to {sequences} sequences of {name}, each several times"):
+        findings = check_adapter(adapter, root, hands, sequences)
     bad = {"fail", "warn"} if strict else {"fail"}
     failed = sum(item.outcome in bad for item in findings)
     _print(name, findings, note)

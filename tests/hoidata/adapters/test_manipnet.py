@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hoidata.adapters import Quarantined, RawTree, SequenceKey
+from hoidata.adapters.conformance import check_adapter
 from hoidata.adapters.manipnet import ManipNetAdapter, object_words, read_recording, thirty_fps_frames
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
@@ -375,3 +376,22 @@ def test_clips_say_that_their_hands_were_fitted_to_keypoints_and_how_well(carrie
     ]
     assert clip.hands_from == "keypoints"
     assert clip.fit_error_m == pytest.approx(np.mean(error_m), abs=1e-6)
+
+
+@pytest.mark.slow
+def test_it_keeps_every_rule_of_the_conformance_check_but_shares_one_shape_among_sequences(tmp_path: Path) -> None:
+    """Two lifts of one subject; the hands lie flat beside the object, so that touch is of no account."""
+    left, right, thing = lift_rows(280)
+    write_tree(tmp_path, left, right, thing, "tetra_large7")
+    bent = [[*row[:6], *[value / 8 for value in POSE[6:]]] for row in right]
+    write_tree(tmp_path, left, bent, thing, "tetra_large8")
+    found = {item.rule: item for item in check_adapter(ManipNetAdapter(), tmp_path, HANDS, worker=False)}
+    assert [item for item in found.values() if item.outcome == "fail"] == []
+    removed = found["clips stay the same when another sequence is removed"]
+    assert removed.outcome == "warn"
+    assert "is also made from sequences/tetra_large7/leftHand.bvh.gz" in removed.detail
+
+
+def test_a_margin_that_is_no_whole_number_is_refused() -> None:
+    with pytest.raises(BadInput, match="whole number of 0 or more"):
+        ManipNetAdapter(margin_frames=-1)
