@@ -60,7 +60,7 @@ def read_manifest(path: Path) -> Manifest:
         values = json.loads(path.read_text())
     except FileNotFoundError as error:
         raise BadInput(path, "a manifest", "no file", "restore it with git checkout") from error
-    except ValueError as error:
+    except (ValueError, RecursionError, OSError) as error:
         raise BadInput(path, "a JSON manifest", str(error), "restore it, or run `hoidata raw scan`") from error
     if not isinstance(values, dict) or values.pop("schema", None) != SCHEMA:
         raise BadInput(path, f"schema {SCHEMA}", "another one", "write it anew with `hoidata raw scan`")

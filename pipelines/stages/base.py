@@ -100,7 +100,7 @@ class Place:
 
 def load_params(kind: type[Params], section: str, path: Path = Path("params.yaml")) -> Params:
     """One section of params.yaml, checked. Raises BadInput that names the wrong key and lists the known ones."""
-    values = yaml.safe_load(path.read_text()).get(section)
+    values = _sections(path).get(section)
     known = ", ".join(kind.model_fields) or "none"
     try:
         return kind.model_validate(values or {})
@@ -108,6 +108,16 @@ def load_params(kind: type[Params], section: str, path: Path = Path("params.yaml
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
         raise BadInput(f"{path}: {section}", f"keys among: {known}", f"{key}: {first['msg']}", "correct it") from error
+
+
+def _sections(path: Path) -> dict[str, Any]:
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:
+        raise BadInput(path, "YAML text", str(error)[:300], "correct it, or restore it with git checkout") from error
+    if not isinstance(values, dict):
+        raise BadInput(path, "sections with a name each", type(values).__name__, "restore it with git checkout")
+    return values
 
 
 def root_variable(name: str) -> str:
@@ -119,9 +129,20 @@ def own_root(name: str) -> Path | None:
     """The user's raw folder of ``name``: its environment variable, else hoidata.toml's [roots], else None."""
     if value := os.environ.get(root_variable(name)):
         return Path(value)
-    settings = Path("hoidata.toml")
-    roots = tomllib.loads(settings.read_text()).get("roots", {}) if settings.is_file() else {}
-    return Path(roots[name]) if name in roots else None
+    root = _registered_roots(Path("hoidata.toml")).get(name)
+    return None if root is None else Path(root)
+
+
+def _registered_roots(path: Path) -> dict[str, str]:
+    """[roots] of hoidata.toml; none without that file."""
+    remedy = "correct it, or register the folders anew with `hoidata raw scan`"
+    try:
+        roots = tomllib.loads(path.read_text(encoding="utf-8")).get("roots", {}) if path.is_file() else {}
+    except (ValueError, RecursionError, OSError) as error:  # tomllib's own error is a ValueError
+        raise BadInput(path, "TOML text", str(error)[:300], remedy) from error
+    if not isinstance(roots, dict) or not all(isinstance(root, str) and "\0" not in root for root in roots.values()):
+        raise BadInput(path, "[roots] with one folder per name", str(roots)[:80], remedy)
+    return roots
 
 
 def raw_root(place: Place) -> Path:
