@@ -6,7 +6,7 @@ the bytes depend neither on the number of workers nor on how often the run was k
 """
 
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from hoidata.hands import HandPair
 from hoidata.schema.clip import Clip, SourceFile
 from hoidata.schema.hand_parameters import hands_for
 from hoidata.schema.quarantine import Quarantined
-from hoidata.schema.store import write_store
+from hoidata.schema.store import open_store, write_store
 from hoidata.schema.validation import check_clip
 
 DEFECT = "report this defect of hoidata"
@@ -84,17 +84,16 @@ def convert_dataset(
     out, root = Path(out), Path(root or ".")
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
     convert = SequenceConverter(adapter, root, hands, listed, synthetic, work)
-    left_out: list[Quarantined] = []
     with exclusive(out) as lock:
         remove_leftovers(out)
         work.open(job_of(adapter, hands, root, keys, listed, synthetic))
         taken_up = _convert_all(convert, keys, jobs, lock, progress)
-        groups = (work.read(key) for key in keys)
-        counts = write_store(out, _flattened(groups, left_out), _store_info(adapter, hands, synthetic, reason))
+        items = (item for key in keys for item in work.read(key))
+        counts = write_store(out, items, _store_info(adapter, hands, synthetic, reason))
         work.remove()
-    summary = ConversionSummary(
-        adapter.name, len(keys), counts["clips"], counts["frames"], tuple(left_out), reason, taken_up
-    )
+        # Read back: the store leaves out clips of its own accord, too (an id that is given twice).
+        left_out = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
+    summary = ConversionSummary(adapter.name, len(keys), counts["clips"], counts["frames"], left_out, reason, taken_up)
     if progress:
         print(summary, file=sys.stdout)
     return summary
@@ -182,11 +181,3 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
         "source_fps": adapter.source_fps,
         "empty_reason": reason,
     }
-
-
-def _flattened(groups: Iterable[list[Clip | Quarantined]], left_out: list[Quarantined]) -> Iterator[Clip | Quarantined]:
-    for group in groups:
-        for item in group:
-            if isinstance(item, Quarantined):
-                left_out.append(item)
-            yield item

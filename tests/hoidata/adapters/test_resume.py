@@ -27,7 +27,7 @@ DRIVER = Path(__file__).with_name("killable.py")
 N_SEQUENCES = 24
 KILLS = int(os.environ.get("HOIDATA_KILLS", 3))
 # What to die at, and when: as a share of all renames or writes of a run, or counted back from the last one (-1).
-IN_A_WRITE = (("rename", 0.1), ("write", 0.2), ("write", 0.5), ("renamed", 0.6), ("write", -1))
+IN_A_WRITE = (("rename", 0.1), ("write", 0.05), ("write", 0.25), ("write", 0.5), ("renamed", 0.6), ("write", -1))
 AT_THE_END = (("rename", -3), ("rename", -2), ("renamed", -2), ("rename", -1), ("renamed", -1))
 
 
@@ -171,7 +171,7 @@ def test_when_the_parent_alone_is_killed_its_workers_end_and_the_next_run_waits_
 def test_ctrl_c_ends_at_once_and_the_next_run_goes_on(conversions, tmp_path, jobs):
     stopped = conversions.kill_and_run_again(tmp_path / "clips", jobs, after_s=0.1, signal=signal.SIGINT, who="group")
     assert stopped.status == 130
-    assert stopped.ended_s < 3
+    assert stopped.ended_s < 10
     assert stopped.said == ""
 
 
