@@ -142,7 +142,7 @@ BAD_FILES = {
     "a missing mesh": (lambda root: (root / MESH).unlink(), "mesh.obj", "a file"),
     "a mesh that is no text": (_text(MESH, b"\xff\xfe\x00v"), "mesh.obj", "vertices"),
     "a corner beyond all vertices": (
-        _text(MESH, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4000000000\n"),
+        _text(MESH, b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 900\n"),
         "mesh.obj",
         "corners",
     ),
