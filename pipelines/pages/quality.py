@@ -138,7 +138,8 @@ def _values(table: pd.DataFrame, measure: Measure) -> np.ndarray:
 
 
 def _text(value: float) -> str:
-    return f"{value:g}" if value == round(value) else number(value)
+    rounded = round(value, 4)
+    return f"{rounded:g}" if rounded == round(rounded) else number(value)
 
 
 def _summary(counts: Mapping[str, int]) -> str:

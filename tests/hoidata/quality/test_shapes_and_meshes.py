@@ -24,6 +24,11 @@ def test_clip_of_another_shape_than_its_subjects_other_clips_stands_out():
     assert distances_to_others(betas) == pytest.approx({**dict.fromkeys(betas, 0.0), "odd": 2.0})
 
 
+def test_clip_is_compared_with_the_others_only():
+    betas = {"a": np.zeros((1, 10)), "b": np.zeros((1, 10)), "c": np.full((1, 10), 2.0)}
+    assert distances_to_others(betas) == {"a": 1, "b": 1, "c": 2}
+
+
 def test_betas_per_frame_count_by_their_median():
     frames = np.zeros((11, 10))
     frames[0] = 9.0
@@ -54,6 +59,11 @@ def test_missing_triangle_opens_three_edges():
     facts = surface_facts(BOX.vertices, BOX.faces[1:])
     assert facts.open_edge_share == pytest.approx(3 / 33)
     assert not facts.is_solid
+
+
+def test_collapsed_triangle_is_no_edge_of_the_surface():
+    faces = np.concatenate([BOX.faces[1:], [[0, 0, 1]]])
+    assert surface_facts(BOX.vertices, faces).open_edge_share == pytest.approx(3 / 33)
 
 
 def test_triangle_turned_round_leaves_three_pairs_of_edges_without_an_opposite():
