@@ -52,13 +52,15 @@ def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> N
 class TreeMemory:
     """Peak memory of a process and all below it, while the block runs, from /proc (Linux).
 
-    peak_at_once: the largest sum of resident memory seen at one moment (sampled 50 times a second). sum_of_peaks:
-    every process's own highest mark (VmHWM) added up, an upper bound of it. Pages processes share count for each.
+    peak_at_once: the largest sum of resident memory seen at one moment (sampled 50 times a second); own_at_once: of
+    the memory that is no file's, which the system cannot take back. sum_of_peaks: every process's own highest mark
+    (VmHWM) added up, an upper bound. Pages processes share count for each.
     """
 
     def __init__(self, root: int) -> None:
         self.root = root
         self.peak_at_once = 0
+        self.own_at_once = 0
         self.peaks: dict[int, int] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
@@ -78,8 +80,9 @@ class TreeMemory:
     def _watch(self) -> None:
         while not self._stop.wait(0.02):
             now = {pid: _memory(pid) for pid in _tree(self.root)}
-            self.peak_at_once = max(self.peak_at_once, sum(resident for resident, _ in now.values()))
-            for pid, (_, highest) in now.items():
+            self.peak_at_once = max(self.peak_at_once, sum(resident for resident, _, _ in now.values()))
+            self.own_at_once = max(self.own_at_once, sum(own for _, own, _ in now.values()))
+            for pid, (_, _, highest) in now.items():
                 self.peaks[pid] = max(self.peaks.get(pid, 0), highest)
 
 
@@ -91,11 +94,12 @@ def _tree(pid: int) -> list[int]:
     return [pid, *(below for child in children for below in _tree(int(child)))]
 
 
-def _memory(pid: int) -> tuple[int, int]:
-    """Bytes resident now, and at most so far; none for a process that has ended."""
+def _memory(pid: int) -> tuple[int, int, int]:
+    """Bytes resident now, of those no file's, and at most so far; none for a process that has ended."""
     try:
         lines = Path(f"/proc/{pid}/status").read_text().splitlines()
     except OSError:
-        return 0, 0
-    found = {line.split(":")[0]: line.split()[1] for line in lines if line.startswith(("VmRSS", "VmHWM"))}
-    return int(found.get("VmRSS", 0)) * 1024, int(found.get("VmHWM", 0)) * 1024
+        return 0, 0, 0
+    found = dict(line.split(":", 1) for line in lines)
+    resident, own, highest = (int(found.get(name, "0 kB").split()[0]) for name in ("VmRSS", "RssAnon", "VmHWM"))
+    return resident * 1024, own * 1024, highest * 1024

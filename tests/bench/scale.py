@@ -1,10 +1,11 @@
 """A corpus of the papers' size: time, memory and bytes of conversion, annotation and contact, and how they grow.
 
-``python -m tests.bench.scale [SHARE ...]`` (1 and 0.1 when none is given). The raw files are the embedded corpora's,
-repeated (see ``corpus``); nothing is read from a manifest. Each stage runs in processes of its own, so that its memory
-can be told apart; conversion on two workers, the others on one process, as the graph runs them.
+``python -m tests.bench.scale [SHARE ...]`` (0.01, 0.1 and 1 when none is given). The raw files are those of the
+embedded corpora, repeated (see ``corpus``); nothing is read from a manifest. Each stage runs in processes of its own,
+so that its memory can be told apart; conversion on two workers, the others on one process, as the graph runs them.
 """
 
+import itertools
 import json
 import os
 import subprocess
@@ -21,6 +22,7 @@ from tests.bench.corpus import PAPER, embedded_root, replicate
 from tests.bench.harness import TreeMemory, show
 
 MEBI = 1 << 20
+MEMORY = ("peak_at_once", "own_at_once", "sum_of_peaks")
 PARTS = ("clips", "annotation", "contact")
 # What a clip's motion is made of; all else in the arrays is what a source offers besides (contact labels, cameras).
 PARAMETERS = (
@@ -31,11 +33,12 @@ PARAMETERS = (
 
 @dataclass(frozen=True)
 class Measured:
-    """One stage over all datasets. processor_s counts all processes; the two peaks are those of ``TreeMemory``."""
+    """One stage over all datasets. processor_s counts all processes; the rest is that of ``TreeMemory``."""
 
     wall_s: float
     processor_s: float
     peak_at_once: int
+    own_at_once: int
     sum_of_peaks: int
 
 
@@ -73,7 +76,7 @@ def measured(stage: str, name: str, raw: Path, out: Path) -> Measured:
         raise RuntimeError(f"{stage} of {name} ended with exit code {code}")
     wall, after = time.perf_counter() - start, os.times()
     processor = after.children_user + after.children_system - before.children_user - before.children_system
-    found = Measured(wall, processor, memory.peak_at_once, memory.sum_of_peaks)
+    found = Measured(wall, processor, memory.peak_at_once, memory.own_at_once, memory.sum_of_peaks)
     print(f"{stage} of {name}: {found}", file=sys.stderr)
     return found
 
@@ -84,6 +87,7 @@ def total(parts: list[Measured]) -> Measured:
         sum(part.wall_s for part in parts),
         sum(part.processor_s for part in parts),
         max(part.peak_at_once for part in parts),
+        max(part.own_at_once for part in parts),
         max(part.sum_of_peaks for part in parts),
     )
 
@@ -125,21 +129,23 @@ def folder_bytes(folder: Path) -> int:
 
 
 def report(figures: list[dict]) -> None:
-    rows = []
-    for name, line in LINES.items():
-        rows.append((name, *(line(figure) for figure in figures), *_growth(name, figures)))
-    columns = ["", *(f"share {figure['share']:g}" for figure in figures)]
-    show("Paper scale", [*columns, "per frame, first : last"] if len(figures) > 1 else columns, rows)
+    rows = [(name, *(line(figure) for figure in figures), _growth(name, figures)) for name, line in LINES.items()]
+    columns = ["", *(f"share {figure['share']:g}" for figure in figures), "per further frame"]
+    show("Paper scale", columns, rows)
 
 
-def _growth(name: str, figures: list[dict]) -> tuple[str, ...]:
-    """How a figure per frame differs between the first share and the last: 1.0 is linear growth."""
-    if len(figures) < 2:
-        return ()
-    if name not in GROWING:
-        return ("",)
-    first, last = (GROWING[name](figure) / figure["frames"] for figure in (figures[0], figures[-1]))
-    return (f"{first / last:.2f}",)
+def _growth(name: str, figures: list[dict]) -> str:
+    """What a further frame costs between the last two shares, beside the two before: 1.00 is linear growth.
+
+    What a run costs however small it is (starting processes, imports) drops out.
+    """
+    if len(figures) < 3 or name not in GROWING:
+        return ""
+    slopes = [
+        (GROWING[name](larger) - GROWING[name](smaller)) / (larger["frames"] - smaller["frames"])
+        for smaller, larger in itertools.pairwise(figures[-3:])
+    ]
+    return f"{slopes[1] / slopes[0]:.2f}" if slopes[0] else ""
 
 
 def _stage(stage: str, key: str) -> Callable[[dict], float]:
@@ -151,9 +157,7 @@ def _seconds(stage: str) -> Callable[[dict], str]:
 
 
 def _peak(stage: str) -> Callable[[dict], str]:
-    return lambda figure: (
-        f"{_stage(stage, 'peak_at_once')(figure) / MEBI:.0f} / {_stage(stage, 'sum_of_peaks')(figure) / MEBI:.0f} MiB"
-    )
+    return lambda figure: " / ".join(f"{_stage(stage, kind)(figure) / MEBI:.0f}" for kind in MEMORY) + " MiB"
 
 
 def _mebibytes(size: Callable[[dict], float]) -> Callable[[dict], str]:
@@ -161,7 +165,7 @@ def _mebibytes(size: Callable[[dict], float]) -> Callable[[dict], str]:
 
 
 GROWING: dict[str, Callable[[dict], float]] = {
-    **{f"{stage}: wall / processor": _stage(stage, "wall_s") for stage in STAGES},
+    **{f"{stage}: wall / processor": _stage(stage, "processor_s") for stage in STAGES},
     "bytes of parameters": lambda figure: figure["parameter_bytes"],
     **{
         f"bytes of {part}": lambda figure, part=part: figure["bytes"][part]
@@ -175,7 +179,7 @@ LINES: dict[str, Callable[[dict], str]] = {
     "making the raw folder (links)": lambda figure: f"{figure['made_s']:.1f} s",
     **{f"{stage}: wall / processor": _seconds(stage) for stage in STAGES},
     "convert: frames per second": lambda figure: f"{figure['frames'] / _stage('convert', 'wall_s')(figure):,.0f}",
-    **{f"{stage}: peak at once / sum of peaks": _peak(stage) for stage in STAGES},
+    **{f"{stage}: memory at once / no file's / sum of peaks": _peak(stage) for stage in STAGES},
     "parameters per frame": lambda figure: f"{figure['parameter_bytes'] / figure['frames']:.1f} bytes",
     **{
         name: lambda figure, size=size: f"{size(figure) / MEBI:,.1f} MiB"
@@ -186,7 +190,7 @@ LINES: dict[str, Callable[[dict], str]] = {
 }
 
 
-def main(shares: tuple[float, ...] = (1.0, 0.1)) -> None:
+def main(shares: tuple[float, ...] = (0.01, 0.1, 1.0)) -> None:
     """Measure each share, one after another, and show them side by side."""
     corpora = embedded_root()
     # Beside the corpora: hard links do not leave a file system.
@@ -200,4 +204,4 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--stage"]:
         STAGES[sys.argv[2]](sys.argv[3], Path(sys.argv[4]), Path(sys.argv[5]))
     else:
-        main(tuple(map(float, sys.argv[1:])) or (1.0, 0.1))
+        main(*([tuple(map(float, sys.argv[1:]))] if sys.argv[1:] else []))
