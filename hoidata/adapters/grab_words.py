@@ -9,7 +9,7 @@ INTENTS = {
     **{word: word for word in ("squeeze", "stamp", "staple", "toast", "use", "wear")},
     "offhand": "hand over",
     "switchON": "switch on",
-    "takepicture": "take picture",
+    "takepicture": "take a picture with",
 }
 _SHAPES, _SIZES = ("cube", "cylinder", "pyramid", "sphere", "torus"), ("small", "medium", "large")
 # The 51 objects that are handled; the sizes of the plain shapes are part of their words.

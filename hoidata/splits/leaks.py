@@ -8,6 +8,8 @@ from typing import Any, Literal, get_args
 
 import pandas as pd
 
+from hoidata.splits.rules import handled_objects, object_name
+
 Promise = Literal["subject", "object", "sequence", "file", "frame", "motion"]
 PROMISES: tuple[Promise, ...] = get_args(Promise)
 ALWAYS: tuple[Promise, ...] = ("frame", "motion")
@@ -56,7 +58,7 @@ def find_leaks(
     part_of = [str(parts[row["clip_id"]]) for row in rows]
     keys = {
         "subject": [[row["subject"]] for row in rows],
-        "object": [[row["object"], *row["other_objects"]] for row in rows],
+        "object": [[object_name(row["object"]), *handled_objects(row["other_objects"])] for row in rows],
         "sequence": [[row["sequence"]] for row in rows],
         "file": [_motion_paths(row, files, motion_files) for row in rows],
     }

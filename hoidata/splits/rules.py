@@ -1,6 +1,6 @@
 """Which clips train, which validate, which test: a rule over the columns of a store's ``sequences``."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -16,6 +16,8 @@ IN_TIME = ("time", "rounds")
 REST = "rest"
 ROUND: tuple[Part, ...] = ("train", "train", "train", "validation", "test")
 REMEDY = "mend params.yaml"
+# What objects lie on belongs to the room: GRAB's table stands in every clip and is no reason to keep two apart.
+FURNITURE = frozenset({"table"})
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class SplitRule:
 
     by "subject", "object", "sequence": the parts list names of that column. by "prefix": they list beginnings of
     sequence names (``subject3/k2/``). ``train`` is such a list, or "rest" for all clips the other two do not name.
-    by "object": a clip that also shows an object of another part is left out.
+    by "object": a clip that also shows an object of another part (but for a table) is left out.
     by "time": in every source sequence the last ``test_share`` of its clips test, the ``validation_share`` before
     them validate (rounded, at least one clip each where a sequence has three or more).
     by "rounds": in time order of every source sequence, of five successive clips three train, one validates, one tests
@@ -121,11 +123,22 @@ def _by_prefix(sequence: str, rule: SplitRule) -> Part | None:
     return found[0] if found else _otherwise(rule)
 
 
+def object_name(key: str) -> str:
+    """The name of an object of a store: where two meshes share a name, its key carries a digest (``mug#1a2b3c4d``)."""
+    return key.partition("#")[0]
+
+
+def handled_objects(keys: Iterable[str]) -> list[str]:
+    """Names of further objects of a clip, without what they lie on."""
+    return [name for name in map(object_name, keys) if name not in FURNITURE]
+
+
 def _by_object(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
     part_of = _part_of(rule)
     parts: list[Part | None] = []
     for name, others in zip(rows["object"], rows["other_objects"], strict=True):
-        found: list[Part | None] = [_listed(key, part_of, rule) for key in (name, *others)]
+        handled = [object_name(name), *handled_objects(others)]
+        found: list[Part | None] = [_listed(key, part_of, rule) for key in handled]
         parts.append(found[0] if len(set(found)) == 1 else None)
     return parts
 

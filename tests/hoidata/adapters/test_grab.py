@@ -62,7 +62,7 @@ def test_words_come_from_intent_and_object_name_with_the_size_kept(clip):
 
 @pytest.mark.parametrize(
     ("intent", "verb"),
-    [("switchON", "switch on"), ("takepicture", "take picture"), ("pass", "pass"), ("drink", "drink")],
+    [("switchON", "switch on"), ("takepicture", "take a picture with"), ("pass", "pass"), ("drink", "drink")],
 )
 def test_joined_intents_become_words_and_others_stay(root, load_all, intent, verb):
     recording.write_sequence(root, recording.sequence() | {"motion_intent": intent})
@@ -161,7 +161,7 @@ INTENTS = {
     "cook": "cook", "drink": "drink", "eat": "eat", "fly": "fly", "inspect": "inspect", "lift": "lift", "open": "open",
     "pass": "pass", "peel": "peel", "play": "play", "pour": "pour", "screw": "screw", "see": "see", "set": "set",
     "shake": "shake", "squeeze": "squeeze", "stamp": "stamp", "staple": "staple", "switchON": "switch on",
-    "takepicture": "take picture", "toast": "toast", "use": "use", "wear": "wear",
+    "takepicture": "take a picture with", "toast": "toast", "use": "use", "wear": "wear",
 }  # fmt: skip
 OBJECTS = [
     "airplane", "alarmclock", "apple", "banana", "binoculars", "bowl", "camera", "cubelarge", "cubemedium",

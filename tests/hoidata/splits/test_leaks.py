@@ -53,6 +53,11 @@ def test_clips_that_share_nothing_break_no_promise():
     assert found.as_json() == {kind: {"promised": True, "in_two_parts": 0, "first": []} for kind in PROMISES}
 
 
+def test_a_table_may_stand_in_both_parts():
+    rows = [row("a", other_objects=["table"]), row("b", other_objects=["table", "cup"])]
+    assert leaks(rows, {"a": "train", "b": "test"}, ["object"]).shared["object"] == ()
+
+
 def test_a_mesh_may_serve_both_parts_but_a_motion_file_in_a_subfolder_may_not():
     rows = [row("a", source_files=[2, 3]), row("b", source_files=[2, 3])]
     assert leaks(rows, {"a": "train", "b": "test"}, ["file"]).shared["file"] == ("raw/sub/c.npz",)

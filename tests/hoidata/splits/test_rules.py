@@ -118,3 +118,15 @@ def test_a_rule_that_contradicts_itself_is_refused(rule, message):
 @pytest.mark.parametrize("by", ["subject", "object", "sequence", "prefix", "time", "rounds"])
 def test_an_empty_table_has_an_empty_split(by):
     assert assign_split(table([]), SplitRule(by, "rest")).tolist() == []
+
+
+def test_a_table_in_every_clip_does_not_keep_test_objects_out_of_the_test():
+    clips = of_objects(("mug", ["table"]), ("apple", ["table"]), ("mug", ["table", "apple"]))
+    split = assign_split(clips, SplitRule(by="object", train="rest", test=("mug",)))
+    assert split.tolist() == ["test", "train", None]
+
+
+def test_two_meshes_of_one_name_are_one_object_to_a_split():
+    clips = of_objects(("mug#1a2b3c4d", ["table#00000000"]), ("apple", []), ("mug#5e6f7a8b", []))
+    split = assign_split(clips, SplitRule(by="object", train="rest", test=("mug",)))
+    assert split.tolist() == ["test", "train", "test"]
