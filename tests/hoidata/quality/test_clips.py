@@ -139,6 +139,7 @@ def test_planted_fault_is_found(good, plant, expected):
 def test_fault_does_not_raise_what_it_does_not_concern(good):
     assert set(over_limit(row(giant_betas(good)))) <= {"largest_beta", "penetration_m", "penetration_share"}
     assert set(over_limit(row(no_hand(good)))) == {"handless_share"}
+    assert "finger_acceleration_m_s2" not in over_limit(row(shaking_wrist(good)))
     assert set(over_limit(row(jumping_object(good)))) <= {"object_jump_m"}
 
 
