@@ -336,7 +336,7 @@ def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
         capsules = json.loads(raw.read(HAND_REFERENCE))["capsules"]
         ends = {capsule["joint"]: np.array(capsule["end_local"], dtype=np.float64) for capsule in capsules}
         tips = {joint: ends[joint] * MIRROR_X for joint in TIP_JOINTS}
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         expected = f"capsules with joint and end_local for {', '.join(TIP_JOINTS)}"
         raise BadInput(HAND_REFERENCE, expected, f"{type(error).__name__}: {error}") from error
     if any(tip.shape != (3,) or not np.isfinite(tip).all() for tip in tips.values()):

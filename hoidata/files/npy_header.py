@@ -19,6 +19,7 @@ _LONGEST_HEADER = 10_000
 _MOST_DIMENSIONS = 32
 _DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}|O8?)")
 _PYTHON_2_LONG = re.compile(r"(?<=\d)L(?=[,)])")
+_WARNED_ABOUT = re.compile(r"\\|\d[A-Za-z_]")  # "1e5", "0if", "\\d": Python reads some of them with a warning
 _LARGEST_CODE_POINT = 0x10FFFF
 
 
@@ -67,7 +68,10 @@ def read_npy_header(stream: Any, where: str | Path) -> NpyHeader:
 
 
 def _parsed(text: str) -> NpyHeader:
-    values = ast.literal_eval(_PYTHON_2_LONG.sub("", text.strip()))
+    text = _PYTHON_2_LONG.sub("", text.strip())
+    if _WARNED_ABOUT.search(text):
+        raise ValueError("a number or text as no header has")
+    values = ast.literal_eval(text)
     if not isinstance(values, dict) or set(values) != {"descr", "fortran_order", "shape"}:
         raise ValueError("other entries than descr, fortran_order and shape")
     shape, by_columns = values["shape"], values["fortran_order"]

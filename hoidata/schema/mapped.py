@@ -7,9 +7,9 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
-from numpy.lib import format as npy_format
 
 from hoidata.errors import BadInput
+from hoidata.files.npy_header import check_text, read_npy_header
 
 _LOCAL_HEADER = 30  # bytes of a zip local header before name and extra field
 _NPY_HEADER = 1 << 16  # at most so many bytes describe the dtype and shape of a member
@@ -25,12 +25,14 @@ def map_npz(path: str | Path) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(path) as archive, open(path, "rb") as stream:
             mapped = mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ)
-            return {item.filename.removesuffix(".npy"): _view(mapped, item) for item in archive.infolist()}
-    except (OSError, ValueError, EOFError, SyntaxError, TypeError, zipfile.BadZipFile) as error:
+            return {item.filename.removesuffix(".npy"): _view(path, mapped, item) for item in archive.infolist()}
+    except BadInput:
+        raise
+    except Exception as error:  # what zipfile raises on damaged archives has no common base
         raise BadInput(path, "a stored NPZ file of plain arrays", str(error), "run the conversion again") from error
 
 
-def _view(mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndarray:
+def _view(path: str | Path, mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndarray:
     if item.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"{item.filename} is compressed")
     header = mapped[item.header_offset : item.header_offset + _LOCAL_HEADER]
@@ -38,9 +40,7 @@ def _view(mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndarray:
     skipped = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")
     start = item.header_offset + _LOCAL_HEADER + skipped
     stream = io.BytesIO(mapped[start : start + min(item.file_size, _NPY_HEADER)])
-    version = npy_format.read_magic(stream)
-    read_header = npy_format.read_array_header_1_0 if version == (1, 0) else npy_format.read_array_header_2_0
-    shape, fortran, dtype = read_header(stream)
+    shape, fortran, dtype = read_npy_header(stream, f"{path}: {item.filename}")
     if dtype.hasobject:
         raise ValueError(f"{item.filename} holds Python objects")
     count = math.prod(shape)
@@ -49,4 +49,6 @@ def _view(mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndarray:
     if count == 0:
         return np.zeros(shape, dtype)
     flat = np.frombuffer(mapped, dtype, count, start + stream.tell())
+    if dtype.kind == "U":
+        check_text(flat.tobytes(), dtype)
     return flat.reshape(shape, order="F" if fortran else "C")

@@ -1,0 +1,470 @@
+"""Small valid files of every format, made here: nothing binary is committed."""
+
+import gzip
+import io
+import json
+import pickle
+import struct
+import zipfile
+from collections import OrderedDict
+from functools import cache
+
+import numpy as np
+
+from hoidata.hands import load_embedded_hands
+from tests.fuzz.structure import npy_bytes
+
+HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
+
+
+def _objects() -> list[object]:
+    return [
+        {"a": np.arange(4.0).reshape(2, 2), "b": [1, 2.5, "x", None, True, (1, "y")], "c": np.float32(2)},
+        [np.asfortranarray(np.arange(6, dtype=np.int16).reshape(2, 3)), b"\xff", {1, 2}, np.array(["cup", "b"])],
+        {"deep": {"x": np.array([1, "x", np.arange(2)], dtype=object)}, "big": np.arange(3, dtype=">i4")},
+    ]
+
+
+def array_pickles() -> list[bytes]:
+    return [
+        pickle.dumps(value, protocol).replace(b"numpy._core", core)
+        for value in _objects()
+        for protocol, core in ((0, b"numpy.core"), (2, b"numpy.core"), (3, b"numpy._core"), (5, b"numpy._core"))
+    ]
+
+
+def _chumpy(module: bytes, name: bytes, state: bytes) -> bytes:
+    """An object of a class that is not installed, as Python 2 wrote it: no arguments, then its state."""
+    return b"c" + module + b"\n" + name + b"\n)\x81" + state + b"b"
+
+
+def _inner(value: object) -> bytes:
+    """The opcodes that build ``value``, without PROTO and STOP."""
+    return pickle.dumps(value, 2)[2:-1].replace(b"numpy._core", b"numpy.core")
+
+
+def mano_pickles() -> list[bytes]:
+    """A chumpy array, a selection of one and a sparse matrix, in a dictionary each."""
+    array = _chumpy(b"chumpy.ch", b"Ch", _inner({"x": np.arange(6.0).reshape(2, 3)}))
+    chosen = b"}(U\x01a" + array + b"U\x04idxs" + _inner(np.array([0, 2, 4])) + b"U\x0fpreferred_shape" + _inner((3, 1))
+    matrix = {"_shape": (3, 2), "data": np.ones(3), "indices": np.array([0, 1, 2]), "indptr": np.array([0, 2, 3])}
+    return [
+        b"\x80\x02}U\x01a" + array + b"s.",
+        b"\x80\x02}U\x01b" + _chumpy(b"chumpy.reordering", b"Select", chosen + b"u") + b"s.",
+        b"\x80\x02}U\x01c" + _chumpy(b"scipy.sparse.csc", b"csc_matrix", _inner(matrix)) + b"s.",
+        b"\x80\x02}U\x01d" + _inner(np.arange(3.0)) + b"s.",
+    ]
+
+
+@cache
+def mano_file() -> bytes:
+    """A whole right hand in MANO's layout; its bulk in one-byte numbers, so that one reading is quick."""
+    model = load_embedded_hands().right
+    content = {
+        "v_template": model.template_m.astype(np.float32),
+        "shapedirs": np.zeros((778, 3, 10), np.int8),
+        "posedirs": np.zeros((778, 3, 135), np.int8),
+        "J_regressor": model.joint_regressor.astype(np.float32),
+        "weights": model.skin_weights.astype(np.float32),
+        "kintree_table": np.array([[2**32 - 1, *model.parents[1:]], range(16)], np.int64),
+        "f": model.faces.astype(np.uint16),
+        "hands_mean": model.mean_pose.astype(np.float32),
+        "hands_components": model.components.astype(np.float32),
+    }
+    return pickle.dumps(content, 2).replace(b"numpy._core", b"numpy.core")
+
+
+def torch_pickles() -> list[bytes]:
+    """As TACO's hand files: tensors of two frames; one as saved on a GPU, one a slice, one a parameter."""
+    small = {"00000": {"hand_pose": _tensor(np.arange(4.0)), "hand_trans": _tensor(np.zeros(3, np.float32))}}
+    turned = {"hand_shape": _tensor(np.arange(6.0).reshape(2, 3).T)}
+    return [
+        pickle.dumps(small, 4),
+        pickle.dumps(turned, 3),
+        pickle.dumps([_tensor(np.arange(8), location="cuda:0"), OrderedDict(a=1)], 3),
+        pickle.dumps([_parameter(np.ones(2))], 3),
+    ]
+
+
+class _Call:
+    def __init__(self, function: object, *arguments: object) -> None:
+        self.function, self.arguments = function, arguments
+
+    def __reduce__(self) -> tuple:
+        return self.function, self.arguments
+
+
+def _tensor(array: np.ndarray, location: str = "cpu") -> _Call:
+    from torch._utils import _rebuild_tensor_v2
+
+    elements = np.ascontiguousarray(array) if array.flags.c_contiguous else array.T
+    strides = tuple(step // array.itemsize for step in array.strides)
+    return _Call(_rebuild_tensor_v2, _storage(elements, location), 0, array.shape, strides, False, OrderedDict())
+
+
+def _parameter(array: np.ndarray) -> _Call:
+    from torch._utils import _rebuild_parameter
+
+    return _Call(_rebuild_parameter, _tensor(array), True, OrderedDict())
+
+
+def _storage(elements: np.ndarray, location: str) -> _Call:
+    from torch.storage import _load_from_bytes
+
+    return _Call(_load_from_bytes, storage_bytes(elements, location))
+
+
+def storage_bytes(elements: np.ndarray, location: str = "cpu") -> bytes:
+    """What ``torch.save`` writes for a storage in its legacy format."""
+    name = {"f8": "DoubleStorage", "f4": "FloatStorage", "i8": "LongStorage"}[elements.dtype.str[1:]].encode()
+    place = location.encode()
+    head = b"\x80\x02(X\x07\x00\x00\x00storagectorch\n" + name + b"\nX\x01\x00\x00\x007"
+    head += b"X" + struct.pack("<I", len(place)) + place + b"K" + bytes((elements.size,)) + b"NtQ."
+    first = (0x1950A86A20F9469CFC6C, 1001, {"protocol_version": 1001, "little_endian": True})
+    pickles = b"".join(pickle.dumps(value, 2) for value in first) + head + pickle.dumps(["7"], 2)
+    return pickles + struct.pack("<q", elements.size) + elements.tobytes()
+
+
+def npy_files() -> list[bytes]:
+    arrays = (np.arange(6.0).reshape(2, 3), np.asfortranarray(np.ones((2, 2), np.int16)), np.array("text"))
+    return [_saved(array) for array in (*arrays, np.zeros((0, 3), np.float32))]
+
+
+def _saved(array: np.ndarray) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=False)
+    return stream.getvalue()
+
+
+def npy_object_files() -> list[bytes]:
+    return [*(npy_bytes(HEADER, _zero_d(value)) for value in _objects()), npy_files()[0], npy_files()[2]]
+
+
+def _zero_d(value: object) -> bytes:
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return pickle.dumps(array, 3).replace(b"numpy._core", b"numpy.core")
+
+
+def npz_files(compressed: bool) -> list[bytes]:
+    save = np.savez_compressed if compressed else np.savez
+    found = []
+    for arrays in ({"a": np.arange(4.0), "b": np.array("x"), "c": np.zeros((0, 2))}, {"deep/name": np.ones((2, 2))}):
+        stream = io.BytesIO()
+        save(stream, allow_pickle=False, **arrays)
+        found.append(stream.getvalue())
+    return found
+
+
+def npz_object_files() -> list[bytes]:
+    """As GRAB's: strings, numbers and pickled dictionaries."""
+    found = []
+    for compressed in (False, True):
+        stream = io.BytesIO()
+        hand = np.array({"params": {"transl": np.zeros((2, 3)), "global_orient": np.ones((2, 3))}, "vtemp": "a.ply"})
+        contact = np.array({"object": np.zeros((2, 4), np.int8), "body": np.zeros((2, 4100), np.int8)})
+        save = np.savez_compressed if compressed else np.savez
+        save(stream, obj_name="cup", n_frames=np.array(2), lhand=hand, contact=contact)
+        found.append(stream.getvalue())
+    return found
+
+
+OBJ = b"""# comment
+mtllib x.mtl
+v 0 0 0
+v 1.5 0 0 0.5 0.5 0.5
+v 0 1e0 0
+v 0 0 -1
+vn 0 0 1
+vt 0 0
+g part
+f 1 2 3
+f 1/1/1 2/1/1 4/1/1
+f -1 -2 -3
+f 1//1 2//1 3//1 4//1
+"""
+_PLY_HEAD = """ply
+format {} 1.0
+comment made by hand
+element vertex 4
+property float x
+property float y
+property float z
+property uchar red
+element face 3
+property list uchar int vertex_indices
+end_header
+"""
+_CORNERS = ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+_FACES = ((0, 1, 2), (0, 1, 3), (0, 2, 3))
+
+
+def ply_texts() -> list[bytes]:
+    rows = [" ".join(map(str, (*corner, 7))) for corner in _CORNERS]
+    rows += [" ".join(map(str, (len(face), *face))) for face in _FACES]
+    quads = [*rows[:-1], "4 0 1 2 3"]
+    return [(_PLY_HEAD.format("ascii") + "\n".join(lines) + "\n").encode() for lines in (rows, quads)]
+
+
+def ply_binaries() -> list[bytes]:
+    found = []
+    for name, order in (("binary_little_endian", "<"), ("binary_big_endian", ">")):
+        for faces in (_FACES, (*_FACES[:2], (0, 1, 2, 3))):
+            body = b"".join(struct.pack(f"{order}3fB", *corner, 7) for corner in _CORNERS)
+            body += b"".join(struct.pack(f"{order}B{len(face)}i", len(face), *face) for face in faces)
+            found.append(_PLY_HEAD.format(name).encode() + body)
+    return found
+
+
+BVH = b"""HIERARCHY
+ROOT Hand
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation
+  JOINT Finger
+  {
+    OFFSET 1 0.5 0
+    CHANNELS 3 Yrotation Xrotation Zrotation
+    End Site
+    {
+      OFFSET 1 0 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.008333
+0 0 0 1 2 3 4 5 6
+1 0 0 1 2 3 4 5 -6.5
+"""
+
+
+def gzipped() -> list[bytes]:
+    return [gzip.compress(BVH, mtime=0), gzip.compress("é\n".encode(), mtime=0), gzip.compress(b"", mtime=0)]
+
+
+def as_json(*values: object) -> list[bytes]:
+    return [json.dumps(value).encode() for value in values]
+
+
+# Files that are nearly right: each leads to one refusal that chance alone seldom finds.
+_RECONSTRUCT = b"cnumpy.core.multiarray\n_reconstruct\n"
+_NDARRAY = b"cnumpy\nndarray\n"
+_DTYPE_CALL = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR"
+_ARRAY = _RECONSTRUCT + b"(" + _NDARRAY + b"(I0\ntS'b'\ntR"
+NEAR_PICKLES = (
+    b"cos\nsystem\n(S'true'\ntR.",
+    b"(S'true'\nios\nsystem\n.",
+    b"P1\n.",
+    b"\x80\x02Nr\xff\xff\xff\x7f.",
+    b"\x80\x02N2.",
+    b"\x80\x02})NNs.",
+    b"\x80\x02})Ns.",
+    b"\x80\x020.",
+    b"\x80\x02q\x00.",
+    b"\x80\x02tN.",
+    b"\x80\x04\x8f(K\x01K\x02\x90.",
+    b"\x80\x04(K\x01K\x02\x91.",
+    b"\x80\x04(N)d.",
+    b"cbuiltins\nset\nN}S'x'\nI1\ns\x86b.",
+    b"cbuiltins\nset\n.",
+    b"cbuiltins\nset\n(I5\ntR.",
+    b"cbuiltins\nset\n((I1\nttR.",
+    b"cbuiltins\nset\n(((I1\ntttR.",
+    b"c__builtin__\nbytes\n)R.",
+    b"c_codecs\nencode\n(Vabc\nVlatin1\ntR.",
+    b"c_codecs\nencode\n(Vabc\nVrot13\ntR.",
+    b"c_codecs\nencode\n(I1\nVlatin1\ntR.",
+    _RECONSTRUCT + b"(cnumpy\ndtype\n(I0\ntS'b'\ntR.",
+    _RECONSTRUCT + b"(" + _NDARRAY + b"(I9\ntS'b'\ntR.",
+    b"cnumpy\ndtype\n(S'V8'\nI0\nI1\ntR.",
+    b"cnumpy\ndtype\n(C\x02f8I0\nI1\ntR.",
+    _DTYPE_CALL + b"(I3\nS'<'\nN(S'a'\ntN}I-1\nI-1\nI0\ntb.",
+    _DTYPE_CALL + b"(I3\nS'x'\nNNNI-1\nI-1\nI0\ntb.",
+    _DTYPE_CALL + b".",
+    _ARRAY + b"(I1\n(I1\nt" + _DTYPE_CALL + b"I00\nS'short'\ntb.",
+    _ARRAY + b"(I1\n(I-1\nt" + _DTYPE_CALL + b"I00\nS'short'\ntb.",
+    _ARRAY + b"(I1\n(I1\ntNI00\nS'short'\ntb.",
+    _ARRAY + b"(I1\n(I1\nt" + _DTYPE_CALL + b"I00\nNtb.",
+    _ARRAY + b"(I1\n(I1\nt" + _DTYPE_CALL + b"I00\nX\x08\x00\x00\x00abcdefghtb.",
+    _ARRAY + b"(I1\n(I1\ntcnumpy\ndtype\n(S'O8'\nI0\nI1\ntRI00\nS'short'\ntb.",
+    _ARRAY + b"(I1\n(I1\ntcnumpy\ndtype\n(S'U1'\nI0\nI1\ntRI00\nC\x04\xff\xff\xff\x7ftb.",
+    b"cnumpy.core.multiarray\nscalar\n(" + _DTYPE_CALL + b"C\x08\x00\x00\x00\x00\x00\x00\xf0?tR.",
+    b"cnumpy.core.multiarray\nscalar\n(" + _DTYPE_CALL + b"C\x01\x00tR.",
+    b"cnumpy.core.multiarray\nscalar\n(cnumpy\ndtype\n(S'O8'\nI0\nI1\ntRC\x01\x00tR.",
+    b"cnumpy.core.multiarray\nscalar\n(cnumpy\ndtype\n(S'S0'\nI0\nI1\ntRC\x00tR.",
+    b"cnumpy.core.numeric\n_frombuffer\n(C\x08\0\0\0\0\0\0\0\0" + _DTYPE_CALL + b"(I1\ntS'C'\ntR.",
+    b"cnumpy.core.numeric\n_frombuffer\n(C\x08\0\0\0\0\0\0\0\0" + _DTYPE_CALL + b"(I1\ntS'K'\ntR.",
+)
+
+
+def near_array_pickles() -> list[bytes]:
+    shared = [np.zeros(2)]
+    values = ((np.zeros(2), [np.ones(1)]), [shared, shared], [{1: np.array([b"x"])}])
+    return [*NEAR_PICKLES, *(pickle.dumps(value, 5) for value in values), b"\x80\x02N" + b"0N" * 9000 + b"."]
+
+
+def near_torch_pickles() -> list[bytes]:
+    from torch._utils import _rebuild_parameter, _rebuild_tensor_v2
+    from torch.storage import _load_from_bytes
+
+    good, four = storage_bytes(np.arange(4.0)), np.arange(4.0)
+    storage = _Call(_load_from_bytes, good)
+
+    def tensor(*arguments: object) -> bytes:
+        return pickle.dumps(_Call(_rebuild_tensor_v2, *arguments), 3)
+
+    def stored(old: bytes, new: bytes) -> bytes:
+        assert old in good
+        return pickle.dumps(_Call(_load_from_bytes, good.replace(old, new)), 3)
+
+    return [
+        tensor(storage, 0, (5,), (1,), False, None),
+        tensor(storage, 0, (2, 2), (1,), False, None),
+        tensor(storage, 0, (0, 2), (1, 1), False, None),
+        tensor(storage, 0, (10**9,), (0,), False, None),
+        tensor([1], 0, (1,), (1,), False, None),
+        pickle.dumps(_Call(_rebuild_parameter, 5, True, None), 3),
+        pickle.dumps(_Call(_load_from_bytes, "text"), 3),
+        pickle.dumps(_Call(_load_from_bytes, b"short"), 3),
+        pickle.dumps(storage, 3),
+        pickle.dumps(OrderedDict([(1, _tensor(four))]), 2).replace(b")R", b"]\x85R"),
+        b"ccollections\nOrderedDict\n(I5\ntR.",
+        b"ccollections\nOrderedDict\n(((I1\nI2\ntttR.",
+        stored(b"\x04\0\0\0\0\0\0\0", b"\x05\0\0\0\0\0\0\0"),
+        stored(b"DoubleStorage", b"QInt32Storage"),
+        stored(b"little_endianq\x02\x88", b"little_endianq\x02\x89"),
+        stored(b"M\xe9\x03.", b"M\xea\x03."),
+        stored(b"storagec", b"storagfc"),
+        stored(b"K\x04NtQ", b"NNtQ"),
+        stored(b"NtQ.", b"Nt."),
+        stored(pickle.dumps(["7"], 2), pickle.dumps(["8"], 2)),
+    ]
+
+
+def near_npy_files() -> list[bytes]:
+    whole = dict(HEADER, descr="<f8", shape=(2,))
+    headers = (
+        {**whole, "shape": 5},
+        {**whole, "fortran_order": 1},
+        {**whole, "descr": "V8"},
+        {**whole, "shape": (10**12,)},
+        {**whole, "shape": (0, 2**47, 2**47)},
+        {**whole, "descr": "<U4"},
+        [1],
+        " " * 11_000,
+    )
+    files = [npy_bytes(header, b"\xff" * 16) for header in headers]
+    return [*files, npy_bytes(whole, bytes(16), 3), b"", b"\x93NUMPY\x01\0\xff\xff{", npy_bytes(HEADER, b"I1\n.")]
+
+
+def near_object_archives() -> list[bytes]:
+    """A member too few, one twice, too many, too large when unpacked, more bytes than its array, a damaged sum."""
+    whole = npz_object_files()[0]
+    found = [npz_files(False)[0], whole[:-30] + b"\0" * 30]
+    for names in (["obj_name", "obj_name"], [f"m{number}" for number in range(300)]):
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive:
+            for name in names:
+                archive.NameToInfo.clear()
+                archive.writestr(zipfile.ZipInfo(f"{name}.npy"), b"")
+        found.append(stream.getvalue())
+    at = whole.rfind(b"PK\x01\x02")
+    found.append(whole[: at + 24] + b"\xff\xff\xff\xf0" + whole[at + 28 :])
+    for content in (npy_files()[0] + b"more", npy_bytes(HEADER, pickle.dumps(5))):
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive:
+            for name in ("obj_name", "n_frames", "lhand"):
+                archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content)
+        found.append(stream.getvalue())
+    return found
+
+
+def near_pieces() -> list[bytes]:
+    """Contact members of other kinds: arrays by columns, of protocol 5, of text, short ones, no dictionary at all."""
+    big = np.zeros((3, 5000), np.int8)
+    contents = [
+        pickle.dumps(_zero({"object": np.asfortranarray(big), "small": np.ones((2, 2))}), 5),
+        pickle.dumps(_zero({"object": big, "text": np.array([["a"]])}), 3),
+        pickle.dumps(_zero({"object": big}), 3).replace(b"K\x03M\x88\x13\x86", b"K\x03M\x89\x13\x86"),
+        pickle.dumps(_zero({"object": big, "flat": np.zeros(3)}), 3),
+        pickle.dumps(_zero({"object": big}), 0),
+        pickle.dumps(_zero({"object": big}), 2),
+        pickle.dumps(_zero({"object": 5, "other": {1: 2}}), 4),
+        pickle.dumps(_zero([big]), 4),
+        pickle.dumps({"object": big}, 4),
+        b"N" * 1000,
+        b"\xfe.",
+        b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f",
+        b"T\xff\xff\xff\xff",
+        b"S" + b"x" * 5000,
+    ]
+    files = [npy_bytes(HEADER, data.replace(b"numpy._core", b"numpy.core")) for data in contents[:7]]
+    files += [npy_bytes(HEADER, data) for data in contents] + [npy_files()[0]]
+    found = []
+    for content in files:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(zipfile.ZipInfo("contact.npy"), content)
+        found.append(stream.getvalue())
+    return [*found, npz_files(False)[0], near_object_archives()[3]]
+
+
+def _zero(value: object) -> np.ndarray:
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return array
+
+
+def mano_files() -> list[bytes]:
+    """A whole hand, and nine in which one thing is wrong."""
+    whole = pickle.loads(mano_file().replace(b"numpy.core", b"numpy._core"))  # written above
+    faces, weights, regressor = whole["f"].copy(), whole["weights"] * 1.1, whole["J_regressor"]
+    faces[0, 0] = 9999
+    changes: tuple[dict, ...] = (
+        {"f": faces},
+        {"weights": weights},
+        {"kintree_table": np.zeros((2, 16), np.int64)},
+        {"kintree_table": np.zeros(3)},
+        {"v_template": whole["v_template"] * np.float32(-1)},
+        {"v_template": whole["v_template"] * np.float32(np.nan)},
+        {"J_regressor": regressor[:, :5]},
+        {"hands_mean": "text"},
+    )
+    found = [mano_file(), pickle.dumps([1], 2), pickle.dumps({"f": 1}, 2)]
+    found += [pickle.dumps({**whole, **change}, 2) for change in changes]
+    return [data.replace(b"numpy._core", b"numpy.core") for data in found]
+
+
+def near_meshes() -> list[bytes]:
+    lines = ("v nan 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "v 0 0\n", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "f 0 1 2\n")
+    flat = ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "v 0 0 0\n", "", "f 1 2 99999999999\n")
+    return [line.encode() for line in (*lines, *flat)]
+
+
+def near_ply(text: bool) -> list[bytes]:
+    whole = (ply_texts() if text else ply_binaries())[0]
+    changes = (
+        (b"property float x", b"property float w"),
+        (b"property float x", b"property list uchar float x"),
+        (b"property float x", b"property huge x"),
+        (b"element vertex 4", b"element vertex 900"),
+        (b"element face 3", b"element face 900"),
+        (b"element face 3", b"element vertex 3"),
+        (b"element face 3", b"element edge 3"),
+        (b"element vertex 4", b"element point 4"),
+        (b"vertex_indices", b"corners"),
+        (b"format", b"formed"),
+        (b"format ascii 1.0\n", b""),
+        (b"end_header", b"end"),
+        (b"\n3 0 1 2", b"\n2 0 1 2"),
+        (b"\n3 0 1 2", b"\n3 0 1 0.5"),
+        (b"\n3 0 1 2", b"\n-3 0 1 2"),
+        (b"\n3 0 1 2", b"\n3 0 1 77"),
+        (b"\n3 0 1 2", b"\n3 0 1 " + b"7" * 80),
+        (b"0.0 0.0 0.0 7", b"nan 0.0 0.0 7"),
+        (b"1.0 0.0 0.0 7\n0.0 1.0 0.0 7", b"0 0 0 7\n0 0 0 7"),
+        (b"int vertex_indices", b"float vertex_indices"),
+        (b"element face 3", b"element face 0"),
+    )
+    return [whole.replace(old, new) for old, new in changes if old in whole] + [b"ply\nend_header\n", whole[:-3]]

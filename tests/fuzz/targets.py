@@ -1,0 +1,448 @@
+"""Every parser of files from outside, each with seeds, words of its format and the functions whose lines count."""
+
+import io
+import os
+import random
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hoidata.adapters import arctic_files, bvh, h2o_files, manipnet
+from hoidata.adapters.base import RawTree
+from hoidata.files import (
+    array_pieces,
+    arrays,
+    npy_header,
+    numpy_files,
+    pickle_check,
+    restricted_pickle,
+    torch_pickle,
+)
+from hoidata.hands import mano, model
+from hoidata.lineage import manifests
+from hoidata.objects import mesh
+from hoidata.objects import ply as ply_reader
+from hoidata.schema import mapped, store, versions
+from hoidata.schema.clip import SourceFile
+from pipelines.stages import base
+from tests.fuzz import seeds
+from tests.fuzz.coverage import functions_of
+from tests.fuzz.engine import Target
+from tests.fuzz.mutation import LONGEST, mutate
+from tests.fuzz.structure import (
+    gzip_mutation,
+    json_mutation,
+    npy_mutation,
+    pickle_mutation,
+    storage_mutation,
+    zip_mutation,
+)
+
+ABSENT = b"absent"  # stands for a file that is not there
+GLOBALS = (
+    *(b"cnumpy.core.multiarray\n_reconstruct\n", b"cnumpy._core.multiarray\nscalar\n", b"cnumpy\nndarray\n"),
+    *(b"cnumpy\ndtype\n", b"cnumpy._core.numeric\n_frombuffer\n", b"c_codecs\nencode\n", b"cbuiltins\nset\n"),
+    *(b"c__builtin__\nbytes\n", b"cos\nsystem\n", b"cbuiltins\neval\n", b"\x8c\x02os\x8c\x06system\x93"),
+)
+OPCODES = (
+    *(b"N", b"\x88", b"]", b"}", b")", b"(", b"t", b"\x85", b"\x86", b"\x87", b"a", b"e", b"s", b"u", b"R", b"b"),
+    *(b"0", b"1", b"2", b"\x94", b"q\x00", b"h\x00", b"h\x01", b"r\xff\xff\xff\x7f", b"j\x00\x00\x00\x00", b"."),
+    *(b"K\x05", b"J\xff\xff\xff\xff", b"\x8a\x08\x00\x00\x00\x00\x00\x00\x00\x40", b"\x8a\x00", b"\x81", b"\x92"),
+    *(b"G\x7f\xf8\x00\x00\x00\x00\x00\x00", b"X\x02\x00\x00\x00f8", b"U\x02O8", b"C\x04\x00\x00\x00\x00", b"\x8f"),
+    *(b"\x90", b"\x91", b"Q", b"P1\n", b"\x97", b"\x98", b"I-1\n", b"L5L\n", b"S'<'\n", b"Vlatin1\n", b"\x80\x05"),
+)
+MANO_GLOBALS = (b"cchumpy.ch\nCh\n", b"cchumpy.reordering\nSelect\n", b"cscipy.sparse.csc\ncsc_matrix\n")
+TORCH_GLOBALS = (
+    *(b"ctorch._utils\n_rebuild_tensor_v2\n", b"ctorch._utils\n_rebuild_parameter\n"),
+    *(b"ctorch.storage\n_load_from_bytes\n", b"ccollections\nOrderedDict\n", b"ctorch\nFloatStorage\n"),
+    *(b"ctorch.cuda\nHalfStorage\n", b"ctorch\nBFloat16Storage\n"),
+)
+MESH_WORDS = (
+    *(b"v ", b"f ", b"vn 0 0 1\n", b"1/2/3", b"//", b"-1", b"\\\n", b"end_header\n", b"element face 1000000000\n"),
+    *(b"property list uchar int vertex_indices\n", b"property double x\n", b"element vertex 1000000000\n", b"ply\n"),
+    *(b"format ascii 1.0\n", b"format binary_little_endian 1.0\n", b"comment TextureFile x.png\n", b"obj_info\n"),
+    *(b"property list int double vertex_index\n", b"element more 2\n", b"property uchar red\n", b"nan ", b"\xff\xfe"),
+)
+BVH_WORDS = (b"MOTION\n", b"JOINT ", b"End Site", b"{", b"}", b"OFFSET 0 0 0", b"CHANNELS 3 ", b"Frames: ", b"ROOT ")
+PICKLE = pickle_mutation((*OPCODES, *GLOBALS))
+TORCH_POOL = (*OPCODES, *TORCH_GLOBALS)
+ARCTIC_TEXT = "12-100 grab, right hand\n1-30 use, both hand\n\n31-45 type, left hand\n"
+FUNCTIONS = functions_of
+
+
+class _Scratch:
+    """A folder in memory for parsers that take a path."""
+
+    def __init__(self) -> None:
+        shared = Path("/dev/shm")
+        self.root = Path(tempfile.mkdtemp(prefix="hoidata-fuzz-", dir=shared if shared.is_dir() else None))
+        for folder in ("meta", str(Path(manipnet.HAND_REFERENCE).parent)):
+            (self.root / folder).mkdir()
+
+    def written(self, name: str, data: bytes) -> Path:
+        path = self.root / name
+        if data == ABSENT:
+            path.unlink(missing_ok=True)
+            return path
+        with open(path, "wb") as stream:
+            stream.write(data)
+        return path
+
+
+def scratch() -> _Scratch:
+    """The folder of this process: workers are forked."""
+    return _scratch_of(os.getpid())
+
+
+@cache
+def _scratch_of(_process: int) -> _Scratch:
+    return _Scratch()
+
+
+def removed_scratch() -> None:
+    """Remove this process's folder in memory."""
+    shutil.rmtree(scratch().root, ignore_errors=True)
+
+
+def on_disk(name: str, parse: Callable[[Path], Any]) -> Callable[[bytes], Any]:
+    return lambda data: parse(scratch().written(name, data))
+
+
+def all_targets() -> dict[str, Target]:
+    groups = (_pickles(), _numpy_files(), _hand_files(), _meshes(), _texts(), _json_files(), _settings())
+    return {target.name: target for group in groups for target in group}
+
+
+UNPICKLER = [*functions_of(restricted_pickle), *functions_of(pickle_check)]
+
+
+def _pickles() -> list[Target]:
+    return [
+        Target(
+            "pickle-arrays",
+            lambda: [*seeds.array_pickles(), *seeds.near_array_pickles()],
+            _restricted,
+            UNPICKLER,
+            (*OPCODES, *GLOBALS),
+            PICKLE,
+        ),
+        Target(
+            "pickle-mano",
+            seeds.mano_pickles,
+            _mano_values,
+            (mano._dense, mano._dense_csc),
+            (*OPCODES, *GLOBALS, *MANO_GLOBALS),
+            pickle_mutation((*OPCODES, *MANO_GLOBALS)),
+        ),
+        Target(
+            "pickle-torch",
+            lambda: [*seeds.torch_pickles(), *seeds.near_torch_pickles()],
+            _torch,
+            functions_of(torch_pickle),
+            TORCH_POOL,
+            pickle_mutation(TORCH_POOL, storage_mutation(TORCH_POOL)),
+        ),
+    ]
+
+
+def _torch(data: bytes) -> Any:
+    source = scratch().written("hand.pkl", data) if len(data) % 2 else data
+    return torch_pickle.load_torch_pickle(source, "hand.pkl")
+
+
+def _restricted(data: bytes) -> Any:
+    source = io.BytesIO(data) if len(data) % 2 else data
+    return restricted_pickle.restricted_load(source, restricted_pickle.ARRAYS, max_bytes=LONGEST - 256)
+
+
+def _mano_values(data: bytes) -> Any:
+    content = restricted_pickle.restricted_load(data, mano._ALLOW, encoding="latin1", where="MANO_RIGHT.pkl")
+    if isinstance(content, dict):
+        return [mano._dense(f"MANO_RIGHT.pkl: {key}", value) for key, value in content.items()]
+    return mano._dense("MANO_RIGHT.pkl", content)
+
+
+def _numpy_files() -> list[Target]:
+    words = (b"\x93NUMPY", b"'descr': '|O'", b"(1000000000, 1000000000)", b"True", b"<f8", b"()", *OPCODES[:8])
+    zip_words = (
+        b"PK\x03\x04",
+        b"PK\x01\x02",
+        b"PK\x05\x06",
+        b"PK\x06\x06",
+        b"PK\x06\x07",
+        b".npy",
+        b"\xff\xff\xff\xff",
+    )
+    plain = npy_mutation(lambda rng, body: mutate(rng, body, (), (b"\0",)))
+    objects = npy_mutation(PICKLE)
+    reading = [numpy_files._read, *functions_of(npy_header)]
+    members = [numpy_files.load_npz_objects, numpy_files._chosen_members, numpy_files._check_size]
+    members += [numpy_files._read_member, numpy_files._archive, numpy_files._item]
+    return [
+        Target(
+            "npy",
+            lambda: [*seeds.npy_files(), *seeds.near_npy_files()],
+            on_disk("a.npy", numpy_files.load_npy),
+            functions_of(npy_header),
+            words,
+            plain,
+        ),
+        Target(
+            "npy-object",
+            lambda: [*seeds.npy_object_files(), *seeds.near_npy_files()],
+            on_disk("a.npy", numpy_files.load_npy_object),
+            reading,
+            words,
+            objects,
+        ),
+        Target(
+            "npz-object",
+            lambda: [*seeds.npz_object_files(), *seeds.near_object_archives()],
+            on_disk("a.npz", lambda path: numpy_files.load_npz_objects(path, ("obj_name", "n_frames", "lhand"))),
+            members,
+            zip_words,
+            zip_mutation(objects),
+        ),
+        Target(
+            "npz-pieces",
+            lambda: [*seeds.npz_object_files(), *seeds.near_pieces()],
+            on_disk("a.npz", _pieces),
+            [item for item in functions_of(array_pieces) if item.__name__ != "_readable"],
+            zip_words,
+            zip_mutation(objects),
+        ),
+        Target(
+            "npz-read",
+            lambda: [*seeds.npz_files(False), *seeds.npz_files(True), *seeds.near_object_archives(), ABSENT],
+            on_disk("a.npz", arrays.read_npz),
+            [item for item in functions_of(arrays) if item.__name__ != "write_npz"],
+            zip_words,
+            zip_mutation(plain),
+        ),
+        Target(
+            "npz-map",
+            lambda: [*seeds.npz_files(False), seeds.npz_files(True)[0], seeds.npz_object_files()[0], ABSENT],
+            on_disk("a.npz", _mapped),
+            functions_of(mapped),
+            zip_words,
+            zip_mutation(plain),
+        ),
+    ]
+
+
+def _pieces(path: Path) -> None:
+    for name, array in array_pieces.locate_arrays(path, "contact").items():
+        for number, (_, piece) in enumerate(array.pieces()):
+            if number > 3:  # an array of rows without columns may have any number of them
+                break
+            _ = name, piece.sum()
+
+
+def _mapped(path: Path) -> None:
+    for array in mapped.map_npz(path).values():
+        _ = array.ravel()[:10].tolist()
+
+
+def _hand_files() -> list[Target]:
+    checks = (mano._load_side, mano._find, mano._fields, mano._parents, mano._check_side)
+    return [
+        Target(
+            "mano-file",
+            seeds.mano_files,
+            on_disk("MANO_RIGHT.pkl", lambda path: mano._load_side(path.parent, "right")),
+            (*checks, model.checked_model, model._check_meaning),
+            structure=_mano_mutation,
+            longest=1 << 20,
+            structured_only=True,
+        )
+    ]
+
+
+_change_mano = pickle_mutation((*OPCODES, *GLOBALS, *MANO_GLOBALS))
+
+
+def _mano_mutation(rng: random.Random, data: bytes) -> bytes:
+    """Mostly other opcodes; now and then a changed place in the bulk, or a cut."""
+    if rng.random() < 0.7:
+        return _change_mano(rng, data)
+    at = rng.randrange(len(data))
+    if rng.random() < 0.3:
+        return data[:at]
+    start = max(0, at - 64)
+    return data[:start] + mutate(rng, data[start:at], (), OPCODES) + data[at:]
+
+
+def _meshes() -> list[Target]:
+    obj = (mesh._read_obj, mesh.parse_obj, mesh._obj_index, mesh._checked)
+    ply = [mesh._read_ply, *functions_of(ply_reader)]
+    text = [item for item in ply if item is not ply_reader._BinaryRows]
+    binary = [item for item in ply if item is not ply_reader._TextRows]
+    return [
+        Target(
+            "obj", lambda: [seeds.OBJ, *seeds.near_meshes(), ABSENT], on_disk("a.obj", mesh.load_mesh), obj, MESH_WORDS
+        ),
+        Target(
+            "ply-ascii",
+            lambda: [*seeds.ply_texts(), *seeds.near_ply(True)],
+            on_disk("a.ply", mesh.load_mesh),
+            text,
+            MESH_WORDS,
+        ),
+        Target(
+            "ply-binary",
+            lambda: [*seeds.ply_binaries(), *seeds.near_ply(False)],
+            on_disk("a.ply", mesh.load_mesh),
+            binary,
+            MESH_WORDS,
+        ),
+    ]
+
+
+def _texts() -> list[Target]:
+    return [
+        Target(
+            "bvh",
+            lambda: [seeds.BVH],
+            lambda data: bvh.parse_bvh(data.decode("utf-8", "replace"), "a.bvh"),
+            (bvh.parse_bvh, bvh._SkeletonReader, bvh._parse_motion_head, bvh._parse_rows),
+            BVH_WORDS,
+        ),
+        Target(
+            "gzip-text",
+            seeds.gzipped,
+            lambda data: bvh.unpack_text(data, "a.bvh.gz", 4096),
+            (bvh.unpack_text,),
+            (b"\x1f\x8b\x08", b"\0", b"\xff"),
+            gzip_mutation(lambda rng, text: mutate(rng, text, (), (b"\xff", b"x" * 60))),
+        ),
+        Target(
+            "h2o-rows",
+            lambda: [b"1 2.5 -3e-2\n4", b"-0 1 2", b"1.0  2 3\r\n", b"0.5 1 nan"],
+            lambda data: h2o_files.parse_rows([b"1 2 3\n", data], 3, "cam_pose", ["000000.txt", "000001.txt"]),
+            (h2o_files.parse_rows, h2o_files._parse_as_json, h2o_files._parse_line),
+            (b" ", b"\n", b"e", b"-", b"_", b"],[", b"Infinity", b"\xd9\xa3"),
+        ),
+        Target(
+            "h2o-segments",
+            lambda: list(map(str.encode, _segment_lists())),
+            lambda data: h2o_files.parse_segments(data, "action_train.txt"),
+            (h2o_files.parse_segments, h2o_files._segment),
+            (b"subject1/h1/0", b"\n", b"id ", b"action_label", "٣".encode(), b"\xff", b"99999999999"),
+        ),
+        Target(
+            "arctic-descriptions",
+            lambda: [ARCTIC_TEXT.encode()],
+            lambda data: arctic_files.parse_descriptions(data, "description.txt"),
+            (arctic_files.parse_descriptions, arctic_files.parse_description),
+            (b"1-2 grab, both hand\n", b"left", b"-", b"\n", "٣".encode(), b"\xff"),
+        ),
+    ]
+
+
+def _segment_lists() -> tuple[str, str]:
+    head = "id path action_label start_act end_act start_frame end_frame\n"
+    row = "1 subject1/h1/0 8 56 92 0 640\n"
+    return head + row + "\n" + row, head.replace("action_label ", "") + row.replace(" 8 ", " ")
+
+
+def _json_files() -> list[Target]:
+    capsules = [{"joint": joint, "end_local": [0.1, -0.2, 3]} for joint in manipnet.TIP_JOINTS]
+    entry = asdict(SourceFile("grab/s1/a.npz", 12, "0" * 64))
+    manifest = {"schema": manifests.SCHEMA, "dataset": "grab", "present": True, "source": "files", "licence": "x"}
+    info = {"schema_version": store.SCHEMA_VERSION, "dataset": "grab", "hand_model": {"digest": "x"}, "synthetic": True}
+    return [
+        _json_target(
+            "arctic-parts",
+            [[0, 1, 0, 1], [True, False, 1, 0]],
+            lambda data: arctic_files.parse_parts(data, "parts.json", 4),
+            (arctic_files.parse_parts,),
+        ),
+        _json_target(
+            "arctic-misc",
+            [{"s01": {"ioi_offset": 644, "gender": "male"}, "s02": {"ioi_offset": 1}}],
+            lambda data: arctic_files.parse_misc(data, "misc.json"),
+            (arctic_files.parse_misc,),
+        ),
+        _json_target(
+            "manipnet-hand-reference",
+            [{"capsules": capsules}],
+            on_disk(manipnet.HAND_REFERENCE, lambda path: manipnet._read_tips(RawTree(path.parent.parent))),
+            (manipnet._read_tips,),
+        ),
+        _json_target(
+            "manifest",
+            [{**manifest, "files": [entry, entry]}, {**manifest, "recipe": {"seed": 0}, "source": "generated"}],
+            on_disk("grab.json", manifests.read_manifest),
+            (manifests.read_manifest, manifests.Manifest.by_path.fget),
+        ),
+        _json_target(
+            "store-info",
+            [info, {**info, "schema_version": "1.0.0"}, {**info, "schema_version": "9.0.0"}, {**info, "hand_model": 1}],
+            on_disk("meta/info.json", lambda path: _store_info(path.parent.parent)),
+            (store.read_info, versions.checked_version, versions.filled_info),
+        ),
+    ]
+
+
+def _json_target(name: str, values: Sequence[Any], run: Callable[[bytes], Any], code: Sequence[Any]) -> Target:
+    words = (b"[", b"]", b"{", b'"', b",", b"null", b"NaN", b"1e999", b"-", b"\xff", b"\\ud800", b"true")
+    return Target(name, lambda: [*seeds.as_json(*values), ABSENT], run, code, words, json_mutation)
+
+
+def _store_info(folder: Path) -> None:
+    info = store.read_info(folder)
+    version = versions.checked_version(folder, info["schema_version"])
+    versions.filled_info(info, version)
+    store.open_store(folder)  # ends at the tables, which are not there
+
+
+def _settings() -> list[Target]:
+    toml = b'[roots]\ngrab = "/data/grab"\nh2o = "x"\n\n[other]\na = [1, 2.5, true, 1979-05-27]\n'
+    text = yaml.safe_dump({"profile": "own", "convert": {"margin_frames": 3}, "split": {"h2o": "text2hoi"}}).encode()
+    return [
+        Target(
+            "hoidata-toml",
+            lambda: [toml],
+            on_disk("hoidata.toml", _own_root),
+            (base.own_root, base._registered_roots),
+            (
+                b"[roots]\n",
+                b"=",
+                b'"',
+                b"'''",
+                b"[[a]]\n",
+                b"roots = 5\n",
+                b"{",
+                b"\xff",
+                b"grab = 1\n",
+                b"a.b.c = 1\n",
+            ),
+        ),
+        Target(
+            "params-yaml",
+            lambda: [text],
+            on_disk("params.yaml", _params),
+            (base.load_params, base._sections),
+            (b"convert: ", b"- ", b"!!python/object/apply:os.system ", b"&a ", b"*a", b"<<: *a\n", b"{", b"]", b"? "),
+        ),
+    ]
+
+
+class _Margin(base.StageParams):
+    margin_frames: int = 0
+
+
+def _params(path: Path) -> Any:
+    return base.load_params(_Margin, "convert", path)
+
+
+def _own_root(path: Path) -> Any:
+    os.chdir(path.parent)
+    os.environ.pop(base.root_variable("grab"), None)
+    return base.own_root("grab")
