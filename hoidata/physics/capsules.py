@@ -1,0 +1,169 @@
+"""Capsules (spheres swept along segments) against an object's mesh: at most one contact per capsule and frame.
+
+A capsule overlaps where the signed distance somewhere on its axis is below its radius. The distance along a segment
+changes by at most the way gone, so a coarse search with two refinements finds the deepest axis point of all but
+features thinner than an eighth of the segment. Each part of a hinged object is met in its own frame.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.objects.distance import signed_distance
+from hoidata.objects.model import ObjectModel
+
+COARSE_SAMPLES = 9
+_REFINEMENTS = 2
+_ON_SURFACE_M = 1e-6  # nearer than this the direction to the surface is rounding; the triangle's normal is used
+
+
+class Capsules(NamedTuple):
+    """start_m, end_m: (frame, capsule, 3) ends of the axes, metres. radius_m: (capsule,)."""
+
+    start_m: np.ndarray
+    end_m: np.ndarray
+    radius_m: np.ndarray
+
+    def taken(self, frames: np.ndarray | slice, capsules: np.ndarray | slice = slice(None)) -> "Capsules":
+        """Some frames and some capsules only."""
+        return Capsules(self.start_m[frames][:, capsules], self.end_m[frames][:, capsules], self.radius_m[capsules])
+
+    def moved(self, shift_m: np.ndarray) -> "Capsules":
+        """Shifted by (3,) or, frame by frame, (frame, 3)."""
+        shift = np.broadcast_to(shift_m, (len(self.start_m), 3))[:, None]
+        return Capsules(self.start_m + shift, self.end_m + shift, self.radius_m)
+
+
+class ObjectPoses(NamedTuple):
+    """rotmats: (frame, 3, 3) and translation_m: (frame, 3) of ``world_from_object``; hinge_rad: (frame,) or None."""
+
+    rotmats: np.ndarray
+    translation_m: np.ndarray
+    hinge_rad: np.ndarray | None = None
+
+    def taken(self, frames: np.ndarray | slice) -> "ObjectPoses":
+        hinge = None if self.hinge_rad is None else self.hinge_rad[frames]
+        return ObjectPoses(self.rotmats[frames], self.translation_m[frames], hinge)
+
+
+class CapsuleContacts(NamedTuple):
+    """One row per overlap, sorted by frame, then capsule; world frame.
+
+    frame, capsule: (contact,) int. part: (contact,) touched part. depth_m: (contact,) radius less signed distance of
+    the deepest axis point. point_m: (contact, 3) nearest surface point to it. normal: (contact, 3) unit, out of the
+    object, the gradient of the signed distance there. along: (contact,) place of the deepest point on the axis, 0 to 1.
+    """
+
+    frame: np.ndarray
+    capsule: np.ndarray
+    part: np.ndarray
+    depth_m: np.ndarray
+    point_m: np.ndarray
+    normal: np.ndarray
+    along: np.ndarray
+
+
+def joined(hands: list[Capsules]) -> Capsules:
+    """The capsules of several hands as one set, in the order given."""
+    starts, ends, radii = zip(*hands, strict=True)
+    return Capsules(np.concatenate(starts, axis=1), np.concatenate(ends, axis=1), np.concatenate(radii))
+
+
+def capsule_contacts(
+    model: ObjectModel, poses: ObjectPoses, capsules: Capsules, tolerance_m: float = 0.0, at_centre: bool = False
+) -> CapsuleContacts:
+    """Every capsule within ``tolerance_m`` of the object, world frame; a hinged object counts by its nearer part.
+
+    at_centre: contact point and normal are those nearest to the middle of the axis, as ManipNet's release takes them,
+    instead of those nearest to its deepest point; depth and overlap are the same.
+    """
+    found = [
+        _part_contacts(model, part, part_poses(model, poses, part), capsules, tolerance_m, at_centre)
+        for part in _parts(model)
+    ]
+    every = CapsuleContacts(*(np.concatenate(column) for column in zip(*found, strict=True)))
+    order = np.lexsort((-every.depth_m, every.capsule, every.frame))
+    frame, capsule = every.frame[order], every.capsule[order]
+    first = np.r_[True, (np.diff(frame) != 0) | (np.diff(capsule) != 0)] if len(order) else np.zeros(0, dtype=bool)
+    return CapsuleContacts(*(column[order][first] for column in every))
+
+
+def part_poses(model: ObjectModel, poses: ObjectPoses, part: int) -> ObjectPoses:
+    """World-from-part of one part: the object's own pose for the base, turned by the hinge for part 1."""
+    if part == 0 or model.hinge is None:
+        return ObjectPoses(poses.rotmats, poses.translation_m)
+    if poses.hinge_rad is None:
+        raise ValueError(f"{model.name}: hinge angles are needed to place the moving part")
+    turn = rotvec_to_rotmat(model.hinge.axis[None] * np.asarray(poses.hinge_rad, dtype=np.float64)[:, None])
+    shift = model.hinge.origin_m - turn @ model.hinge.origin_m
+    return ObjectPoses(poses.rotmats @ turn, poses.translation_m + np.einsum("fij,fj->fi", poses.rotmats, shift))
+
+
+def to_part_frame(points_m: np.ndarray, poses: ObjectPoses) -> np.ndarray:
+    """World points (frame, point, 3) in the frame of a rigid part."""
+    return (points_m - poses.translation_m[:, None]) @ poses.rotmats
+
+
+def _parts(model: ObjectModel) -> list[int]:
+    return [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
+
+
+def _part_contacts(
+    model: ObjectModel, part: int, poses: ObjectPoses, capsules: Capsules, tolerance_m: float, at_centre: bool
+) -> CapsuleContacts:
+    faces = model.faces[model.face_part == part] if model.is_articulated else model.faces
+    start, end = to_part_frame(capsules.start_m, poses), to_part_frame(capsules.end_m, poses)
+    frame, capsule = _candidates(model.vertices_m[np.unique(faces)], start, end, capsules.radius_m + tolerance_m)
+    start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
+    middle, half = (start + end) / 2, np.linalg.norm(end - start, axis=1) / 2
+    near = _distances(model, faces, middle)[0] < half + radius + tolerance_m
+    frame, capsule, start, end, radius = (column[near] for column in (frame, capsule, start, end, radius))
+    along = _deepest(model, faces, start, end)
+    distance, point, normal = _distances(model, faces, start + along[:, None] * (end - start))
+    if at_centre:
+        _, point, normal = _distances(model, faces, (start + end) / 2)
+    hit = distance < radius + tolerance_m
+    frame = frame[hit]
+    point = np.einsum("nij,nj->ni", poses.rotmats[frame], point[hit]) + poses.translation_m[frame]
+    normal = np.einsum("nij,nj->ni", poses.rotmats[frame], normal[hit])
+    depth = (radius - distance)[hit]
+    return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal, along[hit])
+
+
+def _candidates(
+    vertices_m: np.ndarray, start: np.ndarray, end: np.ndarray, reach_m: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frame and capsule of those whose bounding box, widened by its reach, meets the part's."""
+    low, high = np.minimum(start, end) - reach_m[:, None], np.maximum(start, end) + reach_m[:, None]
+    frame, capsule = np.nonzero(((low < vertices_m.max(axis=0)) & (high > vertices_m.min(axis=0))).all(axis=-1))
+    return frame, capsule
+
+
+def _deepest(model: ObjectModel, faces: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(segment,) place on each axis, 0 to 1, where the signed distance is least."""
+    grid = np.linspace(0, 1, COARSE_SAMPLES)
+    along = np.broadcast_to(grid, (len(start), COARSE_SAMPLES))
+    step = grid[1]
+    for _ in range(_REFINEMENTS):
+        best = _least(model, faces, start, end, along)
+        step /= 4
+        along = np.clip(best[:, None] + step * np.arange(-4, 5), 0, 1)
+    return _least(model, faces, start, end, along)
+
+
+def _least(model: ObjectModel, faces: np.ndarray, start: np.ndarray, end: np.ndarray, along: np.ndarray) -> np.ndarray:
+    points = start[:, None] + along[:, :, None] * (end - start)[:, None]
+    distance = _distances(model, faces, points.reshape(-1, 3))[0].reshape(along.shape)
+    return along[np.arange(len(along)), distance.argmin(axis=1)]
+
+
+def _distances(model: ObjectModel, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Signed distance, nearest surface point, and the gradient of the distance, of points in the part's frame."""
+    if not len(points):
+        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
+    found = signed_distance(model.vertices_m, faces, points)
+    away = np.abs(found.distance_m) > _ON_SURFACE_M
+    gradient = found.normal.copy()
+    gradient[away] = (points[away] - found.closest_m[away]) / found.distance_m[away, None]
+    return found.distance_m, found.closest_m, gradient

@@ -1,0 +1,100 @@
+"""What physics is asked about: an object's motion, the capsules of the hands, gravity; and which frames are scored."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import HandPair
+from hoidata.objects.model import ObjectModel, articulate
+from hoidata.physics.capsules import Capsules, ObjectPoses, joined
+from hoidata.physics.contact_forces import GRAVITY_M_S2, MASS_KG, BodyMotion, required_wrench
+from hoidata.physics.mano_capsules import hand_capsules
+from hoidata.physics.surface import body_motion
+from hoidata.schema.clip import FPS, SIDES, Clip
+
+LIFTED_M = 0.015
+TABLE_PERCENTILE = 3
+_FALLING = 0.05  # of the weight: an object that needs less support than this falls
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One object, the capsules that may touch it (none at all is allowed), world frame, every frame of a recording.
+
+    gravity: (3,) unit vector, the direction things fall. A capsule whose ends are NaN in a frame is not there.
+    table_m: height of the table top, measured against gravity from the world's origin, or None: the 3rd percentile of
+    the lowest vertex over these frames stands for it (``reference/manipnet-data.md``), which needs frames at rest.
+    """
+
+    model: ObjectModel
+    poses: ObjectPoses
+    capsules: Capsules
+    fps: float
+    gravity: np.ndarray
+    table_m: float | None = None
+
+    @property
+    def n_frames(self) -> int:
+        return len(self.poses.translation_m)
+
+    @cached_property
+    def motion(self) -> BodyMotion:
+        """Of 1 kg of even density; a hinged object is one body at each frame's angle."""
+        return body_motion(self.model, self.poses.rotmats, self.poses.translation_m, self.poses.hinge_rad)
+
+    @cached_property
+    def wrench(self) -> np.ndarray:
+        """(frame, 6) N and N m about the centre of mass that hands and table together must give."""
+        return required_wrench(self.motion, self.fps, self.gravity)
+
+    @cached_property
+    def vertices_m(self) -> np.ndarray:
+        """(frame, vertex, 3) of the object in the world."""
+        model = self.model
+        local = articulate(model.vertices_m, model.part, model.hinge, self.poses.hinge_rad)
+        return local @ self.poses.rotmats.transpose(0, 2, 1) + self.poses.translation_m[:, None]
+
+    @cached_property
+    def lowest_m(self) -> np.ndarray:
+        """(frame,) height of the object's lowest vertex, against gravity."""
+        return (-self.vertices_m @ self.gravity).min(axis=1)
+
+    @property
+    def table_height_m(self) -> float:
+        return float(np.percentile(self.lowest_m, TABLE_PERCENTILE)) if self.table_m is None else self.table_m
+
+    @property
+    def lifted(self) -> np.ndarray:
+        """(frame,) bool: the lowest vertex is more than 1.5 cm above the table. Nothing but hands can hold it then."""
+        return self.lowest_m - self.table_height_m > LIFTED_M
+
+    @property
+    def held(self) -> np.ndarray:
+        """(frame,) bool: lifted, and not falling: the force it needs is more than 5 % of its weight."""
+        return self.lifted & (np.linalg.norm(self.wrench[:, :3], axis=1) > _FALLING * MASS_KG * GRAVITY_M_S2)
+
+    def with_capsules(self, capsules: Capsules) -> "Scene":
+        """The same object under other hands."""
+        return replace(self, capsules=capsules)
+
+
+def clip_scene(clip: Clip, hands: HandPair, table_m: float | None = None) -> Scene:
+    """A clip's object and the 19 capsules of each of its hands, left before right, at 30 fps. Raises BadInput."""
+    if clip.gravity is None:
+        raise BadInput(clip.clip_id, "a clip whose gravity is known", "none", "leave it out of physical measures")
+    capsules = []
+    for side in SIDES:
+        own, valid = hand_capsules(clip.hands[side], hands[side]), clip.hands[side].valid[:, None, None]
+        capsules.append(
+            Capsules(np.where(valid, own.start_m, np.nan), np.where(valid, own.end_m, np.nan), own.radius_m)
+        )
+    track = clip.object
+    poses = ObjectPoses(
+        rotvec_to_rotmat(np.asarray(track.rotvec, dtype=np.float64)),
+        np.asarray(track.translation_m, dtype=np.float64),
+        None if track.hinge_rad is None else np.asarray(track.hinge_rad, dtype=np.float64),
+    )
+    return Scene(clip.object.model, poses, joined(capsules), FPS, clip.gravity, table_m)
