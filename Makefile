@@ -9,7 +9,7 @@ export PREFECT_SERVER_ANALYTICS_ENABLED := false
 export HF_HUB_OFFLINE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo install install-dev test test-fast lint types imports check bench clean
+.PHONY: demo install install-dev test test-fast fuzz lint types imports check bench clean
 
 demo: $(VENV)/.installed
 	dvc repro
@@ -31,6 +31,10 @@ test: install-dev
 
 test-fast: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow"
+
+# Over a million damaged files for every parser, within the hour on two cores; inputs that fail are kept in .fuzz/.
+fuzz: install-dev
+	OMP_NUM_THREADS=1 python -m tests.fuzz --full --jobs 2 --executions 50000
 
 lint: install-dev
 	ruff check .
