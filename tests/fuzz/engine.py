@@ -23,6 +23,7 @@ from tests.fuzz.mutation import LONGEST, mutate
 from tests.fuzz.structure import Bytes
 
 SLOWEST_S = 1.0
+_NOTABLE_S = 0.1  # longer calls are repeated: the machine may have been busy
 MEMORY_BYTES = 1 << 30
 _TRACED = 24  # one execution in so many is traced; the others run at full speed
 _STRUCTURED = 0.6
@@ -134,7 +135,7 @@ def _execute(target: Target, data: bytes, coverage: LineCoverage | None, outcome
             raise
         _note_fault(target, data, _described(error), outcome, folder)
     duration = time.perf_counter() - begin
-    if duration > SLOWEST_S:
+    if duration > _NOTABLE_S:
         duration = min(duration, _repeated(target, data))
         if duration > SLOWEST_S:
             _note_fault(target, data, f"{duration:.2f} s", outcome, folder)

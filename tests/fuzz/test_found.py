@@ -1,0 +1,115 @@
+"""Inputs that fuzzing found, each of which once ended in something else than a clear error."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hoidata.adapters import RawTree, manipnet
+from hoidata.errors import BadInput
+from hoidata.files.arrays import read_npz
+from hoidata.lineage.manifests import read_manifest
+from hoidata.objects.mesh import load_mesh
+from hoidata.schema.mapped import map_npz
+from hoidata.schema.store import open_store
+from pipelines.stages.base import StageParams, load_params, own_root
+
+
+def archive(content: bytes, kind: int = zipfile.ZIP_STORED) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", kind) as target:
+        target.writestr("a.npy", content)
+    return stream.getvalue()
+
+
+def npy(header: str, body: bytes = bytes(32)) -> bytes:
+    return b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode() + body
+
+
+def shaped(shape: str, descr: str = "<f8") -> bytes:
+    return npy(f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}}}\n")
+
+
+def patched(data: bytes, mark: bytes, at: int, new: bytes) -> bytes:
+    """Bytes overwritten at a place counted from the last mark (PK12: of the zip's directory)."""
+    place = data.rindex(mark) + at
+    return data[:place] + new + data[place + len(new) :]
+
+
+GOOD = archive(shaped("(4,)"))
+PACKED = archive(shaped("(4,)") + np.random.default_rng(0).bytes(400), zipfile.ZIP_DEFLATED)
+ARCHIVES = {
+    "unclosed header (TokenError)": archive(npy("{'descr': '<f8', 'shape': (\n")),
+    "empty header (IndexError)": archive(npy("()")),
+    "huge shape (MemoryError)": archive(shaped("(1000000000000,)")),
+    "endless shape (OverflowError)": archive(shaped("(99999999999999999999,)")),
+    "shape of flags (TypeError)": archive(shaped("(None,)")),
+    "impossible text (SystemError)": archive(shaped("()", "<U1")[:-32] + b"\xff\xff\xff\x7f"),
+    "zip of version 7.5 (NotImplementedError)": patched(GOOD, b"PK\x01\x02", 6, b"\x4b"),
+    "encrypted (RuntimeError)": patched(patched(GOOD, b"PK\x01\x02", 8, b"\x01"), b"PK\x03\x04", 6, b"\x01"),
+    "strong encryption (NotImplementedError)": patched(GOOD, b"PK\x01\x02", 8, b"\x40"),
+    "damaged stream (zlib.error)": patched(PACKED, b"PK\x03\x04", 60, b"\xff" * 30),
+}
+
+
+@pytest.mark.parametrize("kind", ARCHIVES)
+@pytest.mark.parametrize("read", [read_npz, map_npz])
+def test_damaged_archives_are_bad_input(tmp_path: Path, kind: str, read: Callable) -> None:
+    path = tmp_path / "a.npz"
+    path.write_bytes(ARCHIVES[kind])
+    if read is map_npz and kind.startswith(("encrypted", "strong")):
+        pytest.skip("a map looks at no flag of a member: its bytes are what they are")
+    with pytest.raises(BadInput, match=r"a\.npz"):
+        read(path)
+
+
+def test_a_corner_beyond_64_bits_is_bad_input(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 99999999999999999999\n")
+    with pytest.raises(BadInput, match=r"a\.obj:4"):
+        load_mesh(tmp_path / "a.obj")
+
+
+def test_a_capsule_end_too_large_for_a_number_is_bad_input(tmp_path: Path) -> None:
+    path = tmp_path / manipnet.HAND_REFERENCE
+    path.parent.mkdir(parents=True)
+    ends = [{"joint": joint, "end_local": [10**400, 0, 0]} for joint in manipnet.TIP_JOINTS]
+    path.write_text(json.dumps({"capsules": ends}))
+    with pytest.raises(BadInput, match="hand_reference"):
+        manipnet._read_tips(RawTree(tmp_path))
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "\udcff", "5", ""])
+def test_a_manifest_nested_without_end_or_of_other_bytes_is_bad_input(tmp_path: Path, text: str) -> None:
+    (tmp_path / "grab.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(BadInput, match=r"grab\.json"):
+        read_manifest(tmp_path / "grab.json")
+
+
+@pytest.mark.parametrize("model", [5, "x", None, [1], True, 1.5])
+def test_a_store_whose_hand_model_is_no_entry_is_bad_input(tmp_path: Path, model: object) -> None:
+    (tmp_path / "meta").mkdir()
+    (tmp_path / "meta" / "info.json").write_text(json.dumps({"schema_version": "1.1.0", "hand_model": model}))
+    with pytest.raises(BadInput, match="hand_model"):
+        open_store(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["a = ", "[roots]\ngrab = 5\n", "roots = 5\n", "\udcff", "[roots]\ngrab = '\0'\n"])
+def test_settings_that_are_no_toml_are_bad_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("HOIDATA_GRAB", raising=False)
+    Path("hoidata.toml").write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(BadInput, match=r"hoidata\.toml"):
+        own_root("grab")
+
+
+@pytest.mark.parametrize(
+    "text", ["a: [", "*a", "- 1", "", "\udcff", "!!python/object/apply:os.system ['true']", "a\tb: {"]
+)
+def test_params_that_are_no_sections_are_bad_input(tmp_path: Path, text: str) -> None:
+    (tmp_path / "params.yaml").write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(BadInput, match=r"params\.yaml"):
+        load_params(StageParams, "convert", tmp_path / "params.yaml")
