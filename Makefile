@@ -32,7 +32,7 @@ test: install-dev
 test-fast: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow"
 
-# Over a million damaged files for every parser, within the hour on two cores; inputs that fail are kept in .fuzz/.
+# 50,000 damaged files for each parser, over a million in all; inputs that fail are kept in .fuzz/.
 fuzz: install-dev
 	OMP_NUM_THREADS=1 python -m tests.fuzz --full --jobs 2 --executions 50000
 
