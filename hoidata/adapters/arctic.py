@@ -43,12 +43,20 @@ CONVENTION = HandConvention(
     left_shape="as released",
     note="MANO: axis-angles relative to the mean pose, betas per sequence, translation added to the rest wrist",
 )
-PARTS = (
-    DatasetPart("hand and object motion", tuple(f"{top}raw_seqs/s*/*.object.npy" for top in TOPS), "raw_seqs.zip"),
-    DatasetPart("object meshes", tuple(f"{top}meta/object_vtemplates/*/mesh.obj" for top in TOPS), "meta.zip"),
-    DatasetPart(
-        "segments and words", tuple(f"{top}description/s*/*/description.txt" for top in TOPS), "Text2HOI's repository"
-    ),
+
+
+def _below_tops(*patterns: str) -> tuple[str, ...]:
+    return tuple(f"{top}{pattern}" for top in TOPS for pattern in patterns)
+
+
+MOTION_PARTS = (
+    DatasetPart("object motion", _below_tops("raw_seqs/s*/*.object.npy"), "raw_seqs.zip"),
+    DatasetPart("hand motion", _below_tops("raw_seqs/s*/*.mano.npy"), "raw_seqs.zip"),
+    DatasetPart("object meshes", _below_tops("meta/object_vtemplates/*/mesh.obj"), "meta.zip"),
+    DatasetPart("parts of the objects", _below_tops("meta/object_vtemplates/*/parts.json"), "meta.zip"),
+    DatasetPart("head camera", _below_tops("raw_seqs/s*/*.egocam.dist.npy"), "raw_seqs.zip", optional=True),
+    DatasetPart("bodies", _below_tops("raw_seqs/s*/*.smplx.npy"), "raw_seqs.zip", optional=True),
+    DatasetPart("image offsets", _below_tops("meta/misc.json"), "meta.zip", optional=True),
 )
 WITHHELD_SUBJECT = "s03"
 KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
@@ -93,13 +101,19 @@ class ArcticAdapter:
     may_be_shared: bool = False
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
-    parts: tuple[DatasetPart, ...] = PARTS
 
     def __post_init__(self) -> None:
         for name in ("margin_frames", "shortest_frames", "trimmed_frames"):
             checks.whole_setting(self.name, name, getattr(self, name))
         checks.choice_setting(self.name, "clips", self.clips, get_args(Stretches))
         checks.switch_setting(self.name, "body", self.body)
+
+    @property
+    def parts(self) -> tuple[DatasetPart, ...]:
+        """Descriptions are needed only where clips are cut by them."""
+        files = _below_tops("description/s*/*/description.txt")
+        where = "Text2HOI's description files (linked from its and ARCTIC's page)"
+        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional=self.clips == "whole"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence that has any of its files; they are paired by name, never by position."""

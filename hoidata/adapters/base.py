@@ -41,6 +41,7 @@ class SequenceKey:
 class DatasetPart:
     """Files a raw folder must hold: at least one match of one of ``patterns`` (globs below the raw root).
 
+    Every file the adapter may read matches a pattern of some part: no other is scanned into a manifest.
     what: in words; where: the archive or page it comes from. optional: conversion works without it.
     """
 

@@ -32,13 +32,13 @@ CONVENTION = HandConvention(
 PARTS = (
     DatasetPart("sequences", ("grab/s*/*.npz", "GRAB/grab/s*/*.npz"), "grab__s1.zip to grab__s10.zip"),
     DatasetPart(
-        "object meshes",
-        ("tools/object_meshes/contact_meshes/*.ply", "GRAB/tools/object_meshes/contact_meshes/*.ply"),
+        "meshes of objects and table",
+        ("tools/object_meshes/*/*.ply", "GRAB/tools/object_meshes/*/*.ply"),
         "object_meshes.zip",
     ),
     DatasetPart(
         "the subjects' hand meshes",
-        ("tools/subject_meshes/*/*_rhand.ply", "GRAB/tools/subject_meshes/*/*_rhand.ply"),
+        ("tools/subject_meshes/*/*.ply", "GRAB/tools/subject_meshes/*/*.ply"),
         "tools__subject_meshes.zip",
     ),
 )

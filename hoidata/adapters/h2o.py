@@ -37,8 +37,9 @@ CAMERA = "cam4"
 OLD_NAMES = {"spray": "lotion_spray", "cocoa": "ovomaltine", "chips": "pringles", "cappuccino": "starbucks"}
 FRAME = WorldFrame(None, "estimated", "H2O's camera-rig world, right-handed, metres; its axes are not documented")
 PARTS = (
-    DatasetPart("pose files of the head camera", ("subject*/*/*/cam4/obj_pose_rt/*.txt",), "subjectN_pose_v1_1.tar.gz"),
+    DatasetPart("pose files of the head camera", ("subject*/*/*/cam4/*/*.txt",), "subjectN_pose_v1_1.tar.gz"),
     DatasetPart("object meshes", ("object/*/*.obj",), "object.zip"),
+    DatasetPart("the head camera's lens", ("subject*/*/*/cam4/*.txt",), "subjectN_pose_v1_1.tar.gz", optional=True),
     DatasetPart("segments of all subjects", ("label_split/action_*.txt",), "label_split.zip", optional=True),
 )
 

@@ -38,21 +38,21 @@ def scan(
 
 
 def _scan_dataset(place, root: Path):
-    from hoidata.adapters.registry import get_adapter
     from hoidata.errors import BadInput
     from hoidata.lineage.graph import read_params
     from hoidata.lineage.manifests import absent_manifest, scan_files
+    from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
 
     known = read_params(Path())["datasets"]
-    adapter = get_adapter(place.dataset)
+    adapter = configured_adapter(place.dataset)
     if place.dataset not in known:
         remedy = f"add {place.dataset} to `datasets` in params.yaml"
         raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
     _ensure_manifests(adapter)
     require_hand(place)
     _require_parts(adapter, root)
-    return absent_manifest(adapter).with_files(scan_files(root))
+    return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
 
 
 def _ensure_manifests(adapter) -> None:
@@ -115,11 +115,11 @@ def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are 
 
 def _verify_one(dataset: str) -> bool:
     """Print how one dataset's files compare with its manifest; True when there is nothing to complain about."""
-    from hoidata.adapters.registry import get_adapter
     from hoidata.lineage.manifests import read_manifest, verify_files
+    from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.base import Place, raw_root
 
-    place, adapter = Place(current_profile(), dataset), get_adapter(dataset)
+    place, adapter = Place(current_profile(), dataset), configured_adapter(dataset)
     manifest = read_manifest(place.manifest)
     if not manifest.present:
         typer.echo(f"{dataset}: not present; {manifest.licence}; {manifest.where_to_register}")
@@ -127,7 +127,7 @@ def _verify_one(dataset: str) -> bool:
             typer.echo(f"  {part.what}: {part.where}{' (optional)' if part.optional else ''}")
         return True
     listed = read_manifest(place.raw_manifest) if manifest.synthetic else manifest
-    differences = verify_files(raw_root(place), listed)
+    differences = verify_files(raw_root(place), listed, adapter.parts)
     for item in differences[:SHOWN_DIFFERENCES]:
         typer.echo(f"{dataset}: {item.path} is {item.problem}{_where_to_get(adapter, item.path)}")
     if len(differences) > SHOWN_DIFFERENCES:

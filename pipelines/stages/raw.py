@@ -8,6 +8,7 @@ from hoidata.lineage.digests import paths_digests, value_digest
 from hoidata.lineage.graph import read_graph
 from hoidata.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
 from hoidata.schema.clip import SourceFile
+from pipelines.stages.adapters import configured_adapter
 from pipelines.stages.base import Place, jobs, raw_root, root_variable
 
 SHOWN_DIFFERENCES = 5
@@ -33,13 +34,13 @@ def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
         write_generated(place, manifest, root)
         with atomic_file(stamp) as part:
             part.write_text(wanted)
-    return scan_files(root)
+    return scan_files(root, configured_adapter(place.dataset).parts)
 
 
 def recipe_digest(place: Place, manifest: Manifest) -> str:
-    """Digest of the recipe and of the code that follows it."""
+    """Digest of the recipe and of the code that follows it; adapters only say which of the files count."""
     project = Path()
-    code = read_graph(project)[f"raw@{place}"].code
+    code = [path for path in read_graph(project)[f"raw@{place}"].code if not path.startswith("hoidata/adapters")]
     return value_digest([manifest.recipe, paths_digests(project, code)])
 
 
@@ -55,9 +56,7 @@ def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
 
 def require_hand(place: Place) -> None:
     """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
-    from hoidata.adapters.registry import get_adapter
-
-    if not get_adapter(place.dataset).needs_mano or read_manifest(place.hand_manifest).present:
+    if not configured_adapter(place.dataset).needs_mano or read_manifest(place.hand_manifest).present:
         return
     raise MissingResource(
         f"{place.dataset} holds MANO parameters and no MANO files are registered. Register at "
@@ -69,7 +68,7 @@ def require_hand(place: Place) -> None:
 def check_own_files(place: Place, manifest: Manifest) -> None:
     """Compare the user's files with the scanned manifest. Raises BadInput that lists the first differences."""
     root = raw_root(place)
-    differences = verify_files(root, manifest)
+    differences = verify_files(root, manifest, configured_adapter(place.dataset).parts)
     if differences:
         shown = ", ".join(f"{item.path} ({item.problem})" for item in differences[:SHOWN_DIFFERENCES])
         got = f"{len(differences)} differences: {shown}"

@@ -7,8 +7,8 @@ import pytest
 from hoidata.adapters.grab import GrabAdapter
 from hoidata.errors import BadInput
 from hoidata.lineage.graph import read_graph, read_params
+from pipelines.stages.adapters import ConvertParams
 from pipelines.stages.base import load_params
-from pipelines.stages.convert import ConvertParams
 
 PROJECT = Path(__file__).parents[2]
 

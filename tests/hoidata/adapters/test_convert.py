@@ -18,6 +18,7 @@ from hoidata.adapters.grab import GrabAdapter
 from hoidata.errors import BadInput, MissingResource
 from hoidata.lineage.manifests import scan_files
 from hoidata.schema.store import open_store
+from hoidata.synthetic.corpus import write_corpus
 
 N_FRAMES = 40
 
@@ -253,3 +254,17 @@ def test_a_frame_file_that_is_a_link_out_of_the_raw_folder_is_refused(tmp_path):
         RawTree(tmp_path / "raw").read_folder("linked", ["secret.txt"])
     with pytest.raises(BadInput, match="nothing there"):
         RawTree(tmp_path / "raw").read_folder("frames", ["000001.txt"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["h2o", "grab", "arctic"])
+def test_a_manifest_scanned_by_parts_lists_every_file_a_conversion_reads(name, hands, tmp_path):
+    write_corpus(name, tmp_path / "raw", 0, "small", 1)
+    adapter = get_adapter(name)
+    (tmp_path / "raw" / "notes.json").write_text("{}")
+    listed = scan_files(tmp_path / "raw", adapter.parts)
+    assert "notes.json" not in {item.path for item in listed}
+    summary = convert_dataset(adapter, tmp_path / "raw", hands, tmp_path / "a", manifest=listed, progress=False)
+    free = convert_dataset(adapter, tmp_path / "raw", hands, tmp_path / "b", progress=False)
+    assert summary == free
+    assert summary.clips > 0
