@@ -39,8 +39,8 @@ CONVENTION = HandConvention(
     note="MANO: absolute axis-angles, own betas for each side, the translation is the wrist (manopth, center_idx 0)",
 )
 PARTS = (
-    DatasetPart("hand motion", (f"{HANDS}/*/*/right_hand.pkl",), "Hand_Poses.zip"),
-    DatasetPart("object motion", (f"{OBJECTS}/*/*/tool_*.npy",), "Object_Poses.zip"),
+    DatasetPart("hand motion and shapes", (f"{HANDS}/*/*/*.pkl",), "Hand_Poses.zip"),
+    DatasetPart("object motion", (f"{OBJECTS}/*/*/*.npy",), "Object_Poses.zip"),
     DatasetPart("object meshes", (f"{MODELS}/*_cm.obj",), "Object_Models.zip"),
 )
 
