@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import hoidata.files
 from hoidata.adapters import get_adapter
 from hoidata.adapters.convert import convert_dataset
 from hoidata.hands import load_embedded_hands
@@ -249,7 +250,7 @@ def grab_rows() -> Iterable[tuple[str, str, Spoil, str]]:
         "malicious pickle deep inside",
         GRAB,
         grab_with(set_in("object", "params", "transl", value=Command())),
-        "not a",
+        "not allowed",
     )
     yield "NaN", GRAB, grab_number("object", np.nan), "finite"
     yield "infinity", GRAB, grab_number("rhand", np.inf), "finite"
@@ -554,6 +555,10 @@ def test_the_table_has_every_row_the_issue_names() -> None:
         "missing camera file", "missing object file", "frame-count mismatch", "non-UTF-8 text", "duplicate ids",
         "symlink out of the root", "zero-face mesh", "absurd size",
     }  # fmt: skip
+
+
+def test_the_readme_prints_this_table() -> None:
+    assert as_markdown(ROWS) in Path(hoidata.files.__file__).with_name("README.md").read_text()
 
 
 if __name__ == "__main__":
