@@ -18,7 +18,7 @@ from hoidata.schema.clip import HandTrack
 WALK_THROUGH = Path(hoidata.adapters.__file__).with_name("README.md")
 PACKAGE = "kitchen_hoi"
 FRAMES_AT_60_HZ = 48
-HALF_BOX_M = np.array([0.035, 0.03, 0.02])
+HALF_BOX_M = np.array([0.05, 0.02, 0.05])
 
 
 def example_code() -> str:
@@ -51,7 +51,7 @@ def import_example(folder: Path) -> ModuleType:
 
 
 def write_kitchen(root: Path, hands: HandPair) -> Path:
-    """Three recordings of two people. Both hands grip a box of 7 x 6 x 4 cm that is moved and turned."""
+    """Three recordings of two people. Both hands grip a box of 10 x 4 x 10 cm that is moved and turned."""
     (root / "meshes").mkdir(parents=True)
     box_cm = trimesh.creation.box(2 * HALF_BOX_M * 100)
     (root / "meshes" / "cup.obj").write_text(
@@ -76,12 +76,12 @@ def _recording(rng: np.random.Generator, hands: HandPair) -> dict:
 
 
 def _hand(side: str, turn: Rotation, place: np.ndarray, rng: np.random.Generator, hands: HandPair) -> dict:
-    """Bent about as the mean pose; the middle of index, middle and ring tip lies on one side of the box."""
+    """Bent about as the mean pose; the middle of index, middle and ring tip lies on the face below the palm."""
     model = hands[side]
     betas, fingers = rng.normal(0, 0.3, 10), np.tile(rng.normal(0, 0.05, 45), (len(place), 1))
     flat = HandTrack(np.zeros((1, 3)), np.zeros((1, 3)), fingers[:1] + model.mean_pose, betas[None], np.ones(1, bool))
     tips = track_joints(flat, model)[0, [16, 17, 19]].mean(axis=0)
-    grip = HALF_BOX_M * ((1, 0, 0) if side == "right" else (-1, 0, 0))
+    grip = np.array([0.02 if side == "right" else -0.02, HALF_BOX_M[1], 0.0])
     wrist = place + turn.apply(grip - tips)
     rest = model.joint_regressor[0] @ (model.template_m + model.shape_directions @ betas)
     return {
