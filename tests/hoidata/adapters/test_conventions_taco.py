@@ -70,7 +70,7 @@ def write(root: Path) -> Path:
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     raw = RawTree(write(tmp_path_factory.mktemp("taco")))
-    (clip,) = TacoAdapter().load(raw, KEY, load_embedded_hands())
+    (clip,) = TacoAdapter(margin_frames=N_FRAMES).load(raw, KEY, load_embedded_hands())
     assert isinstance(clip, Clip)
     assert clip.n_frames == N_FRAMES
     return clip
