@@ -46,8 +46,7 @@ def acting_hands(
 
 
 def _per_frame_m(clip: Clip, joints_m: np.ndarray, index: ProximityIndex, side: Side) -> np.ndarray:
-    nearest = index.nearest_m(joints_m, clip.object).min(axis=1, initial=np.inf)
-    return np.where(clip.hands[side].valid, nearest, np.inf)
+    return np.where(clip.hands[side].valid, index.closest_m(joints_m, clip.object), np.inf)
 
 
 def _hand_type(acting: Mapping[Side, bool]) -> HandType | None:

@@ -1,79 +1,73 @@
 """Distances from hand joints to an object's sampled points, found in the object's own frame.
 
 Moving 21 joints into the frame of a part (which a hinge may have turned) instead of 1,024 points into the world lets
-one search tree per part serve every frame of every clip, and makes every result independent of the world frame.
+one index per part serve every frame of every clip, and makes every result independent of the world frame.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
-from scipy.spatial import KDTree
 
+from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entries
+from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, nearest_of_each, point_boxes
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.model import Hinge
 from hoidata.objects.sampling import SampledPoints
 from hoidata.schema import ObjectTrack
 
 CONTACT_THRESHOLD_M = 0.02
-# One joint close to one point in one frame: 9 bytes.
-ENTRY = np.dtype([("frame", "<i2"), ("point", "<i2"), ("joint", "i1"), ("distance_m", "<f4")])
-
-
-@dataclass(frozen=True)
-class _PartIndex:
-    """Search tree over the points of one part; ``points``: their indices among all sampled points."""
-
-    part: int
-    points: np.ndarray
-    tree: KDTree
 
 
 class ProximityIndex:
-    """Search trees over one object's sampled points, one per part. Build once per object, use for all its clips."""
+    """One object's sampled points, ready for both questions. Build once per object, use for all its clips."""
 
     def __init__(self, points: SampledPoints) -> None:
-        positions = points.points_m.astype(np.float64)
-        members = [(int(part), np.flatnonzero(points.part == part)) for part in np.unique(points.part)]
-        self.parts = [_PartIndex(part, index, KDTree(positions[index])) for part, index in members]
         self.count = len(points)
+        self.parts = [int(part) for part in np.unique(points.part)]
+        self._positions = points.points_m.astype(np.float64)
+        self._members = [np.flatnonzero(points.part == part) for part in self.parts]
+        self._grids: dict[float, CellGrids] = {}
+        self._point_boxes: PointBoxes | None = None
 
     def nearest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(frame, joint) distance from world joints ``(frame, joint, 3)`` to the nearest sampled point, metres."""
-        in_object = joints_in_object(joints_m, track)
-        nearest = np.full(joints_m.shape[:2], np.inf)
-        for part in self.parts:
-            local = joints_in_part(in_object, part.part, track.model.hinge, track.hinge_rad)
-            np.minimum(nearest, part.tree.query(local)[0], out=nearest)
-        return nearest
+        return nearest_of_each(self._places(joints_m, track), self._boxes())
+
+    def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
+        """(frame,) the smallest of ``nearest_m`` of each frame: most joints need not be looked at closely for it."""
+        return closest_of_joints(self._places(joints_m, track), self._boxes())
 
     def entries(
         self, joints_m: np.ndarray, valid: np.ndarray, track: ObjectTrack, threshold_m: float = CONTACT_THRESHOLD_M
     ) -> np.ndarray:
         """All (frame, point, joint, distance) closer than ``threshold_m``, as ``ENTRY`` rows in that order.
 
-        joints_m: (frame, joint, 3) world. valid: (frame,) bool; other frames give no entry.
+        joints_m: (frame, joint, 3) world. valid: (frame,) bool; other frames give no entry. Raises BadInput for more
+        frames, points or joints than an entry can count.
         """
-        in_object = joints_in_object(joints_m, track)
-        found = [self._part_entries(part, in_object, valid, track, threshold_m) for part in self.parts]
-        entries = np.concatenate(found) if found else np.zeros(0, ENTRY)
-        # Sorting one integer per entry, and take, are eight times as fast as lexsort and indexing of packed rows.
-        place = (entries["frame"].astype(np.int64) * self.count + entries["point"]) * joints_m.shape[1]
-        return np.take(entries, np.argsort(place + entries["joint"]))
-
-    def _part_entries(
-        self, part: _PartIndex, in_object: np.ndarray, valid: np.ndarray, track: ObjectTrack, threshold_m: float
-    ) -> np.ndarray:
-        local = joints_in_part(in_object, part.part, track.model.hinge, track.hinge_rad)
-        inside = (local > part.tree.mins - threshold_m) & (local < part.tree.maxes + threshold_m)
-        frame, joint = np.nonzero(inside.all(axis=2) & valid[:, None])
-        if not len(frame):
+        counted = {"frame": len(joints_m), "point": self.count, "joint": joints_m.shape[1]}
+        for name, count in counted.items():
+            most = int(np.iinfo(ENTRY[name]).max)
+            if count > most:
+                raise BadInput("distance map", f"at most {most} {name}s", f"{count}", "cut the sequence, or take fewer")
+        if not len(self.parts):
             return np.zeros(0, ENTRY)
-        near = KDTree(local[frame, joint]).sparse_distance_matrix(part.tree, threshold_m, output_type="ndarray")
-        near = near[near["v"] < threshold_m]
-        entries = np.empty(len(near), ENTRY)
-        entries["frame"], entries["joint"] = frame[near["i"]], joint[near["i"]]
-        entries["point"], entries["distance_m"] = part.points[near["j"]], near["v"]
-        return entries
+        if threshold_m not in self._grids:
+            self._grids[threshold_m] = cell_grids(self._positions, self._members, threshold_m)
+        places = self._places(joints_m, track)
+        return near_entries(places, np.asarray(valid, bool), self._grids[threshold_m], self.count, threshold_m)
+
+    def _boxes(self) -> PointBoxes:
+        if self._point_boxes is None:
+            self._point_boxes = point_boxes(self._positions, self._members)
+        return self._point_boxes
+
+    def _places(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
+        """(part, frame, joint, 3) float64 joints in the frame of each part."""
+        in_object = joints_in_object(joints_m, track)
+        places = np.empty((len(self.parts), *in_object.shape))
+        for row, part in enumerate(self.parts):
+            places[row] = joints_in_part(in_object, part, track.model.hinge, track.hinge_rad)
+        return places
 
 
 def joints_in_object(joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:

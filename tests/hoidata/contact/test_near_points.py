@@ -1,0 +1,134 @@
+"""The compiled searches against SciPy's trees and brute force: the same rows, the same bits, in the same order."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import KDTree
+
+from hoidata.contact import ENTRY, ProximityIndex
+from hoidata.contact.near_points import cell_grids, near_entries
+from hoidata.contact.proximity import joints_in_object, joints_in_part
+from hoidata.errors import BadInput
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.sampling import SampledPoints
+from hoidata.schema import ObjectTrack
+
+FRAMES, JOINTS = 9, 21
+Scene = tuple[SampledPoints, ObjectTrack, np.ndarray]
+
+
+def sampled(points_m: np.ndarray, part: np.ndarray) -> SampledPoints:
+    nothing = np.zeros((len(points_m), 3), np.float32)
+    return SampledPoints(points_m.astype(np.float32), nothing, np.zeros(len(part)), nothing, part, "surface-fps")
+
+
+def scene(seed: int, n_points: int, articulated: bool, spread_m: float) -> Scene:
+    """A moving, maybe folding cloud of points, and joints scattered about it."""
+    random = np.random.default_rng(seed)
+    points = random.uniform(-0.09, 0.09, (n_points, 3)) * random.uniform(0, 1, 3)
+    part = (points[:, 0] > 0).astype(np.uint8) if articulated else np.zeros(n_points, np.uint8)
+    hinge = Hinge(np.array([0.0, 0.6, 0.8]), np.array([0.01, -0.02, 0.03])) if articulated else None
+    model = ObjectModel("cloud", points, np.zeros((1, 3), np.int64), part, hinge)
+    angle = random.uniform(-2, 2, FRAMES) if articulated else None
+    track = ObjectTrack(model, random.normal(size=(FRAMES, 3)), random.normal(size=(FRAMES, 3)), angle)
+    joints = track.translation_m[:, None] + random.normal(0, spread_m, (FRAMES, JOINTS, 3))
+    return sampled(points, part), track, joints.astype(np.float32)
+
+
+def by_part(
+    points: SampledPoints, track: ObjectTrack, joints: np.ndarray
+) -> list[tuple[np.ndarray, KDTree, np.ndarray]]:
+    """Per part its rows, a tree of its points, and the joints in its frame."""
+    in_object = joints_in_object(joints, track)
+    found = []
+    for part in np.unique(points.part):
+        rows = np.flatnonzero(points.part == part)
+        local = joints_in_part(in_object, int(part), track.model.hinge, track.hinge_rad)
+        found.append((rows, KDTree(points.points_m[rows].astype(np.float64)), local))
+    return found
+
+
+def entries_from_trees(given: Scene, valid: np.ndarray, threshold_m: float) -> np.ndarray:
+    """One tree per part and one of the joints, sorted afterwards."""
+    found = [np.zeros(0, ENTRY)]
+    for rows, tree, local in by_part(*given):
+        near = KDTree(local.reshape(-1, 3)).sparse_distance_matrix(tree, threshold_m, output_type="ndarray")
+        near = near[near["v"] < threshold_m]
+        entries = np.zeros(len(near), ENTRY)
+        entries["frame"], entries["joint"] = np.divmod(near["i"], JOINTS)
+        entries["point"], entries["distance_m"] = rows[near["j"]], near["v"]
+        found.append(entries[valid[entries["frame"]]])
+    entries = np.concatenate(found)
+    return entries[np.lexsort((entries["joint"], entries["point"], entries["frame"]))]
+
+
+@given(
+    st.integers(0, 2**32), st.integers(1, 600), st.booleans(), st.sampled_from([0.001, 0.02, 0.3]),
+    st.sampled_from([0.0, 0.03, 0.3]),
+)  # fmt: skip
+@settings(max_examples=60, deadline=None)
+def test_entries_are_those_of_trees_bit_for_bit_and_in_order(
+    seed, n_points, articulated, threshold_m, spread_m
+) -> None:
+    given = scene(seed, n_points, articulated, spread_m)
+    points, track, joints = given
+    valid = np.random.default_rng(seed).random(FRAMES) < 0.8
+    found = ProximityIndex(points).entries(joints, valid, track, threshold_m)
+    assert found.tobytes() == entries_from_trees(given, valid, threshold_m).tobytes()
+
+
+@given(st.integers(0, 2**32), st.integers(1, 600), st.booleans(), st.sampled_from([0.0, 0.03, 0.3, 5.0]))
+@settings(max_examples=60, deadline=None)
+def test_the_nearest_point_is_that_of_trees_bit_for_bit(seed, n_points, articulated, spread_m) -> None:
+    points, track, joints = scene(seed, n_points, articulated, spread_m)
+    index = ProximityIndex(points)
+    expected = np.min([tree.query(local)[0] for _, tree, local in by_part(points, track, joints)], axis=0)
+    np.testing.assert_array_equal(index.nearest_m(joints, track), expected)
+    np.testing.assert_array_equal(index.closest_m(joints, track), expected.min(axis=1))
+
+
+def test_every_cell_lists_every_point_within_reach_of_any_place_in_it() -> None:
+    random = np.random.default_rng(3)
+    points, reach = random.uniform(-0.05, 0.05, (200, 3)), 0.02
+    grids = cell_grids(points, [np.arange(200)], reach)
+    places = random.uniform(-0.069, 0.069, (1, 500, 1, 3))
+    near = np.linalg.norm(places[0] - points[None], axis=2) < reach
+    entries = near_entries(places, np.ones(500, bool), grids, 200, reach)
+    np.testing.assert_array_equal(np.column_stack((entries["frame"], entries["point"])), np.argwhere(near))
+    # And few more than that: otherwise the grid would be brute force in disguise.
+    assert len(grids.point) / len(grids.first) < 40
+
+
+def test_places_exactly_between_cells_and_on_corners_lose_no_point() -> None:
+    points = np.stack(np.meshgrid(*[np.arange(5) * 0.01] * 3, indexing="ij"), -1).reshape(-1, 3)
+    places = points.reshape(1, -1, 1, 3)
+    grids = cell_grids(points, [np.arange(125)], 0.0101)
+    entries = near_entries(places, np.ones(125, bool), grids, 125, 0.0101)
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) < 0.0101
+    np.testing.assert_array_equal(np.column_stack((entries["frame"], entries["point"])), np.argwhere(near))
+
+
+def test_more_entries_than_room_was_made_for_are_all_there() -> None:
+    points, track, _ = scene(1, 1000, False, 0.0)
+    still = ObjectTrack(track.model, np.zeros((FRAMES, 3)), np.zeros((FRAMES, 3)))
+    entries = ProximityIndex(points).entries(np.zeros((FRAMES, JOINTS, 3)), np.ones(FRAMES, bool), still, 1.0)
+    assert len(entries) == FRAMES * JOINTS * 1000
+    np.testing.assert_array_equal(entries["joint"], np.tile(np.arange(JOINTS), FRAMES * 1000))
+
+
+@pytest.mark.parametrize(
+    ("shape", "n_points", "what"),
+    [
+        ((32768, 1), 3, "at most 32767 frames"),
+        ((1, 128), 3, "at most 127 joints"),
+        ((1, 1), 32768, "at most 32767 points"),
+    ],
+    ids=["frames", "joints", "points"],
+)
+def test_what_an_entry_cannot_count_is_refused(shape: tuple[int, int], n_points: int, what: str) -> None:
+    index = ProximityIndex(sampled(np.zeros((n_points, 3)), np.zeros(n_points, np.uint8)))
+    model = ObjectModel("dot", np.zeros((1, 3)), np.zeros((1, 3), np.int64), np.zeros(1, np.uint8))
+    track = ObjectTrack(model, np.zeros((shape[0], 3)), np.zeros((shape[0], 3)))
+    with pytest.raises(BadInput, match=what):
+        index.entries(np.zeros((*shape, 3)), np.ones(shape[0], bool), track)
