@@ -8,6 +8,7 @@ convert (change of frame, unit and convention, into ``Clip``). Nothing outside a
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
@@ -52,6 +53,12 @@ class DatasetPart:
 
     def is_in(self, root: Path) -> bool:
         return any(next(Path(root).glob(pattern), None) is not None for pattern in self.patterns)
+
+    def holds(self, path: str) -> bool:
+        """Whether a source of that path matches a pattern; a folder of frame files is known by its files."""
+        tries = [text.split("/") for text in (path, f"{path}/000000.txt")]
+        patterns = [pattern.split("/") for pattern in self.patterns]
+        return any(len(names) == len(p) and all(map(fnmatchcase, names, p)) for p in patterns for names in tries)
 
 
 @runtime_checkable

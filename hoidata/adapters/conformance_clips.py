@@ -32,6 +32,7 @@ def clip_findings(adapter: Adapter, loaded: list[Loaded]) -> list[Finding]:
         finding("ids come from the sequence's key and are unique", _ids(loaded)),
         _per_clip("clips say where they come from", _origin, adapter, clips),
         finding("clips name the files they were made from", _sources(loaded)),
+        finding("files that are read belong to a declared part", _undeclared(adapter, loaded)),
         _per_clip("clips are valid: shapes, finite numbers, possible sizes", _validity, adapter, clips),
         _per_clip("frames are 1/30 s apart by the source's own clock", _clock, adapter, clips),
         _per_clip("words are words: a lower-case verb or None, and a noun", _words, adapter, clips),
@@ -85,6 +86,12 @@ def _sources(loaded: list[Loaded]) -> list[str]:
                 problems.append(f"{clip.clip_id}: none")
             problems += [f"{clip.clip_id}: {s.path} was not read" for s in clip.sources if known.get(s.path) != s]
     return problems
+
+
+def _undeclared(adapter: Adapter, loaded: list[Loaded]) -> list[str]:
+    paths = sorted({source.path for item in loaded for source in item.sources})
+    undeclared = [path for path in paths if not any(part.holds(path) for part in adapter.parts)]
+    return [f"{path} matches no pattern of parts: `raw scan` would leave it out" for path in undeclared]
 
 
 def _validity(adapter: Adapter, clip: Clip) -> list[str]:

@@ -135,13 +135,7 @@ def missing_parts(adapter: Adapter, root: Path) -> list[DatasetPart]:
 
 def part_of(adapter: Adapter, path: str) -> DatasetPart | None:
     """The part of the dataset a manifest entry belongs to; a folder of frame files is known by its files."""
-    tries = [tuple(text.split("/")) for text in (path, f"{path}/000000.txt")]
-    for part in adapter.parts:
-        for pattern in part.patterns:
-            segments = pattern.split("/")
-            if any(len(names) == len(segments) and all(map(_fits, names, segments)) for names in tries):
-                return part
-    return None
+    return next((part for part in adapter.parts if part.holds(path)), None)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from hoidata.adapters import RawTree, SequenceKey, get_adapter
+from hoidata.adapters import DatasetPart, RawTree, SequenceKey, get_adapter
 from hoidata.adapters.arctic import ArcticAdapter
 from hoidata.adapters.conformance import Finding, check_adapter
 from hoidata.adapters.conformance_loading import first_difference, opened_files
@@ -91,7 +91,7 @@ def mistaken(example: type, methods: dict) -> object:
 def test_the_walk_throughs_example_keeps_every_rule(example: type, kitchen_root: Path) -> None:
     findings = check(example(), kitchen_root)
     assert not_passed(findings) == {}
-    assert len(findings) >= 35
+    assert len(findings) >= 36
     assert len({item.rule for item in findings}) == len(findings)
     assert [item.rule for item in findings if item.outcome == "skip"] == ["a worker process gives the same"]
 
@@ -106,7 +106,7 @@ def test_the_command_checks_an_adapter_of_another_package(tmp_path: Path, kitche
         assert text in listed.stdout
     good = run("check", "kitchen", "--root", str(kitchen_root))
     assert good.returncode == 0, good.stdout + good.stderr
-    assert "35 pass" in good.stdout
+    assert "36 pass" in good.stdout
     module = tmp_path / "site" / kitchen.PACKAGE / "__init__.py"
     module.write_text(module.read_text().replace("return sorted(", "return list("))
     module.write_text(module.read_text().replace("clip_id=str(key)", 'clip_id=f"{key}".upper()'))
@@ -351,6 +351,7 @@ def test_a_mistake_in_finding_or_reading_files_is_caught(methods, rule, words, e
         ({"source_fps": 0.0}, "source_fps is 0.0"),
         ({"needs_mano": "yes"}, "needs_mano is 'yes'"),
         ({"parts": ()}, "parts is empty"),
+        ({"parts": (DatasetPart("recordings", ("recordings/*/*.json",), "zip"),)}, "meshes/cup.obj matches no pattern"),
     ],
 )
 def test_missing_or_contradicting_facts_are_caught(facts, words, example, kitchen_root) -> None:
