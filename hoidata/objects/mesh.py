@@ -10,6 +10,7 @@ from hoidata.errors import BadInput
 from hoidata.objects.ply import parse_ply
 
 LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen times as much when read
+_FARTHEST = 1e9  # in any unit; areas and volumes of such a mesh still fit into a float
 
 
 class Mesh(NamedTuple):
@@ -98,6 +99,8 @@ def _checked(path: str | Path, mesh: Mesh) -> Mesh:
         raise BadInput(path, "a mesh with vertices of 3 coordinates", f"an array of shape {vertices.shape}")
     if not np.isfinite(vertices).all():
         raise BadInput(path, "finite vertices", "NaN or infinity")
+    if np.abs(vertices).max() > _FARTHEST:
+        raise BadInput(path, f"coordinates up to {_FARTHEST:g}", f"{np.abs(vertices).max():g}", "check the mesh's unit")
     if not len(faces):
         raise BadInput(path, "a mesh with faces", f"{len(vertices)} vertices and no face")
     if faces.min() < 0 or faces.max() >= len(vertices):

@@ -188,17 +188,20 @@ class _TextRows:
         return found
 
     def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
-        listed = [item.count_kind is not None for item in element.properties]
-        self.width = sum(lengths) + sum(listed)
+        self.width = sum(lengths) + sum(item.count_kind is not None for item in element.properties)
         fitting = min(most, (len(self.words) - self.place) // self.width)
         words = np.array(self.words[self.place : self.place + fitting * self.width])
-        table = words.astype(np.float64).reshape(fitting, self.width)
+        with np.errstate(all="ignore"):  # what does not fit its type becomes infinite, and is refused as such
+            return self._columns(element, lengths, words.astype(np.float64).reshape(fitting, self.width))
+
+    def _columns(
+        self, element: _Element, lengths: list[int], table: np.ndarray
+    ) -> list[tuple[np.ndarray | None, np.ndarray]]:
         found, column = [], 0
-        for item, length, is_list in zip(element.properties, lengths, listed, strict=True):
-            stated = table[:, column] if is_list else None
-            column += is_list
-            with np.errstate(all="ignore"):  # what does not fit its type is noticed as no number or no vertex
-                values = table[:, column : column + length].astype(item.kind if item.kind[0] == "f" else np.float64)
+        for item, length in zip(element.properties, lengths, strict=True):
+            stated = None if item.count_kind is None else table[:, column]
+            column += stated is not None
+            values = table[:, column : column + length].astype(item.kind if item.kind[0] == "f" else np.float64)
             found.append((stated, values))
             column += length
         return found

@@ -1,7 +1,7 @@
 """Fuzzing of one parser in one process: mutate, run, keep what reaches new lines, stop at nothing but the count.
 
-A fault is any exception but BadInput and MissingResource, a call over one second, or memory refused by the limit of
-1 GiB above what the process had at its start. Faults are saved, and the run goes on.
+A fault is any exception but BadInput and MissingResource, any warning, a call over one second, or memory refused by
+the limit of 1 GiB above what the process had at its start. Faults are saved, and the run goes on.
 """
 
 import contextlib
@@ -12,6 +12,7 @@ import resource
 import struct
 import time
 import traceback
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -90,6 +91,7 @@ def fuzz(target: Target, seed: int, executions: int, seconds: float, folder: Pat
     coverage = LineCoverage(code_objects(target.code))
     watched = Watched(folder / "running" / target.name, max(target.longest, *map(len, seeds)))
     limit_memory()
+    warnings.simplefilter("error")  # a file must not make a conversion print warnings either
     outcome = Outcome(target.name, lines=len(coverage.lines))
     corpus, rng = list(seeds), random.Random(f"{seed} {target.name}")
     start = time.perf_counter()

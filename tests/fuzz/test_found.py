@@ -73,6 +73,17 @@ def test_a_corner_beyond_64_bits_is_bad_input(tmp_path: Path) -> None:
         load_mesh(tmp_path / "a.obj")
 
 
+@pytest.mark.parametrize("number", ["1e308", "-1e200", "1e999"])
+def test_coordinates_beyond_all_units_are_bad_input_without_a_warning(tmp_path: Path, number: str) -> None:
+    (tmp_path / "a.obj").write_text(f"v {number} 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    rows = f"end_header\n{number} 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+    (tmp_path / "a.ply").write_text(head + "element face 1\nproperty list uchar int vertex_index\n" + rows)
+    for name in ("a.obj", "a.ply"):
+        with pytest.raises(BadInput, match=r"coordinates up to|finite"):
+            load_mesh(tmp_path / name)
+
+
 def test_a_capsule_end_too_large_for_a_number_is_bad_input(tmp_path: Path) -> None:
     path = tmp_path / manipnet.HAND_REFERENCE
     path.parent.mkdir(parents=True)

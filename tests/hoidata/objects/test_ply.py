@@ -104,6 +104,6 @@ def test_triangles_and_quads_by_turns_take_linear_time():
     rows = b"".join(struct.pack(f"<B{3 + i % 2}i", 3 + i % 2, *range(3 + i % 2)) for i in range(20_000))
     head = b"ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
     head += b"property float z\nelement face 20000\nproperty list uchar int vertex_index\nend_header\n"
-    start = time.perf_counter()
+    start = time.process_time()
     assert len(parse_ply(head + bytes(48) + rows)[1]) == 30_000
-    assert time.perf_counter() - start < 3
+    assert time.process_time() - start < 3
