@@ -197,18 +197,25 @@ def test_larger_than_the_cap_is_refused():
         restricted_load(io.BytesIO(pickle.dumps(np.zeros(100))), ARRAYS, max_bytes=100)
 
 
-DEEP = b"\x80\x02})" + b"\x85" * 500_000 + b"Ns."
+DEEP = b"\x80\x02})" + b"\x85" * 3_000 + b"Ns."
 DOUBLED = b"\x80\x02})q\x00" + b"".join(b"h\x00h\x00\x86q\x00" for _ in range(60)) + b"Ns."
-IN_A_SET = b"\x80\x02cbuiltins\nset\n])" + b"\x85" * 500_000 + b"a\x85R."
-AS_ITEMS = b"\x80\x04\x8f(" + b")" + b"\x85" * 500_000 + b"\x90."
+IN_A_SET = b"\x80\x02cbuiltins\nset\n])" + b"\x85" * 3_000 + b"a\x85R."
+AS_ITEMS = b"\x80\x04\x8f(" + b")" + b"\x85" * 3_000 + b"\x90."
 DOUBLED_AT_ONCE = b"\x80\x02})" + b"2\x86" * 60 + b"Ns."
 
 
 @pytest.mark.parametrize("data", [DEEP, DOUBLED, IN_A_SET, AS_ITEMS, DOUBLED_AT_ONCE], ids=range(5))
 def test_keys_that_would_overflow_the_stack_or_take_for_ever_to_hash_are_refused(data):
-    """500,000 nested tuples used to end the process; 60 tuples of two used to take 2^60 steps."""
+    """500,000 nested tuples as a key ended the process; 60 tuples of two, each within the next, took 2^60 steps."""
     with pytest.raises(BadInput, match="not allowed"):
         restricted_load(data, ARRAYS)
+
+
+def test_a_pickle_of_millions_of_opcodes_is_refused(monkeypatch):
+    monkeypatch.setattr("hoidata.files.pickle_check._MOST_OPCODES", 100)
+    assert restricted_load(pickle.dumps([1] * 40), ARRAYS) == [1] * 40
+    with pytest.raises(BadInput, match="more than 100 opcodes"):
+        restricted_load(pickle.dumps([1] * 100), ARRAYS)
 
 
 def test_a_huge_integer_is_refused():
