@@ -1,0 +1,297 @@
+"""Controls of physical realism on scenes whose answer is known: free fall, a table, pinches, sliding hands."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.physics.as_released import AsReleased, friction_edges
+from hoidata.physics.capsules import CapsuleContacts, Capsules, ObjectPoses, capsule_contacts
+from hoidata.physics.realism import score, smoothness_m_s2
+from hoidata.physics.scene import Scene, clip_scene
+from hoidata.physics.standard_units import StandardUnits, sliding_velocity, table_contacts
+
+SIZE = np.array([0.1, 0.08, 0.06])
+DOWN = np.array([0.0, 0.0, -1.0])
+FPS = 120.0
+EVERY = np.ones(20, dtype=bool)
+NONE = np.zeros((20, 0, 3))
+
+
+def _box() -> ObjectModel:
+    mesh = trimesh.creation.box(SIZE)
+    return ObjectModel("box", mesh.vertices, mesh.faces, np.zeros(8, dtype=np.uint8))
+
+
+def _scene(centre_m: np.ndarray, rotmats: np.ndarray | None = None, hands: Capsules | None = None, **given) -> Scene:
+    turned = np.tile(np.eye(3), (len(centre_m), 1, 1)) if rotmats is None else rotmats
+    hands = Capsules(NONE, NONE, np.zeros(0)) if hands is None else hands
+    return Scene(_box(), ObjectPoses(turned, centre_m), hands, FPS, DOWN, **{"table_m": 0.0, **given})
+
+
+def _times() -> np.ndarray:
+    return np.arange(20)[:, None] / FPS
+
+
+def _pinch(centre_m: np.ndarray, rotmats: np.ndarray | None = None, sides=(-1, 1)) -> Capsules:
+    """Two fingers along y pressed 1 mm into the +x and -x faces, carried along with the object."""
+    turned = np.tile(np.eye(3), (len(centre_m), 1, 1)) if rotmats is None else rotmats
+    radius = 0.01
+    middle = np.array([[side * (SIZE[0] / 2 + radius - 0.001), 0, z] for side in sides for z in (-0.01, 0.01)])
+    half = np.array([0, 0.005, 0])
+    place = [(middle + end) @ turned.transpose(0, 2, 1) + centre_m[:, None] for end in (-half, half)]
+    return Capsules(*place, np.full(len(middle), radius))
+
+
+def _thrown() -> tuple[np.ndarray, np.ndarray]:
+    """A box thrown upwards, spinning about one of its principal axes: no torque is needed."""
+    time = _times()
+    centre = np.array([0.0, 0.0, 1.0]) + time * [0.3, 0.1, 1.0] - 0.5 * 9.81 * time**2 * [0, 0, 1]
+    return centre, Rotation.from_rotvec(time * [0.0, 0.0, 4.0]).as_matrix()
+
+
+def _resting() -> np.ndarray:
+    return np.tile([0.2, 0.1, SIZE[2] / 2], (20, 1))
+
+
+def test_a_ballistic_flight_without_contact_is_explained_and_counts_as_lifted_but_not_held():
+    scene = _scene(*_thrown())
+    result = score(scene, StandardUnits())
+    assert result.share == 1.0
+    assert len(result.frames) == 20
+    assert scene.lifted.all()
+    assert not scene.held.any()
+
+
+def test_an_object_held_in_the_air_without_any_contact_is_never_explained():
+    time = _times()
+    paths = {
+        "still": np.tile([0.0, 0.0, 0.5], (20, 1)),
+        "circling": 0.5 + 0.05 * np.concatenate([np.cos(6 * time), np.sin(6 * time), 0 * time], axis=1),
+        "lifted": np.array([0, 0, 0.5]) + time * [0, 0, 0.4],
+    }
+    for path in paths.values():
+        scene = _scene(path)
+        assert scene.held.all()
+        result = score(scene, StandardUnits(), scene.held)
+        assert result.share == 0.0
+        assert result.residual.min() > 5  # of 9.81 N
+
+
+def test_a_box_on_a_table_is_explained_by_the_table_and_by_nothing_less():
+    scene = _scene(_resting())
+    assert not scene.lifted.any()
+    assert score(scene, StandardUnits(), EVERY).share == 0.0
+    assert score(scene, StandardUnits(table_m=0.0), EVERY).share == 1.0
+    assert score(scene, StandardUnits(table_m=-0.01), EVERY).share == 0.0
+
+
+def test_a_table_carries_no_box_whose_centre_lies_beyond_its_edge():
+    # Turned by 30 degrees about y the box stands on one edge, its centre beside it: it must fall.
+    turn = Rotation.from_rotvec([0, np.pi / 6, 0]).as_matrix()
+    lowest = (_box().vertices_m @ turn.T)[:, 2].min()
+    scene = _scene(np.tile([0.0, 0.0, -lowest], (20, 1)), np.tile(turn, (20, 1, 1)))
+    assert score(scene, StandardUnits(table_m=0.0), EVERY).share == 0.0
+
+
+def test_support_of_a_table_is_the_four_corners_that_stand_on_it():
+    frame, point = table_contacts(_scene(_resting()), 0.0)
+    assert (np.bincount(frame) == 4).all()
+    corners = {(round(x, 6), round(y, 6)) for x, y in point[frame == 3][:, :2] - [0.2, 0.1]}
+    assert corners == {(x, y) for x in (-0.05, 0.05) for y in (-0.04, 0.04)}
+
+
+def test_a_pinch_carries_the_box_along_any_gentle_motion_and_one_side_alone_does_not():
+    time = _times()
+    centre = np.array([0.0, 0.0, 0.5]) + 0.05 * np.concatenate([np.sin(5 * time), 1 - np.cos(5 * time), 0 * time], 1)
+    turned = Rotation.from_rotvec(time * [0.0, 0.0, 1.0]).as_matrix()
+    assert score(_scene(centre, turned, _pinch(centre, turned)), StandardUnits()).share == 1.0
+    assert score(_scene(centre, turned, _pinch(centre, turned, sides=(1,))), StandardUnits()).share == 0.0
+    away = _pinch(centre, turned).moved(np.array([0.0, 0.0, 0.1]))
+    assert score(_scene(centre, turned, away), StandardUnits()).share == 0.0
+
+
+def test_the_answer_does_not_depend_on_the_world_frame():
+    centre = np.array([0.0, 0.0, 0.5]) + 0.3 * np.random.default_rng(0).normal(size=(20, 3)).cumsum(axis=0) / FPS**2
+    hands = _pinch(centre, sides=(1,))
+    turn, shift = Rotation.from_rotvec([0.5, 1.0, -0.3]).as_matrix(), np.array([1.0, -2.0, 0.3])
+    scene = _scene(centre, hands=hands)
+    moved = Scene(
+        _box(),
+        ObjectPoses(np.tile(turn, (20, 1, 1)), centre @ turn.T + shift),
+        Capsules(hands.start_m @ turn.T + shift, hands.end_m @ turn.T + shift, hands.radius_m),
+        FPS,
+        turn @ DOWN,
+        table_m=float(-(turn @ DOWN) @ shift),
+    )
+    for thing in (scene, moved):
+        assert thing.held.all()
+    first, second = (score(thing, StandardUnits()) for thing in (scene, moved))
+    assert first.residual.max() > 1
+    # The four edges of a cone turn about its normal with the world, so only a little of a residual may change.
+    np.testing.assert_allclose(first.residual, second.residual, rtol=0.1)
+
+
+def test_frames_with_a_capsule_too_deep_are_not_scored():
+    centre = np.tile([0.0, 0.0, 0.5], (20, 1))
+    hands = _pinch(centre)
+    shift = np.zeros((20, 3))
+    shift[5:8, 0] = 0.02  # one finger 21 mm into the box, the other off it
+    result = score(_scene(centre, hands=hands.moved(shift)), StandardUnits())
+    assert result.frames.tolist() == [*range(5), *range(8, 20)]
+    np.testing.assert_allclose(result.penetration_m[5:8], 0.021, atol=1e-6)
+    np.testing.assert_allclose(result.penetration_m[8:], 0.001, atol=1e-6)
+    assert result.colliding_m == pytest.approx((17 * 4 * 0.001 + 3 * 2 * 0.021) / (17 * 4 + 3 * 2), abs=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_hand_that_slides_under_a_box_drags_it_along_and_never_back(sign):
+    # The box rides on a fingertip that runs ahead along +y; kinetic friction has one direction and a fixed share.
+    time, middle = _times(), 10
+    centre = np.array([0.0, 0.0, 0.5]) + 0.5 * sign * 0.35 * 9.81 * time**2 * [0, 1, 0]
+    below = -np.array([0.0, 0.35 * SIZE[2] / 2, SIZE[2] / 2])  # the force of this contact points at the centre of mass
+    slide = (time - time[middle]) * [0.0, 0.2, 0.0]
+    tip = (centre + below - [0, 0, 0.009] + slide)[:, None]
+    scene = _scene(centre, hands=Capsules(tip, tip, np.array([0.01])))
+    contacts = capsule_contacts(scene.model, scene.poses, scene.capsules)
+    np.testing.assert_allclose(sliding_velocity(scene, contacts), np.tile([0, 0.2, 0], (20, 1)), atol=1e-6)
+    residual = StandardUnits(sliding_m_s=0.05).residuals(scene, contacts)[middle]
+    if sign > 0:
+        assert residual == pytest.approx(0, abs=1e-6)
+    else:
+        # What is left of (0, -mu, 1) beside (0, mu, 1), times the weight; its torque is a few hundredths.
+        assert residual == pytest.approx(9.81 * 2 * 0.35 / np.hypot(1, 0.35), rel=0.01)
+    assert StandardUnits(sliding_m_s=0.3).residuals(scene, contacts)[middle] < residual + 1e-9
+
+
+def test_a_contact_that_moves_with_the_box_does_not_slide_however_the_box_spins():
+    centre, turned = _thrown()
+    scene = _scene(centre, turned, _pinch(centre, turned))
+    contacts = capsule_contacts(scene.model, scene.poses, scene.capsules)
+    np.testing.assert_allclose(sliding_velocity(scene, contacts), 0, atol=1e-6)
+    swinging = Rotation.from_rotvec(_times() * [2.0, 0.0, 0.0]).as_matrix()
+    held = _scene(centre, turned, _pinch(centre, turned @ swinging))
+    contacts = capsule_contacts(held.model, held.poses, held.capsules)
+    outer = np.abs(np.linalg.norm(sliding_velocity(held, contacts), axis=1)[4:8])
+    # Fingers that turn about the x axis at 2 rad/s pass over the faces at 2 rad/s times their distance from it.
+    assert outer == pytest.approx(2 * np.linalg.norm(_local(held, contacts)[4:8, 1:], axis=1), rel=0.02)
+
+
+def _local(scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
+    away = contacts.point_m - scene.poses.translation_m[contacts.frame]
+    return np.einsum("ni,nij->nj", away, scene.poses.rotmats[contacts.frame])
+
+
+def test_as_released_passes_an_object_that_hangs_still_in_the_air_which_is_its_floor():
+    scene = _scene(np.tile([0.0, 0.0, 0.5], (20, 1)))
+    result = score(scene, AsReleased())
+    assert result.share == 1.0
+    # (9.8 / 120)^2 / 6, squared gravity per frame, is below the limit of 0.01.
+    np.testing.assert_allclose(result.residual, (9.8 / 120) ** 2 / 6, rtol=1e-6)
+    assert score(scene, StandardUnits()).share == 0.0
+
+
+def test_as_released_measures_acceleration_in_decimetres_per_second_and_frame():
+    time = _times()
+    scene = _scene(np.array([0.0, 0, 0.5]) + 0.5 * 4.0 * time**2 * [1, 0, 0])
+    expected = (4.0 * 10 / 120) ** 2 / 6 + (9.8 / 120) ** 2 / 6
+    residual = score(scene, AsReleased()).residual
+    np.testing.assert_allclose(residual[:-2], expected, rtol=1e-6)  # the last two have no frame after them
+
+
+def test_as_released_about_the_origin_differs_only_where_the_mesh_is_not_centred():
+    time = _times()
+    path = np.array([0.0, 0, 0.5]) + 0.5 * 3.0 * time**2 * [1, 0, 0]
+    turned = Rotation.from_rotvec(time * [0.0, 2.0, 0.0]).as_matrix()
+    centred = _scene(path, turned, _pinch(path, turned))
+    about = {name: AsReleased(reference=name) for name in ("origin", "centre of mass")}
+    np.testing.assert_allclose(*(score(centred, one).residual for one in about.values()), atol=1e-12)
+    shifted = ObjectModel("box", _box().vertices_m + np.array([0, 0, 0.05]), _box().faces, np.zeros(8, dtype=np.uint8))
+    poses = ObjectPoses(turned, path - turned @ [0, 0, 0.05])
+    empty = Capsules(NONE, NONE, np.zeros(0))
+    scene = Scene(shifted, poses, empty, FPS, DOWN, 0.0)
+    first, second = (score(scene, one).residual for one in about.values())
+    np.testing.assert_allclose(second, score(_scene(path, turned), AsReleased()).residual, atol=1e-9)
+    assert np.abs(first - second).max() > 5e-4
+
+
+def test_released_friction_edges_push_inwards_with_two_tangents_and_are_not_normalised():
+    rng = np.random.default_rng(0)
+    normals = np.concatenate([rng.normal(size=(50, 3)), [[0, 1.0, 0], [0, -1.0, 0], [1.0, 0, 0]]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    edges = friction_edges(normals, 0.35)
+    np.testing.assert_allclose(np.einsum("cek,ck->ce", edges, -normals), 1 / 0.35, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(edges, axis=2), np.hypot(1, 1 / 0.35), atol=1e-6)
+    np.testing.assert_allclose(edges[:, 0] + edges[:, 1], edges[:, 2] + edges[:, 3], atol=1e-6)
+
+
+def test_torques_over_a_length_weigh_more_but_a_perfect_grasp_stays_perfect():
+    centre = np.tile([0.0, 0.0, 0.5], (20, 1))
+    turned = Rotation.from_rotvec(_times() ** 2 * [50.0, 0, 0]).as_matrix()
+    bare = [score(_scene(centre, turned), StandardUnits(torque_length_m=length)).residual for length in (1.0, 0.05)]
+    wrench = _scene(centre, turned).wrench
+    np.testing.assert_allclose(bare[1], np.linalg.norm(wrench / [1, 1, 1, 0.05, 0.05, 0.05], axis=1))
+    assert (bare[1] > bare[0]).all()
+    held = _scene(centre, hands=_pinch(centre))
+    assert score(held, StandardUnits(torque_length_m=0.05)).share == 1.0
+
+
+def test_the_table_of_a_recording_is_the_third_percentile_of_the_lowest_vertex():
+    heights = np.r_[np.full(15, 0.03), np.linspace(0.031, 0.2, 5)]
+    scene = _scene(np.stack([0 * heights, 0 * heights, heights], axis=1), table_m=None)
+    assert scene.table_height_m == pytest.approx(0.0, abs=1e-9)
+    assert scene.lifted.tolist() == [bool(height - 0.03 > 0.015) for height in heights]
+
+
+def test_a_lid_that_opens_counts_for_the_lowest_vertex():
+    box, hinge = _box(), Hinge(np.array([1.0, 0, 0]), np.array([0, SIZE[1] / 2, -SIZE[2] / 2]))
+    model = ObjectModel(
+        "tin",
+        np.concatenate([box.vertices_m, box.vertices_m + np.array([0, SIZE[1], 0])]),
+        np.concatenate([box.faces, box.faces + 8]),
+        np.repeat(np.array([0, 1], dtype=np.uint8), 8),
+        hinge,
+    )
+    poses = ObjectPoses(np.tile(np.eye(3), (3, 1, 1)), np.tile([0, 0, 0.5], (3, 1)), np.array([0.0, -0.5, -1.0]))
+    scene = Scene(model, poses, Capsules(*np.zeros((2, 3, 0, 3)), np.zeros(0)), FPS, DOWN)
+    expected = 0.5 - SIZE[2] / 2 - SIZE[1] * np.sin([0, 0.5, 1.0])
+    np.testing.assert_allclose(scene.lowest_m, expected, atol=1e-9)
+
+
+def test_a_clip_becomes_a_scene_with_both_hands_and_an_invalid_hand_is_absent(make_clip):
+    clip = make_clip(n_frames=6, hand_type="right")
+    scene = clip_scene(clip, load_embedded_hands(), table_m=-1.0)
+    assert scene.capsules.start_m.shape == (6, 38, 3)
+    assert scene.fps == 30
+    np.testing.assert_allclose(scene.poses.rotmats, rotvec_to_rotmat(clip.object.rotvec.astype(float)))
+    clip.hands["right"].valid[2:4] = False
+    absent = clip_scene(clip, load_embedded_hands(), table_m=-1.0)
+    assert np.isnan(absent.capsules.start_m[2:4, 19:]).all()
+    assert np.isfinite(absent.capsules.start_m[:, :19]).all()
+    assert score(absent, StandardUnits(tolerance_m=0.005)).frames.tolist() == [*range(6)]
+
+
+def test_a_clip_that_does_not_know_where_down_is_is_refused(make_clip):
+    with pytest.raises(BadInput, match="gravity"):
+        clip_scene(make_clip(n_frames=6, gravity=None), load_embedded_hands())
+
+
+def test_smoothness_is_the_acceleration_at_60_hz_in_the_frame_of_the_wrist():
+    time = np.arange(241) / 120
+    wave = 0.01 * np.sin(2 * np.pi * time)
+    finger = np.stack([wave, 0 * wave, 0.1 + 0 * wave], axis=1)
+    turned = Rotation.from_rotvec(time[:, None] * [1.0, 2.0, 0.5]).as_matrix()
+    wrist = np.stack([time**3, -time, np.cos(5 * time)], axis=1)
+    joints = np.stack([wrist, wrist + np.einsum("fij,fj->fi", turned, finger)], axis=1)
+    # Mean of |sin| is 2/pi; the wrist itself counts with zero.
+    expected = 0.5 * 0.01 * (2 * np.pi) ** 2 * 2 / np.pi
+    assert smoothness_m_s2(joints, turned, 120.0) == pytest.approx(expected, rel=0.01)
+    jitter = joints.copy()
+    jitter[::4, 1] += 0.001
+    assert smoothness_m_s2(jitter, turned, 120.0) > 10 * expected
+    with pytest.raises(ValueError, match="three frames"):
+        smoothness_m_s2(joints[:4], turned[:4], 120.0)
