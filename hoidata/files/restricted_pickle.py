@@ -7,6 +7,7 @@ its arguments; everything else is refused before it is looked up. Every problem 
 import io
 import math
 import pickle
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
@@ -20,6 +21,9 @@ from hoidata.files.pickle_check import check_opcodes
 
 MAX_BYTES = 2 << 30
 _PIECE_BYTES = 1 << 20
+# What calls in a pickle make may take this much more than the file: a call can be repeated in a few bytes.
+_GROWTH = 4
+_FREE_BYTES = 64 << 20
 Allow = Mapping[tuple[str, str], Any]
 
 _REMEDY = "download it again from the dataset's own site; it is not opened otherwise, because it could run code"
@@ -42,7 +46,8 @@ def restricted_load(
         raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
     try:
         check_opcodes(data)
-        return _plain(_Unpickler(io.BytesIO(data), allow, encoding).load(), {})
+        budget = Budget(_GROWTH * len(data) + _FREE_BYTES)
+        return _plain(_Unpickler(io.BytesIO(data), allow, encoding, budget).load(), {})
     except BadInput:
         raise
     except Exception as error:  # a malformed pickle can raise anything
@@ -59,17 +64,30 @@ def read_at_most(stream: BinaryIO, size: int) -> bytes:
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
 
 
+class Budget:
+    """Bytes that may still be allocated for one file."""
+
+    def __init__(self, n_bytes: int) -> None:
+        self.left = n_bytes
+
+    def spend(self, n_bytes: int) -> None:
+        self.left -= n_bytes
+        if self.left < 0:
+            raise pickle.UnpicklingError("values that are together far larger than the file")
+
+
 class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream: BinaryIO, allow: Allow, encoding: str) -> None:
+    def __init__(self, stream: BinaryIO, allow: Allow, encoding: str, budget: Budget) -> None:
         super().__init__(stream, fix_imports=False, encoding=encoding)
         self._allow = allow
+        self._budget = budget
 
     def find_class(self, module: str, name: str) -> Any:
         try:
             allowed = self._allow[module, name]
         except KeyError:
             raise pickle.UnpicklingError(f"it names {module}.{name}, which is not allowed") from None
-        return _Callable(allowed) if isinstance(allowed, FunctionType) else allowed
+        return _Callable(allowed, self._budget) if isinstance(allowed, FunctionType) else allowed
 
     def persistent_load(self, pid: Any) -> Any:
         raise pickle.UnpicklingError("it holds a persistent id, which is not allowed")
@@ -87,13 +105,20 @@ class StandIn:
 class _Callable(StandIn):
     """An allowed function that a pickle can call and nothing else: BUILD on it could set its defaults for all files."""
 
-    __slots__ = ("_function",)
+    __slots__ = ("_budget", "_function")
 
-    def __init__(self, function: Callable[..., Any]) -> None:
+    def __init__(self, function: Callable[..., Any], budget: Budget) -> None:
         self._function = function
+        self._budget = budget
 
     def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments)
+        result = self._function(*arguments)
+        if isinstance(result, CheckedArray):
+            result.budget = self._budget
+            self._budget.spend(result.nbytes)
+        elif isinstance(result, bytes | set | dict):
+            self._budget.spend(sys.getsizeof(result))
+        return result
 
 
 def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
@@ -143,6 +168,8 @@ class Record:
 class CheckedArray(np.ndarray):
     """An array whose pickled state is checked before NumPy sees it."""
 
+    budget: Budget | None = None
+
     def __setstate__(self, state: tuple) -> None:  # type: ignore[override]
         _, shape, dtype, is_fortran, raw = state
         kind = _checked_dtype(dtype)
@@ -157,6 +184,8 @@ class CheckedArray(np.ndarray):
         wanted = math.prod(shape) * (1 if kind.hasobject else kind.itemsize)
         if len(raw) != wanted:
             raise pickle.UnpicklingError(f"an array of shape {tuple(shape)} with {len(raw)} in the place of {wanted}")
+        if self.budget is not None:
+            self.budget.spend(len(raw) * (kind.itemsize if kind.hasobject else 1))
         super().__setstate__((1, tuple(shape), kind, bool(is_fortran), raw))  # type: ignore[arg-type]
 
 

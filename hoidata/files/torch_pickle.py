@@ -19,6 +19,7 @@ from hoidata.errors import BadInput
 from hoidata.files.pickle_check import REFUSED_OPCODES, check_opcodes
 from hoidata.files.restricted_pickle import (
     Allow,
+    Budget,
     CheckedArray,
     StandIn,
     checked_keys,
@@ -33,6 +34,7 @@ _MAX_DIMENSIONS = 8
 _MAGIC = 0x1950A86A20F9469CFC6C
 _PROTOCOL = 1001
 _LEGACY_PICKLES = 5
+_MOST_OPCODES = 1000  # of each; torch writes 30 at most
 # Little-endian. BFloat16 and quantised storages have no NumPy type and are refused.
 _STORAGE_DTYPES = {
     "DoubleStorage": "<f8",
@@ -67,7 +69,7 @@ def load_torch_pickle(source: str | Path | bytes, where: str | Path) -> Any:
 
 def tensor_globals(where: str | Path, n_bytes: int) -> Allow:
     """The exact allow-list of one file of ``n_bytes``, which also limits how large its tensors get together."""
-    budget = _Budget(n_bytes + _REPEATED_BYTES)
+    budget = Budget(n_bytes + _REPEATED_BYTES)
 
     def load_from_bytes(data: Any) -> _Storage:
         return _load_from_bytes(where, data)
@@ -83,18 +85,6 @@ def tensor_globals(where: str | Path, n_bytes: int) -> Allow:
     }
 
 
-class _Budget:
-    """Bytes that may still be allocated for one file."""
-
-    def __init__(self, n_bytes: int) -> None:
-        self.left = n_bytes
-
-    def spend(self, n_bytes: int) -> None:
-        self.left -= n_bytes
-        if self.left < 0:
-            raise pickle.UnpicklingError("tensors that are together far larger than the file")
-
-
 class _Storage(StandIn):
     """The elements of one storage, (element,), read-only. A pickle can only hand it on."""
 
@@ -105,7 +95,7 @@ class _Storage(StandIn):
 
 
 def _rebuild_tensor(
-    budget: _Budget, storage: Any, offset: Any, size: Any, stride: Any, _requires_grad: Any = False, hooks: Any = None
+    budget: Budget, storage: Any, offset: Any, size: Any, stride: Any, _requires_grad: Any = False, hooks: Any = None
 ) -> CheckedArray:
     if not isinstance(storage, _Storage) or hooks:
         raise pickle.UnpicklingError("a tensor without a storage, or with hooks")
@@ -159,15 +149,16 @@ def _load_from_bytes(where: str | Path, data: Any) -> _Storage:
     return _Storage(np.frombuffer(elements, dtype, length, offset=8))
 
 
-def _split(data: bytes) -> tuple[list[bytes], bytes]:
+def _split(data: bytes) -> tuple[list[bytes], memoryview]:
     """The five pickles of the legacy format and what follows them."""
     stream, parts = io.BytesIO(data), []
     for _ in range(_LEGACY_PICKLES):
         start = stream.tell()
-        for _opcode in pickletools.genops(stream):
-            pass
+        for number, _opcode in enumerate(pickletools.genops(stream)):
+            if number > _MOST_OPCODES:
+                raise pickle.UnpicklingError("a storage that torch.save did not write")
         parts.append(data[start : stream.tell()])
-    return parts, data[stream.tell() :]
+    return parts, memoryview(data)[stream.tell() :]  # not copied: a pickle can ask for the same storage many times
 
 
 def _storage_head(data: bytes) -> tuple[np.dtype, str, int]:

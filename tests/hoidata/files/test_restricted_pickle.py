@@ -218,6 +218,25 @@ def test_a_pickle_of_millions_of_opcodes_is_refused(monkeypatch):
         restricted_load(pickle.dumps([1] * 100), ARRAYS)
 
 
+TEXT = b"X\x00\x00\x10\x00" + b"x" * (1 << 20) + b"q\x000"
+ENCODED = b"c_codecs\nencode\n(h\x00Vlatin1\ntR"
+BIG_ENDIAN = b"cnumpy\ndtype\n(S'f8'\nI0\nI1\ntR(I3\nS'>'\nNNNI-1\nI-1\nI0\ntb"
+SWAPPED = RECONSTRUCT + b"(cnumpy\nndarray\n(I0\ntS'b'\ntR(I1\n(I131072\nt" + BIG_ENDIAN + b"I00\nh\x00tb"
+BUFFER = b"cnumpy.core.numeric\n_frombuffer\n(h\x00" + DTYPE + b"(S'f8'\nI0\nI1\ntR(I131072\ntS'C'\ntR"
+
+
+@pytest.mark.parametrize(
+    ("once", "call"),
+    [(TEXT, ENCODED), (TEXT, SWAPPED), (TEXT, BUFFER)],
+    ids=["bytes", "arrays", "buffers"],
+)
+def test_one_long_text_made_into_values_again_and_again_is_refused(once, call):
+    """A hundred bytes for each call, a megabyte for each result: a small file could fill any memory."""
+    assert len(restricted_load(b"\x80\x02" + once + b"](" + call * 3 + b"e.", ARRAYS, encoding="latin1")) == 3
+    with pytest.raises(BadInput, match="far larger than the file"):
+        restricted_load(b"\x80\x02" + once + b"](" + call * 200 + b"e.", ARRAYS, encoding="latin1")
+
+
 def test_a_huge_integer_is_refused():
     """Hashing one of a megabyte a million times takes minutes; no dataset has one."""
     with pytest.raises(BadInput, match="LONG4"):

@@ -4,6 +4,7 @@ import pickle
 import pickletools
 import subprocess
 import sys
+import tracemalloc
 from collections import OrderedDict
 
 import numpy as np
@@ -249,3 +250,20 @@ def test_the_allow_list_is_the_four_names_of_the_specification():
         ("torch.storage", "_load_from_bytes"),
         ("collections", "OrderedDict"),
     }
+
+
+def test_a_storage_named_many_times_is_held_once():
+    """Each of 400 tensors would otherwise keep its own copy of 8 MB."""
+    stream = io.BytesIO()
+    storage = torch.zeros(2 * 2**20)._typed_storage()
+    function, (blob,) = storage.__reduce__()
+    calls = [Call(function, blob) for _ in range(400)]
+    pickler = pickle.Pickler(stream, 4)
+    pickler.dump([Call(torch._utils._rebuild_tensor_v2, call, 0, (1,), (1,), False, None) for call in calls])
+    assert len(stream.getvalue()) < 9 * 2**20
+    tracemalloc.start()
+    loaded = load_torch_pickle(stream.getvalue(), "x.pkl")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(loaded) == 400
+    assert peak < 60 * 2**20
