@@ -33,7 +33,8 @@ import pandas as pd
 import pyarrow.parquet as pq
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from hoidata.hands import HandPair, load_embedded_hands
+from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.schema.clip import (
     SIDES,
@@ -150,7 +151,7 @@ class Store:
 
     def joints(self, clip_id: str, side: Side) -> np.ndarray:
         """(frame, 21, 3) float32 world joints of one hand, metres, valid frames or not (see ``HandTrack.valid``)."""
-        return track_joints(self._hand(self._row(clip_id), side), self.hand_pair()[side])
+        return fast_track_joints(self._hand(self._row(clip_id), side), self.hand_pair()[side])
 
     def hand_pair(self) -> HandPair:
         """The hand model of this store. Raises MissingResource when it needs the user's MANO files."""
