@@ -62,7 +62,7 @@ def _turns(degrees: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
-    """Raw root; per side offsets (17, 3) and rows (frame, 54), as in the files; ends and radii of the right's capsules."""
+    """Raw root; per side offsets (17, 3) and rows (frame, 54) of the files; ends and radii of right capsules."""
     root, rng = tmp_path_factory.mktemp("manipnet"), np.random.default_rng(0)
     right = np.round(rng.normal(size=(17, 3)) * 0.3, 6)
     right[0] = 0
