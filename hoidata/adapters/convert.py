@@ -117,9 +117,7 @@ class SequenceConverter:
         except BadInput as error:
             self.work.keep(key, [_left_out(key, self.root, error)], None)
         except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
-            problem = BadInput(
-                str(key), "a sequence the adapter can read", repr(error), "report this defect of hoidata"
-            )
+            problem = BadInput(str(key), "a sequence the adapter can read", repr(error), DEFECT)
             self.work.keep(key, [_left_out(key, self.root, problem)], None)
         else:
             self.work.keep(key, results, raw.sources)

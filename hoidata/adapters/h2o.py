@@ -12,6 +12,7 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
+from hoidata.adapters import checks
 from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.adapters.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.adapters.h2o_files import (
@@ -94,9 +95,9 @@ class H2OAdapter:
     parts: tuple[DatasetPart, ...] = PARTS
 
     def __post_init__(self) -> None:
-        if self.hands not in get_args(HandSource):
-            known = " or ".join(get_args(HandSource))
-            raise BadInput("settings of the adapter h2o: hands", known, f"{self.hands!r}", "correct it")
+        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
+        checks.whole_setting(self.name, "shortest_frames", self.shortest_frames)
+        checks.choice_setting(self.name, "hands", self.hands, get_args(HandSource))
 
     @property
     def needs_mano(self) -> bool:

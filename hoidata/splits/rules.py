@@ -158,6 +158,7 @@ def _by_time(n_clips: int, rule: SplitRule) -> Sequence[Part]:
     least = 1 if n_clips >= 3 else 0
     test = max(least, round(rule.test_share * n_clips)) if rule.test_share else 0
     validation = max(least, round(rule.validation_share * n_clips)) if rule.validation_share else 0
+    validation = min(validation, n_clips - test)  # both may be rounded up
     return (*["train"] * (n_clips - validation - test), *["validation"] * validation, *["test"] * test)  # type: ignore[return-value]
 
 

@@ -317,3 +317,11 @@ def test_a_frame_file_too_big_to_be_one_is_refused_without_reading_it(root, load
         stream.truncate(1 << 40)
     with pytest.raises(BadInput, match=r"cam_pose/000007\.txt.*at most 1048576 bytes"):
         load_all(H2OAdapter(), root)
+
+
+@pytest.mark.parametrize(
+    "setting", [{"margin_frames": -5}, {"margin_frames": "abc"}, {"shortest_frames": 20.5}, {"hands": "manual"}]
+)
+def test_a_setting_that_cannot_be_is_refused_before_any_file_is_read(setting):
+    with pytest.raises(BadInput, match=f"settings of the adapter h2o: {next(iter(setting))}"):
+        H2OAdapter(**setting)

@@ -301,6 +301,18 @@ def test_a_changed_template_is_found(folder):
     assert problem.where == f"{TEMPLATES}: {name}"
 
 
+def test_a_plausible_number_changed_in_place_is_found(folder):
+    path = folder / FRAME_FILE
+    with np.load(path) as archive:
+        wrist_m = archive["right_wrist_m"][1]
+    data, old = path.read_bytes(), wrist_m.tobytes()
+    assert data.count(old) == 1
+    path.write_bytes(data.replace(old, (wrist_m + np.float32(0.05)).tobytes()))
+    (problem,) = check_store(folder)
+    assert problem.where == f"{FRAME_FILE}: right_wrist_m"
+    assert "checksum" in problem.got
+
+
 def test_every_member_of_every_shard_is_held_to_its_type(folder):
     for file in (FRAMES, BODY, SOURCE_CONTACT):
         path = folder / file.path.replace("*", "00000")
