@@ -77,9 +77,19 @@
       this.addLights();
       this.addGround();
       this.listen();
+      this.announce("loaded");
       this.start();
       const drawn = document.documentElement.dataset;
       drawn.players = String(Number(drawn.players || 0) + 1);
+    }
+
+    // What else stands on the page may follow the motion: "loaded" once, "shown" whenever another moment is shown.
+    announce(name) {
+      this.figure.dispatchEvent(new CustomEvent(name, { bubbles: true, detail: this }));
+    }
+
+    frame() {
+      return Math.min(this.view.frames - 1, Math.round(this.seconds * this.view.fps));
     }
 
     prepare(node) {
@@ -187,9 +197,9 @@
       // A hair before the end: the mixer wraps to the start exactly at the clip's length.
       this.mixer.setTime(Math.min(this.seconds, this.duration - 1e-4));
       this.slider.value = this.seconds / this.duration;
-      const frame = Math.round(this.seconds * this.view.fps);
-      this.clock.textContent = `frame ${frame} of ${this.view.frames - 1} · ${this.seconds.toFixed(2)} s`;
+      this.clock.textContent = `frame ${this.frame()} of ${this.view.frames - 1} · ${this.seconds.toFixed(2)} s`;
       this.dirty = true;
+      this.announce("shown");
     }
 
     advance(seconds) {

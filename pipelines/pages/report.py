@@ -1,4 +1,4 @@
-"""The report of one profile: one self-contained page over all its datasets."""
+"""The report of one profile: a self-contained page over all its datasets, and beside it a page per dataset."""
 
 import json
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
+from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
 from pipelines.pages.examples import contact_examples, generated_example, is_trained, shown_ids, true_contact
 from pipelines.pages.generation_page import generated_contact, generation_facts
 from pipelines.pages.metrics_table import Table, metrics_tables
@@ -39,10 +40,14 @@ class ReportFolders:
 
 @dataclass(frozen=True)
 class Section:
-    """One dataset on the page. motions: recorded and generated, side by side; contact: sentence, (truth, predicted)."""
+    """One dataset on the page. motions: recorded and generated, side by side; contact: sentence, (truth, predicted).
+
+    page: the dataset's own page, beside the report's; "" where a stage it needs has not run.
+    """
 
     facts: DatasetFacts
     title: str
+    page: str = ""
     shown: str = ""
     quality: QualityFacts | None = None
     motions: list[Player] = field(default_factory=list)
@@ -64,6 +69,8 @@ def write_report(
 ) -> Path:
     """Write ``out/index.html`` from what the stages of ``profile`` left in ``folders`` (below the current folder).
 
+    Beside it the page of each dataset, ``out/<dataset>.html``, and in ``out/clips`` those of its examples.
+
     Where all four models of a dataset are trained, a motion is generated for a held-out clip and shown beside it; seed:
     of what they draw. Equal inputs give equal bytes. Datasets without clips are listed with their reason.
     """
@@ -77,6 +84,9 @@ def write_report(
         empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
         hand_model=hands.name, has_players=has_players,
     )  # fmt: skip
+    for section in sections:
+        if section.page:
+            write_dataset_page(out, folders.data / section.facts.name, section.facts.name, hands, section.title)
     path = Path(out) / "index.html"
     with atomic_file(path) as part:
         part.write_text(page, encoding="utf-8")
@@ -94,6 +104,7 @@ def _section(name: str, folders: ReportFolders, hands: HandPair, seed: int) -> S
     return Section(
         facts,
         title,
+        page=f"{name}.html" if can_be_shown(folders.data / name) else "",
         shown=_what_is_shown(facts),
         quality=read_quality(folders.data / name / "quality", name),
         motions=motions,

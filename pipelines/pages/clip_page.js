@@ -1,0 +1,130 @@
+// The page of one clip: a cursor over the curves that follows the player, and the contact map of every frame.
+"use strict";
+(function () {
+  const NEIGHBOURS = 4;
+  const holder = document.getElementById("clip");
+  const timeline = document.getElementById("timeline");
+  const charts = JSON.parse(document.getElementById("readouts").textContent);
+  const paint = JSON.parse(document.getElementById("paint-values").textContent);
+  const hex = JSON.parse(document.getElementById("paint-colours").textContent);
+  const bits = { left: bytesOf(paint.left), right: bytesOf(paint.right) };
+  const always = { left: anyFrame(bits.left), right: anyFrame(bits.right) };
+  const surfaces = [];
+  let player = null, painted = null, colours = null;
+
+  function bytesOf(text) {
+    return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  }
+
+  function anyFrame(all) {
+    const found = new Uint8Array(paint.stride);
+    for (let i = 0; i < all.length; i++) found[i % paint.stride] |= all[i];
+    return found;
+  }
+
+  function touched(packed, point) {
+    return packed[point >> 3] >> (7 - (point & 7)) & 1;
+  }
+
+  // The few sampled points nearest to each vertex, with Gaussian weights as wide as the points lie apart.
+  function surfaceOf(mesh, part) {
+    const place = mesh.geometry.attributes.position, count = place.count;
+    const nearest = new Uint16Array(count * NEIGHBOURS), weight = new Float32Array(count * NEIGHBOURS);
+    const known = Math.min(NEIGHBOURS, part.numbers.length);
+    const best = new Float64Array(NEIGHBOURS), which = new Int32Array(NEIGHBOURS);
+    for (let vertex = 0; vertex < count; vertex++) {
+      best.fill(Infinity);
+      const x = place.getX(vertex), y = place.getY(vertex), z = place.getZ(vertex);
+      for (let point = 0; point < part.numbers.length; point++) {
+        const dx = part.tenth_mm[3 * point] * 1e-4 - x, dy = part.tenth_mm[3 * point + 1] * 1e-4 - y, dz = part.tenth_mm[3 * point + 2] * 1e-4 - z;
+        const square = dx * dx + dy * dy + dz * dz;
+        let slot = known;
+        while (slot > 0 && square < best[slot - 1]) slot--;
+        if (slot >= known) continue;
+        for (let later = known - 1; later > slot; later--) { best[later] = best[later - 1]; which[later] = which[later - 1]; }
+        best[slot] = square;
+        which[slot] = point;
+      }
+      const width = Math.max(best[known - 1], 1e-10);
+      let sum = 0;
+      for (let k = 0; k < known; k++) sum += Math.exp(-2 * best[k] / width);
+      for (let k = 0; k < known; k++) {
+        nearest[vertex * NEIGHBOURS + k] = part.numbers[which[k]];
+        weight[vertex * NEIGHBOURS + k] = Math.exp(-2 * best[k] / width) / sum;
+      }
+    }
+    return { mesh, nearest, weight };
+  }
+
+  function repaint(left, right) {
+    for (const { mesh, nearest, weight } of surfaces) {
+      const attribute = mesh.geometry.attributes.color, array = attribute.array, size = attribute.itemSize;
+      const scale = array instanceof Uint8Array ? 255 : 1;
+      for (let vertex = 0; vertex < attribute.count; vertex++) {
+        let onLeft = 0, onRight = 0;
+        for (let k = vertex * NEIGHBOURS; k < (vertex + 1) * NEIGHBOURS; k++) {
+          if (left && touched(left, nearest[k])) onLeft += weight[k];
+          if (right && touched(right, nearest[k])) onRight += weight[k];
+        }
+        const both = Math.min(onLeft, onRight), any = Math.max(onLeft, onRight);
+        const one = onLeft > onRight ? colours.left : colours.right;
+        for (let c = 0; c < 3; c++) {
+          const value = colours.plain[c] * (1 - any) + one[c] * (any - both) + colours.both[c] * both;
+          array[vertex * size + c] = Math.round(value * scale * 1e4) / 1e4;
+        }
+      }
+      attribute.needsUpdate = true;
+    }
+    player.dirty = true;
+  }
+
+  function showPaint() {
+    const mode = document.querySelector("input[name=paint]:checked").value;
+    const frame = player.frame();
+    const wanted = mode === "frame" ? `frame ${frame}` : mode;
+    if (wanted === painted || !surfaces.length) return;
+    painted = wanted;
+    const here = (packed) => packed.subarray(frame * paint.stride, (frame + 1) * paint.stride);
+    if (mode === "frame") repaint(here(bits.left), here(bits.right));
+    else if (mode === "clip") repaint(always.left, always.right);
+    else repaint(null, null);
+  }
+
+  function showCursor() {
+    const left = Number(timeline.dataset.left), right = Number(timeline.dataset.right);
+    const part = Math.min(1, player.seconds / player.duration);
+    timeline.querySelector(".cursor").style.left = `${left + (right - left) * part}%`;
+    timeline.querySelectorAll(".readout").forEach((readout, number) => {
+      readout.querySelectorAll("b").forEach((text, line) => {
+        const { values, decimals } = charts[number][line], value = values[player.frame()];
+        text.textContent = value === null || value === undefined ? "–" : value.toFixed(decimals);
+      });
+    });
+  }
+
+  function seek(event) {
+    if (!player || !(event.buttons & 1)) return;
+    const box = timeline.getBoundingClientRect();
+    const left = Number(timeline.dataset.left), right = Number(timeline.dataset.right);
+    const part = ((event.clientX - box.left) / box.width * 100 - left) / (right - left);
+    player.play(false);
+    player.show(Math.min(1, Math.max(0, part)) * player.duration);
+    event.preventDefault();
+  }
+
+  holder.addEventListener("loaded", (event) => {
+    player = event.detail;
+    colours = Object.fromEntries(Object.entries(hex).map(([name, text]) => [name, new THREE.Color(text).convertSRGBToLinear().toArray()]));
+    colours.plain = new THREE.Color("#d6d4cc").convertSRGBToLinear().toArray();
+    // By name: the loader adds the nodes in the order in which it happens to finish them.
+    const parts = new Map(paint.parts.map((part) => [part.mesh, part]));
+    player.scene.traverse((node) => {
+      if (node.isMesh && node.material.vertexColors) surfaces.push(surfaceOf(node, parts.get(node.userData.name)));
+    });
+    document.getElementById("paint").hidden = false;
+  });
+  holder.addEventListener("shown", () => { showCursor(); showPaint(); });
+  document.getElementById("paint").addEventListener("change", showPaint);
+  timeline.addEventListener("pointerdown", seek);
+  timeline.addEventListener("pointermove", seek);
+})();

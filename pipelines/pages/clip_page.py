@@ -1,0 +1,120 @@
+"""One clip as one self-contained page: it plays, with contact, curves, words, evidence and origin below it."""
+
+import base64
+import re
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hoidata.files import atomic_file
+from hoidata.hands import HandPair
+from hoidata.objects.sampling import SampledPoints
+from hoidata.schema.annotated import AnnotatedStore
+from hoidata.schema.clip import SIDES, Clip, Side
+from pipelines.pages.clip_page_facts import (
+    clip_facts,
+    clip_quality,
+    hand_decision,
+    sentence_rows,
+    source_rows,
+    split_rows,
+)
+from pipelines.pages.clip_page_series import ClipSeries, measure_clip
+from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_charts, draw_timeline
+from pipelines.pages.examples import true_contact
+from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.surface import ContactPaint
+from pipelines.pages.view import touched_side
+
+PAINT_COLOURS = {**SIDE_COLOURS, "both": BOTH_COLOUR}
+
+
+def page_name(clip_id: str) -> str:
+    """File name of a clip's page: ``grab/s1/mug_drink_1`` becomes ``grab_s1_mug_drink_1.html``."""
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", clip_id) + ".html"
+
+
+def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, hands: HandPair) -> Path:
+    """Write the page of one clip; equal inputs give equal bytes.
+
+    annotated: its dataset, with quality control's folder beside it. hands: the model of its store. Raises
+    MissingResource that names the stage where quality control has not run.
+    """
+    clip = annotated.clip(clip_id)
+    quality = clip_quality(annotated.root / "quality", clip_id)
+    series = measure_clip(annotated, clip, hands)
+    points = annotated.points(annotated.object_key(clip_id))
+    sides: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
+    title = _title(annotated, clip)
+    page = render_page(
+        "clip_page.html",
+        title=title,
+        synthetic=clip.synthetic,
+        clip_id=clip_id,
+        player=replace(motion_player(clip, hands, title, contact=true_contact(annotated, clip_id)), contact_label=""),
+        paint=paint_values(clip, points, series.touched),
+        paint_colours=PAINT_COLOURS,
+        threshold_cm=annotated.contact_info["threshold_m"] * 100,
+        timeline=draw_timeline(clip_charts(series, sides, len(points)), clip_id),
+        no_depth=series.depth_m is None,
+        maps=_still_maps(clip, series, points),
+        sentences=sentence_rows(annotated, clip_id),
+        left_out="" if clip_id in annotated.ids() else str(annotated.hand_types.at[clip_id, "reason"]),
+        hands=hand_decision(annotated, clip, series),
+        quality=quality,
+        splits=split_rows(annotated, clip_id),
+        facts=clip_facts(annotated, clip, hands),
+        files=source_rows(clip),
+        has_players=True,
+        script=_script(),
+    )
+    with atomic_file(path) as part:
+        part.write_text(page, encoding="utf-8")
+    return Path(path)
+
+
+def paint_values(clip: Clip, points: SampledPoints, touched: Mapping[Side, np.ndarray]) -> dict:
+    """What clip_page.js needs to paint the contact map of any frame, as JSON knows it.
+
+    parts: per part that has triangles, the name of its node in the GLB, points in its mesh's coordinates (the moving
+    part is drawn from its hinge's origin) in 0.1 mm, and their numbers among all points. left, right: touched points
+    per frame, packed bits (first point in the highest bit) in base64, ``stride`` bytes per frame.
+    """
+    model = clip.object.model
+    parts = []
+    for part in sorted(set(model.face_part.tolist())):
+        numbers = np.flatnonzero(points.part == part)
+        origin = model.hinge.origin_m if part == 1 and model.hinge is not None else np.zeros(3)
+        local = np.round((points.points_m[numbers] - origin) * 1e4).astype(int)
+        mesh = f"{model.name} {'base' if part == 0 else 'part'} mesh"
+        parts.append({"mesh": mesh, "numbers": numbers.tolist(), "tenth_mm": local.reshape(-1).tolist()})
+    bits = {side: np.packbits(touched[side], axis=1) for side in SIDES}
+    packed = {side: base64.b64encode(bits[side].tobytes()).decode("ascii") for side in SIDES}
+    return {"parts": parts, "stride": int(bits["left"].shape[1]), "frames": clip.n_frames, **packed}
+
+
+def _title(annotated: AnnotatedStore, clip: Clip) -> str:
+    if clip.clip_id in annotated.ids():
+        return annotated.sentences(clip.clip_id)[0]
+    return f"{clip.verb or 'move'}: {clip.object_words}"
+
+
+def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[Player]:
+    """Per hand that touches: the object to turn, each point by its share of the hand's frames in contact."""
+    players = []
+    for side in SIDES:
+        touching = int(series.touched[side].any(axis=1).sum())
+        if not touching:
+            continue
+        share = series.touched[side].sum(axis=0) / touching
+        paint = ContactPaint(points.points_m, points.part, share)
+        caption = f"{side} hand, {int((share > 0).sum()):,} points, in contact in {touching} of {clip.n_frames} frames"
+        label = "share of these frames, 0 to 1"
+        players.append(contact_player(clip, paint, caption, caption, touched_side(clip, paint), label))
+    return players
+
+
+def _script() -> str:
+    return (Path(__file__).parent / "clip_page.js").read_text(encoding="utf-8")

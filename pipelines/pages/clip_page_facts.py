@@ -1,0 +1,207 @@
+"""The tables of one clip's page: words, what the hand type rests on, quality, splits, where the clip comes from."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from hoidata.errors import MissingResource
+from hoidata.hands import JOINT_NAMES, HandPair
+from hoidata.quality.thresholds import CLIP_MEASURES
+from hoidata.schema.annotated import AnnotatedStore
+from hoidata.schema.clip import FPS, SIDES, Clip, Side
+from pipelines.pages.clip_page_series import ClipSeries
+
+Rows = list[tuple[str, ...]]
+NOTHING = "none"
+
+
+@dataclass(frozen=True)
+class HandFacts:
+    """One hand in the hand test: each a text; acts: whether the hand takes part."""
+
+    side: str
+    valid: str
+    nearest: str
+    where: str
+    within: str
+    acts: bool
+
+
+@dataclass(frozen=True)
+class HandDecision:
+    """The hand type, in words how it was found, and the row of each hand."""
+
+    hand_type: str
+    rule: str
+    agreement: str
+    hands: list[HandFacts]
+
+
+@dataclass(frozen=True)
+class ClipQuality:
+    """Verdict and reasons of quality control, and the measures: (what, value, warn above, leave out above)."""
+
+    verdict: str
+    reasons: str
+    note: str
+    measures: Rows
+
+
+def sentence_rows(annotated: AnnotatedStore, clip_id: str) -> list[tuple[str, list[str]]]:
+    """(form, sentences) as the stage annotate wrote them, in its order; nothing for a clip that got none."""
+    rows = annotated.text[annotated.text["clip_id"] == clip_id]
+    forms = dict.fromkeys(rows["form"].tolist())
+    return [(str(form), rows.loc[rows["form"] == form, "sentence"].tolist()) for form in forms]
+
+
+def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> HandDecision:
+    """What the stage annotate decided, and the distances it rests on."""
+    row = annotated.hand_types.loc[clip.clip_id]
+    threshold, points = annotated.annotation_info["threshold_m"], annotated.annotation_info["points"]
+    return HandDecision(
+        hand_type=NOTHING if pd.isna(row["hand_type"]) else str(row["hand_type"]),
+        rule=f"A hand acts when, in any frame, one of its 21 joints is closer than {threshold * 100:g} cm to one of "
+        f"{points:,} points of the object (Text2HOI, supplement 6).",
+        agreement=_agreement(clip, row["agreement"]),
+        hands=[_hand_facts(annotated, clip, series, side) for side in SIDES],
+    )
+
+
+def _agreement(clip: Clip, agreement: Any) -> str:
+    if clip.labelled_hand is None:
+        return "The source names no hand."
+    verdict = "which agrees" if bool(agreement) else "which DISAGREES"
+    return f"The source's annotator named: {clip.labelled_hand}, {verdict}."
+
+
+def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side: Side) -> HandFacts:
+    valid, distance = clip.hands[side].valid, series.evidence.distance_m[side]
+    threshold = series.evidence.threshold_m
+    count = f"{int(valid.sum())} of {clip.n_frames}"
+    if not valid.any():
+        return HandFacts(side, count, "never seen", "", "", False)
+    frame = int(distance.argmin())
+    within = int((distance < threshold).sum())
+    return HandFacts(
+        side=side,
+        valid=count,
+        nearest=f"{distance[frame] * 100:.2f} cm",
+        where=f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}",
+        within=f"{within} of {clip.n_frames}",
+        acts=within > 0,
+    )
+
+
+def _joint(annotated: AnnotatedStore, clip_id: str, side: Side, frame: int) -> str:
+    """Which joint is nearest in a frame, where the contact stage kept its distance."""
+    entries = annotated.distances(clip_id, side)
+    here = entries.select(entries.frame == frame)
+    return f", {JOINT_NAMES[int(here.joint[here.distance_m.argmin()])]}" if len(here.frame) else ""
+
+
+def clip_quality(folder: Path, clip_id: str) -> ClipQuality:
+    """What quality control found. Raises MissingResource where its stage has not run."""
+    if not (folder / "clips.parquet").is_file():
+        raise MissingResource(f"{folder} is not there: run the stage 'quality' of this dataset first")
+    row = pd.read_parquet(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
+    limits = json.loads((folder / "info.json").read_text(encoding="utf-8"))["thresholds"]["limits"]
+    measures = [
+        (
+            f"{measure.words}{', ' + measure.unit if measure.unit else ''}",
+            _number(row[measure.name]),
+            *(_number(limits[measure.name][end], "") for end in ("warn", "leave_out")),
+        )
+        for measure in CLIP_MEASURES
+    ]
+    return ClipQuality(str(row["verdict"]), str(row["reasons"] or ""), str(row["note"] or ""), measures)
+
+
+def _number(value: Any, missing: str = "not measured") -> str:
+    return missing if pd.isna(value) else f"{float(value):.4g}"
+
+
+def split_rows(annotated: AnnotatedStore, clip_id: str) -> Rows:
+    """(split, part) of every named split of the dataset; the chosen one first."""
+    table = pd.read_parquet(annotated.root / "splits" / "splits.parquet").set_index("clip_id")
+    row = table.loc[clip_id]
+    chosen = str(annotated.split_info["chosen"]["name"])
+    parts = [(str(name), NOTHING if pd.isna(part) else str(part)) for name, part in row.items()]
+    others = [(name, part) for name, part in parts if name not in ("split", chosen)]
+    return [(f"{chosen} (chosen)", dict(parts)["split"]), *others]
+
+
+def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
+    """(name, text) rows about the clip itself."""
+    info = annotated.info
+    licence = f"{info['licence']}; derived data {'may be shared' if info['may_be_shared'] else 'not to be shared'}"
+    return [
+        ("clip", clip.clip_id),
+        ("dataset", f"{info['dataset']}, version {info['dataset_version']}"),
+        ("subject, sequence", f"{clip.subject}, {clip.sequence}"),
+        ("verb", clip.verb or "no label in the source"),
+        ("object", _object_words(clip)),
+        ("other objects", ", ".join(track.model.name for track in clip.other_objects) or NOTHING),
+        ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s at {FPS} per second"),
+        ("source frames", _source_frames(clip)),
+        ("gravity", _gravity(clip)),
+        ("hands from", _hands_from(clip)),
+        ("hand model", hands.name),
+        ("camera", _camera(clip)),
+        ("also there", _further(clip)),
+        ("licence", licence),
+    ]
+
+
+def source_rows(clip: Clip) -> Rows:
+    """(path below the raw folder, bytes, SHA-256) of every raw file behind the clip."""
+    return [(source.path, f"{source.size:,}", source.sha256) for source in clip.sources]
+
+
+def _object_words(clip: Clip) -> str:
+    kind = "with a hinge" if clip.object.is_articulated else "rigid"
+    return f"{clip.object_words} ({clip.object.model.name}), {kind}, {len(clip.object.model.faces):,} triangles"
+
+
+def _source_frames(clip: Clip) -> str:
+    first, last = int(clip.source_frames[0]), int(clip.source_frames[-1])
+    steps = np.unique(np.diff(clip.source_frames)).tolist()
+    every = "" if steps == [1] or not steps else f", in steps of {' or '.join(map(str, steps[:3]))}"
+    return f"{first} to {last}{every}; the source has {clip.source_fps:g} per second"
+
+
+def _gravity(clip: Clip) -> str:
+    if clip.gravity is None:
+        return f"not known: {clip.gravity_note}"
+    words = ", ".join(f"{value + 0.0:.3g}" for value in np.round(clip.gravity, 3))
+    return f"({words}), {clip.gravity_note or 'stated by the source'}"
+
+
+def _hands_from(clip: Clip) -> str:
+    if clip.hands_from == "parameters":
+        return "hand parameters of the source"
+    error = "" if clip.fit_error_m is None else f", mean error {clip.fit_error_m * 1000:.1f} mm"
+    return f"a hand model fitted to the source's keypoints{error}"
+
+
+def _camera(clip: Clip) -> str:
+    if clip.camera is None:
+        return NOTHING
+    images = clip.camera.images
+    lens = (
+        ""
+        if clip.camera.intrinsics is None
+        else "; fx, fy, cx, cy, width, height: "
+        + ", ".join(f"{value:g}" for value in np.round(clip.camera.intrinsics, 1))
+    )
+    return f"{clip.camera.name}, images {int(images[0])} to {int(images[-1])}{lens}"
+
+
+def _further(clip: Clip) -> str:
+    found = ["body parameters"] if clip.body is not None else []
+    if clip.source_contact is not None:
+        found.append(f"contact labels of the source ({len(clip.source_contact.frame):,} entries)")
+    return "; ".join(found) or "nothing"

@@ -1,0 +1,151 @@
+"""Charts over the frames of one clip, one below the other over a shared axis, and what a page needs for a cursor."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from hoidata.schema.clip import Side
+from pipelines.pages.clip_page_series import ClipSeries
+from pipelines.pages.curves import figure_svg
+
+# Stronger than the hands' own colours: lines are thin. clip_page.js paints contact in the same.
+LEFT_COLOUR, RIGHT_COLOUR, BOTH_COLOUR, OBJECT_COLOUR = "#2f6fb0", "#c4571b", "#7b3f99", "#55595f"
+SIDE_COLOURS = {"left": LEFT_COLOUR, "right": RIGHT_COLOUR}
+LIMIT_COLOUR = "#8a8f96"
+WIDTH_INCHES, ROW_INCHES, FOOT_INCHES = 11.2, 1.0, 0.35
+FARTHEST_CM = 12.0
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a chart: values (frame,), NaN where there is none."""
+
+    name: str
+    colour: str
+    values: np.ndarray
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Lines in one unit. limit: a dashed line with its name; top: where the axis ends, values beyond leave the chart;
+    decimals: of the values the page shows under the cursor."""
+
+    title: str
+    unit: str
+    lines: list[Line]
+    limit: tuple[float, str] | None = None
+    top: float | None = None
+    decimals: int = 1
+
+
+@dataclass(frozen=True)
+class ChartPlace:
+    """A chart on the page. top: per cent of the drawing's height; values: per line, None where there is none."""
+
+    title: str
+    unit: str
+    top: float
+    lines: list[dict]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """The drawing; left, right: per cent of its width where frame 0 and the last frame lie."""
+
+    svg: Markup
+    left: float
+    right: float
+    charts: list[ChartPlace] = field(default_factory=list)
+
+
+def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> list[Chart]:
+    """What the page of a clip plots; sides: the hands that are ever valid."""
+    threshold_cm = series.evidence.threshold_m * 100
+    touched = [Line(side, SIDE_COLOURS[side], series.touched_count(side).astype(float)) for side in sides]
+    near = [Line(side, SIDE_COLOURS[side], _finite(series.evidence.distance_m[side]) * 100) for side in sides]
+    charts = [
+        Chart(f"touched, of {point_count:,} points of the object", "points", touched, decimals=0),
+        Chart("nearest joint to the object", "cm", near, (threshold_cm, f"{threshold_cm:g} cm"), FARTHEST_CM),
+    ]
+    if series.depth_m is not None:
+        depths = [Line(side, SIDE_COLOURS[side], series.depth_m[side] * 1000) for side in sides]
+        charts.append(Chart("deepest hand vertex inside the object", "mm", depths))
+    return [chart for chart in charts if chart.lines] + _object_charts(series)
+
+
+def _object_charts(series: ClipSeries) -> list[Chart]:
+    charts = [Chart("speed of the object", "cm/s", [Line("object", OBJECT_COLOUR, series.speed_m_s * 100)])]
+    if series.lift_m is not None:
+        title = "height of the object above its first frame"
+        charts.insert(0, Chart(title, "cm", [Line("object", OBJECT_COLOUR, series.lift_m * 100)]))
+    if series.hinge_rad is not None:
+        charts.append(Chart("hinge", "degrees", [Line("object", OBJECT_COLOUR, np.degrees(series.hinge_rad))]))
+    return charts
+
+
+def draw_timeline(charts: Sequence[Chart], salt: str) -> Timeline:
+    """All charts of equally many frames as one drawing; salt keeps the ids of several drawings apart."""
+    drawn: list[Axes] = []
+
+    def draw(figure: Figure) -> None:
+        rows = figure.subplots(len(charts), 1, squeeze=False, sharex=True)[:, 0]
+        for axes, chart in zip(rows, charts, strict=True):
+            _draw_chart(axes, chart)
+        rows[-1].set_xlabel("frame, 30 per second")
+        drawn.extend(rows)
+
+    svg = figure_svg((WIDTH_INCHES, ROW_INCHES * len(charts) + FOOT_INCHES), salt, draw)
+    boxes = [axes.get_position() for axes in drawn]
+    places = [
+        ChartPlace(
+            chart.title, chart.unit, _percent(1 - box.y1), [_readout(line, chart.decimals) for line in chart.lines]
+        )
+        for chart, box in zip(charts, boxes, strict=True)
+    ]
+    return Timeline(Markup(svg), _percent(boxes[0].x0), _percent(boxes[0].x1), places)
+
+
+def _draw_chart(axes: Axes, chart: Chart) -> None:
+    frames = len(chart.lines[0].values)
+    for line in chart.lines:
+        axes.plot(np.arange(frames), line.values, color=line.colour, linewidth=1.4)
+    lowest, highest = _range(chart)
+    axes.set_ylim(lowest, highest)
+    axes.set_xlim(0, max(frames - 1, 1))
+    axes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(3))
+    axes.grid(color="#ededea", linewidth=0.8)
+    axes.set_axisbelow(True)
+    axes.set_title(f"{chart.title}, {chart.unit}", loc="left", fontsize=9, color="#6a6f76")
+    if chart.limit:
+        axes.axhline(chart.limit[0], color=LIMIT_COLOUR, linewidth=1.0, linestyle=(0, (4, 3)))
+
+
+def _range(chart: Chart) -> tuple[float, float]:
+    """From 0 (or below, with a margin) to the largest value, the limit in sight, not beyond ``top``."""
+    values = np.concatenate([line.values for line in chart.lines])
+    values = values[np.isfinite(values)]
+    low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
+    high = max(high, chart.limit[0] * 1.5 if chart.limit else 0.0)
+    high = min(high, chart.top) if chart.top is not None else high
+    room = 0.06 * (high - low) or 0.5
+    return low - (room if low < 0 else 0.02 * (high - low)), high + room
+
+
+def _readout(line: Line, decimals: int) -> dict:
+    """Name, colour and values rounded for people, as JSON knows them."""
+    rounded = [round(float(value), decimals) if np.isfinite(value) else None for value in line.values]
+    return {"name": line.name, "colour": line.colour, "values": rounded, "decimals": decimals}
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, np.nan)
+
+
+def _percent(fraction: float) -> float:
+    return round(float(fraction) * 100, 3)

@@ -1,0 +1,68 @@
+"""A clip's id, or a dataset's name, to the page that shows it."""
+
+import difflib
+from pathlib import Path
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.lineage.graph import read_params
+from hoidata.schema.annotated import load_annotated
+from hoidata.schema.store import Store, open_store
+from pipelines.pages.clip_page import page_name, write_clip_page
+from pipelines.pages.dataset_page import write_dataset_page
+from pipelines.pages.report import TITLES
+from pipelines.stages.base import Place, empty_reason, load_hands
+
+CLOSEST = 5
+
+
+def write_shown(what: str, profile: str, out: Path) -> Path:
+    """Write the page of the clip, or of the dataset, called ``what`` in ``profile`` below ``out``; returns its path.
+
+    Raises BadInput that names the closest ids for an unknown one, MissingResource for a stage that has not run.
+    """
+    datasets = [str(name) for name in read_params(Path())["datasets"]]
+    if what in datasets:
+        place = Place(profile, what)
+        return write_dataset_page(out, place.data, what, load_hands(profile), TITLES.get(what, what))
+    place = find_clip(what, profile, datasets)
+    hands = load_hands(profile)
+    return write_clip_page(out / page_name(what), load_annotated(place.data, hands), what, hands)
+
+
+def find_clip(clip_id: str, profile: str, datasets: list[str]) -> Place:
+    """The dataset that holds a clip."""
+    stores = {name: store for name in datasets if (store := _store(Place(profile, name))) is not None}
+    for name, store in stores.items():
+        if clip_id in store.sequences.index:
+            return Place(profile, name)
+    if not stores:
+        raise MissingResource(f"no dataset of the profile {profile} is converted; run `dvc repro` first")
+    raise _unknown(clip_id, profile, stores)
+
+
+def _store(place: Place) -> Store | None:
+    """The clips of a dataset, or None where there are none."""
+    if empty_reason(place.clips) or not (place.clips / "meta" / "info.json").is_file():
+        return None
+    return open_store(place.clips)
+
+
+def _unknown(clip_id: str, profile: str, stores: dict[str, Store]) -> BadInput:
+    left_out = [
+        row for store in stores.values() for row in store.quarantine.to_dict("records") if row["source_key"] == clip_id
+    ]
+    if left_out:
+        row = left_out[0]
+        got = f"left out when converting: {row['where']}: expected {row['expected']}, got {row['got']}"
+        return BadInput(clip_id, "a clip", got, str(row["remedy"]))
+    counts = ", ".join(f"{name} {len(store)}" for name, store in stores.items())
+    near = closest_ids(clip_id, [known for store in stores.values() for known in store.ids])
+    expected = f"the id of one of the clips of the profile {profile} ({counts}) or a dataset"
+    return BadInput("CLIP", expected, clip_id, f"closest: {', '.join(near)}")
+
+
+def closest_ids(wanted: str, known: list[str]) -> list[str]:
+    """Up to five ids: those that hold the wanted words first, then those spelt most alike."""
+    holding = [name for name in known if wanted.lower() in name.lower()]
+    alike = difflib.get_close_matches(wanted, known, n=CLOSEST, cutoff=0.0)
+    return list(dict.fromkeys([*holding[:CLOSEST], *alike]))[:CLOSEST]

@@ -1,0 +1,244 @@
+"""The page of one clip: its series against formulas of the test, what the page says, and that it repeats."""
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.annotation.stage import annotate_store
+from hoidata.contact.stage import contact_store
+from hoidata.errors import MissingResource
+from hoidata.hands import track_joints, track_vertices
+from hoidata.quality.stage import quality_store
+from hoidata.schema.annotated import load_annotated
+from hoidata.schema.clip import CameraTrack, SourceFile
+from hoidata.schema.info import generated_info
+from hoidata.schema.store import write_store
+from hoidata.splits import split_store
+from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
+from pipelines.pages.clip_page_series import measure_clip
+from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline
+from pipelines.pages.glb import write_glb
+from pipelines.pages.player import three_javascript
+
+THRESHOLD_M = 0.09
+SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
+SHA256 = "5e88" * 16
+
+
+@pytest.fixture
+def dataset(hands, page_clip, tmp_path):
+    """Three annotated clips: both hands with a hinged box, a right hand that leaves for five frames, hands far away."""
+    both = replace(page_clip(left=True, hinged=True), clip_id="test/s1/lid", labelled_hand="right")
+    right = page_clip()
+    valid = right.hands["right"].valid.copy()
+    valid[5:10] = False
+    hand = replace(right.hands["right"], valid=valid)
+    frames = right.n_frames
+    camera = CameraTrack("cam4", np.zeros((frames, 3)), np.zeros((frames, 3)), np.arange(frames, dtype=np.int32) + 700)
+    right = replace(
+        right,
+        clip_id="test/s2/box",
+        subject="s2",
+        hands={"left": right.hands["left"], "right": hand},
+        sources=(SourceFile("s2/<box>.npz", 12345, SHA256),),
+        camera=camera,
+    )
+    far_hand = replace(right.hands["right"], wrist_m=right.hands["right"].wrist_m + 1.0)
+    far = replace(
+        right,
+        clip_id="test/s2/far",
+        hands={"left": right.hands["left"], "right": far_hand},
+        gravity=None,
+        gravity_note="still",
+    )
+    root = tmp_path / "grab"
+    write_store(root / "clips", [both, right, far], generated_info("grab", hands))
+    quality_store(root / "clips", root / "quality", progress=False)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=THRESHOLD_M)
+    contact_store(root / "clips", root / "contact", threshold_m=THRESHOLD_M)
+    split_store(root / "clips", root / "annotation", root / "splits", SPLIT)
+    return load_annotated(root, hands)
+
+
+def world_points(annotated, clip):
+    """(frame, point, 3) sampled points in the world, from the definition of a hinge and a pose."""
+    points = annotated.points(annotated.object_key(clip.clip_id))
+    placed = []
+    for frame in range(clip.n_frames):
+        local = points.points_m.astype(np.float64).copy()
+        if clip.object.model.hinge is not None:
+            hinge, moves = clip.object.model.hinge, points.part == 1
+            turn = Rotation.from_rotvec(np.asarray(hinge.axis) * clip.object.hinge_rad[frame]).as_matrix()
+            local[moves] = (local[moves] - hinge.origin_m) @ turn.T + hinge.origin_m
+        turn = Rotation.from_rotvec(clip.object.rotvec[frame]).as_matrix()
+        placed.append(local @ turn.T + clip.object.translation_m[frame])
+    return np.stack(placed)
+
+
+@pytest.mark.parametrize("clip_id", ["test/s1/lid", "test/s2/box"])
+def test_touched_points_and_nearest_distances_are_those_of_brute_force(dataset, hands, clip_id):
+    clip = dataset.clip(clip_id)
+    series = measure_clip(dataset, clip, hands)
+    points = world_points(dataset, clip)
+    for side, track in clip.hands.items():
+        joints = track_joints(track, hands[side]).astype(np.float64)
+        distance = np.linalg.norm(joints[:, :, None] - points[:, None], axis=3)
+        distance[~track.valid] = np.inf
+        clear = np.abs(distance - THRESHOLD_M).min(axis=1) > 1e-6
+        assert (series.touched[side] == (distance.min(axis=1) < THRESHOLD_M))[clear].all()
+        np.testing.assert_allclose(series.evidence.distance_m[side], distance.min(axis=(1, 2)), atol=1e-6)
+    assert series.touched["right"].any()
+
+
+def test_lift_and_speed_are_those_of_the_objects_middle(dataset, hands):
+    clip = dataset.clip("test/s1/lid")
+    series = measure_clip(dataset, clip, hands)
+    middle = world_points(dataset, clip).mean(axis=1)
+    assert series.lift_m is not None
+    np.testing.assert_allclose(series.lift_m, middle[:, 2] - middle[0, 2], atol=1e-6)
+    inner = np.linalg.norm(middle[2:] - middle[:-2], axis=1) / 2 * 30
+    np.testing.assert_allclose(series.speed_m_s[1:-1], inner, atol=1e-5)
+    assert series.lift_m[-1] > 0.19
+    assert measure_clip(dataset, dataset.clip("test/s2/far"), hands).lift_m is None
+
+
+def test_depth_is_how_far_a_vertex_lies_within_the_box(dataset, hands):
+    """Rigid box of 8 x 12 x 6 cm: the depth of an inner point is its distance to the nearest of six planes."""
+    clip = dataset.clip("test/s2/box")
+    track = clip.hands["right"]
+    deep = replace(track, wrist_m=clip.object.translation_m + np.array((0.05, 0.0, 0.0), np.float32))
+    moved = replace(clip, hands={"left": clip.hands["left"], "right": deep})
+    series = measure_clip(dataset, moved, hands)
+    vertices = track_vertices(deep, hands["right"]).astype(np.float64) - clip.object.translation_m[:, None]
+    rotation = Rotation.from_rotvec(clip.object.rotvec).as_matrix()
+    local = np.einsum("fvi,fij->fvj", vertices, rotation)
+    depth = np.maximum((np.array((0.04, 0.06, 0.03)) - np.abs(local)).min(axis=2).max(axis=1), 0)
+    assert depth.max() > 0.01
+    assert series.depth_m is not None
+    np.testing.assert_allclose(series.depth_m["right"][track.valid], depth[track.valid], atol=1e-6)
+    assert np.isnan(series.depth_m["right"][~track.valid]).all()
+    assert np.isnan(series.depth_m["left"]).all()
+
+
+def test_packed_contact_of_every_frame_unpacks_to_the_touched_points(dataset, hands):
+    clip = dataset.clip("test/s1/lid")
+    points = dataset.points("lidded box")
+    touched = measure_clip(dataset, clip, hands).touched
+    values = json.loads(json.dumps(paint_values(clip, points, touched)))
+    for side in ("left", "right"):
+        data = base64.b64decode(values[side])
+        for frame in (0, 11, 23):
+            row = data[frame * values["stride"] : (frame + 1) * values["stride"]]
+            found = [point for point in range(len(points)) if row[point // 8] >> (7 - point % 8) & 1]
+            assert found == np.flatnonzero(touched[side][frame]).tolist()
+
+
+def test_every_painted_mesh_of_the_glb_finds_its_points_where_its_vertices_are(dataset, hands, read_glb, tmp_path):
+    clip = dataset.clip("test/s1/lid")
+    points = dataset.points("lidded box")
+    glb = read_glb(write_glb(tmp_path / "clip.glb", clip, hands))
+    values = paint_values(clip, points, measure_clip(dataset, clip, hands).touched)
+    assert sorted(number for part in values["parts"] for number in part["numbers"]) == list(range(len(points)))
+    assert len(values["parts"]) == 2
+    for part in values["parts"]:
+        node = glb.document.nodes[glb.node(part["mesh"])]
+        vertices = glb.array(glb.document.meshes[node.mesh].primitives[0].attributes.POSITION)
+        place = np.array(part["tenth_mm"]).reshape(-1, 3) * 1e-4
+        np.testing.assert_allclose(place.min(axis=0), vertices.min(axis=0), atol=0.012)
+        np.testing.assert_allclose(place.max(axis=0), vertices.max(axis=0), atol=0.012)
+
+
+def test_page_tells_words_evidence_quality_split_and_sources(dataset, hands, tmp_path):
+    text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/box", hands).read_text()
+    for sentence in dataset.sentences("test/s2/box"):
+        assert sentence in text
+    assert f'<td>s2/&lt;box&gt;.npz</td><td class="number">12,345</td><td>{SHA256}</td>' in text
+    assert "<h2>Hand type: right</h2>" in text
+    assert re.search(r"<td>right</td><td>yes</td>.*<td class=\"number\">19 of 24</td></tr>", text)
+    assert '<td>left</td><td>no</td><td class="number">never seen</td>' in text
+    assert "The source names no hand." in text
+    assert "cam4, images 700 to 723" in text
+    assert "(chosen)</td><td>test</td>" in text
+    assert "(0, 0, -1), stated by the source" in text
+    assert "SYNTHETIC" in text
+
+
+def test_page_says_where_annotator_and_distances_disagree(dataset, hands, tmp_path):
+    text = write_clip_page(tmp_path / "page.html", dataset, "test/s1/lid", hands).read_text()
+    assert "annotator named: right, which DISAGREES" in text
+    assert "with a hinge" in text
+    assert text.count('<div class="readout"') == 6
+
+
+def test_clip_without_words_says_why_and_still_has_its_page(dataset, hands, tmp_path):
+    text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/far", hands).read_text()
+    assert "No sentences: no joint within 9 cm of the object" in text
+    assert "<h2>Hand type: none</h2>" in text
+    assert "It is not known where down is" in text
+    assert "No hand comes within 9 cm of the object." in text
+
+
+def test_page_repeats_byte_for_byte_and_fetches_nothing(dataset, hands, tmp_path):
+    first, second = (write_clip_page(tmp_path / name, dataset, "test/s1/lid", hands) for name in "ab")
+    assert first.read_bytes() == second.read_bytes()
+    own_part = first.read_text().replace(three_javascript(), "")
+    assert not re.search(r"https?://|@import|url\((?!#)", own_part)
+    assert "default-src 'none'" in own_part
+
+
+def test_missing_quality_control_is_named(dataset, hands, tmp_path):
+    shutil.rmtree(dataset.root / "quality")
+    with pytest.raises(MissingResource, match="run the stage 'quality'"):
+        write_clip_page(tmp_path / "page.html", dataset, "test/s1/lid", hands)
+
+
+def test_cursor_of_the_first_and_the_last_frame_lie_at_the_ends_of_the_lines(dataset, hands):
+    """Checked against the drawing itself: the x coordinates of the plotted line, in the svg's own units."""
+    timeline = draw_timeline([Chart("height", "cm", [Line("object", "#123456", np.array([0.0, 5.0, 2.0]))])], "salt")
+    [width] = re.findall(r'viewBox="0 0 ([0-9.]+) ', timeline.svg)
+    [path] = re.findall(r'<path d="M ([^"]*)"[^>]*stroke: #123456', timeline.svg)
+    numbers = [float(word) for word in re.findall(r"-?[0-9.]+", path)]
+    ends = np.array([min(numbers[0::2]), max(numbers[0::2])]) / float(width) * 100
+    np.testing.assert_allclose([timeline.left, timeline.right], ends, atol=0.05)
+
+
+def test_values_under_the_cursor_are_empty_where_a_hand_is_not_valid(dataset, hands):
+    series = measure_clip(dataset, dataset.clip("test/s2/box"), hands)
+    charts = clip_charts(series, ["right"], 1024)
+    near = draw_timeline(charts, "salt").charts[1]
+    assert near.title == "nearest joint to the object"
+    values = near.lines[0]["values"]
+    assert values[5:10] == [None] * 5
+    assert values[4] == pytest.approx(series.evidence.distance_m["right"][4] * 100, abs=0.05)
+
+
+def test_page_names_are_safe_file_names():
+    assert page_name("arctic/s01/box_grab_01/0012-0100") == "arctic_s01_box_grab_01_0012-0100.html"
+    assert "/" not in page_name("../../etc/passwd")
+
+
+@pytest.mark.slow
+def test_curves_and_contact_follow_the_player_in_chromium(dataset, hands, tmp_path):
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium on PATH: the page was not opened")
+    page = write_clip_page(tmp_path / "page.html", dataset, "test/s1/lid", hands)
+    switches = [
+        "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
+        "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=6000", "--dump-dom",
+    ]  # fmt: skip
+    series = measure_clip(dataset, dataset.clip("test/s1/lid"), hands)
+    for part, frame in ((0.0, 0), (1.0, 23)):
+        command = [chromium, *switches, f"{page.as_uri()}#t={part}"]
+        dom = subprocess.run(command, check=True, capture_output=True, text=True, timeout=180).stdout
+        shown = re.findall(r'<div class="readout".*?</div>', dom, re.S)[0]
+        counts = [int(number) for number in re.findall(r"<b>(\d+)</b>", shown)]
+        assert counts == [int(series.touched[side][frame].sum()) for side in ("left", "right")]
+        assert f"frame {frame} of 23" in dom

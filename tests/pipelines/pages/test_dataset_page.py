@@ -1,0 +1,140 @@
+"""The page of one dataset: counts, examples, what was left out; and `hoidata show`, which finds a clip by its id."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from hoidata.annotation.stage import annotate_store
+from hoidata.contact.stage import contact_store
+from hoidata.errors import BadInput, MissingResource
+from hoidata.quality.stage import quality_store
+from hoidata.schema.annotated import load_annotated
+from hoidata.schema.info import generated_info
+from hoidata.schema.quarantine import Quarantined
+from hoidata.schema.store import write_store
+from hoidata.splits import split_store
+from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
+from pipelines.pages.report import ReportFolders, write_report
+from pipelines.pages.view import view_of
+from pipelines.showing import closest_ids, find_clip, write_shown
+
+SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
+LEFT_OUT = Quarantined("grab/s1/mug_1", "s1/mug_1.npz", "finite numbers", "NaN in <frame 3>", "download it again")
+
+
+@pytest.fixture
+def project(hands, page_clip, tmp_path, monkeypatch):
+    """A project folder with one dataset of four clips: the last one's hand is far from its object."""
+    right, both = page_clip(), page_clip(left=True, hinged=True, frames=30)
+    far = {**right.hands, "right": replace(right.hands["right"], wrist_m=right.hands["right"].wrist_m + 1.0)}
+    clips = [
+        replace(right, clip_id="grab/s1/box_1"),
+        replace(right, clip_id="grab/s1/box_2"),
+        replace(both, clip_id="grab/s2/lid_1", subject="s2", verb="open", object_words="lidded <box>"),
+        replace(right, clip_id="grab/s1/box_far", hands=far),
+    ]
+    root = tmp_path / "data" / "embedded" / "grab"
+    write_store(root / "clips", [*clips, LEFT_OUT], generated_info("grab", hands))
+    quality_store(root / "clips", root / "quality", progress=False)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=0.09)
+    contact_store(root / "clips", root / "contact", threshold_m=0.09)
+    split_store(root / "clips", root / "annotation", root / "splits", SPLIT)
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump({"datasets": ["h2o", "grab"], "profile": "embedded"}))
+    (tmp_path / "manifests" / "embedded").mkdir(parents=True)
+    (tmp_path / "manifests" / "embedded" / "hand.json").write_text('{"present": true}')
+    monkeypatch.chdir(tmp_path)
+    return root
+
+
+def test_bars_count_every_clip_most_frequent_first():
+    chart = count_bars("verb", ["lift", "open", "lift", None, "open", "lift"], "no label")
+    assert [(bar.name, bar.clips) for bar in chart.bars] == [("lift", 3), ("open", 2), ("no label", 1)]
+    assert [bar.width for bar in chart.bars] == pytest.approx([100, 66.67, 33.33], abs=0.01)
+    many = count_bars("object", [f"thing {number:02d}" for number in range(30)] * 2, "")
+    assert len(many.bars) == 24
+    assert many.rest == "and 6 others with 12 clips"
+
+
+def test_page_counts_lists_and_links(project, hands, tmp_path):
+    text = write_dataset_page(tmp_path / "out", project, "grab", hands, "GRAB").read_text()
+    assert '<dt>box</dt><dd><i style="width:100.0%"></i><span>3</span></dd>' in text
+    assert "<dt>lidded &lt;box&gt;</dt>" in text
+    assert "<dt>both</dt>" in text
+    assert "<dt>none acts</dt>" in text
+    assert "Shortest 0.80 s, median 0.80 s, longest 1.00 s." in text
+    assert re.search(r"<td>grab/s1/box_far</td><td>no joint within 9 cm", text)
+    assert "NaN in &lt;frame 3&gt;" in text
+    assert "Of 4 clips" in text
+    assert "<dt>licence</dt><dd>none: generated; derived data may be shared</dd>" in text
+    links = re.findall(r'href="(clips/[^"]+)"', text)
+    assert sorted(links) == ["clips/grab_s1_box_1.html", "clips/grab_s1_box_2.html", "clips/grab_s2_lid_1.html"]
+    assert all((tmp_path / "out" / link).is_file() for link in links)
+
+
+def test_page_repeats_byte_for_byte(project, hands, tmp_path):
+    first, second = (write_dataset_page(tmp_path / name, project, "grab", hands) for name in "ab")
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_examples_show_what_is_new_first(project, hands):
+    annotated = load_annotated(project, hands)
+    assert example_ids(annotated, 2) == ["grab/s1/box_1", "grab/s2/lid_1"]
+    assert len(example_ids(annotated, 9)) == 3
+
+
+def test_still_shows_the_frame_in_which_most_points_are_touched(project, hands):
+    annotated = load_annotated(project, hands)
+    clip_id = "grab/s2/lid_1"
+    counts = np.zeros(30, int)
+    for side in ("left", "right"):
+        entries = annotated.distances(clip_id, side)
+        for frame, _ in set(zip(entries.frame.tolist(), entries.point.tolist(), strict=True)):
+            counts[frame] += 1
+    busiest = int(np.argmax(counts))
+    still = still_of(annotated, clip_id, hands, "Open a box.")
+    assert still.view.frames == 1
+    assert still.view == view_of(annotated.clip(clip_id).cut(busiest, busiest + 1), hands)
+
+
+def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, hands, tmp_path):
+    assert can_be_shown(project)
+    page = write_report(tmp_path / "report", "embedded", ["h2o", "grab"], hands, ReportFolders.of("embedded", tmp_path))
+    assert 'href="grab.html"' in page.read_text()
+    assert "<h1>GRAB" in (tmp_path / "report" / "grab.html").read_text()
+    (project / "splits" / "splits.parquet").unlink()
+    page = write_report(tmp_path / "less", "embedded", ["grab"], hands, ReportFolders.of("embedded", tmp_path))
+    assert "grab.html" not in page.read_text()
+
+
+def test_show_writes_the_page_of_a_clip_or_of_a_dataset(project, tmp_path):
+    path = write_shown("grab/s2/lid_1", "embedded", tmp_path / "pages")
+    assert path == tmp_path / "pages" / "grab_s2_lid_1.html"
+    assert '<p class="quiet">grab/s2/lid_1</p>' in path.read_text()
+    assert write_shown("grab", "embedded", tmp_path / "pages").name == "grab.html"
+    assert find_clip("grab/s1/box_2", "embedded", ["h2o", "grab"]).dataset == "grab"
+
+
+def test_unknown_clip_names_the_closest_ones(project, tmp_path):
+    with pytest.raises(BadInput, match=r"grab 4\).*got grab/s2/lid_2; closest: grab/s2/lid_1"):
+        write_shown("grab/s2/lid_2", "embedded", tmp_path)
+    with pytest.raises(BadInput, match="closest: grab/s1/box_far"):
+        write_shown("far", "embedded", tmp_path)
+    assert closest_ids("FAR", ["s/box", "s/afar", "s/far"])[:2] == ["s/afar", "s/far"]
+
+
+def test_sequence_left_out_when_converting_is_named_with_its_reason(project, tmp_path):
+    with pytest.raises(BadInput, match=r"left out when converting: s1/mug_1\.npz: expected finite numbers, got NaN"):
+        write_shown("grab/s1/mug_1", "embedded", tmp_path)
+
+
+def test_what_has_not_run_is_named(project, tmp_path):
+    with pytest.raises(MissingResource, match="h2o has no clips to show: it was not converted"):
+        write_shown("h2o", "embedded", tmp_path)
+    with pytest.raises(MissingResource, match="no dataset of the profile own is converted"):
+        write_shown("grab/s1/box_1", "own", tmp_path)
+    (project / "contact").rename(project / "elsewhere")
+    with pytest.raises(MissingResource, match="run the stage 'contact'"):
+        write_shown("grab/s1/box_1", "embedded", tmp_path)
