@@ -1,7 +1,7 @@
 """ManipNet (Zhang et al. 2021): motion capture of two hands and one object, in left-handed decimetres at 120 Hz.
 
 The hands are 17-joint skeletons, not MANO: a MANO-layout hand is fitted to their joints and finger tips, with one shape
-for the one subject. There are no action labels: the words come from the object's file name and from what it does.
+per recording. There are no action labels: the words come from the object's file name and from what it does.
 To go right-handed, the world and every joint frame are seen in a mirror with normal x; meshes already are right-handed.
 """
 
@@ -69,14 +69,14 @@ CONVENTION = HandConvention(
     fingers="absolute",
     shape="fitted",
     left_shape="unused",
-    note="17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape for the subject",
+    note="17-joint skeletons: a MANO-layout hand was fitted to joints and tips, one shape per recording",
 )
 PARTS = (
     DatasetPart("object and hand motion", ("sequences/*/*.bvh.gz",), "the data release"),
     DatasetPart("object meshes", ("objects/*/*.obj.gz",), "the data release"),
     DatasetPart("the hand's capsules and tips", (HAND_REFERENCE,), "the data release"),
 )
-SHAPE_FRAMES_PER_SEQUENCE = 20
+SHAPE_FRAMES = 100
 MIRROR_X = np.array([-1.0, 1.0, 1.0])
 
 
@@ -135,8 +135,8 @@ class ManipNetAdapter:
 
     margin_frames: frames (of 30 fps) kept before and after each interaction, as far as the tracking is usable; ids and
     verbs are those of the interaction itself. Sequences without hand files are refused with that reason.
-    The subject's shape is fitted to 20 frames of each readable two-hand sequence, so every clip also lists the other
-    sequences' hand files among its sources.
+    The shape of the hands is fitted to 100 frames of the recording itself: all are of one subject, but no clip may
+    depend on which other recordings are there.
     """
 
     margin_frames: int = 0
@@ -162,7 +162,7 @@ class ManipNetAdapter:
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """Clips of interaction of one sequence, and the stretches left out with their reasons."""
         recording = read_recording(raw, key.name)
-        betas = subject_shape(raw, self.sequences(raw.root), hands)
+        betas = recording_shape(recording, hands)
         results: list[Clip | Quarantined] = [_left_out(key, *cut) for cut in recording.cuts]
         lift_m, centre_m, usable = recording.lift_m(), recording.centre_m(), recording.usable()
         nearest = np.minimum(*(distance.min(axis=1) for distance in recording.distances_m().values()))
@@ -177,7 +177,7 @@ class ManipNetAdapter:
                 results.append(_left_out(key, start, stop + 1, "an object that moves", "one that stays on the table"))
             else:
                 kept = widened(stretch, self.margin_frames, usable)
-                sources = raw.recorded(*recording.paths, *_all_hand_files(self.sequences(raw.root)))
+                sources = raw.recorded(*recording.paths)
                 clip = self._clip(key, recording, kept, betas, hands)
                 results.append(replace(clip, clip_id=_clip_id(key, start, stop), verb=verb, sources=sources))
         return results
@@ -241,22 +241,13 @@ def read_recording(raw: RawTree, name: str) -> Recording:
     )
 
 
-def subject_shape(raw: RawTree, keys: list[SequenceKey], hands: HandPair) -> np.ndarray:
-    """Betas (10,) of the one subject, from frames of all two-hand sequences; unreadable ones are passed over."""
-    tips = _read_tips(raw)
-    samples: dict[Side, list[np.ndarray]] = {side: [] for side in SIDES}
-    for key in keys:
-        for side in SIDES:
-            path = _hand_path(key.name, side)
-            if not raw.has(path):
-                continue
-            try:
-                motion = _read_hand(raw, path)
-            except BadInput:
-                continue  # reported where that sequence itself is loaded
-            frames = np.unique(np.linspace(0, motion.n_frames - 1, SHAPE_FRAMES_PER_SEQUENCE).astype(int))
-            samples[side].append(keypoints_m(motion.at(frames), side, tips))
-    return fit_shape({side: np.concatenate(points) for side, points in samples.items() if points}, hands)
+def recording_shape(recording: Recording, hands: HandPair) -> np.ndarray:
+    """Betas (10,) fitted to 100 frames of one recording.
+
+    Bone lengths are the same in all recordings, and so a clip need not depend on which others are there.
+    """
+    frames = np.unique(np.linspace(0, len(recording.source_frames) - 1, SHAPE_FRAMES).astype(int))
+    return fit_shape({side: points[frames] for side, points in recording.keypoints_m.items()}, hands)
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:
@@ -290,10 +281,6 @@ def object_words(name: str) -> str:
 
 def _hand_path(name: str, side: Side) -> str:
     return f"sequences/{name}/{side}Hand.bvh.gz"
-
-
-def _all_hand_files(keys: list[SequenceKey]) -> list[str]:
-    return [_hand_path(key.name, side) for key in keys for side in SIDES]
 
 
 def _object_path(raw: RawTree, folder: str) -> str:

@@ -539,12 +539,6 @@ def test_a_spoilt_file_costs_its_sequence_and_nothing_else(
     assert row.says in text
     assert "defect of hoidata" not in text
     assert all((found[0].expected, found[0].got, found[0].remedy))
-    if row.dataset == "manipnet" and row.spoilt.endswith("Hand.bvh.gz"):
-        # The subject's one shape is fitted to all hands that can be read: as if this file were not there.
-        shutil.rmtree(root)
-        shutil.copytree(source, root)
-        (root / row.spoilt).unlink()
-        whole, _ = converted(row.dataset, root, tmp_path / "without")
     assert clips == {clip_id: digest for clip_id, digest in whole.items() if not clip_id.startswith(spoilt)}
 
 
