@@ -25,7 +25,8 @@ class CellGrids(NamedTuple):
 
     low_m: (part, 3) corners; cells_per_m: (part,) inverse edge of a cell; shape: (part, 3) cells along the axes;
     cell: (part,) the first cell of each part. first: (cell + 1,) where a cell's candidates start. point: (candidate,)
-    int32, rising within a cell; x, y, z: (candidate,) its coordinates once more, so that a cell is read in one stretch.
+    int16, rising within a cell; x, y, z: (candidate,) float32, its coordinates once more, so that a cell is read in one
+    stretch. Small types, because what is slow is to fetch them.
     """
 
     low_m: np.ndarray
@@ -49,16 +50,16 @@ class _Pairs(NamedTuple):
 
 
 def cell_grids(points_m: np.ndarray, members: Sequence[np.ndarray], reach_m: float) -> CellGrids:
-    """Grids over (point, 3) points for distances up to ``reach_m``. members: per part the rows of its points."""
-    points_m = np.ascontiguousarray(points_m, dtype=np.float64)
-    boxes = [(points_m[rows].min(axis=0) - reach_m, points_m[rows].max(axis=0) + reach_m) for rows in members]
+    """Grids over (point, 3) float32 points for distances up to ``reach_m``. members: each part's rows."""
+    places = points_m.astype(np.float64)
+    boxes = [(places[rows].min(axis=0) - reach_m, places[rows].max(axis=0) + reach_m) for rows in members]
     edges = [_cell_edge_m(high - low, reach_m) for low, high in boxes]
     shapes = [np.ceil((high - low) / edge).astype(np.int64) + 1 for (low, high), edge in zip(boxes, edges, strict=True)]
     counts, points = [], []
     for rows, (low, _), edge, shape in zip(members, boxes, edges, shapes, strict=True):
-        count, own = _candidates(points_m[rows], low, edge, shape, reach_m + _ROUNDING_M)
+        count, own = _candidates(places[rows], low, edge, shape, reach_m + _ROUNDING_M)
         counts.append(count)
-        points.append(rows[own].astype(np.int32))
+        points.append(rows[own].astype(np.int16))
     point = np.concatenate(points)
     return CellGrids(
         low_m=np.stack([low for low, _ in boxes]),
@@ -67,7 +68,7 @@ def cell_grids(points_m: np.ndarray, members: Sequence[np.ndarray], reach_m: flo
         cell=np.cumsum([0, *map(len, counts)])[:-1],
         first=np.concatenate(([0], np.cumsum(np.concatenate(counts)))),
         point=point,
-        **{axis: np.ascontiguousarray(points_m[point, number]) for number, axis in enumerate("xyz")},
+        **{axis: np.ascontiguousarray(points_m[point, number], np.float32) for number, axis in enumerate("xyz")},
     )
 
 
@@ -122,7 +123,7 @@ def near_entries(
     """
     n_frames, n_joints = places_m.shape[1:3]
     most = point_count * n_joints
-    pairs = _Pairs(np.empty(most + 1, np.int32), np.empty(most + 1, np.int8), np.empty(most + 1), np.empty(point_count))
+    pairs = _Pairs(np.empty(most + 1, np.int16), np.empty(most + 1, np.int8), np.empty(most + 1), np.empty(point_count))
     room = np.empty(_FIRST_ENTRIES_PER_FRAME * n_frames * ENTRY.itemsize, np.uint8)  # bytes: NumPy copies rows slowly
     frame = size = 0
     while True:
@@ -136,7 +137,7 @@ def near_entries(
 @njit(cache=True)
 def _fill(places_m, valid, grids, point_count, square_reach, pairs, entries, frame, size):  # pragma: no cover
     """Go on from ``frame`` until all are done or one does not find room; where it stopped, and the entries so far."""
-    starts = np.empty(point_count + 1, np.int64)
+    starts = np.empty(point_count, np.int32)
     for number in range(frame, places_m.shape[1]):
         if not valid[number]:
             continue
@@ -181,12 +182,13 @@ def _write_in_order(pairs, count, starts, frame, entries):  # pragma: no cover (
     points, joints, squares, _ = pairs
     starts[:] = 0
     for pair in range(count):
-        starts[points[pair] + 1] += 1
-    for point in range(1, len(starts)):
-        starts[point] += starts[point - 1]
+        starts[points[pair]] += 1
+    total = 0
+    for point in range(len(starts)):
+        total, starts[point] = total + starts[point], total
     for pair in range(count):
         place = starts[points[pair]]
-        starts[points[pair]] += 1
+        starts[points[pair]] = place + 1
         entries[place].frame = frame
         entries[place].point = points[pair]
         entries[place].joint = joints[pair]

@@ -23,7 +23,7 @@ class ProximityIndex:
     def __init__(self, points: SampledPoints) -> None:
         self.count = len(points)
         self.parts = [int(part) for part in np.unique(points.part)]
-        self._positions = points.points_m.astype(np.float64)
+        self._points_m = points.points_m.astype(np.float32, copy=False)
         self._members = [np.flatnonzero(points.part == part) for part in self.parts]
         self._grids: dict[float, CellGrids] = {}
         self._point_boxes: PointBoxes | None = None
@@ -52,13 +52,13 @@ class ProximityIndex:
         if not len(self.parts):
             return np.zeros(0, ENTRY)
         if threshold_m not in self._grids:
-            self._grids[threshold_m] = cell_grids(self._positions, self._members, threshold_m)
+            self._grids[threshold_m] = cell_grids(self._points_m, self._members, threshold_m)
         places = self._places(joints_m, track)
         return near_entries(places, np.asarray(valid, bool), self._grids[threshold_m], self.count, threshold_m)
 
     def _boxes(self) -> PointBoxes:
         if self._point_boxes is None:
-            self._point_boxes = point_boxes(self._positions, self._members)
+            self._point_boxes = point_boxes(self._points_m.astype(np.float64), self._members)
         return self._point_boxes
 
     def _places(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:

@@ -90,7 +90,7 @@ def test_the_nearest_point_is_that_of_trees_bit_for_bit(seed, n_points, articula
 
 def test_every_cell_lists_every_point_within_reach_of_any_place_in_it() -> None:
     random = np.random.default_rng(3)
-    points, reach = random.uniform(-0.05, 0.05, (200, 3)), 0.02
+    points, reach = random.uniform(-0.05, 0.05, (200, 3)).astype(np.float32), 0.02
     grids = cell_grids(points, [np.arange(200)], reach)
     places = random.uniform(-0.069, 0.069, (1, 500, 1, 3))
     near = np.linalg.norm(places[0] - points[None], axis=2) < reach
@@ -101,11 +101,11 @@ def test_every_cell_lists_every_point_within_reach_of_any_place_in_it() -> None:
 
 
 def test_places_exactly_between_cells_and_on_corners_lose_no_point() -> None:
-    points = np.stack(np.meshgrid(*[np.arange(5) * 0.01] * 3, indexing="ij"), -1).reshape(-1, 3)
-    places = points.reshape(1, -1, 1, 3)
+    points = np.stack(np.meshgrid(*[np.arange(5) * 0.01] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    places = points.reshape(1, -1, 1, 3).astype(np.float64)
     grids = cell_grids(points, [np.arange(125)], 0.0101)
     entries = near_entries(places, np.ones(125, bool), grids, 125, 0.0101)
-    near = np.linalg.norm(points[:, None] - points[None], axis=2) < 0.0101
+    near = np.linalg.norm(places[0] - places[0, None, :, 0], axis=2) < 0.0101
     np.testing.assert_array_equal(np.column_stack((entries["frame"], entries["point"])), np.argwhere(near))
 
 
