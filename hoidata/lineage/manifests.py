@@ -59,7 +59,8 @@ def read_manifest(path: Path) -> Manifest:
     try:
         values = json.loads(path.read_text())
     except FileNotFoundError as error:
-        raise BadInput(path, "a manifest", "no file", "restore it with git checkout") from error
+        remedy = f"write it with `hoidata raw scan {path.stem}`, or restore it with git checkout"
+        raise BadInput(path, "a manifest", "no file", remedy) from error
     except (ValueError, RecursionError, OSError) as error:
         raise BadInput(path, "a JSON manifest", str(error), "restore it, or run `hoidata raw scan`") from error
     if not isinstance(values, dict) or values.pop("schema", None) != SCHEMA:

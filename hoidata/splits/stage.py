@@ -107,7 +107,9 @@ def _refuse_leaks(chosen: Definition, leaks: Leaks) -> None:
     if leaks.broken:
         kind = leaks.broken[0]
         got = f"{len(leaks.shared[kind])} in several: {', '.join(leaks.shared[kind][:3])}"
-        raise BadInput(f"split {chosen.name}", f"no {kind} in two parts, as it promises", got, "choose another split")
+        # Clips cut next to each other share frames once a margin is kept around them.
+        remedy = "choose another split" + (", or convert with margin_frames: 0" if kind == "frame" else "")
+        raise BadInput(f"split {chosen.name}", f"no {kind} in two parts, as it promises", got, remedy)
 
 
 def _record(store: Store, parts: Assignment, definition: Definition, leaks: Leaks) -> dict[str, Any]:

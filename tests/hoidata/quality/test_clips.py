@@ -208,6 +208,15 @@ def test_penetration_looks_at_every_nth_frame_from_the_first_on(good):
     assert depths[1] < 0.01
 
 
+def test_a_hand_that_is_not_seen_penetrates_nothing(make_clip):
+    """What a frame without the hand holds means nothing, wherever it lies."""
+    clip = sunken_hand(make_clip(n_frames=11))
+    valid = np.arange(11) >= 5  # measured in frames 0, 5 and 10
+    some, none = row(with_hand(clip, valid=valid)), row(with_hand(clip, valid=np.zeros(11, bool)))
+    assert some["penetration_share"] == pytest.approx(2 / 3)
+    assert (none["penetration_m"], none["penetration_share"]) == (0, 0)
+
+
 def test_object_measures_are_those_of_its_worst_part(make_clip):
     model = make_clip(articulated=True).object.model
     measured = object_row(ObjectFacts.of(replace(model, faces=model.faces[:-1])))

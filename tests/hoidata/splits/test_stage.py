@@ -13,6 +13,7 @@ from hoidata.schema import SourceFile
 from hoidata.schema.info import generated_info
 from hoidata.schema.store import write_store
 from hoidata.splits import split_store
+from hoidata.splits.stage import motion_digest
 
 RULE = {"by": "subject", "train": ["s1"], "validation": ["s9"], "test": ["s10"]}
 
@@ -170,3 +171,12 @@ def test_how_complete_a_dataset_is_is_told_where_its_makers_list_the_sequences(m
     split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "splits", "bimart")
     told = json.loads((tmp_path / "splits" / "info.json").read_text())["published"]
     assert (told["sequences"], told["usable"], told["with_clips"]) == (339, 301, 2)
+
+
+@pytest.mark.parametrize("moved", ["rotvec", "translation_m", "hinge_rad"])
+def test_clips_that_differ_in_one_number_of_the_object_are_no_copies(make_clip, moved):
+    clip = make_clip(16, articulated=True)
+    values = getattr(clip.object, moved).copy()
+    values[3] += np.float32(0.01)
+    assert motion_digest(clip) == motion_digest(replace(clip, clip_id="test/copy"))
+    assert motion_digest(clip) != motion_digest(replace(clip, object=replace(clip.object, **{moved: values})))
