@@ -11,6 +11,7 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.objects.distance import face_normals
+from hoidata.objects.farthest import farthest_rows
 from hoidata.objects.model import ObjectModel
 
 POINT_COUNT = 1024
@@ -60,21 +61,7 @@ def farthest_points(points_m: np.ndarray, count: int) -> np.ndarray:
 
     Squared distances in float32; among equals the lowest index. Repeats indices only when points coincide.
     """
-    x, y, z = np.ascontiguousarray(points_m.T, dtype=np.float32)
-    nearest = np.full(len(x), np.inf, dtype=np.float32)
-    square, term = np.empty_like(nearest), np.empty_like(nearest)
-    chosen = np.zeros(count, dtype=np.int64)
-    for step in range(1, count):
-        last = chosen[step - 1]
-        np.subtract(x, x[last], out=square)
-        np.multiply(square, square, out=square)
-        for axis in (y, z):
-            np.subtract(axis, axis[last], out=term)
-            np.multiply(term, term, out=term)
-            np.add(square, term, out=square)
-        np.minimum(nearest, square, out=nearest)
-        chosen[step] = nearest.argmax()
-    return chosen
+    return farthest_rows(np.ascontiguousarray(points_m, dtype=np.float32), count)
 
 
 def _vertices_are_dense(model: ObjectModel, corners: np.ndarray, count: int) -> bool:

@@ -1,0 +1,84 @@
+"""Farthest-point sampling with points in buckets: a bucket is read again only where the newest choice can matter.
+
+Compiled with numba. Squared distances in float32 in one fixed order, so that every point keeps the bits a plain loop
+gives it (Eldar et al. 1997; buckets as in Han et al. 2023, "QuickFPS").
+"""
+
+import numpy as np
+from numba import njit
+
+_POINTS_PER_BUCKET = 64
+_ROUNDING = np.float32(1 - 1e-5)  # a bound from box corners is rounded otherwise than a distance
+
+
+def farthest_rows(points: np.ndarray, count: int) -> np.ndarray:
+    """(count,) rows of (point, 3) float32: the first, then always the one farthest from all chosen so far.
+
+    Among equals the lowest row; rows repeat only when points coincide.
+    """
+    order, first = _buckets(points)
+    x, y, z = np.ascontiguousarray(points[order].T, np.float32)
+    low = np.minimum.reduceat(points[order], first[:-1], axis=0)
+    high = np.maximum.reduceat(points[order], first[:-1], axis=0)
+    return _choose(x, y, z, order, first, low, high, points, count)
+
+
+def _buckets(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows bucket by bucket, and where each starts: halves across the longest axis until they are small."""
+    waiting, done = [np.arange(len(points))], []
+    while waiting:
+        rows = waiting.pop()
+        if len(rows) <= _POINTS_PER_BUCKET:
+            done.append(rows)
+            continue
+        along = points[rows, np.ptp(points[rows], axis=0).argmax()]
+        halves = np.argpartition(along, len(rows) // 2)
+        waiting += [np.sort(rows[halves[: len(rows) // 2]]), np.sort(rows[halves[len(rows) // 2 :]])]
+    return np.concatenate(done), np.cumsum([0, *map(len, done)])
+
+
+@njit(cache=True)
+def _choose(x, y, z, order, first, low, high, points, count):  # pragma: no cover (compiled)
+    nearest = np.full(len(x), np.float32(np.inf), np.float32)
+    farthest = np.full(len(low), np.float32(np.inf), np.float32)  # of each bucket: its largest distance
+    winner = np.zeros(len(low), np.int64)  # and the lowest row that has it
+    chosen = np.zeros(count, np.int64)
+    for step in range(1, count):
+        last = points[chosen[step - 1]]
+        best, best_row = np.float32(-1), 0
+        for bucket in range(len(low)):
+            if _square_to_box(last, low[bucket], high[bucket]) * _ROUNDING < farthest[bucket]:
+                start, stop = first[bucket], first[bucket + 1]
+                place = start + _lower(x[start:stop], y[start:stop], z[start:stop], last, nearest[start:stop])
+                farthest[bucket], winner[bucket] = nearest[place], order[place]
+            if farthest[bucket] > best or (farthest[bucket] == best and winner[bucket] < best_row):
+                best, best_row = farthest[bucket], winner[bucket]
+        chosen[step] = best_row
+    return chosen
+
+
+@njit(cache=True)
+def _square_to_box(place, low, high):  # pragma: no cover (compiled)
+    """Square of the distance from a place to a box, 0 inside."""
+    square = np.float32(0)
+    for axis in range(3):
+        outside = max(low[axis] - place[axis], place[axis] - high[axis], np.float32(0))
+        square += outside * outside
+    return square
+
+
+@njit(cache=True)
+def _lower(x, y, z, place, nearest):  # pragma: no cover (compiled)
+    """Lower each distance to that from ``place`` where it is smaller; where the largest is, the first of equals."""
+    for row in range(len(x)):
+        dx, dy, dz = x[row] - place[0], y[row] - place[1], z[row] - place[2]
+        square = (dx * dx + dy * dy) + dz * dz
+        nearest[row] = min(nearest[row], square)
+    # Bits of floats that are not negative are in the order of their values, and a largest integer is found on vectors.
+    bits, largest = nearest.view(np.int32), np.int32(-1)
+    for row in range(len(bits)):
+        largest = max(largest, bits[row])
+    for row in range(len(bits)):
+        if bits[row] == largest:
+            return row
+    return 0
