@@ -32,12 +32,16 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines in one unit. limit: a dashed line with its name; top: where the axis ends, values beyond leave the chart;
-    decimals: of the values the page shows under the cursor."""
+    """Lines in one unit. least: the axis spans at least this much, so that a still object does not look restless.
+
+    limit: a dashed line with its name. top: where the axis ends, values beyond leave the chart. decimals: of the values
+    the page shows under the cursor.
+    """
 
     title: str
     unit: str
     lines: list[Line]
+    least: float
     limit: tuple[float, str] | None = None
     top: float | None = None
     decimals: int = 1
@@ -69,22 +73,22 @@ def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> 
     touched = [Line(side, SIDE_COLOURS[side], series.touched_count(side).astype(float)) for side in sides]
     near = [Line(side, SIDE_COLOURS[side], _finite(series.evidence.distance_m[side]) * 100) for side in sides]
     charts = [
-        Chart(f"touched, of {point_count:,} points of the object", "points", touched, decimals=0),
-        Chart("nearest joint to the object", "cm", near, (threshold_cm, f"{threshold_cm:g} cm"), FARTHEST_CM),
+        Chart(f"touched, of {point_count:,} points of the object", "points", touched, 10, decimals=0),
+        Chart("nearest joint to the object", "cm", near, 3, (threshold_cm, f"{threshold_cm:g} cm"), FARTHEST_CM),
     ]
     if series.depth_m is not None:
         depths = [Line(side, SIDE_COLOURS[side], series.depth_m[side] * 1000) for side in sides]
-        charts.append(Chart("deepest hand vertex inside the object", "mm", depths))
+        charts.append(Chart("deepest hand vertex inside the object", "mm", depths, 2))
     return [chart for chart in charts if chart.lines] + _object_charts(series)
 
 
 def _object_charts(series: ClipSeries) -> list[Chart]:
-    charts = [Chart("speed of the object", "cm/s", [Line("object", OBJECT_COLOUR, series.speed_m_s * 100)])]
+    charts = [Chart("speed of the object", "cm/s", [Line("object", OBJECT_COLOUR, series.speed_m_s * 100)], 5)]
     if series.lift_m is not None:
         title = "height of the object above its first frame"
-        charts.insert(0, Chart(title, "cm", [Line("object", OBJECT_COLOUR, series.lift_m * 100)]))
+        charts.insert(0, Chart(title, "cm", [Line("object", OBJECT_COLOUR, series.lift_m * 100)], 2))
     if series.hinge_rad is not None:
-        charts.append(Chart("hinge", "degrees", [Line("object", OBJECT_COLOUR, np.degrees(series.hinge_rad))]))
+        charts.append(Chart("hinge", "degrees", [Line("object", OBJECT_COLOUR, np.degrees(series.hinge_rad))], 10))
     return charts
 
 
@@ -127,14 +131,15 @@ def _draw_chart(axes: Axes, chart: Chart) -> None:
 
 
 def _range(chart: Chart) -> tuple[float, float]:
-    """From 0 (or below, with a margin) to the largest value, the limit in sight, not beyond ``top``."""
+    """From 0, or the lowest value below it, to the largest value; the limit in sight, not beyond ``top``."""
     values = np.concatenate([line.values for line in chart.lines])
     values = values[np.isfinite(values)]
     low, high = float(values.min(initial=0.0)), float(values.max(initial=0.0))
     high = max(high, chart.limit[0] * 1.5 if chart.limit else 0.0)
     high = min(high, chart.top) if chart.top is not None else high
-    room = 0.06 * (high - low) or 0.5
-    return low - (room if low < 0 else 0.02 * (high - low)), high + room
+    high = max(high, low + chart.least)
+    room = 0.06 * (high - low)
+    return low - (room if low < 0 else room / 3), high + room
 
 
 def _readout(line: Line, decimals: int) -> dict:

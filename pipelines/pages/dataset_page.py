@@ -59,11 +59,13 @@ class Example:
     link: str
 
 
-def write_dataset_page(out: str | Path, root: Path, name: str, hands: HandPair, title: str = "") -> Path:
+def write_dataset_page(
+    out: str | Path, root: Path, name: str, hands: HandPair, title: str = "", examples: int = EXAMPLES
+) -> Path:
     """Write ``out/<name>.html`` and, for its examples, ``out/clips/<clip>.html``; equal inputs give equal bytes.
 
-    root: the folder of the dataset's stages. Raises MissingResource with the reason for a dataset without clips, or
-    naming a stage that has not run.
+    root: the folder of the dataset's stages. examples: at most so many. Raises MissingResource with the reason for a
+    dataset without clips, or naming a stage that has not run.
     """
     facts = read_dataset(root, name, hands)
     if facts.empty:
@@ -77,7 +79,7 @@ def write_dataset_page(out: str | Path, root: Path, name: str, hands: HandPair, 
         charts=count_charts(annotated),
         lengths=Markup(lengths_svg(annotated, f"{name} lengths")),
         length_words=length_words(annotated),
-        examples=_examples(out, annotated, hands),
+        examples=_examples(out, annotated, hands, examples),
         splits=split_rows(annotated),
         quality=read_quality(root / "quality", name),
         without_words=without_words(annotated),
@@ -143,7 +145,7 @@ def lengths_svg(annotated: AnnotatedStore, salt: str) -> str:
     return figure_svg((7.0, 2.0), salt, draw)
 
 
-def example_ids(annotated: AnnotatedStore, count: int = EXAMPLES) -> list[str]:
+def example_ids(annotated: AnnotatedStore, count: int) -> list[str]:
     """Up to ``count`` clips with sentences, each the one with most that is new (hand, verb, object, subject)."""
     rows = annotated.store.sequences.loc[annotated.ids()]
     columns = [rows[name].tolist() for name in ("verb", "object", "subject")]
@@ -161,10 +163,10 @@ def example_ids(annotated: AnnotatedStore, count: int = EXAMPLES) -> list[str]:
     return chosen
 
 
-def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair) -> list[Example]:
+def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair, count: int) -> list[Example]:
     """Stills of the examples; the page of each is written beside."""
     examples = []
-    for clip_id in example_ids(annotated):
+    for clip_id in example_ids(annotated, count):
         link = f"{CLIP_FOLDER}/{page_name(clip_id)}"
         write_clip_page(Path(out) / link, annotated, clip_id, hands)
         sentence = annotated.sentences(clip_id)[0]

@@ -201,7 +201,7 @@ def test_missing_quality_control_is_named(dataset, hands, tmp_path):
 
 def test_cursor_of_the_first_and_the_last_frame_lie_at_the_ends_of_the_lines(dataset, hands):
     """Checked against the drawing itself: the x coordinates of the plotted line, in the svg's own units."""
-    timeline = draw_timeline([Chart("height", "cm", [Line("object", "#123456", np.array([0.0, 5.0, 2.0]))])], "salt")
+    timeline = draw_timeline([Chart("height", "cm", [Line("object", "#123456", np.array([0.0, 5.0, 2.0]))], 1)], "salt")
     [width] = re.findall(r'viewBox="0 0 ([0-9.]+) ', timeline.svg)
     [path] = re.findall(r'<path d="M ([^"]*)"[^>]*stroke: #123456', timeline.svg)
     numbers = [float(word) for word in re.findall(r"-?[0-9.]+", path)]
@@ -217,6 +217,17 @@ def test_values_under_the_cursor_are_empty_where_a_hand_is_not_valid(dataset, ha
     values = near.lines[0]["values"]
     assert values[5:10] == [None] * 5
     assert values[4] == pytest.approx(series.evidence.distance_m["right"][4] * 100, abs=0.05)
+
+
+def test_axis_of_a_still_object_does_not_magnify_its_noise():
+    """The line stays within a fortieth of its chart's height, where it would fill it without the least span."""
+    noise = np.array([0.0, 0.02, -0.01, 0.01])
+    [path] = re.findall(
+        r'<path d="M ([^"]*)"[^>]*stroke: #123456',
+        draw_timeline([Chart("height", "cm", [Line("object", "#123456", noise)], least=2)], "salt").svg,
+    )
+    heights = [float(word) for word in re.findall(r"-?[0-9.]+", path)][1::2]
+    assert max(heights) - min(heights) < 72 / 40
 
 
 def test_page_names_are_safe_file_names():
