@@ -1,7 +1,7 @@
 """Physical realism: non-negative least squares beside a loop over SciPy's, and the cost of one scored frame.
 
-``python -m tests.bench.physics`` with OMP_NUM_THREADS=1. The systems are contacts all round a ball of 5 cm, a third of them on one side
-only, so that about two in three frames are feasible.
+``python -m tests.bench.physics`` with OMP_NUM_THREADS=1. The systems are contacts all round a
+ball of 5 cm, a third of them on one side only, so that about two in three frames are feasible.
 """
 
 import numpy as np

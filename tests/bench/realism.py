@@ -1,8 +1,9 @@
 """The controls of physical realism: what a score says when hands are moved or taken away.
 
-``python -m tests.bench.realism``. Embedded GRAB and ARCTIC clips (H2O's do not say where down is) of HOIDATA_BENCH_CORPORA, HOIDATA_BENCH_CLIPS of each
-(12 if not given, 0 for all), and with HOIDATA_MANIPNET the real recordings of HOIDATA_BENCH_SEQUENCES (cyl_med3 if not
-given): the source hands at 120 Hz, and beside them the clips whose hands were fitted to them.
+``python -m tests.bench.realism``. Embedded GRAB and ARCTIC clips (H2O's do not say where down is) of
+HOIDATA_BENCH_CORPORA, HOIDATA_BENCH_CLIPS of each (12 if not given, 0 for all), and with HOIDATA_MANIPNET the real
+recordings of HOIDATA_BENCH_SEQUENCES (cyl_med3 if not given): the source hands at 120 Hz, and beside them the clips
+whose hands were fitted to them.
 """
 
 import os

@@ -132,6 +132,19 @@ def test_a_lid_is_touched_where_its_hinge_has_put_it():
     np.testing.assert_allclose(found.normal, [[0, 0, 1], [-1, 0, 0]], atol=1e-6)
 
 
+def test_a_capsule_in_the_gap_between_two_parts_touches_the_one_it_is_deeper_in():
+    base, lid = _box((0.1, 0.1, 0.02)), _box((0.1, 0.1, 0.02))
+    vertices = np.concatenate([base.vertices_m, lid.vertices_m + np.array([0, 0, 0.036])])
+    hinge, part = Hinge(np.array([0.0, 1.0, 0.0]), np.zeros(3)), np.repeat(np.array([0, 1], dtype=np.uint8), 8)
+    model = ObjectModel("tin", vertices, np.concatenate([base.faces, lid.faces + 8]), part, hinge)
+    poses = _still()._replace(hinge_rad=np.zeros(1))
+    for height, touched, up in ((0.017, 0, 1), (0.019, 1, -1)):  # the gap is from 10 to 26 mm
+        found = capsule_contacts(model, poses, _capsule([0, 0, height], [0.01, 0, height], 0.01))
+        assert found.part.tolist() == [touched]
+        np.testing.assert_allclose(found.depth_m, 0.003, atol=1e-6)
+        np.testing.assert_allclose(found.normal, [[0, 0, up]], atol=1e-6)
+
+
 def test_a_hinged_object_without_angles_is_refused():
     part = np.repeat(np.array([0, 1], dtype=np.uint8), [4, 4])
     model = ObjectModel("tin", _box().vertices_m, _box().faces, part, Hinge(np.array([0.0, 1, 0]), np.zeros(3)))

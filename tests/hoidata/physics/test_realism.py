@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
@@ -11,6 +12,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.physics.as_released import AsReleased, friction_edges
 from hoidata.physics.capsules import CapsuleContacts, Capsules, ObjectPoses, capsule_contacts
+from hoidata.physics.contact_forces import cone_edges
 from hoidata.physics.realism import score, smoothness_m_s2
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits, sliding_velocity, table_contacts
@@ -179,6 +181,57 @@ def test_a_contact_that_moves_with_the_box_does_not_slide_however_the_box_spins(
     outer = np.abs(np.linalg.norm(sliding_velocity(held, contacts), axis=1)[4:8])
     # Fingers that turn about the x axis at 2 rad/s pass over the faces at 2 rad/s times their distance from it.
     assert outer == pytest.approx(2 * np.linalg.norm(_local(held, contacts)[4:8, 1:], axis=1), rel=0.02)
+
+
+def test_skin_below_an_axis_that_tilts_runs_as_a_lever_does():
+    # A finger along z beside the +x face turns about y at 3 rad/s; its skin, 9 mm towards -x, runs along +z.
+    centre = np.tile([0.0, 0.0, 0.5], (20, 1))
+    tilt = Rotation.from_rotvec((_times() - _times()[10]) * [0.0, 3.0, 0.0]).as_matrix()
+    half = np.array([0, 0, 0.01])
+    middle = centre + np.array([SIZE[0] / 2 + 0.009, 0, 0])
+    capsules = Capsules((middle - tilt @ half)[:, None], (middle + tilt @ half)[:, None], np.array([0.01]))
+    scene = _scene(centre, hands=capsules)
+    contacts = capsule_contacts(scene.model, scene.poses, capsules)
+    np.testing.assert_allclose(sliding_velocity(scene, contacts)[10], [0, 0, 3 * 0.009], atol=1e-4)
+
+
+def _by_scipy(wrench: np.ndarray, edges: np.ndarray, arms: np.ndarray) -> float:
+    columns = [[*edge, *np.cross(arm, edge)] for arm, four in zip(arms, edges, strict=True) for edge in four]
+    return float(nnls(np.array(columns).T, wrench)[1])
+
+
+def test_residuals_of_both_variants_are_those_of_a_system_set_up_by_hand():
+    time = _times()
+    path = np.array([0.0, 0, 0.5]) + 0.5 * 3.0 * time**2 * [1, 0.5, 0]
+    turned = Rotation.from_rotvec(time**2 * [40.0, 90.0, 20.0]).as_matrix()
+    scene = _scene(path, turned, _pinch(path, turned, sides=(1,)))
+    contacts = capsule_contacts(scene.model, scene.poses, scene.capsules)
+    frame, length, released = 7, 0.05, AsReleased()
+    own = contacts.frame == frame
+    assert own.sum() == 2
+    arms = contacts.point_m[own] - path[frame]
+    scaled = scene.wrench[frame] / [1, 1, 1, length, length, length]
+    ours = StandardUnits(torque_length_m=length).residuals(scene, contacts)[frame]
+    assert ours == pytest.approx(_by_scipy(scaled, cone_edges(contacts.normal[own]), arms / length), rel=1e-9)
+    edges = friction_edges(contacts.normal[own], 0.35)
+    expected = _by_scipy(released.wrench(scene, path)[frame], edges, arms * 10) ** 2 / 6
+    assert released.residuals(scene, contacts)[frame] == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_released_torque_is_per_frame_in_square_decimetres_with_its_gyroscopic_part():
+    time, step = _times(), 1 / FPS
+    path = np.tile([0.0, 0, 0.5], (20, 1))
+    x, y, z = (10 * SIZE) ** 2
+    inertia = np.diag([y + z, x + z, x + y]) / 12
+    # Faster and faster about z: the angle is t^2, the spin between frames 2 t + 1/FPS, its change 2/FPS.
+    faster = _scene(path, Rotation.from_rotvec(time**2 * [0.0, 0, 1.0]).as_matrix())
+    torque = AsReleased().wrench(faster, path)[:-2, 3:]
+    np.testing.assert_allclose(torque, np.tile([0, 0, inertia[2, 2] * 2 * step], (18, 1)), atol=1e-9)
+    # Steady about an oblique axis: only w x I w is left.
+    spin = np.array([2.0, 1.0, -3.0])
+    turned = Rotation.from_rotvec(time * spin).as_matrix()
+    expected = [step * np.cross(spin, turn @ inertia @ turn.T @ spin) for turn in turned]
+    np.testing.assert_allclose(AsReleased().wrench(_scene(path, turned), path)[:, 3:], expected, atol=1e-9)
 
 
 def _local(scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
