@@ -7,7 +7,7 @@ gives it (Eldar et al. 1997; buckets as in Han et al. 2023, "QuickFPS").
 import numpy as np
 from numba import njit
 
-_POINTS_PER_BUCKET = 64
+_POINTS_PER_BUCKET = 128
 _ROUNDING = np.float32(1 - 1e-5)  # a bound from box corners is rounded otherwise than a distance
 
 
@@ -24,17 +24,22 @@ def farthest_rows(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def _buckets(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows bucket by bucket, and where each starts: halves across the longest axis until they are small."""
-    waiting, done = [np.arange(len(points))], []
-    while waiting:
-        rows = waiting.pop()
-        if len(rows) <= _POINTS_PER_BUCKET:
-            done.append(rows)
-            continue
-        along = points[rows, np.ptp(points[rows], axis=0).argmax()]
-        halves = np.argpartition(along, len(rows) // 2)
-        waiting += [np.sort(rows[halves[: len(rows) // 2]]), np.sort(rows[halves[len(rows) // 2 :]])]
-    return np.concatenate(done), np.cumsum([0, *map(len, done)])
+    """Rows bucket by bucket, rising in each, and where each starts: stretches of a Morton curve through the points."""
+    above = points.astype(np.float64) - points.min(axis=0)
+    cell = (above / (above.max() or 1) * 1023).astype(np.uint32)
+    x, y, z = _spread_bits(cell).T
+    order = np.argsort(x | y << 1 | z << 2, kind="stable")
+    first = np.append(np.arange(0, len(points), _POINTS_PER_BUCKET), len(points))
+    whole = order[: len(order) // _POINTS_PER_BUCKET * _POINTS_PER_BUCKET]
+    rest = np.sort(order[len(whole) :])
+    return np.concatenate((np.sort(whole.reshape(-1, _POINTS_PER_BUCKET), axis=1).ravel(), rest)), first
+
+
+def _spread_bits(value: np.ndarray) -> np.ndarray:
+    """Ten bits with two empty ones between each pair, for interleaving three coordinates."""
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        value = (value | value << np.uint32(shift)) & np.uint32(mask)
+    return value
 
 
 @njit(cache=True)
