@@ -137,6 +137,17 @@ def test_the_verb_object_pairs_that_text2hoi_left_out_give_no_clip(root, load_al
     assert [clip.verb for clip in load_all(ArcticAdapter(), root) if "box_use" in clip.clip_id] == [verb, "open"]
 
 
+def test_a_range_that_ends_one_frame_after_the_motion_is_left_out_and_not_cut_short(root, load_all):
+    recording.write_sequence(root, "box_use_02", "21-70 open, left hand\n31-71 close, left hand\n")
+    whole, beyond = [item for item in load_all(ArcticAdapter(), root) if "box_use_02" in str(item)]
+    assert whole.source_frames.tolist() == list(range(20, 70))
+    assert (beyond.source_key, beyond.expected, beyond.got) == (
+        "arctic/s04/box_use_02/0031-0071",
+        "frames 1 to 70",
+        "31-71",
+    )
+
+
 def test_trailing_digits_of_an_object_name_are_not_part_of_it(root, load_all):
     recording.write_sequence(root, "box2_use_01", "1-40 open, left hand\n")
     (clip,) = [clip for clip in load_all(ArcticAdapter(), root) if "box2" in clip.clip_id]
