@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hoidata.physics.capsules import CapsuleContacts, part_poses, to_part_frame
+from hoidata.physics.capsules import CapsuleContacts, ObjectPoses, part_poses, to_part_frame
 from hoidata.physics.contact_forces import FRICTION, RESIDUAL_LIMIT, cone_edges
 from hoidata.physics.nnls import wrench_residuals
 from hoidata.physics.scene import Scene
@@ -97,7 +97,7 @@ def sliding_velocity(scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
     return result - inward[:, None] * contacts.normal
 
 
-def to_part_frame_each(points_m: np.ndarray, poses, frame: np.ndarray) -> np.ndarray:
+def to_part_frame_each(points_m: np.ndarray, poses: ObjectPoses, frame: np.ndarray) -> np.ndarray:
     """World points (point, 3), each at its own frame (point,), in the part's frame."""
     return np.einsum("ni,nij->nj", points_m - poses.translation_m[frame], poses.rotmats[frame])
 
