@@ -181,6 +181,7 @@ def test_clip_without_words_says_why_and_still_has_its_page(dataset, hands, tmp_
     text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/far", hands).read_text()
     assert "No sentences: no joint within 9 cm of the object" in text
     assert "<h2>Hand type: none</h2>" in text
+    assert "<td>right</td><td>no</td>" in text
     assert "It is not known where down is" in text
     assert "No hand comes within 9 cm of the object." in text
 
