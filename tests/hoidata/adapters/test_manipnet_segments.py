@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.adapters.manipnet_segments import BodyMotion, find_cuts, interactions, motion_verb
+from hoidata.adapters.manipnet_segments import BodyMotion, find_cuts, interactions, motion_verb, widened
+from hoidata.geometry.stretches import Stretch
 
 
 def body(name: str, position_m: np.ndarray, degrees: np.ndarray | None = None) -> BodyMotion:
@@ -113,3 +114,10 @@ def test_the_verb_says_what_the_object_does(lift_m: tuple, way_m: float, degrees
     centre = np.column_stack((way_m * share, height, np.zeros(60)))
     rotation = Rotation.from_euler("z", (degrees * share)[:, None], degrees=True).as_matrix()
     assert motion_verb(height, centre, rotation) == verb
+
+
+@pytest.mark.parametrize(("margin", "expected"), [(0, (10, 20)), (3, (7, 23)), (12, (2, 28)), (50, (2, 28))])
+def test_a_margin_adds_as_many_usable_frames_on_both_sides(margin, expected):
+    usable = np.ones(30, dtype=bool)
+    usable[[1, 28]] = False
+    assert tuple(widened(Stretch(10, 20), margin, usable)) == expected

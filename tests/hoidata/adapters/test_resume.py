@@ -224,6 +224,16 @@ def test_a_source_that_changed_is_converted_again_alone(half_done):
     assert half_done.run() == ["s2/bowl_lift_001", "s2/bowl_lift_003", "s2/bowl_lift_005"]
 
 
+def test_a_frame_file_rewritten_in_its_folder_is_a_change(tmp_path):
+    from hoidata.adapters.finished import _stamp
+
+    (tmp_path / "000000.txt").write_text("1 2 3")
+    before = _stamp(tmp_path)
+    assert _stamp(tmp_path) == before
+    os.utime(tmp_path / "000000.txt", (1, 1))
+    assert _stamp(tmp_path) != before
+
+
 def test_a_file_added_beside_the_sources_makes_them_be_read_again(half_done):
     half_done.break_off()
     (half_done.root / "grab" / "s1" / "note.txt").write_text("a file an adapter might read when it is there")
