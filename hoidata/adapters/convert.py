@@ -7,7 +7,7 @@ the bytes depend neither on the number of workers nor on how often the run was k
 
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rich.console import Console
@@ -21,11 +21,13 @@ from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
 from hoidata.schema.clip import Clip, SourceFile
 from hoidata.schema.hand_parameters import hands_for
+from hoidata.schema.info import store_info
 from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import open_store, write_store
 from hoidata.schema.validation import check_clip
 
 DEFECT = "report this defect of hoidata"
+GENERATED_LICENCE = "CC0-1.0"
 
 
 @dataclass(frozen=True)
@@ -166,16 +168,16 @@ def _why_empty(adapter: Adapter, root: str | Path | None) -> str:
 
 
 def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str | None) -> dict[str, object]:
-    return {
-        "dataset": adapter.name,
-        "synthetic": synthetic,
-        "hand_model": {"name": hands.name, "digest": hands.digest},
-        "dataset_version": adapter.version,
-        "frame": {"handedness": "right", **asdict(adapter.frame)},
-        "hand_convention": adapter.hand_convention.as_json(),
-        "licence": adapter.licence,
-        "may_be_shared": adapter.may_be_shared,
-        "where_to_register": adapter.where_to_register,
-        "source_fps": adapter.source_fps,
-        "empty_reason": reason,
-    }
+    return store_info(
+        adapter.name,
+        hands,
+        frame=adapter.frame,
+        hand_convention=adapter.hand_convention,
+        dataset_version=adapter.version,
+        licence=f"{GENERATED_LICENCE} (generated in the files of {adapter.name})" if synthetic else adapter.licence,
+        may_be_shared=synthetic or adapter.may_be_shared,
+        source_fps=adapter.source_fps,
+        synthetic=synthetic,
+        where_to_register=adapter.where_to_register,
+        empty_reason=reason,
+    )

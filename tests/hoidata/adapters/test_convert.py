@@ -68,7 +68,7 @@ def test_every_sequence_becomes_a_clip_and_the_store_says_where_it_comes_from(ro
     assert store.ids == ["grab/s1/mug_drink_1", "grab/s1/mug_lift", "grab/s2/mug_pass_1"]
     assert store.info["synthetic"]
     assert store.clip(store.ids[0]).synthetic
-    assert "GRAB" in store.info["licence"]
+    assert store.info["licence"] == "CC0-1.0 (generated in the files of grab)"
     assert store.info["frame"] == {"handedness": "right", **asdict(GrabAdapter().frame)}
     assert store.info["hand_convention"]["translation"] == "transl"
 
@@ -268,3 +268,12 @@ def test_a_manifest_scanned_by_parts_lists_every_file_a_conversion_reads(name, h
     free = convert_dataset(adapter, tmp_path / "raw", hands, tmp_path / "b", progress=False)
     assert summary == free
     assert summary.clips > 0
+
+
+def test_a_generated_store_states_its_own_licence_and_not_the_datasets(root, hands, tmp_path):
+    convert_dataset(GrabAdapter(), root, hands, tmp_path / "made", progress=False, synthetic=True)
+    convert_dataset(GrabAdapter(), root, hands, tmp_path / "real", progress=False)
+    made, real = open_store(tmp_path / "made").info, open_store(tmp_path / "real").info
+    assert made["licence"].startswith("CC0-1.0")
+    assert (made["may_be_shared"], real["may_be_shared"]) == (True, False)
+    assert "no redistribution" in real["licence"]
