@@ -1,4 +1,4 @@
-"""``python -m tests.bench [adapters] [store] [scale]``: the benchmarks named, or all, one after another.
+"""``python -m tests.bench [adapters] [store] [scale] [kernels] [whole]``: the benchmarks named, or all, one after another.
 
 Every figure stands beside a named baseline of the same run; variants take turns and medians of at least five runs are
 shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the embedded raw corpora.
@@ -6,9 +6,15 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from tests.bench import adapters, scale, store
+from tests.bench import adapters, kernels, scale, store, whole
 
-BENCHMARKS = {"adapters": adapters.main, "store": store.main, "scale": scale.main}
+BENCHMARKS = {
+    "adapters": adapters.main,
+    "store": store.main,
+    "scale": scale.main,
+    "kernels": kernels.main,
+    "whole": whole.main,
+}
 
 
 def main() -> int:
