@@ -1,4 +1,4 @@
-"""``python -m tests.bench [adapters] [store] [scale] [kernels] [whole]``: the benchmarks named, or all, one after another.
+"""``python -m tests.bench [NAME ...]``: the benchmarks named (see ``BENCHMARKS``), or all, one after another.
 
 Every figure stands beside a named baseline of the same run; variants take turns and medians of at least five runs are
 shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the embedded raw corpora.
