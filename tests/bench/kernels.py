@@ -28,7 +28,7 @@ from hoidata.objects.sampling import SampledPoints, farthest_points, sample_poin
 from hoidata.schema import HandTrack, ObjectTrack
 from tests.bench.harness import Times, medians, show
 
-RUNS, CLIPS, FRAMES, JOINTS = 9, 12, 150, 21
+RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21
 
 
 @dataclass(frozen=True)
