@@ -83,14 +83,16 @@ class ArcticAdapter:
 
     clips: "described" gives one clip per line of Text2HOI's description files; "whole" one clip per sequence without
     a verb, descriptions or not. margin_frames: frames kept before and after each described range. shortest_frames:
-    shorter ranges are no clips. trimmed_frames: left out at both ends of a whole sequence (ARCTIC's own baselines
-    leave out 10, whose images are black). body: keep the parameters of the subject's SMPL-X body.
+    shorter ranges are no clips. all_pairs: keep the three pairs of verb and object that Text2HOI leaves out.
+    trimmed_frames: left out at both ends of a whole sequence (ARCTIC's own baselines leave out 10, whose images are
+    black). body: keep the parameters of the subject's SMPL-X body.
     """
 
     margin_frames: int = 0
     shortest_frames: int = 20
     clips: Stretches = "described"
     trimmed_frames: int = 0
+    all_pairs: bool = False
     body: bool = False
     name: str = "arctic"
     version: str = "1.0"
@@ -106,7 +108,8 @@ class ArcticAdapter:
         for name in ("margin_frames", "shortest_frames", "trimmed_frames"):
             checks.whole_setting(self.name, name, getattr(self, name))
         checks.choice_setting(self.name, "clips", self.clips, get_args(Stretches))
-        checks.switch_setting(self.name, "body", self.body)
+        for name in ("all_pairs", "body"):
+            checks.switch_setting(self.name, name, getattr(self, name))
 
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
@@ -134,14 +137,26 @@ class ArcticAdapter:
         motion = _read_motion(raw, key, hands, self.body)
         noun = motion.object.model.name
         for description, clip_id in zip(descriptions, _clip_ids(key, descriptions), strict=True):
-            if (description.verb, noun) in EXCLUDED or description.stop - description.start + 1 < self.shortest_frames:
-                continue
-            if description.stop > motion.n_frames:
-                problem = BadInput(where, f"frames 1 to {motion.n_frames}", f"{description.start}-{description.stop}")
+            problem = self._why_no_clip(where, description, noun, motion.n_frames)
+            if problem is None:
+                results.append(self._clip(raw, key, clip_id, motion, description))
+            else:
                 results.append(Quarantined.from_error(clip_id, problem))
-                continue
-            results.append(self._clip(raw, key, clip_id, motion, description))
         return results
+
+    def _why_no_clip(self, where: str, description: Description, noun: str, n_frames: int) -> BadInput | None:
+        """What keeps a described range from being a clip, or None."""
+        length, given = description.stop - description.start + 1, f"{description.start}-{description.stop}"
+        if description.stop > n_frames:
+            return BadInput(where, f"frames 1 to {n_frames}", given)
+        if length < self.shortest_frames:
+            remedy = "nothing to do, or lower the setting shortest_frames"
+            return BadInput(f"{where}: {given}", f"{self.shortest_frames} frames or more", f"{length}", remedy)
+        if not self.all_pairs and (description.verb, noun) in EXCLUDED:
+            remedy = "nothing to do, or set all_pairs"
+            got = f"{description.verb} {noun}"
+            return BadInput(f"{where}: {given}", "none of the pairs Text2HOI leaves out", got, remedy)
+        return None
 
     def _whole(self, raw: RawTree, key: SequenceKey, motion: _Motion) -> Clip:
         start, stop = self.trimmed_frames, motion.n_frames - self.trimmed_frames

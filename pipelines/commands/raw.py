@@ -123,6 +123,7 @@ def _verify_one(dataset: str) -> bool:
     manifest = read_manifest(place.manifest)
     if not manifest.present:
         typer.echo(f"{dataset}: not present; {manifest.licence}; {manifest.where_to_register}")
+        typer.echo(f"  once you have it: hoidata raw scan {dataset} --root FOLDER")
         for part in adapter.parts:
             typer.echo(f"  {part.what}: {part.where}{' (optional)' if part.optional else ''}")
         return True
@@ -132,7 +133,7 @@ def _verify_one(dataset: str) -> bool:
         typer.echo(f"{dataset}: {item.path} is {item.problem}{_where_to_get(adapter, item.path)}")
     if len(differences) > SHOWN_DIFFERENCES:
         typer.echo(f"{dataset}: and {len(differences) - SHOWN_DIFFERENCES} more")
-    typer.echo(f"{dataset}: {len(listed.files)} entries, {len(differences)} differences")
+    typer.echo(f"{dataset}: {len(listed.files)} entries, differences: {len(differences) or 'none'}")
     return not differences
 
 

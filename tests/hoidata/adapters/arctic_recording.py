@@ -23,7 +23,6 @@ STORED[21:24] = (0.0, 0.0, 6.4)  # beyond 2 pi, as it occurs in the real files
 LINES = """1-20 grab, left hand
 
 15-44 lift, both hands
-45-63 open, right hand
 41-70 close right hand
 15-44 open, right hand
 """

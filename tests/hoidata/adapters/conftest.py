@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.adapters import RawTree
 from hoidata.hands import HandModel, load_embedded_hands
+from hoidata.schema import Clip
 
 PARENT = [-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14]
 TIP_VERTEX = [317, 445, 673, 556, 745]
@@ -54,6 +55,12 @@ def formula() -> SimpleNamespace:
 @pytest.fixture
 def hands():
     return load_embedded_hands()
+
+
+@pytest.fixture
+def load_clips(load_all) -> Callable:
+    """As ``load_all``, without the stretches left out."""
+    return lambda adapter, root: [item for item in load_all(adapter, root) if isinstance(item, Clip)]
 
 
 @pytest.fixture

@@ -34,8 +34,8 @@ def root(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def clips(root, load_all):
-    return {clip.clip_id: clip for clip in load_all(ArcticAdapter(), root)}
+def clips(root, load_clips):
+    return {clip.clip_id: clip for clip in load_clips(ArcticAdapter(), root)}
 
 
 @pytest.fixture
@@ -128,13 +128,34 @@ def test_parts_may_be_json_booleans(root, load_all, lift):
 @pytest.mark.parametrize(
     ("verb", "noun"), [("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")]
 )
-def test_the_verb_object_pairs_that_text2hoi_left_out_give_no_clip(root, load_all, verb, noun):
+def test_the_verb_object_pairs_that_text2hoi_left_out_give_no_clip(root, load_clips, verb, noun):
     lines = f"1-40 {verb}, right hand\n20-60 open, left hand\n"
     recording.write_sequence(root, f"{noun}_use_02", lines)
     recording.write_template(root, noun)
-    assert [clip.verb for clip in load_all(ArcticAdapter(), root) if noun in clip.clip_id] == ["open"]
+    assert [clip.verb for clip in load_clips(ArcticAdapter(), root) if noun in clip.clip_id] == ["open"]
     recording.write_sequence(root, "box_use_02", lines)
-    assert [clip.verb for clip in load_all(ArcticAdapter(), root) if "box_use" in clip.clip_id] == [verb, "open"]
+    assert [clip.verb for clip in load_clips(ArcticAdapter(), root) if "box_use" in clip.clip_id] == [verb, "open"]
+
+
+def test_a_pair_text2hoi_leaves_out_is_listed_with_its_reason_and_kept_when_asked_for(root, load_all, load_clips):
+    recording.write_sequence(root, "notebook_use_02", "1-40 write, right hand\n")
+    recording.write_template(root, "notebook")
+    (item,) = [item for item in load_all(ArcticAdapter(), root) if "notebook" in str(item)]
+    assert (item.source_key, item.got) == ("arctic/s04/notebook_use_02/0001-0040", "write notebook")
+    assert "all_pairs" in item.remedy
+    kept = [clip.verb for clip in load_clips(ArcticAdapter(all_pairs=True), root) if "notebook" in clip.clip_id]
+    assert kept == ["write"]
+
+
+def test_a_range_of_19_frames_is_listed_with_its_reason(root, load_all):
+    recording.write_sequence(root, "box_use_02", "1-19 open, left hand\n1-20 close, left hand\n")
+    short, long = [item for item in load_all(ArcticAdapter(), root) if "box_use_02" in str(item)]
+    assert (short.source_key, short.expected, short.got) == (
+        "arctic/s04/box_use_02/0001-0019",
+        "20 frames or more",
+        "19",
+    )
+    assert long.n_frames == 20
 
 
 def test_a_range_that_ends_one_frame_after_the_motion_is_left_out_and_not_cut_short(root, load_all):
@@ -148,19 +169,19 @@ def test_a_range_that_ends_one_frame_after_the_motion_is_left_out_and_not_cut_sh
     )
 
 
-def test_trailing_digits_of_an_object_name_are_not_part_of_it(root, load_all):
+def test_trailing_digits_of_an_object_name_are_not_part_of_it(root, load_clips):
     recording.write_sequence(root, "box2_use_01", "1-40 open, left hand\n")
-    (clip,) = [clip for clip in load_all(ArcticAdapter(), root) if "box2" in clip.clip_id]
+    (clip,) = [clip for clip in load_clips(ArcticAdapter(), root) if "box2" in clip.clip_id]
     assert (clip.object.model.name, clip.object_words) == ("box", "box")
 
 
 @pytest.mark.parametrize(
     ("noun", "words"), [("capsulemachine", "capsule machine"), ("waffleiron", "waffle iron"), ("laptop", "laptop")]
 )
-def test_joined_object_names_become_words(root, load_all, noun, words):
+def test_joined_object_names_become_words(root, load_clips, noun, words):
     recording.write_sequence(root, f"{noun}_use_01", "1-40 open, left hand\n")
     recording.write_template(root, noun)
-    assert {clip.object_words for clip in load_all(ArcticAdapter(), root) if noun in clip.clip_id} == {words}
+    assert {clip.object_words for clip in load_clips(ArcticAdapter(), root) if noun in clip.clip_id} == {words}
 
 
 def test_a_bad_line_is_listed_and_the_others_convert(root, load_all):

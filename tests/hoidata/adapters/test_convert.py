@@ -173,6 +173,23 @@ def test_a_defect_of_an_adapter_is_reported_as_such_and_stops_nothing(root, hand
     assert "report" in summary.left_out[0].remedy
 
 
+@dataclass(frozen=True)
+class SloppyAdapter(GrabAdapter):
+    """An adapter whose clips of one sequence break a rule of Clip."""
+
+    def load(self, raw, key, hands):
+        clips = super().load(raw, key, hands)
+        return [replace(clip, gravity=np.array([0.0, 0.0, -9.81])) for clip in clips] if "lift" in key.name else clips
+
+
+def test_a_clip_that_breaks_a_rule_costs_its_sequence_and_not_the_dataset(root, hands, tmp_path):
+    summary = convert_dataset(SloppyAdapter(), root, hands, tmp_path / "clips", progress=False)
+    assert summary.clips == 2
+    (item,) = summary.left_out
+    assert item.source_key == "grab/s1/mug_lift"
+    assert "gravity" in item.where
+
+
 def test_an_absent_dataset_gives_an_empty_store_that_says_why(hands, tmp_path):
     for number, root in enumerate((None, tmp_path / "nowhere", tmp_path)):
         summary = convert_dataset(GrabAdapter(), root, hands, tmp_path / f"clips{number}", progress=False)

@@ -299,6 +299,15 @@ def test_a_damaged_result_is_made_again(half_done):
     assert digests(half_done.out) == whole
 
 
+def test_results_whose_mesh_is_gone_are_made_again(half_done):
+    half_done.run()
+    whole = digests(half_done.out)
+    half_done.break_off()
+    shutil.rmtree(half_done.out.parent / ".clips.work" / "shared")
+    assert len(half_done.run()) == 6
+    assert digests(half_done.out) == whole
+
+
 def test_meshes_and_personal_hands_are_kept_once_and_the_rest_exactly(half_done, hands):
     half_done.break_off()
     work = half_done.out.parent / ".clips.work"
