@@ -166,4 +166,6 @@ def serve() -> None:
 
 
 if __name__ == "__main__":
+    # A test run in the background of a script may ignore Ctrl-C, and its children would too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     serve()
