@@ -91,7 +91,11 @@ class Conversions:
         assert again.status == 0, again.said
         assert digests(out) == self.expected
         assert os.listdir(out.parent) == ["clips"]
-        assert len(again.loaded) == len(set(again.loaded)) == N_SEQUENCES - finished
+        # Workers that outlive their parent may each finish the sequence they are at after it was looked.
+        orphans = jobs if how.get("who") == "parent" else 0
+        missing = N_SEQUENCES - finished
+        assert len(again.loaded) == len(set(again.loaded))
+        assert missing - orphans <= len(again.loaded) <= missing
         return killed
 
     @staticmethod
