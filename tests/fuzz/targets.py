@@ -1,5 +1,6 @@
 """Every parser of files from outside, each with seeds, words of its format and the functions whose lines count."""
 
+import contextlib
 import io
 import os
 import random
@@ -443,6 +444,6 @@ def _params(path: Path) -> Any:
 
 
 def _own_root(path: Path) -> Any:
-    os.chdir(path.parent)
     os.environ.pop(base.root_variable("grab"), None)
-    return base.own_root("grab")
+    with contextlib.chdir(path.parent):
+        return base.own_root("grab")
