@@ -19,10 +19,10 @@ TESTS = {
     },
     "handedness of the world": {
         "h2o": "test_the_object_goes_from_its_frame_through_the_camera_to_the_world",
-        "grab": "test_left_is_left",
-        "arctic": "test_left_is_left",
+        "grab": "test_the_world_is_not_seen_in_a_mirror",
+        "arctic": "test_the_world_is_not_seen_in_a_mirror",
         "manipnet": "test_the_world_is_seen_in_a_mirror_with_normal_x",
-        "taco": "test_each_side_has_its_own_shape",
+        "taco": "test_the_world_is_not_seen_in_a_mirror",
     },
     "meshes": {
         "h2o": "test_the_object_goes_from_its_frame_through_the_camera_to_the_world",
@@ -71,10 +71,10 @@ TESTS = {
     },
     "left and right": {
         "h2o": "test_the_left_block_comes_first",
-        "grab": "test_left_is_left",
-        "arctic": "test_left_is_left",
+        "grab": "test_each_hands_numbers_bend_a_hand_of_that_side",
+        "arctic": "test_each_hands_numbers_bend_a_hand_of_that_side",
         "manipnet": "test_a_right_hand_is_fitted_to_the_right_hands_file",
-        "taco": "test_the_translation_is_the_wrist_and_not_added_to_the_rest_wrist",
+        "taco": "test_each_hands_numbers_bend_a_hand_of_that_side",
     },
     "numbers per hand": {
         "h2o": "test_a_block_has_62_numbers_and_not_the_59_of_the_readme",

@@ -259,3 +259,45 @@ class TestHeadCamera:
 
 def test_things_fall_along_minus_z(clip):
     assert clip.gravity.tolist() == [0.0, 0.0, -1.0]
+
+
+EDGES_SEEN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def look(tmp_path, hands, formula, load_all):
+    """Joints of both hands and three edges of the box in the world, of a person whose numbers are given."""
+
+    def of(person):
+        root = write(tmp_path)
+        edges_mm = np.array([[-100.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 50.0]]) * person.signs
+        corners = np.concatenate((np.zeros((1, 3)), edges_mm, np.array(TOP_MM) * person.signs))
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f 1 2 3", "f 1 3 4", "f 5 6 7", "f 5 7 8"]
+        (root / "meta/object_vtemplates/box/mesh.obj").write_text("\n".join(lines))
+        blocks = {}
+        for side, (orient, angles, transl) in person.hands.items():
+            rows = {"rot": orient, "pose": angles, "trans": transl}
+            blocks[side] = hand_block(side) | {
+                name: np.tile(np.float32(row), (N_FRAMES, 1)) for name, row in rows.items()
+            }
+        np.save(root / "raw_seqs/s06/box_use_03.mano.npy", np.array(blocks, dtype=object))
+        box = (0.0, *person.object_orient, *(OBJECT_MM * person.signs))
+        np.save(root / "raw_seqs/s06/box_use_03.object.npy", np.tile(box, (N_FRAMES, 1)))
+        (clip,) = load_all(ArcticAdapter(), root)
+        points = clip_points(clip)
+        return {side: hand_joints(clip, side, hands, formula) for side in ("left", "right")}, points[1:4] - points[0]
+
+    return of
+
+
+def test_each_hands_numbers_bend_a_hand_of_that_side(look, seated):
+    joints, _ = look(seated.person())
+    swapped, _ = look(seated.person(swapped=True))
+    assert seated.own_side(joints)
+    assert not seated.own_side(swapped)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_world_is_not_seen_in_a_mirror(look, seated, axis):
+    assert seated.as_described(*look(seated.person()), EDGES_SEEN)
+    assert not seated.as_described(*look(seated.person(mirrored=axis)), EDGES_SEEN)

@@ -259,3 +259,42 @@ def test_contact_labels_keep_frame_vertex_and_toucher(load):
 
 def test_things_fall_along_minus_z(load):
     assert load().gravity.tolist() == [0.0, 0.0, -1.0]
+
+
+# Half a turn about z puts them to her right, towards her, and up.
+MUG_EDGES = [[-0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.0, 0.0, 0.05]]
+EDGES_SEEN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def look(root, hands, formula, load_all, seated):
+    """Joints of both hands and the mug's three edges in the world, of a person whose numbers are given."""
+
+    def of(person):
+        data = recording()
+        for side, (orient, angles, transl) in person.hands.items():
+            params = {"global_orient": orient, "transl": transl, "fullpose": angles}
+            data[f"{side[0]}hand"]["params"] = {name: every_frame(row) for name, row in params.items()}
+            data[f"{side[0]}hand"]["vtemp"] = f"tools/subject_meshes/female/s8_{person.named[side][0]}hand.ply"
+        data["object"]["params"] = thing_block("mug", person.object_orient, np.array(MUG_PLACE) * person.signs)
+        write(root, data)
+        mesh = trimesh.Trimesh([np.zeros(3), *(MUG_EDGES * person.signs), (0.02, 0.02, 0.02)], MUG_FACES, process=False)
+        mesh.export(root / "tools/object_meshes/contact_meshes/mug.ply")
+        (clip,) = load_all(GrabAdapter(), root)
+        corners = placed(clip.object, at(clip))
+        return {side: hand_joints(clip, side, hands, formula) for side in ("left", "right")}, corners[1:4] - corners[0]
+
+    return of
+
+
+def test_each_hands_numbers_bend_a_hand_of_that_side(look, seated):
+    joints, _ = look(seated.person())
+    swapped, _ = look(seated.person(swapped=True))
+    assert seated.own_side(joints)
+    assert not seated.own_side(swapped)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_world_is_not_seen_in_a_mirror(look, seated, axis):
+    assert seated.as_described(*look(seated.person()), EDGES_SEEN)
+    assert not seated.as_described(*look(seated.person(mirrored=axis)), EDGES_SEEN)

@@ -181,3 +181,46 @@ def test_gravity_is_unknown_with_its_reason(clip):
     assert clip.gravity is None
     assert clip.gravity_note
     assert (TacoAdapter().frame.up_axis, TacoAdapter().frame.gravity) == (None, "unknown")
+
+
+EDGES_SEEN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+def write_seated(root: Path, person) -> RawTree:
+    """The recording with other hands, and with a spoon of three straight edges at the right wrist."""
+    poses, things = root / "Hand_Poses" / KEY.name, root / "Object_Poses" / KEY.name
+    for side, (orient, angles, wrist_m) in person.hands.items():
+        frame = {"hand_pose": torch.tensor([*orient, *angles]), "hand_trans": torch.tensor(wrist_m)}
+        (poses / f"{side}_hand.pkl").write_bytes(pickle.dumps({str(number + 1): frame for number in range(N_FRAMES)}))
+    at_the_wrist = next(iter(person.hands.values()))[2]
+    np.save(things / "tool_031.npy", matrices(person.object_orient, at_the_wrist, 0.0))
+    edges_cm = np.array([[-10.0, 0.0, 0.0], [0.0, 8.0, 0.0], [0.0, 0.0, 5.0]]) * person.signs
+    lines = [f"v {x} {y} {z}" for x, y, z in np.concatenate((np.zeros((1, 3)), edges_cm))]
+    (root / "Object_Models" / "031_cm.obj").write_text("\n".join([*lines, "f 1 3 2", "f 1 2 4", "f 2 3 4", "f 3 1 4"]))
+    return RawTree(root)
+
+
+@pytest.fixture
+def look(tmp_path, hands, formula):
+    """Joints of both hands and the spoon's three edges in the world, of a person whose numbers are given."""
+
+    def of(person):
+        (seen,) = TacoAdapter(margin_frames=N_FRAMES).load(write_seated(tmp_path, person), KEY, hands)
+        spoon = corners(seen.object)
+        return {side: clip_joints(seen, side, hands, formula) for side in SIDES}, spoon[1:4] - spoon[0]
+
+    write(tmp_path)
+    return of
+
+
+def test_each_hands_numbers_bend_a_hand_of_that_side(look, seated):
+    joints, _ = look(seated.person())
+    swapped, _ = look(seated.person(swapped=True))
+    assert seated.own_side(joints)
+    assert not seated.own_side(swapped)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_the_world_is_not_seen_in_a_mirror(look, seated, axis):
+    assert seated.as_described(*look(seated.person()), EDGES_SEEN)
+    assert not seated.as_described(*look(seated.person(mirrored=axis)), EDGES_SEEN)
