@@ -13,6 +13,7 @@ _HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
     r"\b(?:(?:with|by|using)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b"
 )
+_RUN = re.compile(r"[\w-]+")
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,15 @@ class _Match:
         return self.start < other.stop and other.start < self.stop
 
 
+@dataclass(frozen=True)
+class _Form:
+    """number: place in the lexicon; of two equally good readings the one that stands first there is taken."""
+
+    number: int
+    words: str
+    base: str
+
+
 class Lexicon:
     """Surface forms of verbs and objects and the base form each stands for.
 
@@ -42,8 +52,8 @@ class Lexicon:
     """
 
     def __init__(self, verbs: Iterable[tuple[str, str]], nouns: Iterable[tuple[str, str]]) -> None:
-        self._verbs = _patterns(verbs)
-        self._nouns = _patterns(nouns)
+        self._verbs = _Forms(verbs)
+        self._nouns = _Forms(nouns)
 
     def read(self, text: str) -> tuple[str | None, str | None]:
         """Verb and object of a sentence, base forms.
@@ -52,13 +62,46 @@ class Lexicon:
         that covers most of the sentence wins; among equals the one whose verb stands first.
         """
         rest = " ".join(_HAND_PHRASE.sub(" ¤ ", text.lower()).split())
-        verbs, nouns = list(_matches(rest, self._verbs)), list(_matches(rest, self._nouns))
+        verbs, nouns = self._verbs.matches(rest), self._nouns.matches(rest)
         pairs = [(verb, noun) for verb in verbs for noun in nouns if not verb.overlaps(noun)]
         if pairs:
             verb, noun = max(pairs, key=_score)
             return verb.base, noun.base
         verb = max(verbs, key=_length, default=None)
         return (verb.base if verb else None), None
+
+
+class _Forms:
+    """Word forms found by the run of letters, digits and hyphens they begin with: a look-up per word of the text."""
+
+    def __init__(self, forms: Iterable[tuple[str, str]]) -> None:
+        bases: dict[str, str] = {}
+        for form, base in forms:
+            if bases.setdefault(form.lower(), base) != base:
+                raise ValueError(f"{form!r} stands for both {bases[form.lower()]!r} and {base!r}")
+        self._by_start: dict[str, list[_Form]] = {}
+        for number, (words, base) in enumerate(bases.items()):
+            start = _RUN.match(words)
+            self._by_start.setdefault(start[0] if start else "", []).append(_Form(number, words, base))
+
+    def matches(self, text: str) -> list[_Match]:
+        """Whole words; places of one form do not overlap. In the order of the lexicon, then of the text."""
+        found: list[tuple[int, _Match]] = []
+        stops: dict[int, int] = {}
+        for form, start in self._candidates(text):
+            stop = start + len(form.words)
+            whole = text.startswith(form.words, start) and not _RUN.match(text, stop)
+            if whole and start >= stops.get(form.number, 0):
+                stops[form.number] = stop
+                found.append((form.number, _Match(form.base, start, stop)))
+        return [match for _, match in sorted(found, key=lambda entry: entry[0])]
+
+    def _candidates(self, text: str) -> Iterator[tuple[_Form, int]]:
+        for run in _RUN.finditer(text):
+            for form in self._by_start.get(run[0], ()):
+                yield form, run.start()
+        for form in self._by_start.get("", ()):  # begins with a bracket or quotation mark
+            yield from ((form, start) for start in range(len(text)) if not _RUN.match(text, max(start - 1, 0), start))
 
 
 def grammar_lexicon(grammar: Grammar) -> Lexicon:
@@ -79,22 +122,8 @@ def read_prompt(text: str, encoder: TextEncoder | None = None, grammar: Grammar 
     return PromptReading(select_hand(text, encoder), verb, noun)
 
 
-def _patterns(forms: Iterable[tuple[str, str]]) -> list[tuple[str, re.Pattern[str]]]:
-    bases: dict[str, str] = {}
-    for form, base in forms:
-        if bases.setdefault(form.lower(), base) != base:
-            raise ValueError(f"{form!r} stands for both {bases[form.lower()]!r} and {base!r}")
-    return [(base, re.compile(rf"(?<![\w-]){re.escape(form)}(?![\w-])")) for form, base in bases.items()]
-
-
 def _forms(verb) -> tuple[str, ...]:
     return verb.base, verb.gerund, verb.past_participle, verb.third_singular
-
-
-def _matches(text: str, patterns: list[tuple[str, re.Pattern[str]]]) -> Iterator[_Match]:
-    for base, pattern in patterns:
-        for match in pattern.finditer(text):
-            yield _Match(base, match.start(), match.end())
 
 
 def _length(match: _Match) -> int:
