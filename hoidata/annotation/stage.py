@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder
+from hoidata.annotation.hand_distances import write_hand_distances
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
 from hoidata.contact import CONTACT_THRESHOLD_M, HandEvidence, ProximityIndex, acting_hands
 from hoidata.contact.stage import sample_objects
@@ -78,6 +79,7 @@ def annotate_store(
     counts = _counts(found, sentences)
     with atomic_folder(out_folder) as part:
         write_table(part / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
+        write_hand_distances(part / "hand_distance.npz", [item.evidence for item in found])
         write_table(part / "text.parquet", _text_rows(named, sentences), TEXT_TABLE)
         _write_embeddings(part / "embeddings.npz", encoder, sentences)
         info = {"encoder": encoder.identity, "threshold_m": threshold_m, "points": points, "counts": counts}

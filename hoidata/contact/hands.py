@@ -1,34 +1,14 @@
 """Which hands take part in an interaction: the proximity test of Text2HOI (supplement, section 6)."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
-from hoidata.schema import SIDES, Clip, HandType, Side
-
-
-@dataclass(frozen=True)
-class HandEvidence:
-    """What the hand type of a clip rests on.
-
-    hand_type: None when neither hand came close. distance_m: per side (frame,), the nearest of 21 joints to any sampled
-    point; infinite in frames where the hand is not valid. threshold_m: a hand acts below it.
-    """
-
-    hand_type: HandType | None
-    distance_m: dict[Side, np.ndarray]
-    threshold_m: float
-
-    def closest_m(self, side: Side) -> float:
-        """The smallest distance of the clip, infinite when the hand is never valid."""
-        return float(self.distance_m[side].min(initial=np.inf))
-
-    def at_threshold(self, threshold_m: float) -> "HandEvidence":
-        """The same distances judged by another threshold."""
-        acting: dict[Side, bool] = {side: self.closest_m(side) < threshold_m for side in SIDES}
-        return HandEvidence(_hand_type(acting), self.distance_m, threshold_m)
+from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex, joints_in_object
+from hoidata.errors import BadInput
+from hoidata.objects.surface_index import SurfaceIndex
+from hoidata.schema import SIDES, Clip, Side
+from hoidata.schema.hand_evidence import HandEvidence
 
 
 def acting_hands(
@@ -49,7 +29,23 @@ def _per_frame_m(clip: Clip, joints_m: np.ndarray, index: ProximityIndex, side: 
     return np.where(clip.hands[side].valid, index.closest_m(joints_m, clip.object), np.inf)
 
 
-def _hand_type(acting: Mapping[Side, bool]) -> HandType | None:
-    if acting["left"] and acting["right"]:
-        return "both"
-    return next((side for side in SIDES if acting[side]), None)
+def acting_hands_at_surface(
+    clip: Clip,
+    joints_m: Mapping[Side, np.ndarray],
+    index: SurfaceIndex,
+    threshold_m: float = CONTACT_THRESHOLD_M,
+    most_m: float = np.inf,
+) -> HandEvidence:
+    """The same test against the object's surface instead of sampled points of it, exact at every hinge angle.
+
+    joints_m: as in ``acting_hands``. index: ``surface_index(clip.object.model)``. most_m: larger distances are given as
+    infinite, which is faster; at least ``threshold_m``. Distances count from the surface on either side of it.
+    """
+    if most_m < threshold_m:
+        raise BadInput("most_m", f"at least the threshold, {threshold_m:g} m", f"{most_m:g} m")
+    distance: dict[Side, np.ndarray] = {}
+    for side in SIDES:
+        places = joints_in_object(joints_m[side], clip.object)
+        nearest = index.distance_m(places, clip.object.hinge_rad, most_m).min(axis=1, initial=np.inf)
+        distance[side] = np.where(clip.hands[side].valid, nearest, np.inf)
+    return HandEvidence(None, distance, threshold_m).at_threshold(threshold_m)

@@ -4,6 +4,7 @@
     annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz)
                   hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
                                       reason (why a clip is left out)
+                  hand_distance.npz   how near each hand is in every frame (``hoidata.schema.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
                   info.json           encoder, threshold_m, counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
@@ -34,11 +35,9 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
 from hoidata.schema.clip import SIDES, Clip, HandType, Side
 from hoidata.schema.dataset import DistanceEntries
+from hoidata.schema.hand_evidence import HandDistances, HandEvidence
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.store import Store, open_store
-
-STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
-
 
 STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
 
@@ -80,6 +79,7 @@ class AnnotatedStore:
         self._points = read_npz(contact / "points.npz")
         self._contact = read_npz(contact / "contact.npz")
         self._distances: dict[int, dict[str, np.ndarray]] = {}
+        self._hand_distances: HandDistances | None = None
         self._refuse_other_clips()
 
     def __len__(self) -> int:
@@ -111,6 +111,23 @@ class AnnotatedStore:
         if found not in ("left", "right", "both"):
             raise KeyError(f"no hand acts in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")
         return found
+
+    def hand_evidence(self, clip_id: str, threshold_m: float | None = None) -> HandEvidence:
+        """How near each hand comes in every frame, and the hand type at ``threshold_m``, by default the stage's own.
+
+        Kept by the stage annotate: nothing is computed. Per-frame distances are rounded to float32 (1 nm at 2 cm); the
+        clip's hand type rests on the exact smallest ones.
+        """
+        if self._hand_distances is None:
+            self._hand_distances = HandDistances(self.root / "annotation" / "hand_distance.npz", len(self.store.ids))
+        row = self.hand_types.index.get_loc(clip_id)
+        assert isinstance(row, int)
+        smallest: dict[Side, float] = {}
+        for side in SIDES:
+            value = self.hand_types.at[clip_id, f"min_{side}_m"]
+            smallest[side] = np.inf if pd.isna(value) else float(value)
+        judged_m: float = self.annotation_info["threshold_m"] if threshold_m is None else threshold_m
+        return HandEvidence(None, self._hand_distances.of(row), judged_m, smallest).at_threshold(judged_m)
 
     def sentences(self, clip_id: str) -> tuple[str, ...]:
         """Imperative, passive, subject and gerund form."""
@@ -171,7 +188,7 @@ class AnnotatedStore:
 
     def __getstate__(self) -> dict[str, Any]:
         """Workers map the distances anew: a pickled memory map would carry all of them."""
-        return {**self.__dict__, "_distances": {}}
+        return {**self.__dict__, "_distances": {}, "_hand_distances": None}
 
     def _refuse_other_clips(self) -> None:
         """Raise BadInput when a stage's output belongs to another conversion than the clips beside it."""

@@ -1,0 +1,192 @@
+"""The distances of the hand test are kept: other thresholds give what a run of the whole stage with them would give."""
+
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import trimesh
+
+from hoidata.annotation.hand_distances import hand_types_at, write_hand_distances
+from hoidata.annotation.stage import annotate_store
+from hoidata.contact import ProximityIndex, acting_hands
+from hoidata.contact.hands import acting_hands_at_surface
+from hoidata.contact.stage import contact_store
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.arrays import read_npz, write_npz
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.sampling import sample_points
+from hoidata.objects.surface_index import surface_index
+from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.schema.annotated import AnnotatedStore, load_annotated
+from hoidata.schema.hand_evidence import HandDistances, HandEvidence
+from hoidata.schema.info import generated_info
+from hoidata.schema.store import write_store
+from hoidata.splits import split_store
+
+RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
+HEIGHTS_M = {"toy/1": (0.012, 0.5), "toy/2": (0.5, 0.015), "toy/3": (0.033, 0.018), "toy/4": (0.3, 0.4)}
+THRESHOLDS_M = (0.001, 0.0125, 0.02, 0.03, 0.06, 0.45, 2.0)
+
+
+def clip(name: str, heights_m: tuple[float, float], frames: int) -> Clip:
+    """Each hand comes down to its height above a box and goes up again; the right hand is lost in the last frame."""
+    box = trimesh.creation.box((0.06, 0.06, 0.2))
+    model = ObjectModel("box", box.vertices, box.faces, np.zeros(8, np.uint8))
+    dip = np.abs(np.linspace(-0.05, 0.05, frames)).astype(np.float32)
+    hands: dict[Side, HandTrack] = {}
+    for side, height in zip(SIDES, heights_m, strict=True):
+        wrist = np.zeros((frames, 3), np.float32)
+        wrist[:, 2] = 0.1 + height + dip
+        zeros, pose = np.zeros((frames, 3), np.float32), np.zeros((frames, 45), np.float32)
+        valid = np.arange(frames) < frames - (side == "right")
+        hands[side] = HandTrack(wrist, zeros, pose, np.zeros((1, 10), np.float32), valid)
+    still = np.zeros((frames, 3), np.float32)
+    subject = f"s{name[-1]}"
+    return Clip(
+        name, "toy", subject, subject, hands, ObjectTrack(model, still, still),
+        np.arange(frames, dtype=np.int32), np.array([0.0, 0, -1]), "lift", "box", synthetic=True,
+    )  # fmt: skip
+
+
+def made() -> list[Clip]:
+    return [clip(name, heights, 5 + number) for number, (name, heights) in enumerate(HEIGHTS_M.items())]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("toy")
+    write_store(root / "clips", made(), generated_info("toy"))
+    annotate_store(root / "clips", root / "annotation", encoder="hash")
+    contact_store(root / "clips", root / "contact")
+    split_store(root / "clips", root / "annotation", root / "splits", RULE)
+    return root
+
+
+@pytest.fixture(scope="module")
+def annotated(root: Path) -> AnnotatedStore:
+    return load_annotated(root)
+
+
+def measured(annotated: AnnotatedStore, clip_id: str) -> HandEvidence:
+    clip = annotated.clip(clip_id)
+    joints: dict[Side, np.ndarray] = {side: annotated.joints(clip_id, side) for side in SIDES}
+    return acting_hands(clip, joints, ProximityIndex(sample_points(clip.object.model)))
+
+
+def test_the_kept_distances_are_the_measured_ones_of_the_same_clip(annotated: AnnotatedStore) -> None:
+    for clip_id in HEIGHTS_M:
+        kept, fresh = annotated.hand_evidence(clip_id), measured(annotated, clip_id)
+        assert kept.hand_type == fresh.hand_type
+        for side in SIDES:
+            assert kept.distance_m[side].dtype == np.float32
+            np.testing.assert_array_equal(kept.distance_m[side], fresh.distance_m[side].astype(np.float32))
+            assert kept.closest_m(side) == fresh.closest_m(side)
+        assert np.isinf(kept.distance_m["right"][-1])
+
+
+def test_another_threshold_gives_what_a_run_of_the_stage_with_it_gives(
+    annotated: AnnotatedStore, root: Path, tmp_path: Path
+) -> None:
+    types = set()
+    for threshold_m in THRESHOLDS_M:
+        annotate_store(root / "clips", tmp_path / f"{threshold_m}", encoder="hash", threshold_m=threshold_m)
+        table = pd.read_parquet(tmp_path / f"{threshold_m}" / "hand_type.parquet")
+        found = table["hand_type"].astype(object).where(table["hand_type"].notna(), None)
+        whole_run = dict(zip(table["clip_id"], found, strict=True))
+        assert hand_types_at(root / "annotation", threshold_m) == whole_run
+        judged = {clip_id: annotated.hand_evidence(clip_id, threshold_m).hand_type for clip_id in HEIGHTS_M}
+        assert judged == whole_run
+        types |= set(whole_run.values())
+    assert types == {None, "left", "right", "both"}
+
+
+def test_the_distances_do_not_depend_on_the_threshold(root: Path, tmp_path: Path) -> None:
+    annotate_store(root / "clips", tmp_path / "other", encoder="hash", threshold_m=0.06)
+    name = "hand_distance.npz"
+    assert (tmp_path / "other" / name).read_bytes() == (root / "annotation" / name).read_bytes()
+
+
+def test_a_threshold_just_above_and_at_the_smallest_distance(annotated: AnnotatedStore) -> None:
+    """A hand acts strictly below the threshold, judged by the exact minimum and not by its float32 rounding."""
+    smallest = annotated.hand_evidence("toy/1").closest_m("left")
+    assert annotated.hand_evidence("toy/1", smallest).hand_type is None
+    assert annotated.hand_evidence("toy/1", np.nextafter(smallest, 1)).hand_type == "left"
+
+
+def test_frames_are_judged_one_by_one(annotated: AnnotatedStore) -> None:
+    """The right hand is 6.5, 4.5, 2.5, 2.5, 4.5 cm above the box and then lost."""
+    evidence = annotated.hand_evidence("toy/2", 0.05)
+    assert evidence.near("right").tolist() == [False, True, True, True, True, False]
+    assert evidence.at_threshold(0.03).near("right").tolist() == [False, False, True, True, False, False]
+    assert not evidence.near("left").any()
+
+
+def test_a_store_that_was_opened_can_be_sent_to_a_worker(annotated: AnnotatedStore) -> None:
+    before = annotated.hand_evidence("toy/3")
+    sent = pickle.loads(pickle.dumps(annotated))
+    np.testing.assert_array_equal(sent.hand_evidence("toy/3").distance_m["left"], before.distance_m["left"])
+
+
+def test_an_annotation_without_distances_names_its_stage(root: Path, tmp_path: Path) -> None:
+    with pytest.raises(MissingResource, match="'annotate'"):
+        HandDistances(tmp_path / "hand_distance.npz", 4)
+    with pytest.raises(BadInput, match=r"distances of 3 clips.*of 4"):
+        HandDistances(root / "annotation" / "hand_distance.npz", 3)
+    arrays = read_npz(root / "annotation" / "hand_distance.npz")
+    write_npz(tmp_path / "short.npz", {**arrays, "left_m": arrays["left_m"][:-1]})
+    with pytest.raises(BadInput, match="run the stage annotate again"):
+        HandDistances(tmp_path / "short.npz", 4)
+
+
+def test_no_length_is_no_threshold(root: Path) -> None:
+    for wrong in (0.0, -0.02, float("nan")):
+        with pytest.raises(BadInput, match="metres above 0"):
+            hand_types_at(root / "annotation", wrong)
+
+
+def test_no_clips_give_no_distances(tmp_path: Path) -> None:
+    write_hand_distances(tmp_path / "hand_distance.npz", [])
+    with pytest.raises(IndexError):
+        HandDistances(tmp_path / "hand_distance.npz", 0).of(0)
+
+
+def test_at_the_surface_a_hand_is_as_near_as_the_box_is_and_never_farther_than_its_points() -> None:
+    """The wrist is the lowest of the joints above the box's top; points lie on that surface, so none is nearer."""
+    turned = clip("toy/3", HEIGHTS_M["toy/3"], 7)
+    model = turned.object.model
+    joints: dict[Side, np.ndarray] = {side: wrist_and_far_joints(turned, side) for side in SIDES}
+    exact = acting_hands_at_surface(turned, joints, surface_index(model), 0.02)
+    sampled = acting_hands(turned, joints, ProximityIndex(sample_points(model)), 0.02)
+    for side in SIDES:
+        valid = turned.hands[side].valid
+        height = turned.hands[side].wrist_m[valid, 2].astype(np.float64) - 0.1
+        np.testing.assert_allclose(exact.distance_m[side][valid], height, atol=1e-7)
+        assert np.isinf(exact.distance_m[side][~valid]).all()
+        assert (exact.distance_m[side] <= sampled.distance_m[side] + 1e-9).all()
+    assert exact.hand_type == "right"
+
+
+def wrist_and_far_joints(clip: Clip, side: Side) -> np.ndarray:
+    joints = np.full((clip.n_frames, 21, 3), 3.0)
+    joints[:, 0] = clip.hands[side].wrist_m
+    return joints
+
+
+def test_the_surface_test_follows_the_objects_motion() -> None:
+    still = clip("toy/2", HEIGHTS_M["toy/2"], 6)
+    joints: dict[Side, np.ndarray] = {side: wrist_and_far_joints(still, side) for side in SIDES}
+    shift = np.linspace(0, 0.3, 6, dtype=np.float32)[:, None] * np.array([1, 0, 0], np.float32)
+    moved = replace(still, object=replace(still.object, translation_m=shift))
+    carried: dict[Side, np.ndarray] = {side: joints[side] + shift[:, None] for side in SIDES}
+    index = surface_index(still.object.model)
+    for side in SIDES:
+        np.testing.assert_allclose(
+            acting_hands_at_surface(moved, carried, index).distance_m[side],
+            acting_hands_at_surface(still, joints, index).distance_m[side],
+            atol=1e-7,
+        )
+    with pytest.raises(BadInput, match="at least the threshold"):
+        acting_hands_at_surface(still, joints, index, 0.02, most_m=0.01)
