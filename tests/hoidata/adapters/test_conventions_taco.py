@@ -192,10 +192,10 @@ def write_seated(root: Path, person) -> RawTree:
     for side, (orient, angles, wrist_m) in person.hands.items():
         frame = {"hand_pose": torch.tensor([*orient, *angles]), "hand_trans": torch.tensor(wrist_m)}
         (poses / f"{side}_hand.pkl").write_bytes(pickle.dumps({str(number + 1): frame for number in range(N_FRAMES)}))
-    at_the_wrist = next(iter(person.hands.values()))[2]
-    np.save(things / "tool_031.npy", matrices(person.object_orient, at_the_wrist, 0.0))
-    edges_cm = np.array([[-10.0, 0.0, 0.0], [0.0, 8.0, 0.0], [0.0, 0.0, 5.0]]) * person.signs
-    lines = [f"v {x} {y} {z}" for x, y, z in np.concatenate((np.zeros((1, 3)), edges_cm))]
+    np.save(things / "tool_031.npy", matrices(person.object_orient, person.hands["right"][2], 0.0))
+    # The first edge is held in its middle: a wrist that is a few centimetres off along it still touches.
+    corners_cm = np.array([[20.0, 0.0, 0.0], [-20.0, 0.0, 0.0], [20.0, 8.0, 0.0], [20.0, 0.0, 5.0]]) * person.signs
+    lines = [f"v {x} {y} {z}" for x, y, z in corners_cm]
     (root / "Object_Models" / "031_cm.obj").write_text("\n".join([*lines, "f 1 3 2", "f 1 2 4", "f 2 3 4", "f 3 1 4"]))
     return RawTree(root)
 
@@ -206,6 +206,7 @@ def look(tmp_path, hands, formula):
 
     def of(person):
         (seen,) = TacoAdapter(margin_frames=N_FRAMES).load(write_seated(tmp_path, person), KEY, hands)
+        assert isinstance(seen, Clip)
         spoon = corners(seen.object)
         return {side: clip_joints(seen, side, hands, formula) for side in SIDES}, spoon[1:4] - spoon[0]
 
