@@ -13,7 +13,7 @@ from hoidata.objects.sampling import sample_points
 from hoidata.quality import motion
 from hoidata.quality.meshes import SurfaceFacts, part_faces, part_facts
 from hoidata.quality.penetration import depths_m, object_frame
-from hoidata.quality.shape import largest_beta
+from hoidata.quality.shape import largest_beta, meant_betas
 from hoidata.quality.thresholds import Thresholds
 from hoidata.quality.timing import ObjectMotion, time_offset
 from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
@@ -79,7 +79,7 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
         **_frozen(clip, joints, corners),
         **_penetration(clip, facts, hands, thresholds),
         **_offset(clip, joints, facts, thresholds),
-        "largest_beta": max((largest_beta(clip.hands[side].betas) for side in seen), default=NAN),
+        "largest_beta": max((largest_beta(meant_betas(clip.hands[side])) for side in seen), default=NAN),
         "gap_share": max(motion.gap_share(flags) for flags in valid.values()),
         "handless_share": float((~(valid["left"] | valid["right"])).mean()),
         **{f"{side}_invalid_share": float((~flags).mean()) for side, flags in valid.items()},

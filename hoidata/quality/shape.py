@@ -4,6 +4,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hoidata.schema.clip import HandTrack
+
+
+def meant_betas(track: HandTrack) -> np.ndarray:
+    """(row, 10) betas of the frames in which the hand is valid; what stands in the others means nothing."""
+    return track.betas if len(track.betas) == 1 else track.betas[track.valid]
+
 
 def largest_beta(betas: np.ndarray) -> float:
     """Largest ``|beta|`` of (row, 10), standard deviations. Zero for a personal template, which replaces the shape."""

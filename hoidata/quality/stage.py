@@ -24,7 +24,7 @@ from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.quality.measures import ObjectFacts, clip_row, object_row
-from hoidata.quality.shape import distances_to_others
+from hoidata.quality.shape import distances_to_others, meant_betas
 from hoidata.quality.thresholds import (
     CLIP_MEASURES,
     MESH_MEASURES,
@@ -160,7 +160,7 @@ def _add_beta_distances(store: Store, rows: list[dict[str, Any]]) -> None:
     for _, clips in store.sequences.groupby("subject", sort=False):
         for side in SIDES:
             shown = clips[(clips[f"{side}_valid_frames"] > 0) & clips[f"{side}_template"].isna()]
-            betas = {clip_id: store.clip(clip_id).hands[side].betas for clip_id in shown["clip_id"]}
+            betas = {clip_id: meant_betas(store.clip(clip_id).hands[side]) for clip_id in shown["clip_id"]}
             for clip_id, distance in distances_to_others(betas).items():
                 worst[clip_id].append(distance)
     for row in rows:

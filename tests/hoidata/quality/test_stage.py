@@ -31,6 +31,14 @@ def with_betas(clip: Clip, value: float) -> Clip:
     return replace(clip, hands={side: replace(track, betas=betas) for side, track in clip.hands.items()})
 
 
+def lost(clip: Clip, value: float, frames: slice) -> Clip:
+    """Betas per frame; no right hand in some frames, and numbers of another shape there."""
+    track = clip.hands["right"]
+    betas, valid = np.full((FRAMES, 10), 0.3, np.float32), np.ones(FRAMES, bool)
+    betas[frames], valid[frames] = value, False
+    return replace(clip, hands={**clip.hands, "right": replace(track, betas=betas, valid=valid)})
+
+
 def jumping(clip: Clip) -> Clip:
     place = clip.object.translation_m.copy()
     place[30:] += 0.5
@@ -135,6 +143,16 @@ def test_personal_templates_have_no_shape_to_compare(make_clip, tmp_path):
     rows, _ = tables(tmp_path / "quality")
     assert rows["beta_distance"].isna().all()
     assert rows["largest_beta"].tolist() == [0, 0, 0, 0]
+
+
+def test_shapes_of_frames_without_the_hand_are_not_read(make_clip, tmp_path):
+    clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(4)]
+    clips[2] = lost(clips[2], 50.0, slice(10, 50))
+    write_store(tmp_path / "clips", clips, generated_info("test"))
+    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
+    rows, _ = tables(tmp_path / "quality")
+    assert rows["largest_beta"].tolist() == pytest.approx([0.3] * 4)
+    assert rows["beta_distance"].tolist() == pytest.approx([0.0] * 4, abs=1e-6)
 
 
 def test_store_without_clips_gives_empty_tables(tmp_path):
