@@ -5,7 +5,7 @@ import importlib
 import os
 import sys
 
-STAGES = ("raw", "convert", "quality", "annotate", "contact", "split", "train", "evaluate", "report")
+STAGES = ("raw", "convert", "quality", "annotate", "contact", "surface", "split", "train", "evaluate", "report")
 
 
 def main() -> int:

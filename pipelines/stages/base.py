@@ -74,6 +74,10 @@ class Place:
         return self.data / "contact"
 
     @property
+    def surface(self) -> Path:
+        return self.data / "surface"
+
+    @property
     def splits(self) -> Path:
         return self.data / "splits"
 

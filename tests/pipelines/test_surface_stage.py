@@ -1,0 +1,85 @@
+"""Stage surface in the pipeline: its settings, what quality control left out, and turning it off."""
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hoidata.contact.surface_stage import TOUCH_M
+from hoidata.contact.surface_store import open_surface
+from hoidata.errors import BadInput, MissingResource
+from hoidata.objects.sampling import POINT_COUNT
+from hoidata.schema.info import generated_info
+from hoidata.schema.store import write_store
+from pipelines.stages import quality, surface
+from pipelines.stages.base import Place, empty_reason, write_empty
+
+PROJECT = Path(__file__).parents[2]
+PLACE = Place("embedded", "grab")
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """Params and hand manifest in the current folder; few points."""
+    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    params["surface"]["points"] = 64
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
+    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
+    monkeypatch.chdir(tmp_path)
+    return params
+
+
+def with_surface(params: dict, **settings) -> None:
+    Path("params.yaml").write_text(yaml.safe_dump({**params, "surface": {**params["surface"], **settings}}))
+
+
+def test_params_hold_the_defaults_of_the_library():
+    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    assert params["surface"] == {"enabled": True, "touch_m": TOUCH_M, "points": POINT_COUNT}
+    assert params["surface"]["points"] == params["contact"]["points"]
+
+
+def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_its_reason(project, make_clip, capsys):
+    clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
+    place = clips[1].object.translation_m.copy()
+    place[20:] += 0.5
+    clips[1] = replace(clips[1], object=replace(clips[1].object, translation_m=place))
+    write_store(PLACE.clips, clips, generated_info("grab"))
+    quality.run(PLACE)
+    surface.run(PLACE)
+    store = open_surface(PLACE.surface)
+    assert store.ids == ["test/s1/0"]
+    assert store.info["points"] == 64
+    assert store.touched("test/s1/0", "right").any()
+    assert store.clips.at["test/s1/1", "reason"].startswith("left out by quality control: largest sudden step")
+    assert "2 clips, 1 left_out, 40 frames" in capsys.readouterr().out
+
+
+def test_quality_control_has_to_run_first(project, make_clip):
+    write_store(PLACE.clips, [make_clip(4)], generated_info("grab"))
+    with pytest.raises(MissingResource, match="run the stage 'quality'"):
+        surface.run(PLACE)
+
+
+def test_empty_dataset_passes_through_and_the_stage_can_be_turned_off(project, make_clip):
+    write_empty(PLACE.clips, "grab is not present")
+    surface.run(PLACE)
+    assert empty_reason(PLACE.surface) == "grab is not present"
+    shutil.rmtree(PLACE.clips)
+    write_store(PLACE.clips, [make_clip(4)], generated_info("grab"))
+    with_surface(project, enabled=False)
+    surface.run(PLACE)
+    assert empty_reason(PLACE.surface) == "surface.enabled is false in params.yaml"
+
+
+def test_unknown_setting_is_named_and_a_threshold_of_nothing_refused(project, make_clip):
+    write_store(PLACE.clips, [make_clip(40)], generated_info("grab"))
+    with_surface(project, touch_mm=5)
+    with pytest.raises(BadInput, match="touch_mm"):
+        surface.run(PLACE)
+    quality.run(PLACE)
+    with_surface(project, touch_m=0)
+    with pytest.raises(BadInput, match=r"surface\.touch_m"):
+        surface.run(PLACE)
