@@ -50,8 +50,9 @@ def _scan_dataset(place, root: Path):
         remedy = f"add {place.dataset} to `datasets` in params.yaml"
         raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
     _ensure_manifests(adapter)
+    # First what was asked about, then what it needs besides.
+    _require_parts(adapter, root, also=_hand_problem(place))
     require_hand(place)
-    _require_parts(adapter, root)
     return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
 
 
@@ -66,8 +67,23 @@ def _ensure_manifests(adapter) -> None:
             write_manifest(path, absent_manifest(adapter))
 
 
-def _require_parts(adapter, root: Path) -> None:
-    """Refuse a folder in which a required part is missing; name optional ones. Both with where to get them."""
+def _hand_problem(place) -> str:
+    """What is missing of the MANO files the dataset needs; nothing where all is well."""
+    from hoidata.errors import MissingResource
+    from pipelines.stages.raw import require_hand
+
+    try:
+        require_hand(place)
+    except MissingResource as error:
+        return str(error)
+    return ""
+
+
+def _require_parts(adapter, root: Path, also: str = "") -> None:
+    """Refuse a folder in which a required part is missing; name optional ones. Both with where to get them.
+
+    also: another problem to name behind that of the folder.
+    """
     from hoidata.errors import BadInput
     from hoidata.lineage.manifests import missing_parts
 
@@ -77,6 +93,7 @@ def _require_parts(adapter, root: Path) -> None:
         what = "; ".join(f"{part.what} ({part.patterns[0]}, from {part.where})" for part in required)
         got = f"no {what}" if what else "none"
         remedy = f"give the folder that {adapter.name} unpacks to; register at {adapter.where_to_register}"
+        remedy += f". Besides, {also}" if also else ""
         raise BadInput(root, f"sequences of {adapter.name}", got, remedy)
     for part in missing:
         typer.echo(f"{adapter.name}: without {part.what} ({part.patterns[0]}), to be had from {part.where}")
@@ -105,36 +122,54 @@ def _scan_hand(place, root: Path):
 
 @app.command()
 def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
-    """Compare raw files with the manifests of the current profile. Exit code 1 when they differ."""
+    """Compare raw files with the manifests of the current profile. Exit code 1 when they differ or are not there."""
     enter_project()
     from hoidata.lineage.graph import read_params
 
-    results = [_verify_one(name) for name in ([dataset] if dataset else read_params(Path())["datasets"])]
+    names = [dataset] if dataset else read_params(Path())["datasets"]
+    results = [_verify_one(name, asked_for=bool(dataset)) for name in names]
     raise typer.Exit(0 if all(results) else 1)
 
 
-def _verify_one(dataset: str) -> bool:
-    """Print how one dataset's files compare with its manifest; True when there is nothing to complain about."""
-    from hoidata.lineage.manifests import read_manifest, verify_files
+def _verify_one(dataset: str, asked_for: bool) -> bool:
+    """Print how one dataset's files compare with its manifest; True when there is nothing to complain about.
+
+    asked_for: by name, so that its absence is a complaint.
+    """
+    from hoidata.errors import MissingResource
+    from hoidata.lineage.manifests import absent_manifest, read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.base import Place, raw_root
 
     place, adapter = Place(current_profile(), dataset), configured_adapter(dataset)
-    manifest = read_manifest(place.manifest)
+    manifest = read_manifest(place.manifest) if place.manifest.is_file() else absent_manifest(adapter)
     if not manifest.present:
-        typer.echo(f"{dataset}: not present; {manifest.licence}; {manifest.where_to_register}")
-        typer.echo(f"  once you have it: hoidata raw scan {dataset} --root FOLDER")
-        for part in adapter.parts:
-            typer.echo(f"  {part.what}: {part.where}{' (optional)' if part.optional else ''}")
-        return True
+        typer.echo(f"{dataset}: not present in the profile {place.profile}: no raw files were scanned")
+        _say_where_to_get(adapter)
+        return not asked_for
+    try:
+        root = raw_root(place)
+    except MissingResource as error:
+        typer.echo(f"{dataset}: {error}")
+        _say_where_to_get(adapter)
+        return False
     listed = read_manifest(place.raw_manifest) if manifest.synthetic else manifest
-    differences = verify_files(raw_root(place), listed, adapter.parts)
+    differences = verify_files(root, listed, adapter.parts)
     for item in differences[:SHOWN_DIFFERENCES]:
         typer.echo(f"{dataset}: {item.path} is {item.problem}{_where_to_get(adapter, item.path)}")
     if len(differences) > SHOWN_DIFFERENCES:
         typer.echo(f"{dataset}: and {len(differences) - SHOWN_DIFFERENCES} more")
     typer.echo(f"{dataset}: {len(listed.files)} entries, differences: {len(differences) or 'none'}")
     return not differences
+
+
+def _say_where_to_get(adapter) -> None:
+    """The parts a copy consists of and where each is to be had, the licence, and what to do once they are here."""
+    typer.echo(f"  {adapter.licence}; {adapter.where_to_register}")
+    for part in adapter.parts:
+        optional = " (optional)" if part.optional else ""
+        typer.echo(f"  missing: {part.what} ({part.patterns[0]}), from {part.where}{optional}")
+    typer.echo(f"  once you have it: hoidata raw scan {adapter.name} --root FOLDER")
 
 
 def _where_to_get(adapter, path: str) -> str:

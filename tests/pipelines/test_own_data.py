@@ -6,7 +6,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from typer.testing import CliRunner, Result
 
+from hoidata.adapters import get_adapter
+from hoidata.errors import BadInput, MissingResource
+from pipelines.cli import app
 from pipelines.stages.base import Place, load_params
 from pipelines.stages.train import TrainParams
 
@@ -57,9 +61,81 @@ def test_a_folder_without_sequences_is_not_registered(project, tmp_path, project
     assert not manifest(project, "manipnet")["present"]
 
 
-def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
-    from hoidata.errors import BadInput
+def hoidata(*words: str) -> Result:
+    """The command in this process and in the current folder."""
+    return CliRunner().invoke(app, words)
 
+
+@pytest.fixture
+def here(project, monkeypatch) -> Path:
+    for name in [name for name in os.environ if name.startswith("HOIDATA_")]:
+        monkeypatch.delenv(name)
+    monkeypatch.chdir(project)
+    return project
+
+
+def set_own(folder: Path, present: str = "") -> None:
+    """Profile own, in which one dataset was scanned."""
+    params = folder / "params.yaml"
+    params.write_text(params.read_text().replace("profile: embedded", "profile: own"))
+    if present:
+        path = folder / "manifests/own" / f"{present}.json"
+        path.write_text(path.read_text().replace('"present": false', '"present": true'))
+
+
+@pytest.mark.parametrize("name", ["grab", "taco"])  # taco: not even named in params.yaml
+def test_verifying_a_dataset_that_is_absent_fails_with_what_is_missing_and_where_it_is_to_be_had(here, name):
+    set_own(here)
+    result = hoidata("raw", "verify", name)
+    adapter = get_adapter(name)
+    for words in (f"{name}: not present", adapter.licence, adapter.where_to_register, f"raw scan {name} --root"):
+        assert words in result.stdout
+    for part in adapter.parts:
+        assert f"missing: {part.what}" in result.stdout
+        assert part.where in result.stdout
+    assert result.exit_code == 1
+
+
+def test_verifying_whatever_is_there_does_not_complain_of_what_is_not(here):
+    set_own(here)
+    result = hoidata("raw", "verify")
+    assert result.exit_code == 0
+    assert "grab: not present" in result.stdout
+
+
+def test_verifying_files_whose_folder_is_gone_fails_with_where_they_are_to_be_had(here):
+    set_own(here, present="grab")
+    for words in (["raw", "verify", "grab"], ["raw", "verify"]):
+        result = hoidata(*words)
+        assert result.exit_code == 1
+        for part in ("HOIDATA_GRAB", "object_meshes.zip", "https://grab.is.tue.mpg.de"):
+            assert part in result.stdout
+
+
+def test_scanning_speaks_of_the_dataset_before_it_speaks_of_mano(here, tmp_path):
+    params = yaml.safe_load((here / "params.yaml").read_text())
+    params["datasets"].append("taco")
+    (here / "params.yaml").write_text(yaml.safe_dump(params))
+    root = tmp_path / "taco"
+    root.mkdir()
+    empty = hoidata("raw", "scan", "taco", "--root", str(root)).exception
+    assert isinstance(empty, BadInput)
+    text = str(empty)
+    assert 0 < text.index("Hand_Poses.zip") < text.index("mano.is.tue.mpg.de")
+    for path in (
+        "Hand_Poses/(a, b, c)/1_1/left_hand.pkl",
+        "Object_Poses/(a, b, c)/1_1/x.npy",
+        "Object_Models/1_cm.obj",
+    ):
+        (root / path).parent.mkdir(parents=True, exist_ok=True)
+        (root / path).write_bytes(b"")
+    complete = hoidata("raw", "scan", "taco", "--root", str(root)).exception
+    assert isinstance(complete, MissingResource)
+    assert str(complete).startswith("taco holds MANO parameters and no MANO files are registered")
+    assert not manifest(here, "taco")["present"]
+
+
+def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
     path = project / "params.yaml"
     values = yaml.safe_load(path.read_text())
     values["train"]["sizes"] = 3
