@@ -39,8 +39,11 @@ class SignedDistance:
 
 
 @dataclass(frozen=True)
-class _Surface:
-    """Coinciding vertices merged, collapsed triangles left out; ``kept`` maps back to the caller's face indices."""
+class MergedSurface:
+    """Coinciding vertices merged, collapsed triangles left out; ``kept`` maps back to the caller's face indices.
+
+    vertices_m: (vertex, 3) float64; faces: (face, 3) int64.
+    """
 
     vertices_m: np.ndarray
     faces: np.ndarray
@@ -52,7 +55,7 @@ def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarr
 
     Raises BadInput for a mesh without triangles of positive area or with numbers that are not finite.
     """
-    surface = _surface(vertices_m, faces)
+    surface = merged_surface(vertices_m, faces)
     parts = [
         igl.point_mesh_squared_distance(chunk, surface.vertices_m, surface.faces)[:3] for chunk in _chunks(points_m)
     ]
@@ -67,8 +70,8 @@ def signed_distance(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndar
     turned inside out is turned back.
     Raises BadInput as :func:`closest_points` does.
     """
-    surface = _surface(vertices_m, faces)
-    closed = _is_closed(surface.faces)
+    surface = merged_surface(vertices_m, faces)
+    closed = is_closed(surface.faces)
     if _is_inside_out(surface, closed):
         surface = replace(surface, faces=np.ascontiguousarray(surface.faces[:, ::-1]))
     kinds = igl.SignedDistanceType
@@ -87,7 +90,8 @@ def face_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return cross / np.where(length > 0, length, 1.0)
 
 
-def _surface(vertices_m: np.ndarray, faces: np.ndarray) -> _Surface:
+def merged_surface(vertices_m: np.ndarray, faces: np.ndarray) -> MergedSurface:
+    """Vertices that coincide taken as one. Raises BadInput as :func:`closest_points` does."""
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
     if not np.isfinite(vertices).all():
         raise BadInput("object mesh", "finite vertices", "NaN or infinity", "repair the mesh")
@@ -99,10 +103,10 @@ def _surface(vertices_m: np.ndarray, faces: np.ndarray) -> _Surface:
         raise BadInput(
             "object mesh", "at least one triangle", f"{len(merged)} faces, none with area", "repair the mesh"
         )
-    return _Surface(unique, np.ascontiguousarray(merged[kept]), kept)
+    return MergedSurface(unique, np.ascontiguousarray(merged[kept]), kept)
 
 
-def _is_closed(faces: np.ndarray) -> bool:
+def is_closed(faces: np.ndarray) -> bool:
     """Every directed edge is met by its opposite exactly as often: a closed, consistently oriented surface."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     size = int(faces.max()) + 1
@@ -111,7 +115,7 @@ def _is_closed(faces: np.ndarray) -> bool:
     return bool(np.array_equal(forward, backward))
 
 
-def _is_inside_out(surface: _Surface, closed: bool) -> bool:
+def _is_inside_out(surface: MergedSurface, closed: bool) -> bool:
     """Negative volume: more than rounding of it (two opposite shells enclose nothing), or where the surface is open
     and its volume vague, more than 1 % of the bounding box.
     """

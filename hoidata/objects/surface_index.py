@@ -1,7 +1,8 @@
 """One object's surface, ready for many questions: is a place nearer than a threshold, how far is it, how deep inside.
 
 Places are given in the object frame; each part answers in its own rest frame, where its surface never changes, so one
-index serves every frame of every clip at every hinge angle.
+index serves every frame of every clip at every hinge angle. All answers are exact: a grid of distances only saves
+looking at triangles, and is made when an object is asked about so often that this pays.
 """
 
 import hashlib
@@ -11,15 +12,19 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.objects.distance import closest_points, signed_distance
+from hoidata.objects.distance import merged_surface
+from hoidata.objects.distance_grid import distance_grid, lower_distances, mark_within, no_grid, raise_depths
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.solid import NoSolid, Solid, solid_of
+from hoidata.objects.triangle_tree import triangle_tree
 
+GRID_PAYS_FROM = 1_000_000  # places; a grid takes 0.1-0.5 s and saves 0.05 us (within) to 0.3 us (depth) on each
 _KEPT = 8
 _indices: OrderedDict[str, "SurfaceIndex"] = OrderedDict()
 
 
 def surface_index(model: ObjectModel) -> "SurfaceIndex":
-    """The index of a model; the few used last are kept, by what the mesh, its parts and its hinge are."""
+    """The index of a model; those used last are kept in memory, by what mesh, parts and hinge are."""
     key = _digest(model)
     if key not in _indices:
         _indices[key] = SurfaceIndex(model)
@@ -30,23 +35,40 @@ def surface_index(model: ObjectModel) -> "SurfaceIndex":
 
 
 class SurfaceIndex:
-    """The surface of one object; of a hinged one that of both parts, at the angle each frame has.
+    """The surface of one object; of a hinged one that of both parts, at the angle of each frame.
 
-    solid_note: None, or a sentence about parts that enclose no solid, so that nothing can be inside them.
+    solids: by part, the solid it bounds, or why there is none. solid_note: None where every part is one as it is, else
+    a sentence that says what was repaired or left out of depths. grid_from: a part gets its grid when it is asked about
+    more places than this. Raises BadInput for a part without triangles.
     """
 
-    def __init__(self, model: ObjectModel) -> None:
+    def __init__(self, model: ObjectModel, grid_from: int = GRID_PAYS_FROM) -> None:
         self.model = model
-        self.parts = [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
-        self._faces = {part: self._part_faces(part) for part in self.parts}
-        self.solid_note: str | None = None
+        faces = {part: _faces_of(model, part) for part in _parts(model)}
+        self.solids = {part: solid_of(model.vertices_m, own) for part, own in faces.items()}
+        self.solid_note = _note(model, self.solids)
+        self._surfaces: dict[int, _Surface] = {}
+        self._closed: dict[int, _Surface] = {}
+        for part, solid in self.solids.items():
+            if isinstance(solid, Solid):
+                self._closed[part] = _Surface(solid.vertices_m, solid.faces, True, grid_from)
+            if isinstance(solid, Solid) and not solid.patched:
+                self._surfaces[part] = self._closed[part]
+            else:
+                merged = merged_surface(model.vertices_m, faces[part])
+                self._surfaces[part] = _Surface(merged.vertices_m, merged.faces, False, grid_from)
 
     def within(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, threshold_m: float) -> np.ndarray:
         """(frame, place) bool: the distance to the surface is less than ``threshold_m``.
 
         places_m: (frame, place, 3), object frame, metres. hinge_rad: (frame,) for a hinged object, else None.
+        Places that are not finite are not within.
         """
-        return self.distance_m(places_m, hinge_rad) < threshold_m
+        within = np.zeros(places_m.shape[:2], bool)
+        for part, surface in self._surfaces.items():
+            places = self._in_part(places_m, hinge_rad, part)
+            mark_within(surface.tree, surface.grid_for(places), places, float(threshold_m), within.reshape(-1))
+        return within
 
     def distance_m(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, most_m: float = np.inf) -> np.ndarray:
         """(frame, place) float64 distance to the surface, metres, never negative; infinite where it exceeds ``most_m``.
@@ -54,44 +76,87 @@ class SurfaceIndex:
         Arguments as in ``within``.
         """
         distance = np.full(places_m.shape[:2], np.inf)
-        for part in self.parts:
-            local = self._local(places_m, hinge_rad, part)
-            found = closest_points(self.model.vertices_m, self._faces[part], local.reshape(-1, 3))
-            np.minimum(distance, found.distance_m.reshape(distance.shape), out=distance)
-        return np.where(distance <= most_m, distance, np.inf)
+        for part, surface in self._surfaces.items():
+            places = self._in_part(places_m, hinge_rad, part)
+            lower_distances(surface.tree, surface.grid_for(places), places, float(most_m), distance.reshape(-1))
+        return distance
 
     def depth_m(self, places_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
-        """(frame, place) float64 metres inside the solid, 0 outside; of two parts, how deep in the one it is deeper in.
+        """(frame, place) float64 distance to the surface for places inside the solid, metres, 0 outside.
 
-        Arguments as in ``within``. Raises BadInput where no part encloses a solid.
+        Inside is what the surface winds around (a cavity is outside, two shells that overlap count as one solid); of
+        two parts the one that it is deeper in counts. Arguments as in ``within``. Raises BadInput where no part
+        encloses a solid.
         """
+        self.check_solid()
         depth = np.zeros(places_m.shape[:2])
-        for part in self.parts:
-            local = self._local(places_m, hinge_rad, part)
-            found = signed_distance(self.model.vertices_m, self._faces[part], local.reshape(-1, 3))
-            np.maximum(depth, -found.distance_m.reshape(depth.shape), out=depth)
+        for part, surface in self._closed.items():
+            places = self._in_part(places_m, hinge_rad, part)
+            raise_depths(surface.tree, surface.grid_for(places), places, depth.reshape(-1))
         return depth
 
-    def _part_faces(self, part: int) -> np.ndarray:
-        return self.model.faces[self.model.face_part == part] if self.model.is_articulated else self.model.faces
+    def check_solid(self) -> None:
+        """Raises BadInput where no part encloses a solid, with the reason."""
+        if not self._closed:
+            why = "; ".join(sorted({solid.why for solid in self.solids.values() if isinstance(solid, NoSolid)}))
+            raise BadInput(f"mesh of {self.model.name!r}", "a mesh that encloses a solid", why, "repair the mesh")
 
-    def _local(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
-        """The places in the part's rest frame."""
-        places = np.asarray(places_m, dtype=np.float64)
-        hinge = self.model.hinge
-        if part == 0 or hinge is None:
-            return places
-        if hinge_rad is None:
-            raise BadInput(self.model.name, "hinge angles", "none", "give the angle of every frame")
-        turn = rotvec_to_rotmat(hinge.axis[None] * np.asarray(hinge_rad, dtype=np.float64)[:, None])
-        return (places - hinge.origin_m) @ turn + hinge.origin_m
+    def _in_part(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
+        """(frame x place, 3) places in the part's rest frame."""
+        return np.ascontiguousarray(in_part(self.model, places_m, hinge_rad, part).reshape(-1, 3))
+
+
+def in_part(model: ObjectModel, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
+    """Object-frame places (frame, place, 3) in the rest frame of a part, float64: the hinge undone for part 1."""
+    places, hinge = np.asarray(places_m, dtype=np.float64), model.hinge
+    if part == 0 or hinge is None:
+        return places
+    if hinge_rad is None:
+        raise BadInput(f"motion of {model.name!r}", "a hinge angle for every frame", "none", "give the angles")
+    turn = rotvec_to_rotmat(np.asarray(hinge.axis, dtype=np.float64) * np.asarray(hinge_rad, dtype=np.float64)[:, None])
+    return (places - hinge.origin_m) @ turn + hinge.origin_m
+
+
+class _Surface:
+    """One part's triangles in a tree, and their grid once it pays."""
+
+    def __init__(self, vertices_m: np.ndarray, faces: np.ndarray, closed: bool, grid_from: int) -> None:
+        self.tree, self.closed = triangle_tree(vertices_m, faces), closed
+        self._unasked, self._grid = grid_from, no_grid()
+
+    def grid_for(self, places_m: np.ndarray):
+        """The grid to answer about these places with."""
+        if self._unasked >= 0:
+            self._unasked -= len(places_m)
+            if self._unasked < 0:
+                self._grid = distance_grid(self.tree, self.closed)
+        return self._grid
+
+
+def _parts(model: ObjectModel) -> list[int]:
+    return [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
+
+
+def _faces_of(model: ObjectModel, part: int) -> np.ndarray:
+    return model.faces[model.face_part == part] if model.is_articulated else model.faces
+
+
+def _note(model: ObjectModel, solids: dict[int, Solid | NoSolid]) -> str | None:
+    """What was repaired, and what has no inside; None where there is nothing to say."""
+    said = []
+    for part, solid in solids.items():
+        name = f"part {part} of {model.name}" if len(solids) > 1 else model.name
+        if isinstance(solid, NoSolid):
+            said.append(f"{name} has no inside: {solid.why}")
+        elif solid.repairs:
+            said.append(f"{name}: {solid.repairs}")
+    return "; ".join(said) or None
 
 
 def _digest(model: ObjectModel) -> str:
     hinge = () if model.hinge is None else (model.hinge.axis, model.hinge.origin_m)
-    arrays = (model.vertices_m, model.faces, model.part, *hinge)
     digest = hashlib.sha256(model.name.encode())
-    for array in arrays:
+    for array in (model.vertices_m, model.faces, model.part, *hinge):
         digest.update(f"{array.dtype.str}{array.shape}".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.distance import _is_inside_out, _surface, closest_points, signed_distance
+from hoidata.objects.distance import _is_inside_out, closest_points, merged_surface, signed_distance
 
 
 def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -60,7 +60,7 @@ def test_two_opposite_shells_enclose_nothing_and_are_never_turned() -> None:
     faces = np.concatenate([sphere.faces, sphere.faces[:, ::-1]])
     for order in (faces, faces[::-1]):
         for shift in np.eye(3) / 3:
-            surface = _surface(sphere.vertices + shift, order)
+            surface = merged_surface(sphere.vertices + shift, order)
             assert not _is_inside_out(surface, closed=True)
 
 

@@ -1,0 +1,138 @@
+"""What a mesh encloses: as it is, or after small repairs that are said aloud.
+
+Repaired are triangles that lie double (a surface drawn once for each side), uneven orientation, surfaces turned inside
+out, and holes that a patch of 1 % of the surface closes. A cup drawn as one open sheet stays open: nothing says how
+thick it is.
+"""
+
+from typing import NamedTuple
+
+import igl
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from hoidata.objects.distance import is_closed, merged_surface
+
+LARGEST_PATCH = 0.01
+LEAST_SHARE = 1e-3  # of the convex hull: less is enclosed by two opposite sheets
+
+
+class Solid(NamedTuple):
+    """A closed surface, outward by the right-hand rule: vertices_m (vertex, 3), faces (face, 3).
+
+    repairs: what was changed, empty for a mesh taken as it is. patched: the surface has more than the mesh's triangles.
+    """
+
+    vertices_m: np.ndarray
+    faces: np.ndarray
+    repairs: str
+    patched: bool
+
+
+class NoSolid(NamedTuple):
+    """why: what keeps a mesh from having an inside, in words."""
+
+    why: str
+
+
+def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
+    """The solid that a mesh (vertex, 3), (face, 3) bounds, metres. Raises BadInput for a mesh without triangles."""
+    surface = merged_surface(vertices_m, faces)
+    vertices, found = surface.vertices_m, surface.faces
+    repairs = []
+    if not (is_closed(found) and encloses(vertices, found)):
+        single = _without_doubles(found)
+        if len(single) < len(found):
+            repairs.append(f"{len(found) - len(single)} triangles that lay double left out")
+        found = _evenly_turned(single)
+    holes = _holes(found)
+    patched = bool(holes)
+    if holes is None or not all(_is_small(vertices, found, hole) for hole in holes):
+        return NoSolid("it is open" if holes else "its triangles do not meet at their edges two by two")
+    if holes:
+        repairs.append(f"{len(holes)} small hole{'s' if len(holes) > 1 else ''} closed")
+        vertices, found = _patched(vertices, found, holes)
+    if not encloses(vertices, found):
+        return NoSolid("it encloses nothing")
+    if volume_m3(vertices, found) < 0:
+        repairs.append("turned outside out")
+        found = np.ascontiguousarray(found[:, ::-1])
+    return Solid(vertices, found, ", ".join(repairs), patched)
+
+
+def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
+    """Volume a closed surface encloses by the divergence theorem; negative when it is turned inside out."""
+    corners = (vertices_m - vertices_m.mean(axis=0))[faces]
+    return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+
+
+def encloses(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
+    """A closed surface holds more than 0.1 % of its convex hull."""
+    try:
+        hull = ConvexHull(vertices_m[np.unique(faces)]).volume
+    except (QhullError, ValueError):  # flat, or fewer than four points
+        return False
+    return abs(volume_m3(vertices_m, faces)) > LEAST_SHARE * hull
+
+
+def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mesh with every hole closed by a fan about the middle of its edge, whatever its size: a hand at its wrist.
+
+    The fans' middles come after the mesh's own vertices. Raises ValueError where holes share a vertex.
+    """
+    holes = _holes(faces)
+    if holes is None:
+        raise ValueError("triangles that do not meet at their edges two by two")
+    return _patched(vertices_m, faces, holes)
+
+
+def _without_doubles(faces: np.ndarray) -> np.ndarray:
+    """One triangle of each set of three vertices, the first."""
+    return faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
+
+
+def _evenly_turned(faces: np.ndarray) -> np.ndarray:
+    """Neighbours turned alike, unless they are already."""
+    return faces if is_closed(faces) else np.ascontiguousarray(igl.bfs_orient(faces)[0], dtype=np.int64)
+
+
+def _holes(faces: np.ndarray) -> list[np.ndarray] | None:
+    """Vertices around each hole, in the order a patch's triangles run; None where holes share a vertex."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = int(faces.max()) + 1
+    keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
+    found, number = np.unique(keys, return_inverse=True)
+    unmatched = np.bincount(number, np.repeat([1, -1], len(edges)), len(found))
+    stop, start = np.divmod(found[unmatched > 0], size)  # a patch runs against the triangles beside it
+    if unmatched.max(initial=0) > 1 or len(np.unique(start)) < len(start) or len(np.unique(stop)) < len(stop):
+        return None
+    after, holes = dict(zip(start.tolist(), stop.tolist(), strict=True)), []
+    while after:
+        hole = [min(after)]
+        while hole[-1] in after:
+            hole.append(after.pop(hole[-1]))
+        if hole.pop() != hole[0]:
+            return None
+        holes.append(np.array(hole))
+    return holes
+
+
+def _patch(hole: np.ndarray, middle: int) -> np.ndarray:
+    return np.stack([hole, np.roll(hole, -1), np.full(len(hole), middle)], axis=1)
+
+
+def _is_small(vertices_m: np.ndarray, faces: np.ndarray, hole: np.ndarray) -> bool:
+    around = np.concatenate([vertices_m[hole], [vertices_m[hole].mean(axis=0)]])
+    patch = _patch(np.arange(len(hole)), len(hole))
+    return bool(_area(around, patch) <= LARGEST_PATCH * _area(vertices_m, faces))
+
+
+def _area(vertices_m: np.ndarray, faces: np.ndarray) -> float:
+    a, b, c = (vertices_m[faces[:, corner]] for corner in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def _patched(vertices_m: np.ndarray, faces: np.ndarray, holes: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    middles = [vertices_m[hole].mean(axis=0) for hole in holes]
+    patches = [_patch(hole, len(vertices_m) + number) for number, hole in enumerate(holes)]
+    return np.concatenate([vertices_m, *(middle[None] for middle in middles)]), np.concatenate([faces, *patches])

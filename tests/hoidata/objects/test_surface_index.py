@@ -1,0 +1,219 @@
+"""Exact labels, distances and depths of the surface index against libigl, brute force and formulas."""
+
+import gzip
+import os
+from pathlib import Path
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.errors import BadInput
+from hoidata.objects.mesh import parse_obj
+from hoidata.objects.model import Hinge, ObjectModel, articulate
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
+
+ROOT = os.environ.get("HOIDATA_MANIPNET", "")
+AT_ONCE, NEVER = -1, 10**12  # from how many places on there is a grid
+THRESHOLD_M = 0.005
+CLEAR_M = 1e-12  # libigl's and our rounding may differ by less
+
+
+def rigid(mesh: trimesh.Trimesh, name: str = "object") -> ObjectModel:
+    return ObjectModel(name, np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.vertices), np.uint8))
+
+
+def bumpy_torus() -> trimesh.Trimesh:
+    torus = trimesh.creation.torus(0.05, 0.02, major_sections=40, minor_sections=24)
+    torus.vertices += 0.004 * np.sin(60 * torus.vertices[:, ::-1])
+    return torus
+
+
+MESHES = {
+    "box": trimesh.creation.box((0.06, 0.04, 0.1)),
+    "plate of 2 mm": trimesh.creation.box((0.15, 0.12, 0.002)),
+    "needle": trimesh.creation.cylinder(0.0005, 0.2, sections=5),
+    "bumpy torus": bumpy_torus(),
+    "cone": trimesh.creation.cone(0.03, 0.12, sections=60),
+}
+
+
+def queries(vertices_m: np.ndarray, count: int, seed: int = 0) -> np.ndarray:
+    """Places all round a mesh: a quarter in its box, a quarter at its vertices, the rest at the threshold."""
+    rng = np.random.default_rng(seed)
+    low, high = vertices_m.min(axis=0) - 0.03, vertices_m.max(axis=0) + 0.03
+    spread = rng.uniform(low, high, (count // 4, 3))
+    corners = vertices_m[rng.integers(len(vertices_m), size=count - len(spread))]
+    away = rng.normal(size=corners.shape)
+    away *= rng.uniform(0, 2 * THRESHOLD_M, (len(corners), 1)) / np.linalg.norm(away, axis=1, keepdims=True)
+    along = corners[rng.permutation(len(corners))]
+    share = np.where(rng.random((len(corners), 1)) < 0.5, 0, rng.random((len(corners), 1)))
+    return np.concatenate([spread, corners + share * (along - corners) + away])
+
+
+def igl_distance(model: ObjectModel, places_m: np.ndarray) -> np.ndarray:
+    return np.sqrt(igl.point_mesh_squared_distance(places_m, model.vertices_m, model.faces.astype(np.int64))[0])
+
+
+def brute_distance(corners_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
+    """(place,) float64 distances to triangles (face, 3, 3): the plane where the foot is inside, else three segments."""
+    a = corners_m[None]
+    best = np.full((len(places_m), len(corners_m)), np.inf)
+    for start, stop in ((0, 1), (1, 2), (2, 0)):
+        way = a[:, :, stop] - a[:, :, start]
+        from_start = places_m[:, None] - a[:, :, start]
+        along = np.clip((from_start * way).sum(-1) / (way**2).sum(-1), 0, 1)
+        best = np.minimum(best, np.linalg.norm(from_start - along[..., None] * way, axis=-1))
+    normal = np.cross(a[:, :, 1] - a[:, :, 0], a[:, :, 2] - a[:, :, 0])
+    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    height = ((places_m[:, None] - a[:, :, 0]) * normal).sum(-1)
+    foot = places_m[:, None] - height[..., None] * normal
+    inside = np.ones(height.shape, bool)
+    for start, stop in ((0, 1), (1, 2), (2, 0)):
+        inside &= (np.cross(a[:, :, stop] - a[:, :, start], foot - a[:, :, start]) * normal).sum(-1) >= 0
+    return np.where(inside, np.minimum(best, np.abs(height)), best).min(axis=1)
+
+
+@pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
+@pytest.mark.parametrize("name", MESHES)
+def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
+    model = rigid(MESHES[name])
+    index, places = SurfaceIndex(model, grid_from), queries(model.vertices_m, 24_000)
+    expected = igl_distance(model, places)
+    assert (np.abs(expected - THRESHOLD_M) < 0.002).mean() > 0.1
+    clear = np.abs(expected - THRESHOLD_M) > CLEAR_M
+    np.testing.assert_array_equal(
+        (expected < THRESHOLD_M)[clear], index.within(places[None], None, THRESHOLD_M)[0][clear]
+    )
+    np.testing.assert_allclose(index.distance_m(places[None], None)[0], expected, atol=1e-14)
+    near = index.distance_m(places[None], None, 0.02)[0]
+    np.testing.assert_array_equal(np.isinf(near), expected > 0.02)
+    np.testing.assert_allclose(near[expected <= 0.02], expected[expected <= 0.02], atol=1e-14)
+
+
+def test_distances_equal_brute_force() -> None:
+    model = rigid(MESHES["bumpy torus"])
+    places = queries(model.vertices_m, 400, seed=1)
+    expected = brute_distance(model.vertices_m[model.faces], places)
+    for grid_from in (AT_ONCE, NEVER):
+        found = SurfaceIndex(model, grid_from).distance_m(places[None], None)[0]
+        np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+def test_a_grid_changes_no_bit_of_any_answer() -> None:
+    model = rigid(MESHES["bumpy torus"])
+    with_grid, without = SurfaceIndex(model, AT_ONCE), SurfaceIndex(model, NEVER)
+    places = queries(model.vertices_m, 5000, seed=2)[None]
+    for ask in (lambda i: i.distance_m(places, None), lambda i: i.depth_m(places, None)):
+        np.testing.assert_array_equal(ask(with_grid), ask(without))
+    for threshold_m in (1e-6, 0.001, 0.02, 0.1):
+        np.testing.assert_array_equal(
+            with_grid.within(places, None, threshold_m), with_grid.distance_m(places, None) < threshold_m
+        )
+
+
+def test_a_distance_equal_to_the_threshold_is_not_within_and_one_equal_to_the_most_is_kept() -> None:
+    model = rigid(trimesh.creation.box((0.5, 0.5, 0.5)))
+    places = np.array([[[0.0, 0.0, 0.5], [0.0, 0.0, 0.25]]])
+    for grid_from in (AT_ONCE, NEVER):
+        index = SurfaceIndex(model, grid_from)
+        np.testing.assert_array_equal(index.within(places, None, 0.25), [[False, True]])
+        np.testing.assert_array_equal(index.distance_m(places, None, 0.25), [[0.25, 0]])
+        np.testing.assert_array_equal(index.distance_m(places, None, 0.0), [[np.inf, 0]])
+        np.testing.assert_array_equal(index.within(places, None, 0.0), [[False, False]])
+
+
+def laptop() -> ObjectModel:
+    """Two plates, the upper turned by a slanted hinge."""
+    base = trimesh.creation.box((0.2, 0.15, 0.01))
+    lid = trimesh.creation.box((0.2, 0.15, 0.004))
+    lid.vertices += (0, 0, 0.008)
+    part = np.repeat([0, 1], [len(base.vertices), len(lid.vertices)]).astype(np.uint8)
+    axis = np.array([1, 0.1, 0.05]) / np.linalg.norm([1, 0.1, 0.05])
+    both = np.concatenate([base.vertices, lid.vertices])
+    faces = np.concatenate([base.faces, lid.faces + len(base.vertices)])
+    return ObjectModel("laptop", both, faces, part, Hinge(axis, np.array([0, 0.075, 0.006])))
+
+
+@pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
+def test_articulated_parts_are_right_at_every_angle(grid_from: int) -> None:
+    model, angles = laptop(), np.linspace(-2.5, 4, 40)
+    posed = articulate(model.vertices_m, model.part, model.hinge, angles)
+    places = np.stack([queries(vertices, 300, seed) for seed, vertices in enumerate(posed)])
+    index = SurfaceIndex(model, grid_from)
+    for ask in (index.distance_m, index.depth_m):
+        assert np.ptp(ask(places, angles), axis=1).min() > 0
+    found, inside = index.distance_m(places, angles), index.depth_m(places, angles)
+    within = index.within(places, angles, THRESHOLD_M)
+    for frame, vertices in enumerate(posed):
+        whole = ObjectModel("posed", vertices, model.faces, model.part)
+        expected = igl_distance(whole, places[frame])
+        np.testing.assert_allclose(found[frame], expected, atol=1e-12)
+        np.testing.assert_array_equal(within[frame], expected < THRESHOLD_M)
+        signed = [
+            igl.signed_distance(places[frame], vertices, model.faces[model.face_part == part].astype(np.int64))[0]
+            for part in (0, 1)
+        ]
+        np.testing.assert_allclose(inside[frame], np.maximum(-np.minimum(*signed), 0), atol=1e-12)
+
+
+def test_an_articulated_object_without_angles_is_refused() -> None:
+    with pytest.raises(BadInput, match="hinge angle"):
+        SurfaceIndex(laptop()).within(np.zeros((1, 1, 3)), None, THRESHOLD_M)
+
+
+def test_answers_do_not_change_when_object_and_places_move_or_are_mirrored() -> None:
+    mesh = MESHES["cone"]
+    places = queries(np.array(mesh.vertices), 3000, seed=5)
+    plain = (
+        SurfaceIndex(rigid(mesh)).distance_m(places[None], None)[0],
+        SurfaceIndex(rigid(mesh)).depth_m(places[None], None)[0],
+    )
+    turn = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix()
+    moved = ObjectModel(
+        "moved", mesh.vertices @ turn.T + [1, 2, -0.5], np.array(mesh.faces), np.zeros(len(mesh.vertices), np.uint8)
+    )
+    mirrored = ObjectModel(
+        "mirrored", mesh.vertices * [-1, 1, 1], mesh.faces[:, ::-1], np.zeros(len(mesh.vertices), np.uint8)
+    )
+    for model, own in ((moved, places @ turn.T + [1, 2, -0.5]), (mirrored, places * [-1, 1, 1])):
+        np.testing.assert_allclose(SurfaceIndex(model).distance_m(own[None], None)[0], plain[0], atol=1e-14)
+        np.testing.assert_allclose(SurfaceIndex(model).depth_m(own[None], None)[0], plain[1], atol=1e-14)
+
+
+def test_triangles_without_area_count_as_segments_and_places_without_numbers_are_nowhere() -> None:
+    """A needle folded flat: its corners are distinct, its area is zero."""
+    vertices = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.05, 0, 0], [0, 0.1, 0]])
+    model = ObjectModel("flat", vertices, np.array([[0, 1, 2], [0, 2, 3]]), np.zeros(4, np.uint8))
+    places = np.array([[[0.08, 0.0, 0.003], [0.05, -0.004, 0.0], [np.nan, 0, 0]]])
+    index = SurfaceIndex(model)
+    np.testing.assert_allclose(index.distance_m(places, None)[0], [0.003, 0.004, np.inf], atol=1e-17)
+    np.testing.assert_array_equal(index.within(places, None, 0.0035)[0], [True, False, False])
+
+
+def test_the_same_mesh_gives_the_same_index_and_another_hinge_another() -> None:
+    model = laptop()
+    again = ObjectModel(model.name, model.vertices_m.copy(), model.faces.copy(), model.part.copy(), model.hinge)
+    assert surface_index(model) is surface_index(again)
+    assert model.hinge is not None
+    other = ObjectModel(model.name, model.vertices_m, model.faces, model.part, Hinge(model.hinge.axis, np.zeros(3)))
+    assert surface_index(other) is not surface_index(model)
+
+
+@pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the meshes are not part of this repository")
+@pytest.mark.slow
+@pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
+def test_every_label_on_manipnet_s_meshes_equals_libigl_s(grid_from: int) -> None:
+    asked = 0
+    for path in sorted(Path(ROOT).glob("objects/*/*.obj.gz")):
+        mesh = parse_obj(gzip.open(path, "rt").read(), path)
+        model = ObjectModel(path.stem, 0.1 * mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
+        places = queries(model.vertices_m, 20_000)
+        expected = igl_distance(model, places)
+        index = SurfaceIndex(model, grid_from)
+        np.testing.assert_array_equal(index.within(places[None], None, THRESHOLD_M)[0], expected < THRESHOLD_M)
+        np.testing.assert_allclose(index.distance_m(places[None], None)[0], expected, atol=1e-12)
+        asked += len(places)
+    assert asked >= 300_000
