@@ -7,7 +7,7 @@ misspellings ("openning", "takes take") and its passives without an auxiliary ar
 import re
 
 from hoidata.annotation.grammar import Grammar, default_grammar
-from hoidata.annotation.sentences import FourSentences
+from hoidata.annotation.sentences import UNLABELLED_VERB, FourSentences
 from hoidata.schema import HandType
 
 HAND_WORDS: dict[HandType, str] = {"left": "left hand", "right": "right hand", "both": "both hands"}
@@ -23,14 +23,17 @@ JOINED = {
 SIZED = re.compile(r"(?:large|medium|small) (cube|cylinder|pyramid|sphere|torus)")
 
 
-def reference_sentences(verb: str, object_words: str, hand: HandType, grammar: Grammar | None = None) -> FourSentences:
+def reference_sentences(
+    verb: str | None, object_words: str, hand: HandType, grammar: Grammar | None = None
+) -> FourSentences:
     """Imperative, passive, subject and gerund form, in hoidata's order of forms.
 
-    verb, object_words: base forms as in ``four_sentences``. Example: "Place book with both hands." / "Book is placed
+    verb, object_words, errors: as in ``four_sentences``. Example: "Place book with both hands." / "Book is placed
     with both hands." / "Both hands place book." / "Placing book with both hands."
     """
     grammar = grammar or default_grammar()
-    forms, words = grammar.verb(verb), reference_words(object_words)
+    forms = grammar.verb(UNLABELLED_VERB if verb is None else verb)
+    words = reference_words(grammar.noun(object_words).base)
     hands = HAND_WORDS[hand]
     present = forms.base if hand == "both" else forms.third_singular
     return (

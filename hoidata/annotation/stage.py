@@ -5,14 +5,24 @@ The folder it writes is described in ``hoidata.schema.annotated``.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 
+from hoidata.annotation.clip_variations import (
+    ClipVariations,
+    VariationSettings,
+    Wording,
+    clip_variations,
+    hand_speed_m_s,
+)
 from hoidata.annotation.encoders import TextEncoder, load_encoder
+from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.hand_distances import write_hand_distances
+from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
 from hoidata.contact import CONTACT_THRESHOLD_M, HandEvidence, ProximityIndex, acting_hands
 from hoidata.contact.stage import sample_objects
@@ -25,6 +35,9 @@ from hoidata.objects.sampling import POINT_COUNT
 from hoidata.schema import SIDES, Clip, HandType, Side
 from hoidata.schema.store import Store, open_store
 
+Forms = Literal["paper", "reference"]
+# The form of a sentence beyond the four; hoidata.schema.annotated keeps it apart from them.
+VARIATION = "variation"
 HAND_TYPE_SOURCE = "proximity"
 _TEXT = pa.string()
 TEXT_TABLE = pa.schema([("clip_id", _TEXT), ("form", _TEXT), ("sentence", _TEXT), ("text_row", pa.int32())])
@@ -51,6 +64,7 @@ class _Annotated:
     evidence: HandEvidence
     sentences: FourSentences | None
     reason: str | None
+    wording: Wording | None = None
 
 
 def annotate_store(
@@ -62,51 +76,92 @@ def annotate_store(
     points: int = POINT_COUNT,
     hands: HandPair | None = None,
     left_out: Mapping[str, str] | None = None,
+    forms: Forms = "paper",
+    variations: VariationSettings | None = None,
+    features: str | Path | None = None,
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
 
-    encoder: a name for ``load_encoder``, or the encoder itself.
+    encoder: a name for ``load_encoder``, or the encoder itself. features: a folder that keeps text features between
+    runs (``DiskCachedEncoder``); it changes no output.
     threshold_m: a hand acts when one of its joints comes closer to one of ``points`` sampled points.
     hands: as in ``open_store``. Clips without an acting hand, or without a word for their object, are listed with that
     reason and get no sentence. left_out: the same for further clips: reasons by clip id, as quality control found them.
+    forms: the paper's four sentences as we write them, or as the reference does. variations: how many guarded
+    sentences follow those of each clip, by default none. Raises BadInput for other forms.
     Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing.
     """
+    if forms not in get_args(Forms):
+        raise BadInput("forms of the sentences", " or ".join(get_args(Forms)), repr(forms), "choose one of them")
     store = open_store(clips_folder, hands)
     encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
-    found = _annotate_clips(store, threshold_m, points, left_out or {})
-    named = [item for item in found if item.sentences]
-    sentences = list(dict.fromkeys(text for item in named for text in item.sentences or ()))
+    encoder = encoder if features is None else DiskCachedEncoder(encoder, features)
+    variations = variations or VariationSettings()
+    measured = variations.per_clip > 0 and variations.adverbs
+    found = _annotate_clips(store, threshold_m, points, left_out or {}, _Writer(forms, measured))
+    named = [item for item in found if item.wording]
+    varied = clip_variations([item.wording for item in named if item.wording], variations)
+    sentences = _distinct(named, varied)
     counts = _counts(found, sentences)
+    info = {
+        "encoder": encoder.identity,
+        "threshold_m": threshold_m,
+        "points": points,
+        "forms": forms,
+        "variations": {**asdict(variations), **varied.facts()},
+        "counts": counts,
+    }
     with atomic_folder(out_folder) as part:
         write_table(part / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
         write_hand_distances(part / "hand_distance.npz", [item.evidence for item in found])
-        write_table(part / "text.parquet", _text_rows(named, sentences), TEXT_TABLE)
+        write_table(part / "text.parquet", _text_rows(named, varied, sentences), TEXT_TABLE)
         _write_embeddings(part / "embeddings.npz", encoder, sentences)
-        info = {"encoder": encoder.identity, "threshold_m": threshold_m, "points": points, "counts": counts}
         (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
 
 
-def _annotate_clips(store: Store, threshold_m: float, points: int, left_out: Mapping[str, str]) -> list[_Annotated]:
+@dataclass(frozen=True)
+class _Writer:
+    """How clips are put into words. measured: whether speeds are wanted."""
+
+    forms: Forms
+    measured: bool
+
+    def sentences(self, clip: Clip, evidence: HandEvidence) -> tuple[FourSentences | None, str | None]:
+        """The clip's sentences, or None and the reason."""
+        if evidence.hand_type is None:
+            return None, _no_hand(evidence)
+        write = four_sentences if self.forms == "paper" else reference_sentences
+        try:
+            return write(clip.verb, clip.object_words, evidence.hand_type), None
+        except BadInput as error:
+            return None, str(error)
+
+    def wording(
+        self, clip: Clip, hand: HandType | None, taken: FourSentences | None, joints: Mapping[Side, np.ndarray]
+    ) -> Wording | None:
+        """What variations of the clip's sentences may say; None for a clip without sentences."""
+        if hand is None or taken is None:
+            return None
+        acting: list[Side] = [side for side in SIDES if hand in (side, "both")]
+        valid = {side: clip.hands[side].valid for side in acting}
+        speed = hand_speed_m_s({side: joints[side] for side in acting}, valid) if self.measured else None
+        return Wording(clip.clip_id, clip.verb, clip.object_words, hand, speed, taken)
+
+
+def _annotate_clips(
+    store: Store, threshold_m: float, points: int, left_out: Mapping[str, str], writer: _Writer
+) -> list[_Annotated]:
     indices = {name: ProximityIndex(cloud) for name, cloud in sample_objects(store, points).items()}
     found = []
     for clip_id in store.ids:
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        words = (None, left_out[clip_id]) if clip_id in left_out else _sentences(clip, evidence)
-        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *words))
+        words = (None, left_out[clip_id]) if clip_id in left_out else writer.sentences(clip, evidence)
+        wording = writer.wording(clip, evidence.hand_type, words[0], joints)
+        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *words, wording))
     return found
-
-
-def _sentences(clip: Clip, evidence: HandEvidence) -> tuple[FourSentences | None, str | None]:
-    """The clip's sentences, or None and the reason."""
-    if evidence.hand_type is None:
-        return None, _no_hand(evidence)
-    try:
-        return four_sentences(clip.verb, clip.object_words, evidence.hand_type), None
-    except BadInput as error:
-        return None, str(error)
 
 
 def _hand_row(item: _Annotated) -> dict:
@@ -130,12 +185,21 @@ def _no_hand(evidence: HandEvidence) -> str:
     return f"no joint within {evidence.threshold_m * 100:g} cm of the object; nearest {nearest * 100:.1f} cm"
 
 
-def _text_rows(named: Sequence[_Annotated], sentences: Sequence[str]) -> list[dict]:
+def _distinct(named: Sequence[_Annotated], varied: ClipVariations) -> list[str]:
+    """Every sentence once; those of the four forms first, whatever variations there are."""
+    formal = (text for item in named for text in item.sentences or ())
+    return list(dict.fromkeys([*formal, *(text for texts in varied.sentences.values() for text in texts)]))
+
+
+def _text_rows(named: Sequence[_Annotated], varied: ClipVariations, sentences: Sequence[str]) -> list[dict]:
     row_of = {sentence: row for row, sentence in enumerate(sentences)}
     return [
         {"clip_id": item.clip_id, "form": form, "sentence": sentence, "text_row": row_of[sentence]}
         for item in named
-        for form, sentence in zip(FORMS, item.sentences or (), strict=True)
+        for form, sentence in [
+            *zip(FORMS, item.sentences or (), strict=True),
+            *((VARIATION, sentence) for sentence in varied.sentences.get(item.clip_id, ())),
+        ]
     ]
 
 

@@ -5,7 +5,8 @@ reading it gives back its hand by rule, its verb and its object among the words 
 """
 
 import csv
-from collections.abc import Iterable, Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
@@ -18,6 +19,7 @@ from hoidata.annotation.prompts import Lexicon
 from hoidata.schema import HandType
 
 Manner = Literal["slowly", "quickly"]
+Loss = Literal["hand", "verb", "object"]
 HAND_PHRASES: dict[HandType, tuple[str, ...]] = {
     "left": ("the left hand", "your left hand", "only the left hand"),
     "right": ("the right hand", "your right hand", "only the right hand"),
@@ -37,10 +39,10 @@ class WordTable:
 
 @dataclass(frozen=True)
 class Variations:
-    """sentences: distinct and in a fixed order; dropped: how many did not read back."""
+    """sentences: distinct and in a fixed order; dropped: how many did not read back, by what was lost."""
 
     sentences: tuple[str, ...]
-    dropped: int
+    dropped: Mapping[str, int]
 
 
 @dataclass(frozen=True)
@@ -74,14 +76,28 @@ class SentenceMaker:
 
         manner: adds the adverb in two places; only for a clip whose speed was measured.
         """
-        made = dict.fromkeys(self._sentences(verb, object_words, hand, manner))
-        kept = tuple(sentence for sentence in made if self.reads_back(sentence, verb, object_words, hand))
-        return Variations(kept, len(made) - len(kept))
+        made = self.unguarded(verb, object_words, hand, manner)
+        losses = {sentence: self.lost(sentence, verb, object_words, hand) for sentence in made}
+        kept = tuple(sentence for sentence, loss in losses.items() if loss is None)
+        return Variations(kept, Counter(loss for loss in losses.values() if loss))
+
+    def unguarded(self, verb: str, object_words: str, hand: HandType, manner: Manner | None = None) -> tuple[str, ...]:
+        """Every distinct sentence the frames make, before the guard."""
+        return tuple(dict.fromkeys(self._sentences(verb, object_words, hand, manner)))
 
     def reads_back(self, sentence: str, verb: str, object_words: str, hand: HandType) -> bool:
         """Hand by rule alone, verb and object among the dataset's words."""
+        return self.lost(sentence, verb, object_words, hand) is None
+
+    def lost(self, sentence: str, verb: str, object_words: str, hand: HandType) -> Loss | None:
+        """What reading the sentence does not give back, the first of hand, verb and object; None when all are there."""
         choice = select_hand(sentence)
-        return choice.source == "rule" and choice.hand == hand and self._lexicon.read(sentence) == (verb, object_words)
+        if choice.source != "rule" or choice.hand != hand:
+            return "hand"
+        read_verb, read_object = self._lexicon.read(sentence)
+        if read_verb != verb:
+            return "verb"
+        return None if read_object == object_words else "object"
 
     def synonyms(self, verb: str) -> tuple[VerbForms, ...]:
         """The verb itself and its synonym, where that is no other word of the dataset."""

@@ -1,12 +1,13 @@
 """The annotated dataset of one profile and source: clips, words, contacts, read from the four folders stages write.
 
     clips/        the store (see ``hoidata.schema.store``)
-    annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz)
+    annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip the four
+                                      forms, then its variations, if any were asked for
                   hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
                                       reason (why a clip is left out)
                   hand_distance.npz   how near each hand is in every frame (``hoidata.schema.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
-                  info.json           encoder, threshold_m, counts
+                  info.json           encoder, threshold_m, forms, variations (and what their guard dropped), counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
                   contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
@@ -39,6 +40,7 @@ from hoidata.schema.hand_evidence import HandDistances, HandEvidence
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.store import Store, open_store
 
+VARIATION = "variation"
 STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
 
 
@@ -73,7 +75,8 @@ class AnnotatedStore:
         embeddings = read_npz(annotation / "embeddings.npz")
         self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
         self._features = embeddings["features"]
-        self._sentences = {str(key): rows for key, rows in self.text.groupby("clip_id", sort=False)}
+        self._sentences = _by_clip(self.text.query("form != @VARIATION"))
+        self._variations = _by_clip(self.text.query("form == @VARIATION"))
         self._objects = pd.read_parquet(contact / "objects.parquet").set_index("object")
         self._clips = pd.read_parquet(contact / "clips.parquet").set_index("clip_id")
         self._points = read_npz(contact / "points.npz")
@@ -141,6 +144,15 @@ class AnnotatedStore:
         """The same as :meth:`text_features`."""
         return self.text_features(clip_id)
 
+    def variations(self, clip_id: str) -> tuple[str, ...]:
+        """Further sentences that say the same, as many as the stage was asked for; by default none."""
+        return tuple(self._variations[clip_id]["sentence"]) if clip_id in self._variations else ()
+
+    def variation_features(self, clip_id: str) -> np.ndarray:
+        """(variation, 512) float32 features of :meth:`variations`."""
+        rows = self._variations[clip_id]["text_row"].to_numpy() if clip_id in self._variations else []
+        return self._features[np.asarray(rows, np.int64)]
+
     def object_key(self, clip_id: str) -> str:
         """Name of the manipulated object within this dataset."""
         return str(self.store.sequences.at[clip_id, "object"])
@@ -195,6 +207,10 @@ class AnnotatedStore:
         tables = {"annotation": self.hand_types.index, "contact": self._clips.index, "splits": self.splits}
         for folder, found in tables.items():
             _same_ids(self.root / folder, self.store.ids, list(found))
+
+
+def _by_clip(text: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    return {str(key): rows for key, rows in text.groupby("clip_id", sort=False)}
 
 
 def _same_ids(folder: Path, expected: Sequence[str], found: Sequence[str]) -> None:

@@ -1,0 +1,213 @@
+"""Variations of a dataset's clips: the clip's own choice, guarded, with adverbs only where the speed was measured."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hoidata.annotation.clip_variations import (
+    VariationSettings,
+    Wording,
+    clip_variations,
+    hand_speed_m_s,
+    manners,
+)
+from hoidata.annotation.encoders import load_encoder
+from hoidata.annotation.reference_mode import reference_sentences
+from hoidata.annotation.sentences import FORMS, four_sentences
+from hoidata.annotation.stage import annotate_store
+from hoidata.annotation.variations import SentenceMaker
+from hoidata.contact.stage import contact_store
+from hoidata.errors import BadInput
+from hoidata.objects.model import ObjectModel
+from hoidata.schema import Clip, HandTrack, ObjectTrack
+from hoidata.schema.annotated import load_annotated
+from hoidata.schema.info import generated_info
+from hoidata.schema.store import write_store
+from hoidata.splits import split_store
+
+FRAMES = 12
+RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
+WORDS = [("lift", "box", "left"), ("open", "laptop", "both"), ("take out", "milk", "right"), (None, "teapot", "both")]
+
+
+def wordings(speeds: list[float | None] | None = None) -> list[Wording]:
+    speeds = speeds or [None] * 40
+    said = [WORDS[number % len(WORDS)] for number in range(len(speeds))]
+    return [
+        Wording(f"toy/{number}", *words, speed) for number, (words, speed) in enumerate(zip(said, speeds, strict=True))
+    ]
+
+
+def test_a_clip_gets_as_many_as_asked_for_distinct_and_none_it_has_already() -> None:
+    taken = four_sentences("lift", "box", "left")
+    clips = [Wording("toy/a", "lift", "box", "left", None, taken), *wordings()]
+    found = clip_variations(clips, VariationSettings(7))
+    assert {len(set(sentences)) for sentences in found.sentences.values()} == {7}
+    assert not set(found.sentences["toy/a"]) & set(taken)
+    assert found.facts()["kept"] == 7 * len(clips)
+    assert clip_variations(clips, VariationSettings(0)).sentences == {}
+
+
+def test_a_clips_choice_does_not_depend_on_the_clips_beside_it_or_on_how_many_are_asked_for() -> None:
+    clips = wordings()
+    few, many = clip_variations(clips, VariationSettings(3)), clip_variations(clips[::-1], VariationSettings(9))
+    for clip in clips:
+        assert many.sentences[clip.clip_id][:3] == few.sentences[clip.clip_id]
+    same_words = [few.sentences[f"toy/{number}"] for number in range(0, 40, 4)]
+    assert len(set(same_words)) == len(same_words)
+
+
+def test_every_variation_reads_back_and_what_does_not_is_counted_by_what_was_lost() -> None:
+    verbs, things = ("stamp", "brush", "watch", "lift"), ("stamp", "toothbrush", "watch", "hand")
+    clips = [Wording(f"{verb} {thing}", verb, thing, "left") for verb in verbs for thing in things]
+    found = clip_variations(clips, VariationSettings(1000))
+    maker = SentenceMaker(verbs, things)
+    for clip in clips:
+        assert clip.verb is not None
+        assert all(
+            maker.reads_back(text, clip.verb, clip.object_words, "left") for text in found.sentences[clip.clip_id]
+        )
+    made = sum(len(maker.unguarded(str(clip.verb), clip.object_words, "left")) for clip in clips)
+    facts = found.facts()
+    assert facts["dropped"]["verb"] > 0
+    assert facts["kept"] + sum(facts["dropped"].values()) == made
+
+
+def test_slow_and_quick_are_the_outer_fifths_where_they_stand_out() -> None:
+    """Forty clips of one verb at 1 to 40 cm/s: a fifth below and a fifth above; all within 10 %: none."""
+    spread = [Wording(f"{n}", "lift", "box", "left", n / 100) for n in range(1, 41)]
+    found = manners(spread)
+    assert sorted(int(key) for key, manner in found.items() if manner == "slowly") == list(range(1, 9))
+    assert sorted(int(key) for key, manner in found.items() if manner == "quickly") == list(range(33, 41))
+    assert manners([Wording(f"{n}", "lift", "box", "left", 1 + n / 400) for n in range(40)]) == {}
+    assert manners(spread[:9]) == {}
+    assert manners([Wording(f"{n}", "lift", "box", "left", None) for n in range(40)]) == {}
+
+
+def test_speeds_are_compared_among_clips_of_the_same_verb() -> None:
+    """Pouring is slow beside throwing, but not slow for pouring."""
+    pour = [Wording(f"pour {n}", "pour", "cup", "left", 0.1 + n / 1000) for n in range(20)]
+    throw = [Wording(f"throw {n}", "throw", "cup", "left", 2 + n / 1000) for n in range(20)]
+    assert manners(pour + throw) == {}
+    few = [Wording("eat", "eat", "apple", "left", 0.001)]
+    assert manners(pour + throw + few) == {"eat": "slowly"}
+
+
+def test_adverbs_stand_only_in_clips_that_earned_them_and_can_be_turned_off() -> None:
+    clips = wordings([0.1 + 0.02 * number for number in range(40)])
+    earned = manners(clips)
+    found = clip_variations(clips, VariationSettings(30))
+    for clip in clips:
+        said = set(re.findall("slowly|quickly", " ".join(found.sentences[clip.clip_id]).lower()))
+        assert said == ({earned[clip.clip_id]} if clip.clip_id in earned else set())
+    assert earned
+    silent = clip_variations(clips, VariationSettings(30, adverbs=False))
+    assert not any(re.search("slowly|quickly", text.lower()) for texts in silent.sentences.values() for text in texts)
+    assert found.facts()["slowly"] == sum(manner == "slowly" for manner in earned.values())
+
+
+def test_hand_speed_is_the_mean_over_valid_tenths_of_a_second() -> None:
+    frames = np.arange(30)
+    moving = np.stack([0.02 * frames, 0 * frames, 0 * frames], -1)[:, None].repeat(21, 1)
+    everywhere = np.ones(30, bool)
+    assert hand_speed_m_s({"left": moving}, {"left": everywhere}) == pytest.approx(0.02 * 30)
+    both = {"left": moving, "right": np.zeros_like(moving)}
+    assert hand_speed_m_s(both, dict.fromkeys(both, everywhere)) == pytest.approx(0.3)
+    broken = moving.copy()
+    broken[10] += 5
+    assert hand_speed_m_s({"left": broken}, {"left": frames != 10}) == pytest.approx(0.6)
+    assert hand_speed_m_s({"left": moving}, {"left": ~everywhere}) is None
+
+
+def hand(wrist_m: np.ndarray) -> HandTrack:
+    zeros, pose = np.zeros((FRAMES, 3), np.float32), np.zeros((FRAMES, 45), np.float32)
+    return HandTrack(wrist_m.astype(np.float32), zeros, pose, np.zeros((1, 10), np.float32), np.ones(FRAMES, bool))
+
+
+def clip(number: int, **facts) -> Clip:
+    """The left hand lies on a small box and moves a little, the faster the higher the number."""
+    corners = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)])
+    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
+                      [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
+    model = ObjectModel("box", corners, faces, np.zeros(8, np.uint8))
+    way = np.linspace(0, 1, FRAMES)[:, None] * np.array([0.001 * number, 0, 0])
+    still = np.zeros((FRAMES, 3), np.float32)
+    return Clip(
+        f"toy/s{number % 4}/{number:02d}", "toy", f"s{number % 4}", f"{number:02d}",
+        {"left": hand(way + np.array([0, 0, 0.04])), "right": hand(way + np.array([0, 0, 2]))},
+        ObjectTrack(model, still, still),
+        np.arange(FRAMES, dtype=np.int32), np.array([0.0, 0, -1]), facts.get("verb", "lift"),
+        facts.get("object_words", "box"), synthetic=True,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("plain")
+    made = [clip(number) for number in range(1, 15)] + [clip(15, object_words="")]
+    write_store(root / "clips", made, generated_info("toy"))
+    annotate_store(root / "clips", root / "annotation", encoder="hash")
+    contact_store(root / "clips", root / "contact")
+    split_store(root / "clips", root / "annotation", root / "splits", RULE)
+    return root
+
+
+def annotated_as(plain: Path, root: Path, **settings):
+    for folder in ("clips", "contact", "splits"):
+        (root / folder).symlink_to(plain / folder)
+    annotate_store(plain / "clips", root / "annotation", encoder="hash", **settings)
+    return load_annotated(root)
+
+
+def test_variations_follow_the_four_forms_and_leave_them_as_they_are(plain: Path, tmp_path: Path) -> None:
+    before = load_annotated(plain)
+    after = annotated_as(plain, tmp_path, variations=VariationSettings(5))
+    encoder = load_encoder("hash")
+    assert before.ids() == after.ids()
+    assert len(before.ids()) == 14
+    for key in before.ids():
+        assert after.sentences(key) == before.sentences(key)
+        assert after.text_features(key).tobytes() == before.text_features(key).tobytes()
+        assert (before.variations(key), before.variation_features(key).shape) == ((), (0, 512))
+        assert len(after.variations(key)) == 5
+        np.testing.assert_array_equal(after.variation_features(key), encoder.encode(after.variations(key)))
+    forms = pd.read_parquet(tmp_path / "annotation" / "text.parquet").groupby("clip_id")["form"].agg(list)
+    assert set(map(tuple, forms)) == {(*FORMS, *["variation"] * 5)}
+    facts = after.annotation_info["variations"]
+    assert (facts["per_clip"], facts["kept"]) == (5, 5 * 14)
+    assert 1 <= facts["slowly"] <= 3
+    assert 1 <= facts["quickly"] <= 3
+    assert before.annotation_info["variations"]["kept"] == 0
+
+
+def test_reference_forms_are_written_where_asked_for(plain: Path, tmp_path: Path) -> None:
+    after = annotated_as(plain, tmp_path, forms="reference")
+    assert all(after.sentences(key) == reference_sentences("lift", "box", "left") for key in after.ids())
+    assert after.annotation_info["forms"] == "reference"
+    assert after.ids() == load_annotated(plain).ids()
+
+
+def test_unknown_forms_are_refused(plain: Path, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="paper or reference"):
+        annotate_store(plain / "clips", tmp_path / "annotation", encoder="hash", forms="poem")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("state", ["cold", "warm", "damaged", "one bit flipped"])
+def test_the_stages_bytes_are_the_same_whatever_the_feature_cache_holds(
+    plain: Path, tmp_path: Path, state: str
+) -> None:
+    cache = tmp_path / "features"
+    if state != "cold":
+        annotate_store(plain / "clips", tmp_path / "first", encoder="hash", features=cache)
+    for path in cache.rglob("*.npz"):
+        data = path.read_bytes()
+        if state == "damaged":
+            path.write_bytes(data[: len(data) // 2])
+        elif state == "one bit flipped":
+            path.write_bytes(data[:1500] + bytes([data[1500] ^ 1]) + data[1501:])
+    annotate_store(plain / "clips", tmp_path / "annotation", encoder="hash", features=cache)
+    for path in (plain / "annotation").iterdir():
+        assert (tmp_path / "annotation" / path.name).read_bytes() == path.read_bytes(), path.name
