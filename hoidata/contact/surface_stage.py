@@ -81,7 +81,7 @@ def surface_store(
             writer.add(clip)
             for name, value in spent.items():
                 seconds[name] += value
-        counts = writer.finish(_object_row(store.object_model(name)) for name in store.objects["object"])
+        counts = writer.finish(_object_row(SurfaceIndex(store.object_model(name))) for name in store.objects["object"])
     return SurfaceReport(counts, dict(seconds))
 
 
@@ -111,7 +111,8 @@ def measure_hand(
         with watch("contact"):
             touched[rows] = index.within(vertices, hinge, touch_m)
         with watch("depth"):
-            depth[rows] = _depths_m(index, vertices, hinge)
+            if encloses_solid(index):
+                depth[rows] = index.depth_m(vertices, hinge).max(axis=1)
         with watch("joints"):
             joint[rows] = index.distance_m(joints, hinge).min(axis=1)
     with watch("maps"):
@@ -119,19 +120,17 @@ def measure_hand(
     return SideSurface(touched, depth, joint, packed)
 
 
-def _depths_m(index: SurfaceIndex, vertices_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray | float:
-    """(frame,) the deepest vertex, 0 outside; NaN where nothing can be inside the object."""
+def encloses_solid(index: SurfaceIndex) -> bool:
+    """Whether anything can be inside the object."""
     try:
-        return index.depth_m(vertices_m, hinge_rad).max(axis=1)
+        index.check_solid()
     except BadInput:
-        return np.nan
+        return False
+    return True
 
 
-def _object_row(model: ObjectModel) -> dict[str, Any]:
-    index = SurfaceIndex(model)
-    hinge = np.zeros(1) if model.is_articulated else None
-    solid = not np.isnan(_depths_m(index, np.zeros((1, 1, 3)), hinge)).any()
-    return {"object": model.name, "solid": solid, "note": index.solid_note}
+def _object_row(index: SurfaceIndex) -> dict[str, Any]:
+    return {"object": index.model.name, "solid": encloses_solid(index), "note": index.solid_note}
 
 
 class Stopwatch:

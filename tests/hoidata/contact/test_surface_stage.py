@@ -13,6 +13,7 @@ from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import canonical_json
 from hoidata.hands import load_embedded_hands, track_joints, track_vertices
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.schema import SIDES, ObjectTrack
 from hoidata.schema.info import generated_info
@@ -164,6 +165,23 @@ def test_bytes_do_not_depend_on_the_number_of_processes(written, monkeypatch):
     surface_store(folder / "clips", folder / "jobs", points=POINTS, left_out=left_out, jobs=2, progress=False)
     for path in (folder / "surface").iterdir():
         assert (folder / "jobs" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_object_without_an_inside_has_no_depth_and_says_so(make_clip, tmp_path):
+    """A single square plate: it can be touched, nothing can be inside it."""
+    clip = make_clip(6)
+    corners = np.array([(-0.05, -0.04, 0.03), (0.05, -0.04, 0.03), (0.05, 0.04, 0.03), (-0.05, 0.04, 0.03)])
+    plate = ObjectModel("plate", corners, np.array([(0, 1, 2), (0, 2, 3)]), np.zeros(4, np.uint8))
+    clip = replace(clip, object=replace(clip.object, model=plate))
+    write_store(tmp_path / "clips", [clip], generated_info("grab"))
+    report = surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
+    store = open_surface(tmp_path / "surface")
+    assert report.counts["objects_not_solid"] == 1
+    assert not store.is_solid(clip.clip_id)
+    assert np.isnan(store.depth_m(clip.clip_id, "right")).all()
+    assert store.touched(clip.clip_id, "right").any()
+    assert "open" in store.objects.loc[0, "note"]
+    assert pd.isna(store.clips.loc[clip.clip_id, "right_deepest_m"])
 
 
 def test_store_without_clips_gives_a_folder_that_reads(tmp_path):
