@@ -123,7 +123,7 @@ def _measured(
 
 
 def _measure(store: Store, facts: dict[str, ObjectFacts], thresholds: Thresholds, clip_id: str) -> dict[str, Any]:
-    clip = store.clip(clip_id)
+    clip = store.clip(clip_id, motion_only=True)
     name = clip.object.model.name
     return {"clip_id": clip_id, "object": name, **clip_row(clip, facts[name], store.hand_pair(), thresholds)}
 
@@ -160,7 +160,8 @@ def _add_beta_distances(store: Store, rows: list[dict[str, Any]]) -> None:
     for _, clips in store.sequences.groupby("subject", sort=False):
         for side in SIDES:
             shown = clips[(clips[f"{side}_valid_frames"] > 0) & clips[f"{side}_template"].isna()]
-            betas = {clip_id: meant_betas(store.clip(clip_id).hands[side]) for clip_id in shown["clip_id"]}
+            tracks = {key: store.clip(key, motion_only=True).hands[side] for key in shown["clip_id"]}
+            betas = {key: meant_betas(track) for key, track in tracks.items()}
             for clip_id, distance in distances_to_others(betas).items():
                 worst[clip_id].append(distance)
     for row in rows:

@@ -131,8 +131,11 @@ class Store:
     def ids(self) -> list[str]:
         return self.sequences["clip_id"].tolist()
 
-    def clip(self, clip_id: str) -> Clip:
-        """The clip as it was written, float32. Raises KeyError when there is none of that id."""
+    def clip(self, clip_id: str, *, motion_only: bool = False) -> Clip:
+        """The clip as it was written, float32. Raises KeyError when there is none of that id.
+
+        motion_only: without camera, body and the source's contact labels, which can be larger than all the rest.
+        """
         row = self._row(clip_id)
         frames, shard, gravity = row["frames"], self._frames(row["shard"]), row["gravity"]
         return Clip(
@@ -143,9 +146,9 @@ class Store:
             gravity=None if gravity is None else gravity.copy(),
             source_from_world=row["source_from_world"].copy(),
             sources=self._sources_of(row),
-            camera=self._camera(row, shard),
-            body=self._body(row),
-            source_contact=self._source_contact(row),
+            camera=None if motion_only else self._camera(row, shard),
+            body=None if motion_only else self._body(row),
+            source_contact=None if motion_only else self._source_contact(row),
             **row["facts"],
         )
 

@@ -49,7 +49,8 @@ def split_store(
     hand_types, used = _annotated_clips(store, Path(annotation_folder))
     dataset = str(store.info["dataset"])
     chosen, named = choose(dataset, wanted), definitions_for(dataset)
-    rows, digests = store.sequences.loc[used], {clip_id: motion_digest(store.clip(clip_id)) for clip_id in used}
+    rows = store.sequences.loc[used]
+    digests = {clip_id: motion_digest(store.clip(clip_id, motion_only=True)) for clip_id in used}
     parts = {definition: _assign(rows, definition) for definition in (*named.values(), chosen)}
     leaks = {definition: _leaks(store, parts[definition], definition, digests) for definition in parts}
     _refuse_leaks(chosen, leaks[chosen])

@@ -63,7 +63,7 @@ def _column_summary(values: np.ndarray) -> dict[str, Any]:
 def _measure(group: Sequence[Quantity], store: Store, train: Sequence[str]) -> dict[str, Any]:
     rows: dict[str, list[np.ndarray]] = {quantity.name: [] for quantity in group}
     for clip_id in train:
-        clip = store.clip(clip_id)
+        clip = store.clip(clip_id, motion_only=True)
         for quantity in group:
             rows[quantity.name].append(np.asarray(quantity.of(clip), dtype=np.float32))
     found = {}

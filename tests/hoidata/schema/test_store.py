@@ -42,6 +42,14 @@ def test_a_clip_comes_back_as_it_was_written(folder, clips):
         np.testing.assert_array_equal(store.clip(clip.clip_id).object.model.vertices_m, as_trimesh_gave_it)
 
 
+def test_the_motion_alone_is_the_clip_without_what_else_the_source_had(folder, clips):
+    store = open_store(folder)
+    for clip in clips:
+        bare = replace(plain_arrays(clip), camera=None, body=None, source_contact=None)
+        assert_equal_values(store.clip(clip.clip_id, motion_only=True), bare)
+    assert any(clip.camera and clip.body and clip.source_contact for clip in clips)
+
+
 def plain_arrays(clip):
     """The clip with trimesh's tracked arrays replaced by NumPy ones."""
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from hoidata.errors import BadInput
-from hoidata.schema import SourceFile
+from hoidata.schema import SourceContact, SourceFile
 from hoidata.schema.info import generated_info
 from hoidata.schema.store import write_store
 from hoidata.splits import split_store
@@ -59,6 +59,17 @@ def test_every_clip_has_a_row_and_one_that_no_part_covers_is_left_out_and_counte
     assert info["chosen"]["clips"] == {"train": 2, "validation": 1, "test": 1, "left_out": 1}
     assert info["chosen"]["frames"] == {"train": 32, "validation": 16, "test": 16, "left_out": 16}
     assert info["chosen"]["rule"] == RULE
+
+
+def test_contact_labels_of_the_source_are_not_read(clips, tmp_path):
+    """They are ten times what a clip of GRAB moves: a store without their file is split all the same."""
+    touched = SourceContact(np.arange(3, dtype=np.int32), np.zeros(3, np.int32), np.full(3, 22, np.uint8))
+    clips = [replace(clip, source_contact=touched) for clip in clips]
+    first = write(tmp_path, clips)
+    (tmp_path / "clips" / "arrays" / "source_contact-00000.npz").unlink()
+    split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "again", RULE)
+    for name in ("splits.parquet", "info.json", "statistics.json"):
+        assert (tmp_path / "again" / name).read_bytes() == (first / name).read_bytes()
 
 
 def test_all_named_splits_of_the_dataset_stand_beside_the_chosen_one(clips, tmp_path):
