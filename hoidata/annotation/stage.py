@@ -5,9 +5,9 @@ The folder it writes is described in ``hoidata.schema.annotated``.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,7 @@ from hoidata.annotation.clip_variations import (
     clip_variations,
     hand_speed_m_s,
 )
+from hoidata.annotation.derived import derive_verb
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.hand_distances import write_hand_distances
@@ -36,6 +37,7 @@ from hoidata.schema import SIDES, Clip, HandType, Side
 from hoidata.schema.store import Store, open_store
 
 Forms = Literal["paper", "reference"]
+VerbSource = Literal["source", "derived"]
 # The form of a sentence beyond the four; hoidata.schema.annotated keeps it apart from them.
 VARIATION = "variation"
 HAND_TYPE_SOURCE = "proximity"
@@ -51,8 +53,19 @@ HAND_TYPE_TABLE = pa.schema(
         ("labelled_hand", _TEXT),
         ("agreement", pa.bool_()),
         ("reason", _TEXT),
+        ("verb", _TEXT),
+        ("verb_source", _TEXT),
+        ("verb_evidence", _TEXT),
     ]
 )
+
+
+class _Verb(NamedTuple):
+    """base: None for a clip without a verb, whose sentences say "move". source: where it is from, None without one."""
+
+    base: str | None
+    source: VerbSource | None
+    evidence: str | None = None
 
 
 @dataclass(frozen=True)
@@ -64,6 +77,7 @@ class _Annotated:
     evidence: HandEvidence
     sentences: FourSentences | None
     reason: str | None
+    verb: _Verb
     wording: Wording | None = None
 
 
@@ -79,6 +93,7 @@ def annotate_store(
     forms: Forms = "paper",
     variations: VariationSettings | None = None,
     features: str | Path | None = None,
+    derive_verbs: bool = True,
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
 
@@ -89,7 +104,9 @@ def annotate_store(
     reason and get no sentence. left_out: the same for further clips: reasons by clip id, as quality control found them.
     forms: the paper's four sentences as we write them, or as the reference does. variations: how many guarded
     sentences follow those of each clip, by default none. Raises BadInput for other forms.
-    Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing.
+    derive_verbs: a clip whose source names no verb gets the one its motion shows (``derive_verb``), marked as derived
+    with what it rests on; else its sentences say "move".
+    Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing, derived_verbs.
     """
     if forms not in get_args(Forms):
         raise BadInput("forms of the sentences", " or ".join(get_args(Forms)), repr(forms), "choose one of them")
@@ -98,7 +115,7 @@ def annotate_store(
     encoder = encoder if features is None else DiskCachedEncoder(encoder, features)
     variations = variations or VariationSettings()
     measured = variations.per_clip > 0 and variations.adverbs
-    found = _annotate_clips(store, threshold_m, points, left_out or {}, _Writer(forms, measured))
+    found = _annotate_clips(store, threshold_m, points, left_out or {}, _Writer(forms, measured, derive_verbs))
     named = [item for item in found if item.wording]
     varied = clip_variations([item.wording for item in named if item.wording], variations)
     sentences = _distinct(named, varied)
@@ -122,10 +139,20 @@ def annotate_store(
 
 @dataclass(frozen=True)
 class _Writer:
-    """How clips are put into words. measured: whether speeds are wanted."""
+    """How clips are put into words. measured: whether speeds are wanted. derive: verbs from motion where none is."""
 
     forms: Forms
     measured: bool
+    derive: bool
+
+    def verb(self, clip: Clip, evidence: HandEvidence) -> _Verb:
+        """The clip's own verb, else the one its motion shows, if wanted and if a hand acts."""
+        if clip.verb is not None:
+            return _Verb(clip.verb, "source")
+        if not self.derive or evidence.hand_type is None:
+            return _Verb(None, None)
+        derived = derive_verb(clip, evidence)
+        return _Verb(derived.verb, "derived", derived.evidence)
 
     def sentences(self, clip: Clip, evidence: HandEvidence) -> tuple[FourSentences | None, str | None]:
         """The clip's sentences, or None and the reason."""
@@ -158,9 +185,11 @@ def _annotate_clips(
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
+        verb = writer.verb(clip, evidence)
+        clip = replace(clip, verb=verb.base)
         words = (None, left_out[clip_id]) if clip_id in left_out else writer.sentences(clip, evidence)
         wording = writer.wording(clip, evidence.hand_type, words[0], joints)
-        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *words, wording))
+        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *words, verb, wording))
     return found
 
 
@@ -175,6 +204,9 @@ def _hand_row(item: _Annotated) -> dict:
         "labelled_hand": labelled,
         "agreement": None if labelled is None else labelled == found,
         "reason": item.reason,
+        "verb": item.verb.base,
+        "verb_source": item.verb.source,
+        "verb_evidence": item.verb.evidence,
     }
 
 
@@ -220,4 +252,5 @@ def _counts(found: Sequence[_Annotated], sentences: Sequence[str]) -> dict[str, 
         "sentences": len(sentences),
         "labelled": len(labelled),
         "agreeing": sum(item.labelled_hand == item.evidence.hand_type for item in labelled),
+        "derived_verbs": sum(item.verb.source == "derived" for item in found),
     }

@@ -4,7 +4,8 @@
     annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip the four
                                       forms, then its variations, if any were asked for
                   hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
-                                      reason (why a clip is left out)
+                                      reason (why a clip is left out), verb, verb_source (source: the clip came
+                                      with it; derived: its motion shows it), verb_evidence (what that rests on)
                   hand_distance.npz   how near each hand is in every frame (``hoidata.schema.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
                   info.json           encoder, threshold_m, forms, variations (and what their guard dropped), counts

@@ -21,7 +21,8 @@ class VariationParams(StageParams):
 class AnnotateParams(StageParams):
     """encoder: a name for ``load_encoder``. A hand acts below ``threshold_m`` of one of ``points`` object points.
 
-    forms: the paper's four sentences in our English, or as the reference implementation writes them.
+    forms: the paper's four sentences in our English, or as the reference implementation writes them. derive_verbs: a
+    clip whose source names no verb gets the one its motion shows.
     """
 
     encoder: str
@@ -29,6 +30,7 @@ class AnnotateParams(StageParams):
     points: int
     forms: Literal["paper", "reference"]
     variations: VariationParams
+    derive_verbs: bool
 
 
 def run(place: Place) -> None:
@@ -57,5 +59,6 @@ def annotate(place: Place, params: AnnotateParams) -> None:
         forms=params.forms,
         variations=VariationSettings(**params.variations.model_dump()),
         features=FEATURES,
+        derive_verbs=params.derive_verbs,
     )
     print(f"{place}: {', '.join(f'{count} {name}' for name, count in counts.items())}")

@@ -89,7 +89,7 @@ def annotated(root: Path) -> AnnotatedStore:
 def test_sentences_name_the_hand_that_was_found(annotated: AnnotatedStore) -> None:
     assert annotated.sentences("toy/s1/1")[2] == "The left hand lifts a box."
     assert annotated.sentences("toy/s2/2")[1] == "Milk is taken out by the right hand."
-    assert annotated.sentences("toy/s3/3")[0] == "Move a notebook with both hands."
+    assert annotated.sentences("toy/s3/3")[0] == "Open a notebook with both hands."
     assert [annotated.hand_type(key) for key in annotated.ids()] == ["left", "right", "both"]
 
 
