@@ -8,6 +8,7 @@ import numpy as np
 
 from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entries
 from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, nearest_of_each, point_boxes
+from hoidata.contact.part_frames import part_motion, part_places
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.model import Hinge
@@ -53,8 +54,8 @@ class ProximityIndex:
             return np.zeros(0, ENTRY)
         if threshold_m not in self._grids:
             self._grids[threshold_m] = cell_grids(self._points_m, self._members, threshold_m)
-        places = self._places(joints_m, track)
-        return near_entries(places, np.asarray(valid, bool), self._grids[threshold_m], self.count, threshold_m)
+        motion = part_motion(track, self.parts)
+        return near_entries(joints_m, valid, motion, self._grids[threshold_m], self.count, threshold_m)
 
     def _boxes(self) -> PointBoxes:
         if self._point_boxes is None:
@@ -63,11 +64,7 @@ class ProximityIndex:
 
     def _places(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(part, frame, joint, 3) float64 joints in the frame of each part."""
-        in_object = joints_in_object(joints_m, track)
-        places = np.empty((len(self.parts), *in_object.shape))
-        for row, part in enumerate(self.parts):
-            places[row] = joints_in_part(in_object, part, track.model.hinge, track.hinge_rad)
-        return places
+        return part_places(joints_m, part_motion(track, self.parts))
 
 
 def joints_in_object(joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
