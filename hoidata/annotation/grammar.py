@@ -2,7 +2,8 @@
 
 ``grammar.csv`` holds one row per word: kind (verb or object), base, gerund, past_participle, third_singular for verbs,
 noun_phrase and number (singular, plural or mass) for objects. Rules: lemminflect on the head word of an unknown verb;
-the first spoken sound for the article; the head noun's number.
+the first spoken sound for the article; the head noun's number, mass where ``mass_nouns.csv`` lists it: substances and
+collections of everyday English, which no rule of spelling gives away.
 """
 
 import csv
@@ -27,6 +28,14 @@ CONSONANT_SOUND = re.compile(r"(?:eu|ew|uni(?!n|m)|one(?:\b|-)|once|ouija|u[bcfh
 SILENT_H = re.compile(r"(?:hour|honest|honou?r|heir|herb)", re.IGNORECASE)
 VOWEL_NUMBER = re.compile(r"(?:8|11(?!\d)|18(?!\d))")
 SINGULAR_IN_S = re.compile(r"(?:ss|us|is|as|ics|lens|[aeiou]ss|yes)$", re.IGNORECASE)
+# A final consonant is doubled after one short stressed vowel: stop, unclip; not lift, open, play, fix.
+DOUBLED = re.compile(
+    r"(?:un|re|de|over|out|up|under|mis|dis|inter|fore|sub)?(?:[^aeiou]*|[^aeiou]*qu)[aeiou][bdfgklmnprtvz]",
+    re.IGNORECASE,
+)
+SILENT_E = re.compile(r"[^eoy]e$", re.IGNORECASE)
+CONSONANT_Y = re.compile(r"[^aeiou]y$", re.IGNORECASE)
+SIBILANT = re.compile(r"(?:s|x|z|ch|sh|[^aeiou]o)$", re.IGNORECASE)
 logger = logging.getLogger(__name__)
 
 
@@ -78,23 +87,37 @@ class Grammar:
         known = self.nouns.get(head) or self.nouns.get(head.lower())
         if known:
             return known.number
+        if head.lower() in mass_nouns():
+            return "mass"
         plural = head.lower().endswith("s") and len(head) > 3 and not SINGULAR_IN_S.search(head)
         return "plural" if plural else "singular"
 
 
 @lru_cache(maxsize=4096)
 def inflect_verb(base: str) -> VerbForms:
-    """Forms of a verb outside the table: its first word inflected by lemminflect, the rest kept (``zip up``)."""
+    """Forms of a verb outside the table: its first word inflected, the rest kept (``zip up``).
+
+    lemminflect's dictionary knows some 20,000 verbs, irregular ones among them; any other is taken for regular.
+    """
     from lemminflect import getInflection
 
     head, _, rest = base.partition(" ")
     logger.warning("verb %r is not in the grammar table; its forms are made by rule", base)
-    forms = [_first_form(getInflection, head, tag) for tag in ("VBG", "VBN", "VBZ")]
+    listed = [getInflection(head, tag=tag, inflect_oov=False) for tag in ("VBG", "VBN", "VBZ")]
+    forms = [found[0] if found else regular for found, regular in zip(listed, regular_forms(head), strict=True)]
     return VerbForms(base, *(f"{form} {rest}".rstrip() for form in forms))
 
 
-def _first_form(inflection, head: str, tag: str) -> str:
-    return (inflection(head, tag=tag, inflect_oov=False) or inflection(head, tag=tag, inflect_oov=True))[0]
+def regular_forms(verb: str) -> tuple[str, str, str]:
+    """Gerund, past participle and third person of a regular verb: ``clipping``, ``clipped``, ``clips``."""
+    third = verb + ("es" if SIBILANT.search(verb) else "s")
+    if CONSONANT_Y.search(verb):
+        return verb + "ing", verb[:-1] + "ied", verb[:-1] + "ies"
+    if verb.endswith("e"):
+        stem = verb[:-2] + "y" if verb.endswith("ie") else verb[:-1] if SILENT_E.search(verb) else verb
+        return stem + "ing", verb + "d", third
+    stem = verb + verb[-1] if DOUBLED.fullmatch(verb) else verb + "k" if verb.endswith("ic") else verb
+    return stem + "ing", stem + "ed", third
 
 
 def article(noun: str) -> Literal["a", "an"]:
@@ -113,6 +136,13 @@ def default_grammar() -> Grammar:
     """The table shipped with the package: every verb and object of H2O, GRAB and ARCTIC, and common others."""
     table = files("hoidata.annotation").joinpath("grammar.csv").read_text(encoding="utf-8")
     return read_grammar(table.splitlines(), "grammar.csv")
+
+
+@lru_cache(maxsize=1)
+def mass_nouns() -> frozenset[str]:
+    """Nouns that take no article and a singular verb: water, bread, luggage."""
+    table = files("hoidata.annotation").joinpath("mass_nouns.csv").read_text(encoding="utf-8")
+    return frozenset(row["noun"] for row in csv.DictReader(table.splitlines()))
 
 
 def extend_grammar(grammar: Grammar, path: str | Path) -> Grammar:

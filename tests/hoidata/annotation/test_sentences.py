@@ -5,10 +5,17 @@ import re
 from importlib.resources import files
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hoidata.annotation.grammar import Grammar, article, default_grammar, extend_grammar, inflect_verb
+from hoidata.annotation.grammar import (
+    DETERMINERS,
+    Grammar,
+    default_grammar,
+    extend_grammar,
+    mass_nouns,
+    regular_forms,
+)
 from hoidata.annotation.sentences import four_sentences
 from hoidata.errors import BadInput
 
@@ -77,15 +84,92 @@ def test_every_verb_and_object_of_the_table_stands_in_its_sentences_as_written()
         assert (" are " if row["number"] == "plural" else " is ") in sentences[1]
 
 
-def test_the_rules_alone_agree_with_nearly_the_whole_table() -> None:
-    """The table is not consulted: verbs by lemminflect, articles by sound. Only "used to take a picture" is lost."""
-    verbs = [(row, inflect_verb(row["base"])) for row in table_rows("verb")]
-    cells = [getattr(made, name) == row[name] for row, made in verbs for name in ("gerund", "past_participle")]
-    cells += [made.third_singular == row["third_singular"] for row, made in verbs]
-    singular = [row for row in table_rows("object") if row["number"] == "singular"]
-    cells += [f"{article(row['base'])} {row['base']}" == row["noun_phrase"] for row in singular]
-    assert len(cells) > 300
-    assert sum(cells) >= 0.99 * len(cells)
+def without_own_row(row: dict[str, str]) -> Grammar:
+    """The shipped grammar with the one row masked."""
+    whole = default_grammar()
+    verbs = {base: forms for base, forms in whole.verbs.items() if (row["kind"], row["base"]) != ("verb", base)}
+    nouns = {base: noun for base, noun in whole.nouns.items() if (row["kind"], row["base"]) != ("object", base)}
+    return Grammar(verbs, nouns)
+
+
+@pytest.mark.parametrize("masked", [without_own_row, lambda row: Grammar({}, {})], ids=["own row", "whole table"])
+def test_with_its_rows_masked_the_rules_agree_with_nearly_the_whole_table(masked) -> None:
+    """At least 97 %; verbs miss "used to take a picture with", objects are taken for countable where English wavers."""
+    verbs = {
+        (row["base"], name): getattr(masked(row).verb(row["base"]), name) == row[name]
+        for row in table_rows("verb") for name in ("gerund", "past_participle", "third_singular")
+    }  # fmt: skip
+    phrases = {row["base"]: masked(row).noun(row["base"]).words == row["noun_phrase"] for row in table_rows("object")}
+    missed = [key for cells in (verbs, phrases) for key, right in cells.items() if not right]
+    print(f"verb cells {sum(verbs.values())} of {len(verbs)}, article cells {sum(phrases.values())} of {len(phrases)}")
+    assert (len(verbs), len(phrases)) == (3 * len(table_rows("verb")), len(table_rows("object")))
+    assert len(verbs) > 300
+    assert len(phrases) > 100
+    assert sum(verbs.values()) >= 0.97 * len(verbs)
+    assert sum(phrases.values()) >= 0.97 * len(phrases)
+    assert missed == [("take a picture with", "past_participle"), "cappuccino", "espresso", "spray"]
+
+
+def test_the_shipped_table_is_loaded_as_written() -> None:
+    grammar = default_grammar()
+    for row in table_rows("verb"):
+        forms = grammar.verb(row["base"])
+        assert [forms.gerund, forms.past_participle, forms.third_singular] == [
+            row["gerund"], row["past_participle"], row["third_singular"],
+        ]  # fmt: skip
+    for row in table_rows("object"):
+        noun = grammar.noun(row["base"])
+        assert (noun.words, noun.number) == (row["noun_phrase"], row["number"])
+    assert (len(grammar.verbs), len(grammar.nouns)) == (len(table_rows("verb")), len(table_rows("object")))
+
+
+@pytest.mark.parametrize(
+    ("verb", "words", "expected"),
+    [
+        # verbs with particles keep them together in every form
+        ("take out", "scissors", ("Take out scissors with the left hand.", "Scissors are taken out by the left hand.",
+                                  "The left hand takes out scissors.", "Taking out scissors with the left hand.")),
+        # plurals known by rule only
+        ("zip up", "gloves", ("Zip up gloves with the left hand.", "Gloves are zipped up by the left hand.",
+                              "The left hand zips up gloves.", "Zipping up gloves with the left hand.")),
+        # mass nouns known by rule only
+        ("pour out", "coffee", ("Pour out coffee with the left hand.", "Coffee is poured out by the left hand.",
+                                "The left hand pours out coffee.", "Pouring out coffee with the left hand.")),
+        ("spread", "almond butter", ("Spread almond butter with the left hand.",
+                                     "Almond butter is spread by the left hand.",
+                                     "The left hand spreads almond butter.",
+                                     "Spreading almond butter with the left hand.")),
+        # a countable noun whose words hold a mass noun or a plural
+        ("pump", "soap dispenser", ("Pump a soap dispenser with the left hand.",
+                                    "A soap dispenser is pumped by the left hand.",
+                                    "The left hand pumps a soap dispenser.",
+                                    "Pumping a soap dispenser with the left hand.")),
+        ("unclip", "hour glass", ("Unclip an hour glass with the left hand.",
+                                  "An hour glass is unclipped by the left hand.",
+                                  "The left hand unclips an hour glass.",
+                                  "Unclipping an hour glass with the left hand.")),
+    ],
+)  # fmt: skip
+def test_plural_mass_and_particle_words_stand_right_in_all_four_sentences(verb, words, expected) -> None:
+    assert four_sentences(verb, words, "left") == expected
+
+
+@pytest.mark.parametrize(
+    ("verb", "forms"),
+    [
+        ("zorp", ("zorping", "zorped", "zorps")),
+        ("blag", ("blagging", "blagged", "blags")),
+        ("vape", ("vaping", "vaped", "vapes")),
+        ("dritch", ("dritching", "dritched", "dritches")),
+        ("snorry", ("snorrying", "snorried", "snorries")),
+        ("plarick", ("plaricking", "plaricked", "plaricks")),
+        ("fie", ("fying", "fied", "fies")),
+        ("reglip", ("reglipping", "reglipped", "reglips")),
+        ("kree", ("kreeing", "kreed", "krees")),
+    ],
+)
+def test_a_verb_nobody_knows_is_regular(verb: str, forms: tuple[str, str, str]) -> None:
+    assert regular_forms(verb) == forms
 
 
 def test_the_number_rule_knows_plurals_from_singulars_in_s() -> None:
@@ -95,17 +179,47 @@ def test_the_number_rule_knows_plurals_from_singulars_in_s() -> None:
     assert sum(right) >= 0.97 * len(right)
 
 
-@given(st.from_regex(r"[a-z]{2,9}( (up|down|out|off))?", fullmatch=True), st.from_regex(r"[a-z]{3,9}", fullmatch=True))
-def test_made_up_words_never_break_article_agreement_or_shape(verb: str, noun: str) -> None:
-    imperative, passive, subject, gerund = four_sentences(verb, noun, "left")
-    for sentence in (imperative, passive, subject, gerund):
-        assert re.fullmatch(r"[A-Z8][^.]*[a-z]\.", sentence)
-        assert "  " not in sentence
-    plural = default_grammar().noun(noun).number == "plural"
-    assert (" are " in passive) == plural
-    assert re.search(r"\ban? ", subject[len("The left hand ") :].lower()) is not None or plural or noun in MASS
+VOWEL_BY_SOUND = re.compile(
+    r"[aio](?!ne\b|ne-|nce|uija)|e(?!u|w)|u(?!ni|[bcfhjkqrst][aeiou])|hour|hono|honest|heir|herb"
+)
+MADE_UP_VERB = st.from_regex(r"[a-z]{2,9}( (up|down|out|off))?", fullmatch=True)
+MADE_UP_NOUN = st.from_regex(r"([a-z]{2,8} )?[a-z]{3,9}", fullmatch=True)
 
 
+@settings(max_examples=400)
+@given(MADE_UP_VERB, MADE_UP_NOUN, st.sampled_from(["left", "right", "both"]))
+def test_made_up_words_never_break_article_agreement_or_shape(verb: str, noun: str, hand) -> None:
+    sentences = four_sentences(verb, noun, hand)
+    assert all(re.fullmatch(r"[A-Z][^.]*[a-z]\.", sentence) and "  " not in sentence for sentence in sentences)
+    hands = "both hands" if hand == "both" else f"the {hand} hand"
+    imperative, passive, subject, gerund = (sentence[0].lower() + sentence[1:-1] for sentence in sentences)
+    words = passive.partition(" is ")[0].partition(" are ")[0]
+    _check_article(words, noun)
+    plural = passive.startswith(f"{words} are ")
+    assert not (plural and re.match("an? ", words))
+    assert imperative == f"{verb} {words} with {hands}"
+    assert re.fullmatch(rf"{words} (is|are) \S+{_particle(verb)} by {hands}", passive)
+    acts = subject.removeprefix(f"{hands} ").removesuffix(f" {words}")
+    assert acts == verb if hand == "both" else acts.split()[0].endswith("s")
+    assert acts.endswith(_particle(verb))
+    assert re.fullmatch(rf"\S+ing{_particle(verb)} {words} with {hands}", gerund)
+
+
+def _particle(verb: str) -> str:
+    return verb[verb.index(" ") :] if " " in verb else ""
+
+
+def _check_article(words: str, noun: str) -> None:
+    """An article by sound before one thing; none before mass nouns, plurals and nouns that bring a determiner."""
+    if words == noun:
+        head = noun.split()[-1]
+        bare = noun in MASS or head in MASS or head in mass_nouns() or noun.split()[0] in DETERMINERS
+        assert bare or head.endswith("s") or head in PLURAL
+    else:
+        assert words == f"{'an' if VOWEL_BY_SOUND.match(noun) else 'a'} {noun}"
+
+
+PLURAL = {row["base"] for row in table_rows("object") if row["number"] == "plural"}
 MASS = {row["base"] for row in table_rows("object") if row["number"] == "mass"}
 
 
