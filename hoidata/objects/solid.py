@@ -78,7 +78,8 @@ def encloses(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
 def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with every hole closed by a fan about the middle of its edge, whatever its size: a hand at its wrist.
 
-    The fans' middles come after the mesh's own vertices. Raises ValueError where holes share a vertex.
+    vertices_m: (..., vertex, 3), any number of poses; faces: (face, 3). The fans' middles come after the mesh's own
+    vertices. Raises ValueError where holes share a vertex.
     """
     holes = _holes(faces)
     if holes is None:
@@ -133,6 +134,6 @@ def _area(vertices_m: np.ndarray, faces: np.ndarray) -> float:
 
 
 def _patched(vertices_m: np.ndarray, faces: np.ndarray, holes: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    middles = [vertices_m[hole].mean(axis=0) for hole in holes]
-    patches = [_patch(hole, len(vertices_m) + number) for number, hole in enumerate(holes)]
-    return np.concatenate([vertices_m, *(middle[None] for middle in middles)]), np.concatenate([faces, *patches])
+    middles = [vertices_m[..., hole, :].mean(axis=-2, keepdims=True) for hole in holes]
+    patches = [_patch(hole, vertices_m.shape[-2] + number) for number, hole in enumerate(holes)]
+    return np.concatenate([vertices_m, *middles], axis=-2), np.concatenate([faces, *patches])

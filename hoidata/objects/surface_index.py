@@ -95,9 +95,14 @@ class SurfaceIndex:
             raise_depths(surface.tree, surface.grid_for(places), places, depth.reshape(-1))
         return depth
 
+    @property
+    def is_solid(self) -> bool:
+        """Some part encloses a solid, so that depths can be asked for."""
+        return bool(self._closed)
+
     def check_solid(self) -> None:
         """Raises BadInput where no part encloses a solid, with the reason."""
-        if not self._closed:
+        if not self.is_solid:
             why = "; ".join(sorted({solid.why for solid in self.solids.values() if isinstance(solid, NoSolid)}))
             raise BadInput(f"mesh of {self.model.name!r}", "a mesh that encloses a solid", why, "repair the mesh")
 

@@ -174,16 +174,27 @@ def crossings(box, link, corner, vertices_m, y, z, stack, places, turns):  # pra
             size += 2
             continue
         for number in range(link[node, 1], link[node, 2]):
-            a, b, c = corner[number]
-            turn_a, area_a = _side_of_edge(vertices_m, b, c, y, z)
-            turn_b, area_b = _side_of_edge(vertices_m, c, a, y, z)
-            turn_c, area_c = _side_of_edge(vertices_m, a, b, y, z)
-            area = area_a + area_b + area_c
-            if turn_a == turn_b == turn_c and turn_a != 0 and area != 0:
-                x = area_a * vertices_m[a, 0] + area_b * vertices_m[b, 0] + area_c * vertices_m[c, 0]
-                places[count], turns[count] = x / area, turn_a
+            turn, place = crossing(vertices_m, corner[number, 0], corner[number, 1], corner[number, 2], y, z)
+            if turn != 0:
+                places[count], turns[count] = place, turn
                 count += 1
     return count
+
+
+@njit(cache=True)
+def crossing(vertices_m, a, b, c, y, z):  # pragma: no cover (compiled)
+    """The turn with which the line along x through (y, z) crosses a triangle, 0 where it misses, and the place.
+
+    See ``crossings``.
+    """
+    turn_a, area_a = _side_of_edge(vertices_m, b, c, y, z)
+    turn_b, area_b = _side_of_edge(vertices_m, c, a, y, z)
+    turn_c, area_c = _side_of_edge(vertices_m, a, b, y, z)
+    area = area_a + area_b + area_c
+    if turn_a != turn_b or turn_b != turn_c or area == 0:
+        return 0.0, 0.0
+    x = area_a * vertices_m[a, 0] + area_b * vertices_m[b, 0] + area_c * vertices_m[c, 0]
+    return turn_a, x / area
 
 
 @njit(cache=True, inline="always")
