@@ -15,7 +15,6 @@ from rich.progress import Progress
 
 from hoidata.adapters.base import Adapter, RawTree, SequenceKey
 from hoidata.adapters.finished import FinishedWork, job_of
-from hoidata.adapters.workers import WorkerLost, in_workers
 from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
@@ -25,6 +24,7 @@ from hoidata.schema.info import store_info
 from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import open_store, write_store
 from hoidata.schema.validation import check_clip
+from hoidata.workers import WorkerLost, in_workers
 
 DEFECT = "report this defect of hoidata"
 GENERATED_LICENCE = "CC0-1.0"

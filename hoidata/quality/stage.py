@@ -6,10 +6,7 @@ meshes.parquet   one row per object: likewise, ``thresholds.MESH_MEASURES``
 info.json        thresholds, counts
 """
 
-import multiprocessing
 from collections import Counter
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -20,6 +17,7 @@ import pyarrow as pa
 from rich.console import Console
 from rich.progress import Progress
 
+from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
@@ -36,6 +34,7 @@ from hoidata.quality.thresholds import (
 )
 from hoidata.schema.clip import SIDES
 from hoidata.schema.store import Store, open_store
+from hoidata.workers import WorkerLost, in_workers
 
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 50_000
@@ -118,40 +117,25 @@ def _measured(
     measure = partial(_measure, store, facts, thresholds)
     frames = sum(store.sequences["n_frames"].tolist())
     jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
-    with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        return list(bar.track(_in_order(measure, store.ids, jobs), len(store), description="quality"))
+    rows: dict[str, dict[str, Any]] = {}
+    try:
+        with Progress(console=Console(stderr=True), disable=not progress) as bar:
+            rows |= bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality")
+    except WorkerLost as error:
+        raise _worker_lost(error) from error
+    return [rows[clip_id] for clip_id in store.ids]
+
+
+def _worker_lost(error: WorkerLost) -> BadInput:
+    where = ", ".join(map(str, error.in_flight)) or "quality"
+    remedy = "run it again; if memory ran out, set HOIDATA_JOBS=1"
+    return BadInput(where, "worker processes that live until they are done", f"one lost ({error.cause})", remedy)
 
 
 def _measure(store: Store, facts: dict[str, ObjectFacts], thresholds: Thresholds, clip_id: str) -> dict[str, Any]:
     clip = store.clip(clip_id, motion_only=True)
     name = clip.object.model.name
     return {"clip_id": clip_id, "object": name, **clip_row(clip, facts[name], store.hand_pair(), thresholds)}
-
-
-def _in_order(measure: "partial[dict[str, Any]]", ids: list[str], jobs: int) -> Iterator[dict[str, Any]]:
-    if jobs <= 1:
-        yield from map(measure, ids)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(measure,)) as pool:
-        yield from pool.map(_work, ids, chunksize=16)
-
-
-_measure_here: "partial[dict[str, Any]] | None" = None
-
-
-def _start_worker(measure: "partial[dict[str, Any]]") -> None:
-    """Give a worker its store once, and one thread: the pool already uses the cores."""
-    import torch
-
-    torch.set_num_threads(1)
-    global _measure_here
-    _measure_here = measure
-
-
-def _work(clip_id: str) -> dict[str, Any]:
-    assert _measure_here is not None
-    return _measure_here(clip_id)
 
 
 def _add_beta_distances(store: Store, rows: list[dict[str, Any]]) -> None:

@@ -1,7 +1,10 @@
 """The stage's folder: verdicts, reasons, a row per clip and object, equal bytes; real and generated recordings."""
 
 import json
+import multiprocessing
 import os
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import pytest
 
 from hoidata.adapters import get_adapter
 from hoidata.adapters.convert import convert_dataset
-from hoidata.errors import MissingResource
+from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands
 from hoidata.quality import stage
 from hoidata.quality.stage import as_json, quality_store
@@ -129,6 +132,26 @@ def test_worker_processes_change_no_byte(clips_folder, tmp_path, monkeypatch):
     quality_store(clips_folder, tmp_path / "two", jobs=2, progress=False)
     for name in ("clips.parquet", "meshes.parquet", "info.json"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_named_with_the_clips_in_work(clips_folder, tmp_path, monkeypatch):
+    monkeypatch.setattr(stage, "FRAMES_PER_JOB", 1)
+    killer = threading.Thread(target=kill_a_worker)
+    killer.start()
+    with pytest.raises(BadInput, match=r"SIGKILL.*HOIDATA_JOBS=1") as caught:
+        quality_store(clips_folder, tmp_path / "quality", jobs=2, progress=False)
+    killer.join()
+    assert sorted(caught.value.where.split(", ")) == ["test/s1/0", "test/s1/1"]
+    assert not (tmp_path / "quality").exists()
+    assert not multiprocessing.active_children()
+
+
+def kill_a_worker() -> None:
+    """As the system does when memory runs out; the first one that is started, before it has done anything."""
+    while not (workers := multiprocessing.active_children()):
+        time.sleep(0.001)
+    workers[0].kill()
 
 
 def test_personal_templates_have_no_shape_to_compare(make_clip, tmp_path):

@@ -34,8 +34,11 @@ class _Worker:
     item: Any = None
 
 
-def in_workers(function: Callable[[Any], None], items: Sequence[Any], jobs: int, lock: int = -1) -> Iterator[Any]:
-    """Each item when the function has been called on it, in no fixed order; one item per worker at a time.
+Function = Callable[[Any], Any]
+
+
+def in_workers(function: Function, items: Sequence[Any], jobs: int, lock: int = -1) -> Iterator[tuple[Any, Any]]:
+    """Each item with the function's result for it, in no fixed order; one item per worker at a time.
 
     jobs: fresh processes, each with one thread; 1 does the work here. lock: a file descriptor each worker keeps open
     as long as it lives. Raises WorkerLost for a worker that died, and what the function raised; the others are ended.
@@ -43,8 +46,7 @@ def in_workers(function: Callable[[Any], None], items: Sequence[Any], jobs: int,
     if jobs <= 1 or len(items) < 2:
         with one_thread():
             for item in items:
-                function(item)
-                yield item
+                yield item, function(item)
         return
     waiting = iter(items)
     workers = [_start(function, lock) for _ in range(min(jobs, len(items)))]
@@ -77,7 +79,7 @@ def one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _start(function: Callable[[Any], None], lock: int) -> _Worker:
+def _start(function: Function, lock: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(function, theirs, _Descriptor(lock)), daemon=True)
@@ -101,16 +103,16 @@ def _ready(busy: list[_Worker]) -> list[_Worker]:
     return [worker for worker in busy if worker.connection in found or worker.process.sentinel in found]
 
 
-def _result_of(worker: _Worker, busy: list[_Worker]) -> Any:
+def _result_of(worker: _Worker, busy: list[_Worker]) -> tuple[Any, Any]:
     try:
-        answer = worker.connection.recv()
+        result, problem = worker.connection.recv()
     except (EOFError, ConnectionError):
         worker.process.join()
         others = [other.item for other in busy if other is not worker]
         raise WorkerLost(_cause(worker.process.exitcode or 0), [worker.item, *others]) from None
-    if isinstance(answer, BaseException):
-        raise answer
-    return worker.item
+    if problem is not None:
+        raise problem
+    return worker.item, result
 
 
 def _cause(code: int) -> str:
@@ -133,7 +135,7 @@ def _received(copy: Any) -> _Descriptor:
     return _Descriptor(copy.detach())
 
 
-def _serve(function: Callable[[Any], None], connection: Connection, lock: _Descriptor) -> None:
+def _serve(function: Function, connection: Connection, lock: _Descriptor) -> None:
     """A worker's life. ``lock`` is held by being open until the process ends."""
     # Ctrl-C reaches the whole group: the parent decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -147,14 +149,14 @@ def _serve(function: Callable[[Any], None], connection: Connection, lock: _Descr
             connection.send(_answer(function, item))
 
 
-def _answer(function: Callable[[Any], None], item: Any) -> Exception | None:
+def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
+    """The result, or what was raised."""
     try:
-        function(item)
+        return function(item), None
     except HoidataError as error:
-        return error
+        return None, error
     except Exception:
-        return RuntimeError(f"{item}: {traceback.format_exc()}")
-    return None
+        return None, RuntimeError(f"{item}: {traceback.format_exc()}")
 
 
 def _end_with_parent() -> None:
