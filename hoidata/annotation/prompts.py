@@ -8,6 +8,7 @@ from functools import lru_cache
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.grammar import Grammar, default_grammar
 from hoidata.annotation.hand_choice import HandChoice, select_hand
+from hoidata.annotation.reference_mode import JOINED
 
 _HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
@@ -105,9 +106,11 @@ class _Forms:
 
 
 def grammar_lexicon(grammar: Grammar) -> Lexicon:
-    """Every form of the verbs of a grammar, and its objects without their articles."""
+    """Every form of the verbs of a grammar, and its objects without their articles, as the reference joins them too."""
     verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(_forms(verb)))]
-    return Lexicon(verbs, [(noun.base, noun.base) for noun in grammar.nouns.values()])
+    nouns = [(noun.base, noun.base) for noun in grammar.nouns.values()]
+    joined = [(words, base) for base, words in JOINED.items() if base in grammar.nouns and words not in grammar.nouns]
+    return Lexicon(verbs, nouns + joined)
 
 
 @lru_cache(maxsize=1)

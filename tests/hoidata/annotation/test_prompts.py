@@ -1,0 +1,91 @@
+"""Every prompt of the three datasets reads back: hand, object and verb, in the paper's forms and the reference's."""
+
+from collections.abc import Callable, Iterator
+from itertools import product
+
+import numpy as np
+import pytest
+
+from hoidata.adapters.grab_words import INTENTS, OBJECTS
+from hoidata.adapters.h2o import ACTIONS
+from hoidata.annotation.hand_choice import HAND_TYPES
+from hoidata.annotation.prompts import Lexicon, read_prompt
+from hoidata.annotation.reference_mode import reference_sentences, reference_words
+from hoidata.annotation.sentences import four_sentences
+
+ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
+ARCTIC_OBJECTS = (
+    "box", "capsule machine", "espresso machine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
+    "scissors", "waffle iron",
+)  # fmt: skip
+# Every verb with every object: 36 of H2O's pairs and 55 of ARCTIC's are real actions, GRAB's are all.
+PAIRS = [
+    *product(sorted({verb for verb, _ in ACTIONS[1:]}), sorted({noun for _, noun in ACTIONS[1:]})),
+    *product(INTENTS.values(), OBJECTS.values()),
+    *product(ARCTIC_VERBS, ARCTIC_OBJECTS),
+]
+
+
+def prompts(forms: Callable) -> Iterator[tuple[str, tuple[str, str, str]]]:
+    for (verb, noun), hand in product(PAIRS, HAND_TYPES):
+        for sentence in forms(verb, noun, hand):
+            yield sentence, (hand, noun, verb)
+
+
+def shares(forms: Callable, named: Callable[[str], str] = str) -> np.ndarray:
+    """Share of hands, objects and verbs that read back; ``named``: what of an object's name the sentence keeps."""
+    right = []
+    for sentence, (hand, noun, verb) in prompts(forms):
+        found = read_prompt(sentence)
+        by_rule = found.hand.source == "rule" and found.hand.hand == hand
+        right.append((by_rule, named(found.object_words or "") == named(noun), found.verb == verb))
+    share = np.mean(right, axis=0)
+    print(f"{forms.__name__}: {len(right):,} prompts; hand {share[0]:.2%}, object {share[1]:.2%}, verb {share[2]:.2%}")
+    return share
+
+
+@pytest.mark.slow
+def test_all_prompts_over_all_verbs_objects_and_hands_read_back() -> None:
+    assert len(PAIRS) == 8 * 11 + 29 * 51 + 11 * 11
+    hand, thing, verb = shares(four_sentences)
+    assert hand == 1
+    assert thing >= 0.999
+    assert verb >= 0.99
+
+
+@pytest.mark.slow
+def test_the_references_forms_read_back_but_for_the_sizes_they_leave_out() -> None:
+    """ "cube" may be any of three; every other object, hand and verb is read."""
+    sized = {
+        noun for noun in OBJECTS.values() if reference_words(noun) in ("cube", "cylinder", "pyramid", "sphere", "torus")
+    }
+    hand, thing, verb = shares(reference_sentences, lambda noun: "" if noun in sized else noun)
+    assert len(sized) == 15
+    assert (hand, thing, verb) == (1, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("a train, a brain, trains", [(0, 0, 7)]),  # no part of a longer word, no plural the lexicon does not list
+        ("cup-holder, big-cup, cup", [(1, 21, 24)]),
+        ("cup of tea, cup", [(1, 0, 3), (1, 12, 15), (2, 0, 10)]),
+        ("(x) (x)y z(x) (x)", [(3, 0, 3), (3, 14, 17)]),
+        ("a b a b a", [(4, 0, 5)]),
+    ],
+)
+def test_forms_are_found_as_whole_words_wherever_a_search_for_each_finds_them(text: str, found) -> None:
+    forms = ["a train", "cup", "cup of tea", "(x)", "a b a"]
+    lexicon = Lexicon([], [(form, form) for form in forms])
+    matches = [(forms.index(match.base), match.start, match.stop) for match in lexicon._nouns.matches(text)]
+    assert matches == found
+    for number, form in enumerate(
+        forms
+    ):  # the plain way: every place of the form that no letter, digit or hyphen touches
+        places, start = [], 0
+        while (start := text.find(form, start)) >= 0:
+            stop = start + len(form)
+            joined = any(char.isalnum() or char in "_-" for char in (text[start - 1 : start] + text[stop : stop + 1]))
+            places += [] if joined else [(number, start, stop)]
+            start = start + 1 if joined else stop
+        assert places == [match for match in matches if match[0] == number]
