@@ -72,10 +72,10 @@ def hand_volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
 
 def _lines_through(name: str, solid: Solid, cell_m: float) -> _Lines:
     low, high = solid.vertices_m.min(axis=0), solid.vertices_m.max(axis=0)
-    shape = np.ceil((high - low)[1:] / cell_m).astype(np.int64)
-    if not 0 < cell_m < np.inf or shape.prod() > _MOST_LINES:
+    if not cell_m > 0 or np.prod((high - low)[1:] / cell_m) > _MOST_LINES:
         size = " x ".join(f"{side:.3g}" for side in high - low)
         raise BadInput(f"mesh of {name!r}", f"at most {_MOST_LINES} cells of {cell_m} m", f"{size} m", "larger cells")
+    shape = np.ceil((high - low)[1:] / cell_m).astype(np.int64)
     corner = (low + high)[1:] / 2 - shape * cell_m / 2  # the lattice lies evenly about the middle of the part
     tree = triangle_tree(solid.vertices_m, solid.faces)
     first, start, stop = _stretches(tree, corner, cell_m, shape)
