@@ -1,24 +1,28 @@
-"""CLIP ViT-B/32's text tower from a local safetensors file, through open_clip (optional extra ``hoidata[clip]``).
+"""CLIP ViT-B/32's text tower from safetensors weights, through open_clip (optional extra ``hoidata[clip]``).
 
-Only the tower is built, and for 24 tokens: CLIP's attention is causal and features are read at the end-of-text token,
-so later padding changes nothing and costs most of the time. A prompt of the four forms has at most 17 tokens.
+Only the tower is built, and a sentence is encoded at its own length, at most 24 tokens: CLIP's attention is causal and
+features are read at the end-of-text token, so padding behind it changes nothing and costs most of the time. A prompt of
+the four forms has at most 17 tokens.
 """
 
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
+from hoidata.annotation.clip_weights import ARCHITECTURE, WeightsName, missing_file, tagged_weights
 from hoidata.annotation.encoders import DIMENSIONS, Identity
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import sha256_file
 
-ARCHITECTURE = "ViT-B-32"
 CONTEXT_TOKENS = 24
-BATCH = 64
+# Of every CLIP text tower.
+HEAD_WIDTH = 64
+VIT_B_32 = (512, 12)
 # Keeps the stand-in operator names registered for as long as the process lives.
 _registered: list[torch.library.Library] = []
 
@@ -26,37 +30,50 @@ _registered: list[torch.library.Library] = []
 class ClipEncoder:
     """Un-normalised 512-d text features, as Text2HOI uses them.
 
-    weights: an open_clip ViT-B/32 state dict in safetensors, whole or text keys alone. quick_gelu: True for OpenAI's
-    weights, False for LAION's; a wrong choice goes unnoticed by the network, so it is part of the identity.
-    Raises MissingResource when the file or open_clip is missing, BadInput when the file is not such a state dict.
+    weights: an open_clip ViT-B/32 state dict in safetensors, whole or text keys alone, or a tag of open_clip's. Towers
+    of other width and depth are built as their weights are, as long as they give 512 numbers. QuickGELU is right for
+    OpenAI's weights, not for LAION's; a wrong choice goes unnoticed by the network, so it is part of the identity.
+    Raises MissingResource when weights or open_clip are missing, BadInput when the file is not such a state dict.
     """
 
-    def __init__(self, weights: Path, quick_gelu: bool = True) -> None:
-        if not weights.is_file():
-            raise MissingResource(
-                f"CLIP weights {weights} are not on this machine. Give a local file (clip:FILE.safetensors, an "
-                "open_clip ViT-B-32 state dict) or use the built-in offline encoder: text.encoder=use. "
-                "Features of different encoders cannot be mixed."
-            )
+    def __init__(self, weights: WeightsName) -> None:
+        if not weights.is_tag and not Path(weights.name).is_file():
+            raise missing_file(Path(weights.name))
         open_clip = import_open_clip()
-        self._tower = _load_tower(open_clip, weights, quick_gelu)
+        path, quick_gelu = Path(weights.name), weights.quick_gelu
+        if quick_gelu is None:
+            path, quick_gelu = tagged_weights(open_clip, weights.name)
+        self._tower = _load_tower(open_clip, path, quick_gelu)
+        self._mask = self._tower.attn_mask
         self._tokenizer = open_clip.get_tokenizer(ARCHITECTURE)
+        size = (self._tower.width, len(self._tower.transformer.resblocks))
         self.identity: Identity = {
-            "name": f"clip-{ARCHITECTURE}",
+            "name": f"clip-{ARCHITECTURE}" if size == VIT_B_32 else f"clip-text-{size[0]}x{size[1]}",
             "version": version("open-clip-torch"),
             "dims": DIMENSIONS,
-            "sha256": sha256_file(weights),
+            "sha256": sha256_file(path),
             "quick_gelu": quick_gelu,
         }
 
-    @torch.no_grad()
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
-        batches = [sentences[start : start + BATCH] for start in range(0, len(sentences), BATCH)]
-        features = [self._tower(self._tokenizer(list(batch), CONTEXT_TOKENS)).float().numpy() for batch in batches]
-        return np.concatenate(features) if features else np.zeros((0, DIMENSIONS), np.float32)
+        """One sentence and one thread at a time: the last bits would depend on neighbours and number of threads."""
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            rows = [self._feature(sentence) for sentence in sentences]
+        finally:
+            torch.set_num_threads(threads)
+        return np.stack(rows) if rows else np.zeros((0, DIMENSIONS), np.float32)
+
+    @torch.no_grad()
+    def _feature(self, sentence: str) -> np.ndarray:
+        tokens = self._tokenizer([sentence], CONTEXT_TOKENS)
+        length = int(tokens.argmax()) + 1  # the end-of-text token has the largest number
+        self._tower.attn_mask = self._mask[:length, :length]
+        return self._tower(tokens[:, :length])[0].float().numpy()
 
 
-def import_open_clip():
+def import_open_clip() -> Any:
     """open_clip, imported with PyPI's CUDA build of torchvision beside CPU torch as well.
 
     That torchvision fails at import because two of its compiled operators are absent; CLIP's text tower uses neither,
@@ -82,17 +99,33 @@ def _declare_torchvision_operators() -> None:
     _registered.append(library)
 
 
-def _load_tower(open_clip, weights: Path, quick_gelu: bool) -> torch.nn.Module:
-    config = open_clip.get_model_config(ARCHITECTURE)
-    text = {**config["text_cfg"], "context_length": CONTEXT_TOKENS}
-    tower = open_clip.model._build_text_tower(config["embed_dim"], text, quick_gelu=quick_gelu)
+def _load_tower(open_clip: Any, weights: Path, quick_gelu: bool) -> Any:
+    state = _text_state(weights)
+    text = {**open_clip.get_model_config(ARCHITECTURE)["text_cfg"], **_size(weights, state)}
     try:
-        tower.load_state_dict(_text_state(weights))
+        tower = open_clip.model._build_text_tower(DIMENSIONS, text, quick_gelu=quick_gelu)
+        tower.load_state_dict(state)
     except RuntimeError as error:
-        raise BadInput(
-            weights, f"the text tower of {ARCHITECTURE}", str(error)[:200], "give matching weights"
-        ) from error
+        expected = f"the text tower of {ARCHITECTURE}"
+        raise BadInput(weights, expected, str(error)[:200], "give matching weights") from error
     return tower.eval()
+
+
+def _size(weights: Path, state: dict[str, torch.Tensor]) -> dict[str, int]:
+    """Width, heads and layers of a text tower, as its tensors have them."""
+    projection = state.get("text_projection", torch.zeros(0, 0))
+    width = projection.shape[0]
+    layers = {name.split(".")[2] for name in state if name.startswith("transformer.resblocks.")}
+    if tuple(projection.shape) != (width, DIMENSIONS) or width < HEAD_WIDTH or width % HEAD_WIDTH or not layers:
+        expected = f"a CLIP text tower that gives {DIMENSIONS} numbers"
+        got = f"{len(layers)} layers, text_projection {tuple(projection.shape)}"
+        raise BadInput(weights, expected, got, "give matching weights")
+    return {
+        "context_length": CONTEXT_TOKENS,
+        "width": width,
+        "heads": width // HEAD_WIDTH,
+        "layers": len(layers),
+    }
 
 
 def _text_state(weights: Path) -> dict[str, torch.Tensor]:

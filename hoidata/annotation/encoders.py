@@ -30,9 +30,10 @@ class TextEncoder(Protocol):
 
 
 def load_encoder(name: str) -> TextEncoder:
-    """The encoder called ``use`` (offline default), ``hash`` (no semantics, for tests) or ``clip:FILE.safetensors``.
+    """The encoder called ``use`` (offline default), ``hash`` (no semantics, for tests), ``clip:FILE`` or ``clip:TAG``.
 
-    ``clip:`` takes OpenAI's ViT-B/32; append ``?quick_gelu=false`` for weights trained with plain GELU (LAION).
+    ``clip:FILE.safetensors`` takes OpenAI's ViT-B/32; append ``?quick_gelu=false`` for weights trained with plain GELU
+    (LAION). ``clip:openai`` or another tag of open_clip's is looked for on this machine, then downloaded if online.
     Raises BadInput for another name, MissingResource where a package or file is not there.
     """
     if name == "use":
@@ -41,12 +42,10 @@ def load_encoder(name: str) -> TextEncoder:
         return CachedEncoder(HashEncoder())
     if name.startswith("clip:"):
         from hoidata.annotation.clip_encoder import ClipEncoder
+        from hoidata.annotation.clip_weights import parse_weights_name
 
-        path, _, option = name.removeprefix("clip:").partition("?")
-        if option not in ("", "quick_gelu=true", "quick_gelu=false"):
-            raise BadInput("text encoder", "?quick_gelu=true or false", option, "correct the encoder's name")
-        return CachedEncoder(ClipEncoder(Path(path), quick_gelu=option != "quick_gelu=false"))
-    raise BadInput("text encoder", "use, hash or clip:FILE.safetensors", repr(name), "choose one of them")
+        return CachedEncoder(ClipEncoder(parse_weights_name(name.removeprefix("clip:"))))
+    raise BadInput("text encoder", "use, hash, clip:FILE.safetensors or clip:TAG", repr(name), "choose one of them")
 
 
 class UniversalSentenceEncoder:
@@ -104,7 +103,7 @@ def refuse_other_encoder(where: str | Path, expected: Identity, got: Identity) -
             where,
             f"text features of {canonical_json(expected)}",
             canonical_json(got),
-            "use one encoder for data and prompt: set text.encoder back, or annotate and train again",
+            "use one encoder for data and prompt: set annotate.encoder back, or annotate and train again",
         )
 
 
