@@ -13,7 +13,14 @@ import numpy as np
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.distance import merged_surface
-from hoidata.objects.distance_grid import distance_grid, lower_distances, mark_within, no_grid, raise_depths
+from hoidata.objects.distance_grid import (
+    DistanceGrid,
+    distance_grid,
+    lower_distances,
+    mark_within,
+    no_grid,
+    raise_depths,
+)
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, solid_of
 from hoidata.objects.triangle_tree import triangle_tree
@@ -96,6 +103,11 @@ class SurfaceIndex:
         return depth
 
     @property
+    def has_grids(self) -> bool:
+        """Every part has been asked about so often that it has its grid."""
+        return all(surface.has_grid for surface in self._surfaces.values())
+
+    @property
     def is_solid(self) -> bool:
         """Some part encloses a solid, so that depths can be asked for."""
         return bool(self._closed)
@@ -127,14 +139,17 @@ class _Surface:
 
     def __init__(self, vertices_m: np.ndarray, faces: np.ndarray, closed: bool, grid_from: int) -> None:
         self.tree, self.closed = triangle_tree(vertices_m, faces), closed
-        self._unasked, self._grid = grid_from, no_grid()
+        self._grid_from, self._asked, self._grid = grid_from, 0, no_grid()
 
-    def grid_for(self, places_m: np.ndarray):
+    @property
+    def has_grid(self) -> bool:
+        return self._grid.value.size > 0
+
+    def grid_for(self, places_m: np.ndarray) -> DistanceGrid:
         """The grid to answer about these places with."""
-        if self._unasked >= 0:
-            self._unasked -= len(places_m)
-            if self._unasked < 0:
-                self._grid = distance_grid(self.tree, self.closed)
+        self._asked += len(places_m)
+        if not self.has_grid and self._asked > self._grid_from:
+            self._grid = distance_grid(self.tree, self.closed)
         return self._grid
 
 

@@ -16,7 +16,7 @@ from hoidata.objects.surface_index import SurfaceIndex
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 OUTER_M, INNER_M, HEIGHT_M, FLOOR_M, SECTIONS = 0.04, 0.035, 0.1, 0.008, 720
-AT_ONCE, NEVER = -1, 10**12
+AT_ONCE, NEVER = 0, 10**12
 
 
 def model_of(vertices: np.ndarray, faces: np.ndarray) -> ObjectModel:

@@ -16,7 +16,7 @@ from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
-AT_ONCE, NEVER = -1, 10**12  # from how many places on there is a grid
+AT_ONCE, NEVER = 0, 10**12  # from how many places on there is a grid
 THRESHOLD_M = 0.005
 CLEAR_M = 1e-12  # libigl's and our rounding may differ by less
 
@@ -84,10 +84,12 @@ def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
     expected = igl_distance(model, places)
     assert (np.abs(expected - THRESHOLD_M) < 0.002).mean() > 0.1
     clear = np.abs(expected - THRESHOLD_M) > CLEAR_M
+    assert not index.has_grids
     np.testing.assert_array_equal(
         (expected < THRESHOLD_M)[clear], index.within(places[None], None, THRESHOLD_M)[0][clear]
     )
     np.testing.assert_allclose(index.distance_m(places[None], None)[0], expected, atol=1e-14)
+    assert index.has_grids == (grid_from == AT_ONCE)
     near = index.distance_m(places[None], None, 0.02)[0]
     np.testing.assert_array_equal(np.isinf(near), expected > 0.02)
     np.testing.assert_allclose(near[expected <= 0.02], expected[expected <= 0.02], atol=1e-14)
