@@ -31,7 +31,7 @@ from hoidata.schema.store import Store, open_store
 
 TOUCH_M = 0.005
 # Below this a second process costs more to start than it saves.
-FRAMES_PER_JOB = 8_000
+FRAMES_PER_JOB = 20_000
 
 
 class SurfaceReport(NamedTuple):

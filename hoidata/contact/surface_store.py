@@ -237,13 +237,22 @@ class SurfaceStore:
             smallest[side] = np.inf if pd.isna(value) else float(value)
         return HandEvidence(None, distance, threshold_m, smallest).at_threshold(threshold_m)
 
+    def hand(self, clip_id: str, side: Side) -> SideSurface:
+        """All of one hand, as the stage measured it."""
+        frames = self.touched(clip_id, side), self.depth_m(clip_id, side), self.joint_m(clip_id, side)
+        return SideSurface(*frames, self.packed_map(clip_id, side))
+
     def bimart_map(self, clip_id: str, side: Side) -> np.ndarray:
         """(frame, point) float32 metres, see ``hoidata.contact.bimart_maps``: at most half a step off."""
+        return unpacked_map(self.packed_map(clip_id, side))
+
+    def packed_map(self, clip_id: str, side: Side) -> np.ndarray:
+        """(frame, point) uint8: the same in steps of ``info["map_step_m"]``, 255 beyond the reach."""
         row = self._row(clip_id)
         packed = np.full((int(row["n_frames"]), self.info["points"]), BEYOND, np.uint8)
         start, first, stop = (int(row[f"{side}_map_{name}"]) for name in ("row", "first", "stop"))
         packed[first:stop] = self._shard(int(row["shard"]))[f"{side}_map"][start : start + stop - first]
-        return unpacked_map(packed)
+        return packed
 
     def clip_map(self, clip_id: str, side: Side) -> np.ndarray:
         """(point,) float32: how close the hand ever comes to each point; infinite beyond the reach."""

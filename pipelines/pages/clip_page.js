@@ -7,13 +7,19 @@
   const charts = JSON.parse(document.getElementById("readouts").textContent);
   const paint = JSON.parse(document.getElementById("paint-values").textContent);
   const hex = JSON.parse(document.getElementById("paint-colours").textContent);
+  const nearToFarHex = JSON.parse(document.getElementById("distance-colours").textContent);
   const bits = { left: bytesOf(paint.left), right: bytesOf(paint.right) };
+  const distances = Object.fromEntries(Object.entries(paint.distances).map(([side, text]) => [side, bytesOf(text)]));
   const always = { left: anyFrame(bits.left), right: anyFrame(bits.right) };
   const surfaces = [];
-  let player = null, painted = null, colours = null;
+  let player = null, painted = null, colours = null, nearToFar = null;
 
   function bytesOf(text) {
     return Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+  }
+
+  function linear(text) {
+    return new THREE.Color(text).convertSRGBToLinear().toArray();
   }
 
   function anyFrame(all) {
@@ -56,38 +62,58 @@
     return { mesh, nearest, weight };
   }
 
-  function repaint(left, right) {
+  // colourOf(nearest points, their weights, first of the vertex): [red, green, blue], linear.
+  function repaint(colourOf) {
     for (const { mesh, nearest, weight } of surfaces) {
       const attribute = mesh.geometry.attributes.color, array = attribute.array, size = attribute.itemSize;
       const scale = array instanceof Uint8Array ? 255 : 1;
       for (let vertex = 0; vertex < attribute.count; vertex++) {
-        let onLeft = 0, onRight = 0;
-        for (let k = vertex * NEIGHBOURS; k < (vertex + 1) * NEIGHBOURS; k++) {
-          if (left && touched(left, nearest[k])) onLeft += weight[k];
-          if (right && touched(right, nearest[k])) onRight += weight[k];
-        }
-        const both = Math.min(onLeft, onRight), any = Math.max(onLeft, onRight);
-        const one = onLeft > onRight ? colours.left : colours.right;
-        for (let c = 0; c < 3; c++) {
-          const value = colours.plain[c] * (1 - any) + one[c] * (any - both) + colours.both[c] * both;
-          array[vertex * size + c] = Math.round(value * scale * 1e4) / 1e4;
-        }
+        const colour = colourOf(nearest, weight, vertex * NEIGHBOURS);
+        for (let c = 0; c < 3; c++) array[vertex * size + c] = Math.round(colour[c] * scale * 1e4) / 1e4;
       }
       attribute.needsUpdate = true;
     }
     player.dirty = true;
   }
 
+  function contactColours(left, right) {
+    return (nearest, weight, first) => {
+      let onLeft = 0, onRight = 0;
+      for (let k = first; k < first + NEIGHBOURS; k++) {
+        if (left && touched(left, nearest[k])) onLeft += weight[k];
+        if (right && touched(right, nearest[k])) onRight += weight[k];
+      }
+      const both = Math.min(onLeft, onRight), any = Math.max(onLeft, onRight);
+      const one = onLeft > onRight ? colours.left : colours.right;
+      return colours.plain.map((plain, c) => plain * (1 - any) + one[c] * (any - both) + colours.both[c] * both);
+    };
+  }
+
+  // steps: BimArt's map of one hand in one frame; what is beyond its reach has the last colour.
+  function distanceColours(steps) {
+    return (nearest, weight, first) => {
+      let value = 0;
+      for (let k = first; k < first + NEIGHBOURS; k++) value += weight[k] * Math.min(steps[nearest[k]], paint.farthest);
+      const place = value / paint.farthest * (nearToFar.length - 1);
+      const low = Math.min(Math.floor(place), nearToFar.length - 2);
+      return nearToFar[low].map((near, c) => near + (nearToFar[low + 1][c] - near) * (place - low));
+    };
+  }
+
   function showPaint() {
     const mode = document.querySelector("input[name=paint]:checked").value;
     const frame = player.frame();
-    const wanted = mode === "frame" ? `frame ${frame}` : mode;
+    const wanted = mode === "clip" || mode === "none" ? mode : `${mode} ${frame}`;
     if (wanted === painted || !surfaces.length) return;
     painted = wanted;
-    const here = (packed) => packed.subarray(frame * paint.stride, (frame + 1) * paint.stride);
-    if (mode === "frame") repaint(here(bits.left), here(bits.right));
-    else if (mode === "clip") repaint(always.left, always.right);
-    else repaint(null, null);
+    const rows = (all, stride) => all.subarray(frame * stride, (frame + 1) * stride);
+    if (mode in distances) repaint(distanceColours(rows(distances[mode], paint.points)));
+    else if (mode === "frame") repaint(contactColours(rows(bits.left, paint.stride), rows(bits.right, paint.stride)));
+    else if (mode === "clip") repaint(contactColours(always.left, always.right));
+    else repaint(contactColours(null, null));
+    document.querySelectorAll("#paint .legend").forEach((legend) => {
+      legend.hidden = (legend.dataset.for === "distance") !== (mode in distances);
+    });
   }
 
   function showCursor() {
@@ -114,8 +140,9 @@
 
   holder.addEventListener("loaded", (event) => {
     player = event.detail;
-    colours = Object.fromEntries(Object.entries(hex).map(([name, text]) => [name, new THREE.Color(text).convertSRGBToLinear().toArray()]));
-    colours.plain = new THREE.Color("#d6d4cc").convertSRGBToLinear().toArray();
+    colours = Object.fromEntries(Object.entries(hex).map(([name, text]) => [name, linear(text)]));
+    colours.plain = linear("#d6d4cc");
+    nearToFar = nearToFarHex.map(linear);
     // By name: the loader adds the nodes in the order in which it happens to finish them.
     const parts = new Map(paint.parts.map((part) => [part.mesh, part]));
     player.scene.traverse((node) => {

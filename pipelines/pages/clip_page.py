@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hoidata.contact.bimart_maps import REACH_M, STEP_M
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
@@ -28,6 +29,8 @@ from pipelines.pages.player import Player, contact_player, motion_player, render
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
+# Near to far, as BimArt draws its maps (figure 9): red where the hand is close, blue where it is 20 cm away.
+DISTANCE_COLOURS = ("#b5241c", "#efb35b", "#f3efdd", "#7fb0d0", "#2a5f96")
 PAINT_COLOURS = {**SIDE_COLOURS, "both": BOTH_COLOUR}
 
 
@@ -54,8 +57,10 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
         synthetic=clip.synthetic,
         clip_id=clip_id,
         player=replace(motion_player(clip, hands, title, contact=true_contact(annotated, clip_id)), contact_label=""),
-        paint=paint_values(clip, points, series.touched),
+        paint=paint_values(clip, points, series.touched, {side: series.surface[side].map for side in sides}),
         paint_colours=PAINT_COLOURS,
+        distance_colours=DISTANCE_COLOURS,
+        reach_cm=REACH_M * 100,
         threshold_cm=annotated.contact_info["threshold_m"] * 100,
         timeline=draw_timeline(clip_charts(series, sides, len(points)), clip_id),
         no_depth=series.depth_m is None,
@@ -75,12 +80,15 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
     return Path(path)
 
 
-def paint_values(clip: Clip, points: SampledPoints, touched: Mapping[Side, np.ndarray]) -> dict:
+def paint_values(
+    clip: Clip, points: SampledPoints, touched: Mapping[Side, np.ndarray], maps: Mapping[Side, np.ndarray] | None = None
+) -> dict:
     """What clip_page.js needs to paint the contact map of any frame, as JSON knows it.
 
     parts: per part that has triangles, the name of its node in the GLB, points in its mesh's coordinates (the moving
     part is drawn from its hinge's origin) in 0.1 mm, and their numbers among all points. left, right: touched points
-    per frame, packed bits (first point in the highest bit) in base64, ``stride`` bytes per frame.
+    per frame, packed bits (first point in the highest bit) in base64, ``stride`` bytes per frame. distances: of each
+    hand of ``maps``, BimArt's packed map (frame, point) in base64; ``farthest`` steps are its reach.
     """
     model = clip.object.model
     parts = []
@@ -92,7 +100,13 @@ def paint_values(clip: Clip, points: SampledPoints, touched: Mapping[Side, np.nd
         parts.append({"mesh": mesh, "numbers": numbers.tolist(), "tenth_mm": local.reshape(-1).tolist()})
     bits = {side: np.packbits(touched[side], axis=1) for side in SIDES}
     packed = {side: base64.b64encode(bits[side].tobytes()).decode("ascii") for side in SIDES}
-    return {"parts": parts, "stride": int(bits["left"].shape[1]), "frames": clip.n_frames, **packed}
+    distances = {
+        side: base64.b64encode(packed_map.tobytes()).decode("ascii") for side, packed_map in (maps or {}).items()
+    }
+    return {
+        **{"parts": parts, "stride": int(bits["left"].shape[1]), "frames": clip.n_frames, "points": len(points)},
+        **{"farthest": round(REACH_M / STEP_M), "distances": distances, **packed},
+    }
 
 
 def _title(annotated: AnnotatedStore, clip: Clip) -> str:

@@ -21,7 +21,7 @@ NOTHING = "none"
 
 @dataclass(frozen=True)
 class HandFacts:
-    """One hand in the hand test: each a text; acts: whether the hand takes part."""
+    """One hand in the hand test: each a text; acts: whether the hand takes part. surface_*: against the surface."""
 
     side: str
     valid: str
@@ -29,15 +29,20 @@ class HandFacts:
     where: str
     within: str
     acts: bool
+    surface_nearest: str
+    surface_within: str
+    surface_acts: bool
 
 
 @dataclass(frozen=True)
 class HandDecision:
-    """The hand type, in words how it was found, and the row of each hand."""
+    """The hand type, in words how it was found, what the exact surface says, and the row of each hand."""
 
     hand_type: str
     rule: str
     agreement: str
+    surface: str
+    points: int
     hands: list[HandFacts]
 
 
@@ -67,6 +72,8 @@ def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> 
         rule=f"A hand acts when, in any frame, one of its 21 joints is closer than {threshold * 100:g} cm to one of "
         f"{points:,} points of the object (Text2HOI, supplement 6).",
         agreement=_agreement(clip, row["agreement"]),
+        surface=_surface_words(series),
+        points=points,
         hands=[_hand_facts(annotated, clip, series, side) for side in SIDES],
     )
 
@@ -78,14 +85,21 @@ def _agreement(clip: Clip, agreement: Any) -> str:
     return f"The source's annotator named: {clip.labelled_hand}, {verdict}."
 
 
+def _surface_words(series: ClipSeries) -> str:
+    """Whether the same test against the surface gives the same hand."""
+    by_points, exact = series.evidence.hand_type or NOTHING, series.surface_evidence.hand_type or NOTHING
+    verdict = "the same" if by_points == exact else f"{exact}, which DIFFERS"
+    return f"With the object's exact surface in place of the points the hand type is {verdict}."
+
+
 def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side: Side) -> HandFacts:
-    valid, distance = clip.hands[side].valid, series.evidence.distance_m[side]
-    threshold = series.evidence.threshold_m
+    points, surface = series.evidence, series.surface_evidence
+    valid, distance = clip.hands[side].valid, points.distance_m[side]
     count = f"{int(valid.sum())} of {clip.n_frames}"
     if not valid.any():
-        return HandFacts(side, count, "never seen", "", "", False)
+        return HandFacts(side, count, "never seen", "", "", False, "", "", False)
     frame = int(distance.argmin())
-    within = int((distance < threshold).sum())
+    within, exact = int(points.near(side).sum()), int(surface.near(side).sum())
     return HandFacts(
         side=side,
         valid=count,
@@ -93,6 +107,9 @@ def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side:
         where=f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}",
         within=f"{within} of {clip.n_frames}",
         acts=within > 0,
+        surface_nearest=f"{surface.closest_m(side) * 100:.2f} cm",
+        surface_within=f"{exact} of {clip.n_frames}",
+        surface_acts=exact > 0,
     )
 
 

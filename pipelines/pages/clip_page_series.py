@@ -1,21 +1,23 @@
 """What one clip's page plots, frame by frame: touched points, nearest distance, penetration, and how the object moves.
 
-Numbers of the stages are read where they are stored; the distances of the hand test and the penetration, of which the
-stages keep only the extremes, are measured again with the functions of those stages.
+Numbers are read from the folders of the stages. What the stage surface would have found is measured here, with its own
+functions, where it did not run or quality control left the clip out.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from hoidata.contact import HandEvidence, ProximityIndex, acting_hands
+from hoidata.contact import HandEvidence
 from hoidata.contact.maps import LONGEST_CLIP
-from hoidata.hands import HandPair, track_vertices
-from hoidata.objects.sampling import sample_points
-from hoidata.quality.measures import ObjectFacts, placed
-from hoidata.quality.penetration import depths_m, object_frame
+from hoidata.contact.surface_stage import TOUCH_M, encloses_solid, measure_hand
+from hoidata.contact.surface_store import SideSurface, SurfaceStore
+from hoidata.hands import HandPair, track_joints, track_vertices
+from hoidata.objects.surface_index import surface_index
+from hoidata.quality.measures import placed
 from hoidata.schema.annotated import AnnotatedStore
 from hoidata.schema.clip import FPS, SIDES, Clip, Side
+from pipelines.pages.surface_facts import surface_beside
 
 
 @dataclass(frozen=True)
@@ -23,13 +25,16 @@ class ClipSeries:
     """Everything per frame (frame,), NaN where it means nothing.
 
     touched: per side (frame, point) bool, the contact map of each frame. evidence: what the hand type rests on.
-    depth_m: per side the deepest hand vertex inside the object, or None where the mesh has no inside.
+    surface: per side what the stage surface measures; touch_m: a vertex nearer than that touches. solid: whether
+    anything can be inside the object, so that depths mean something.
     lift_m: height of the object above its first frame, or None without gravity. hinge_rad: None for a rigid object.
     """
 
     touched: dict[Side, np.ndarray]
     evidence: HandEvidence
-    depth_m: dict[Side, np.ndarray] | None
+    surface: dict[Side, SideSurface]
+    touch_m: float
+    solid: bool
     speed_m_s: np.ndarray
     lift_m: np.ndarray | None
     hinge_rad: np.ndarray | None
@@ -38,18 +43,50 @@ class ClipSeries:
         """(frame,) how many of the sampled points this hand touches."""
         return self.touched[side].sum(axis=1)
 
+    @property
+    def depth_m(self) -> dict[Side, np.ndarray] | None:
+        """Per side the deepest hand vertex inside the object, or None where the mesh has no inside."""
+        return {side: found.depth_m for side, found in self.surface.items()} if self.solid else None
+
+    @property
+    def surface_evidence(self) -> HandEvidence:
+        """The hand test against the exact surface in place of sampled points, at the same threshold."""
+        distance: dict[Side, np.ndarray] = {side: found.joint_m for side, found in self.surface.items()}
+        return HandEvidence(None, distance, self.evidence.threshold_m).at_threshold(self.evidence.threshold_m)
+
 
 def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> ClipSeries:
     """The series of one clip of an annotated dataset; hands: the model of its store."""
     centre_m = _centre_m(annotated, clip)
+    stored = surface_beside(annotated)
+    if stored is None or clip.clip_id not in stored.ids:
+        surface, touch_m = _measured(annotated, clip, hands), TOUCH_M
+    else:
+        surface, touch_m = _read(stored, clip.clip_id), float(stored.info["touch_m"])
     return ClipSeries(
         touched={side: _touched(annotated, clip, side) for side in SIDES},
-        evidence=_evidence(annotated, clip),
-        depth_m=_depths(clip, hands),
+        evidence=annotated.hand_evidence(clip.clip_id),
+        surface=surface,
+        touch_m=touch_m,
+        solid=encloses_solid(surface_index(clip.object.model)),
         speed_m_s=_speed_m_s(centre_m),
         lift_m=None if clip.gravity is None else -(centre_m - centre_m[0]) @ np.asarray(clip.gravity, np.float64),
         hinge_rad=clip.object.hinge_rad,
     )
+
+
+def _read(stored: SurfaceStore, clip_id: str) -> dict[Side, SideSurface]:
+    return {side: stored.hand(clip_id, side) for side in SIDES}
+
+
+def _measured(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> dict[Side, SideSurface]:
+    points, index = annotated.points(annotated.object_key(clip.clip_id)), surface_index(clip.object.model)
+    found: dict[Side, SideSurface] = {}
+    for side in SIDES:
+        track, model = clip.hands[side], hands[side]
+        places = track_joints(track, model), track_vertices(track, model)
+        found[side] = measure_hand(clip, side, *places, index, points)
+    return found
 
 
 def _touched(annotated: AnnotatedStore, clip: Clip, side: Side) -> np.ndarray:
@@ -59,28 +96,6 @@ def _touched(annotated: AnnotatedStore, clip: Clip, side: Side) -> np.ndarray:
     touched = np.zeros((clip.n_frames, len(annotated.points(annotated.object_key(clip.clip_id)))), dtype=bool)
     touched[entries.frame, entries.point] = True
     return touched
-
-
-def _evidence(annotated: AnnotatedStore, clip: Clip) -> HandEvidence:
-    """The hand test of the stage annotate, with its number of points and its threshold."""
-    info = annotated.annotation_info
-    index = ProximityIndex(sample_points(clip.object.model, info["points"]))
-    joints: dict[Side, np.ndarray] = {side: annotated.joints(clip.clip_id, side) for side in SIDES}
-    return acting_hands(clip, joints, index, info["threshold_m"])
-
-
-def _depths(clip: Clip, hands: HandPair) -> dict[Side, np.ndarray] | None:
-    """Per side the deepest vertex inside the solid parts of the object in every frame, metres."""
-    parts = ObjectFacts.of(clip.object.model).solid_parts
-    return {side: _depth_m(clip, hands, side, parts) for side in SIDES} if parts else None
-
-
-def _depth_m(clip: Clip, hands: HandPair, side: Side, parts: list[int]) -> np.ndarray:
-    track = clip.hands[side]
-    if not track.valid.any():
-        return np.full(clip.n_frames, np.nan)
-    local = object_frame(track_vertices(track, hands[side]), clip.object.rotvec, clip.object.translation_m)
-    return np.where(track.valid, depths_m(clip.object.model, clip.object.hinge_rad, local, parts), np.nan)
 
 
 def _centre_m(annotated: AnnotatedStore, clip: Clip) -> np.ndarray:

@@ -76,6 +76,11 @@ def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> 
         Chart(f"touched, of {point_count:,} points of the object", "points", touched, 10, decimals=0),
         Chart("nearest joint to the object", "cm", near, 3, (threshold_cm, f"{threshold_cm:g} cm"), FARTHEST_CM),
     ]
+    vertices = [
+        Line(side, SIDE_COLOURS[side], series.surface[side].touched.sum(axis=1).astype(float)) for side in sides
+    ]
+    title = f"hand within {series.touch_m * 1000:g} mm of the object's surface"
+    charts.append(Chart(title, "vertices of 778", vertices, 10, decimals=0))
     if series.depth_m is not None:
         depths = [Line(side, SIDE_COLOURS[side], series.depth_m[side] * 1000) for side in sides]
         charts.append(Chart("deepest hand vertex inside the object", "mm", depths, 2))

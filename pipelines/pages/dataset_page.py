@@ -23,6 +23,7 @@ from pipelines.pages.dataset_facts import read_dataset
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, motion_player, render_page
 from pipelines.pages.quality import read_quality
+from pipelines.pages.surface_facts import contact_by_object, surface_beside
 
 EXAMPLES = 6
 SHOWN_BARS = 24
@@ -71,6 +72,7 @@ def write_dataset_page(
     if facts.empty:
         raise MissingResource(f"{name} has no clips to show: {facts.empty}")
     annotated = load_annotated(root, hands)
+    surface = surface_beside(annotated)
     page = render_page(
         "dataset_page.html",
         title=title or name,
@@ -82,6 +84,8 @@ def write_dataset_page(
         examples=_examples(out, annotated, hands, examples),
         splits=split_rows(annotated),
         quality=read_quality(root / "quality", name),
+        contact=[] if surface is None else contact_by_object(surface),
+        touch_mm=0.0 if surface is None else surface.info["touch_m"] * 1000,
         without_words=without_words(annotated),
         provenance=fact_rows(annotated.store),
         has_players=True,

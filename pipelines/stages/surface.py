@@ -1,13 +1,22 @@
 """Stage surface: hand vertices against the exact surface of the object, and BimArt's maps."""
 
+from pydantic import ConfigDict
+
 from pipelines.stages.base import Place, StageParams, empty_reason, jobs, load_hands, load_params, write_empty
 
 
 class SurfaceParams(StageParams):
-    """touch_m: a hand vertex closer to the surface touches it. points: per object, of BimArt's maps."""
+    """touch_m: a hand vertex closer to the surface touches it."""
 
     enabled: bool
     touch_m: float
+
+
+class PointParams(StageParams):
+    """Of the section of the stage contact: the maps of both stages lie on the same points."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
     points: int
 
 
@@ -30,7 +39,7 @@ def measure(place: Place, params: SurfaceParams) -> None:
         place.clips,
         place.surface,
         touch_m=params.touch_m,
-        points=params.points,
+        points=load_params(PointParams, "contact").points,
         hands=load_hands(place.profile),
         left_out=left_out_reasons(place.quality),
         jobs=jobs(),

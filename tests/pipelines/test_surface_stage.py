@@ -24,7 +24,7 @@ PLACE = Place("embedded", "grab")
 def project(tmp_path, monkeypatch):
     """Params and hand manifest in the current folder; few points."""
     params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    params["surface"]["points"] = 64
+    params["contact"]["points"] = 64
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
     shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
     monkeypatch.chdir(tmp_path)
@@ -37,8 +37,8 @@ def with_surface(params: dict, **settings) -> None:
 
 def test_params_hold_the_defaults_of_the_library():
     params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    assert params["surface"] == {"enabled": True, "touch_m": TOUCH_M, "points": POINT_COUNT}
-    assert params["surface"]["points"] == params["contact"]["points"]
+    assert params["surface"] == {"enabled": True, "touch_m": TOUCH_M}
+    assert params["contact"]["points"] == POINT_COUNT
 
 
 def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_its_reason(project, make_clip, capsys):

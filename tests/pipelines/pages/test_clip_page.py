@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.contact.stage import contact_store
-from hoidata.errors import MissingResource
+from hoidata.contact.surface_stage import surface_store
+from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import track_joints, track_vertices
 from hoidata.quality.stage import quality_store
 from hoidata.schema.annotated import load_annotated
@@ -26,6 +27,7 @@ from pipelines.pages.clip_page_series import measure_clip
 from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import three_javascript
+from pipelines.pages.surface_facts import surface_beside
 
 THRESHOLD_M = 0.09
 SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
@@ -127,6 +129,68 @@ def test_depth_is_how_far_a_vertex_lies_within_the_box(dataset, hands):
     assert np.isnan(series.depth_m["left"]).all()
 
 
+def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
+    """Distance to a box of 8 x 12 x 6 cm by formula: from joints, and vertices nearer than 5 mm."""
+    clip = dataset.clip("test/s2/box")
+    series, half = measure_clip(dataset, clip, hands), np.array((0.04, 0.06, 0.03))
+    turns = Rotation.from_rotvec(clip.object.rotvec).as_matrix()
+
+    def distance(places):
+        beyond = np.abs(np.einsum("fvi,fij->fvj", places - clip.object.translation_m[:, None], turns)) - half
+        return np.abs(np.linalg.norm(np.maximum(beyond, 0), axis=2) + np.minimum(beyond.max(axis=2), 0))
+
+    track = clip.hands["right"]
+    joints = distance(track_joints(track, hands["right"]).astype(np.float64)).min(axis=1)
+    np.testing.assert_allclose(series.surface["right"].joint_m[track.valid], joints[track.valid], atol=1e-6)
+    vertices = distance(track_vertices(track, hands["right"]).astype(np.float64))
+    clear = np.abs(vertices - 0.005) > 1e-6
+    expected = (vertices < 0.005) & track.valid[:, None]
+    np.testing.assert_array_equal(series.surface["right"].touched[clear], expected[clear])
+    assert not series.surface["left"].touched.any()
+
+
+def test_page_shows_the_same_whether_the_stage_surface_ran_or_not(dataset, hands, tmp_path):
+    without = write_clip_page(tmp_path / "without.html", dataset, "test/s1/lid", hands)
+    surface_store(dataset.root / "clips", dataset.root / "surface", progress=False)
+    assert write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands).read_text() == without.read_text()
+
+
+def test_page_reads_what_the_stage_wrote_and_measures_what_quality_control_left_out(dataset, hands):
+    left_out = {"test/s2/box": "left out by quality control: so"}
+    surface_store(dataset.root / "clips", dataset.root / "surface", touch_m=0.05, left_out=left_out, progress=False)
+    clips = [dataset.clip(clip_id) for clip_id in ("test/s1/lid", "test/s2/box")]
+    assert [measure_clip(dataset, clip, hands).touch_m for clip in clips] == [0.05, 0.005]
+
+
+def test_surface_of_another_conversion_or_of_other_points_is_refused(dataset, hands, page_clip, tmp_path):
+    surface_store(dataset.root / "clips", dataset.root / "surface", points=32, progress=False)
+    with pytest.raises(BadInput, match="maps on 1024 points, got on 32"):
+        surface_beside(dataset)
+    shutil.rmtree(dataset.root / "surface")
+    write_store(tmp_path / "others", [page_clip()], generated_info("grab", hands))
+    surface_store(tmp_path / "others", dataset.root / "surface", progress=False)
+    with pytest.raises(BadInput, match="the 3 clips of the store beside it"):
+        surface_beside(dataset)
+
+
+def test_packed_distances_of_every_frame_are_bimarts_in_steps(dataset, hands):
+    clip = dataset.clip("test/s1/lid")
+    points, series = dataset.points("lidded box"), measure_clip(dataset, clip, hands)
+    maps = {side: found.map for side, found in series.surface.items()}
+    values = json.loads(json.dumps(paint_values(clip, points, series.touched, maps)))
+    placed = world_points(dataset, clip)
+    for side in ("left", "right"):
+        steps = np.frombuffer(base64.b64decode(values["distances"][side]), np.uint8).reshape(clip.n_frames, -1)
+        vertices = track_vertices(clip.hands[side], hands[side])
+        for frame in (0, 12, 23):
+            nearest = np.linalg.norm(placed[frame][:, None] - vertices[frame][None], axis=2).min(axis=1)
+            near = nearest < 0.1999
+            assert near.any()
+            np.testing.assert_allclose(steps[frame][near] * 0.0008, nearest[near], atol=0.000401)
+            assert (steps[frame][nearest > 0.2001] == 255).all()
+    assert values["farthest"] * 0.0008 == pytest.approx(0.2)
+
+
 def test_packed_contact_of_every_frame_unpacks_to_the_touched_points(dataset, hands):
     clip = dataset.clip("test/s1/lid")
     points = dataset.points("lidded box")
@@ -161,8 +225,9 @@ def test_page_tells_words_evidence_quality_split_and_sources(dataset, hands, tmp
         assert sentence in text
     assert f'<td>s2/&lt;box&gt;.npz</td><td class="number">12,345</td><td>{SHA256}</td>' in text
     assert "<h2>Hand type: right</h2>" in text
-    assert re.search(r"<td>right</td><td>yes</td>.*<td class=\"number\">19 of 24</td></tr>", text)
-    assert '<td>left</td><td>no</td><td class="number">never seen</td>' in text
+    assert '<td>right</td><td class="number">19 of 24</td><td>yes</td>' in text
+    assert '<td>left</td><td class="number">0 of 24</td><td>no</td><td class="number">never seen</td>' in text
+    assert "exact surface in place of the points the hand type is the same." in text
     assert "The source names no hand." in text
     assert "cam4, images 700 to 723" in text
     assert "(chosen)</td><td>test</td>" in text
@@ -174,14 +239,14 @@ def test_page_says_where_annotator_and_distances_disagree(dataset, hands, tmp_pa
     text = write_clip_page(tmp_path / "page.html", dataset, "test/s1/lid", hands).read_text()
     assert "annotator named: right, which DISAGREES" in text
     assert "with a hinge" in text
-    assert text.count('<div class="readout"') == 6
+    assert text.count('<div class="readout"') == 7
 
 
 def test_clip_without_words_says_why_and_still_has_its_page(dataset, hands, tmp_path):
     text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/far", hands).read_text()
     assert "No sentences: no joint within 9 cm of the object" in text
     assert "<h2>Hand type: none</h2>" in text
-    assert "<td>right</td><td>no</td>" in text
+    assert '<td>right</td><td class="number">19 of 24</td><td>no</td>' in text
     assert "It is not known where down is" in text
     assert "No hand comes within 9 cm of the object." in text
 

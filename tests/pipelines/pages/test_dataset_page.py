@@ -9,6 +9,8 @@ import yaml
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.contact.stage import contact_store
+from hoidata.contact.surface_stage import surface_store
+from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
 from hoidata.quality.stage import quality_store
 from hoidata.schema.annotated import load_annotated
@@ -18,6 +20,7 @@ from hoidata.schema.store import write_store
 from hoidata.splits import split_store
 from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
 from pipelines.pages.report import ReportFolders, write_report
+from pipelines.pages.surface_facts import contact_by_object
 from pipelines.pages.view import view_of
 from pipelines.showing import closest_ids, find_clip, write_shown
 
@@ -72,6 +75,48 @@ def test_page_counts_lists_and_links(project, hands, tmp_path):
     links = re.findall(r'href="(clips/[^"]+)"', text)
     assert sorted(links) == ["clips/grab_s1_box_1.html", "clips/grab_s1_box_2.html", "clips/grab_s2_lid_1.html"]
     assert all((tmp_path / "out" / link).is_file() for link in links)
+    assert "Contact and penetration" not in text
+
+
+def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, hands, tmp_path):
+    """The left hand is in the box in frames 10 to 19, the right in 15 to 24 of 30: a frame counts once."""
+    clip = page_clip(left=True, frames=30)
+    tracks = {}
+    for side, first in (("left", 10), ("right", 15)):
+        wrist = clip.hands[side].wrist_m.copy()
+        wrist[first : first + 10] = clip.object.translation_m[first : first + 10]
+        tracks[side] = replace(clip.hands[side], wrist_m=wrist)
+    alone = replace(page_clip(hinged=True), clip_id="test/lid")
+    write_store(tmp_path / "clips", [replace(clip, hands=tracks), alone], generated_info("grab", hands))
+    surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
+    store = open_surface(tmp_path / "surface")
+    rows = {row.name: row for row in contact_by_object(store)}
+    assert list(rows) == ["all objects", "box", "lidded box"]
+    depth = np.nanmax([store.depth_m(clip.clip_id, side) for side in ("left", "right")], axis=0)
+    assert (rows["box"].touching, rows["box"].inside, rows["box"].deep) == ("50.0 %", "50.0 %", "50.0 %")
+    assert rows["box"].deepest == f"{depth.max() * 1000:.1f}"
+    assert rows["lidded box"].touching == rows["lidded box"].inside == "0.0 %"
+    assert (rows["all objects"].frames, rows["all objects"].touching) == ("54", f"{15 / 54 * 100:.1f} %")
+
+
+def test_page_shows_contact_and_penetration_where_the_stage_ran(project, hands, tmp_path):
+    surface_store(project / "clips", project / "surface", touch_m=0.02, progress=False)
+    text = write_dataset_page(tmp_path / "out", project, "grab", hands, examples=0).read_text()
+    assert "<h3>Contact and penetration</h3>" in text
+    assert "within 20 mm of the exact surface" in text
+    assert '<td>all objects</td><td class="number">4</td><td class="number">102</td>' in text
+
+
+def test_object_without_an_inside_has_no_depths_in_the_table(page_clip, hands, tmp_path):
+    clip = page_clip()
+    plate = replace(clip.object.model, faces=clip.object.model.faces[:2])
+    write_store(
+        tmp_path / "clips", [replace(clip, object=replace(clip.object, model=plate))], generated_info("grab", hands)
+    )
+    surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
+    [row] = contact_by_object(open_surface(tmp_path / "surface"))
+    assert (row.inside, row.deep, row.deepest) == ("", "", "")
+    assert "open" in row.note
 
 
 @pytest.mark.slow
