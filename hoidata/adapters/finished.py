@@ -31,7 +31,7 @@ from hoidata.schema.quarantine import Quarantined
 from hoidata.schema.store import SCHEMA_VERSION
 
 # The code a conversion runs: these rooms of hoidata, and the adapter's own file wherever it lies.
-ROOMS = ("adapters", "schema", "objects", "hands", "geometry", "files", "errors.py")
+ROOMS = ("adapters", "schema", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
 LIBRARIES = ("numpy", "scipy", "torch", "trimesh")
 _CACHED_ARRAYS = 32
 

@@ -22,7 +22,9 @@ from hoidata.adapters.manipnet import (
 from hoidata.adapters.manipnet_segments import LIFTED_M, height_above_table
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
-from hoidata.physics.capsules import Capsules, ObjectPoses
+from hoidata.physics.capsules import Capsules, ObjectPoses, joined
+from hoidata.physics.realism import HandMotion
+from hoidata.physics.scene import Scene
 from hoidata.schema.clip import SIDES, Side
 
 N_CAPSULES = 19
@@ -51,6 +53,17 @@ class SourceRecording:
     def lifted(self) -> np.ndarray:
         """(frame,) bool: more than 1.5 cm above the table."""
         return self.lift_m > LIFTED_M
+
+    @property
+    def scene(self) -> Scene:
+        """For ``physics.realism``: every frame, the left hand's 19 capsules before the right's, y up."""
+        capsules = joined([self.capsules[side] for side in SIDES])
+        return Scene(self.model, self.poses, capsules, self.fps, np.array([0.0, -1.0, 0.0]))
+
+    @property
+    def motions(self) -> dict[str, HandMotion]:
+        """For ``physics.realism``: joints and wrists of both hands."""
+        return {side: HandMotion(self.joints_m[side], self.wrist_rotmats[side]) for side in SIDES}
 
 
 @dataclass(frozen=True)

@@ -15,16 +15,17 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.adapters.base import RawTree, SequenceKey
-from hoidata.adapters.manipnet_source_hands import SourceRecording, read_source_hands
+from hoidata.adapters.manipnet_source_hands import read_source_hands
 from hoidata.adapters.registry import get_adapter
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.physics.as_released import AsReleased
-from hoidata.physics.capsules import Capsules, joined
+from hoidata.physics.capsules import Capsules, ObjectPoses, joined
+from hoidata.physics.contact_forces import GRAVITY_M_S2
 from hoidata.physics.mano_capsules import THUMB_CAPSULES
-from hoidata.physics.realism import Realism, Variant, score, smoothness_m_s2
+from hoidata.physics.realism import Realism, Variant, clip_motions, measure, score
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits
-from hoidata.schema.clip import SIDES, Clip
+from hoidata.schema.clip import Clip
 from tests.bench.corpus import embedded_root
 from tests.bench.harness import show
 
@@ -48,27 +49,29 @@ def variants(tolerance_m: float) -> dict[str, Variant]:
 
 def main() -> None:
     for name in ("grab", "arctic"):
-        scenes = [clip_scene(clip, embedded_hands()) for clip in embedded_clips(name, _clips_wanted())]
-        show_controls(f"Embedded {name}, {len(scenes)} clips, lifted frames", scenes, THUMB_CAPSULES, MANO_TOLERANCE_M)
+        clips = embedded_clips(name, _clips_wanted())
+        scenes = [clip_scene(clip, embedded_hands()) for clip in clips]
+        title = f"Embedded {name}, {len(scenes)} clips"
+        show_controls(f"{title}, lifted frames", scenes, THUMB_CAPSULES, MANO_TOLERANCE_M)
+        show_known_answers(title, scenes)
+        show_smoothness(clips, scenes)
     root = os.environ.get("HOIDATA_MANIPNET")
     if not root:
         print("HOIDATA_MANIPNET is not set: no real recordings")
         return
     for sequence in os.environ.get("HOIDATA_BENCH_SEQUENCES", "cyl_med3").split(","):
         source = read_source_hands(RawTree(Path(root)), sequence)
-        scene = source_scene(source)
-        show_controls(f"ManipNet {sequence}, source hands, {source.fps:g} Hz", [scene], SOURCE_THUMB, 0.0)
+        scene, title = source.scene, f"ManipNet {sequence}"
+        show_controls(f"{title}, source hands, {source.fps:g} Hz, lifted frames", [scene], SOURCE_THUMB, 0.0)
+        show_known_answers(title, [scene])
+        smooth = measure(scene, source.motions, {}).smoothness_m_s2
+        print("smoothness, cm/s^2:", ", ".join(f"{side} {100 * value:.1f}" for side, value in smooth.items()))
         slow = [every_fourth_frame(scene)]
-        show_controls(f"ManipNet {sequence}, source hands, every fourth frame", slow, SOURCE_THUMB, 0.0)
+        show_controls(f"{title}, source hands, every fourth frame", slow, SOURCE_THUMB, 0.0)
         clips = fitted_clips(Path(root), sequence)
         fitted = [clip_scene(clip, embedded_hands(), scene.table_height_m) for clip in clips]
-        show_controls(
-            f"ManipNet {sequence}, fitted hands, {len(fitted)} clips, 30 fps", fitted, THUMB_CAPSULES, MANO_TOLERANCE_M
-        )
-        smooth = {
-            side: smoothness_m_s2(source.joints_m[side], source.wrist_rotmats[side], source.fps) for side in SIDES
-        }
-        print("smoothness, cm/s^2:", ", ".join(f"{side} {100 * value:.1f}" for side, value in smooth.items()))
+        show_controls(f"{title}, fitted hands, {len(fitted)} clips, 30 fps", fitted, THUMB_CAPSULES, MANO_TOLERANCE_M)
+        show_smoothness(clips, fitted)
 
 
 def show_controls(title: str, scenes: Sequence[Scene], thumb: Sequence[int], tolerance_m: float) -> None:
@@ -81,6 +84,59 @@ def show_controls(title: str, scenes: Sequence[Scene], thumb: Sequence[int], tol
         depth = _mean([result.colliding_m for result in one], [len(result.frames) for result in one])
         rows.append([name, *(_share(result) for result in results.values()), _count(one), f"{1e3 * depth:.1f}"])
     show(title, ["control", *columns, "scored", "depth mm"], rows)
+
+
+def show_known_answers(title: str, scenes: Sequence[Scene]) -> None:
+    """Without any hand: nothing holds an object, nothing needs to hold one that falls, a table holds one that lies."""
+    answers = {
+        "held in the air": ("0 %", [score(without_hands(scene), StandardUnits(), scene.held) for scene in scenes]),
+        "falling freely": ("100 %", [score(falling(scene), StandardUnits()) for scene in scenes]),
+        "lying on a table, hands alone": ("0 %", [_lying_score(scene, None) for scene in scenes]),
+        "lying on a table, with it": ("100 %", [_lying_score(scene, scene.table_height_m) for scene in scenes]),
+    }
+    rows = [[name, expected, _share(results)] for name, (expected, results) in answers.items()]
+    show(f"{title}: no hands, SI", ["object", "must be", "passes"], rows)
+
+
+def without_hands(scene: Scene) -> Scene:
+    return scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
+
+
+def falling(scene: Scene, frames: int = 30) -> Scene:
+    """The object dropped from 10 m with the turn of the first frame."""
+    time = np.arange(frames)[:, None] / scene.fps
+    drop = -10 * scene.gravity + 0.5 * GRAVITY_M_S2 * time**2 * scene.gravity
+    return _alone(scene, np.zeros(frames, dtype=int), drop, table_m=0.0)
+
+
+def lying(scene: Scene, frames: int = 5) -> Scene:
+    """The object kept still as in the frame in which it is nearest to the table's height, set down on it."""
+    frame = int(np.abs(scene.lowest_m - scene.table_height_m).argmin())
+    down = (scene.lowest_m[frame] - scene.table_height_m) * scene.gravity
+    return _alone(scene, np.full(frames, frame), down, scene.table_height_m)
+
+
+def _alone(scene: Scene, frames: np.ndarray, shift_m: np.ndarray, table_m: float) -> Scene:
+    poses = scene.poses.taken(frames)
+    poses = ObjectPoses(poses.rotmats, poses.translation_m + shift_m, poses.hinge_rad)
+    none = scene.capsules.taken(frames, slice(0, 0))
+    return Scene(scene.model, poses, none, scene.fps, scene.gravity, table_m)
+
+
+def _lying_score(scene: Scene, table_m: float | None) -> Realism:
+    still = lying(scene)
+    return score(still, StandardUnits(table_m=table_m), np.ones(still.n_frames, dtype=bool))
+
+
+def show_smoothness(clips: Sequence[Clip], scenes: Sequence[Scene]) -> None:
+    """Mean over the clips, of each hand."""
+    found = [
+        measure(scene, clip_motions(clip, embedded_hands()), {}, np.zeros(scene.n_frames, dtype=bool)).smoothness_m_s2
+        for clip, scene in zip(clips, scenes, strict=True)
+    ]
+    sides = sorted({side for one in found for side in one})
+    means = {side: np.mean([one[side] for one in found if side in one]) for side in sides}
+    print("smoothness, cm/s^2:", ", ".join(f"{side} {100 * value:.1f}" for side, value in means.items()))
 
 
 def controls(thumb: Sequence[int]) -> dict[str, Callable[[Scene], Capsules]]:
@@ -108,12 +164,6 @@ def moved_away(scene: Scene, way_m: float) -> Capsules:
         direction = (own.start_m + own.end_m).mean(axis=1) / 2 - scene.motion.centre_m
         hands.append(own.moved(way_m * direction / np.linalg.norm(direction, axis=1, keepdims=True)))
     return joined(hands)
-
-
-def source_scene(source: SourceRecording) -> Scene:
-    """A ManipNet recording with its own hands, y up; the table is found over the whole recording."""
-    capsules = joined([source.capsules[side] for side in SIDES])
-    return Scene(source.model, source.poses, capsules, source.fps, np.array([0.0, -1.0, 0.0]))
 
 
 def every_fourth_frame(scene: Scene) -> Scene:

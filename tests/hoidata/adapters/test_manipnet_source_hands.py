@@ -14,11 +14,7 @@ from hoidata.adapters import RawTree
 from hoidata.adapters.manipnet import HAND_JOINTS
 from hoidata.adapters.manipnet_source_hands import N_CAPSULES, read_source_hands
 from hoidata.errors import BadInput
-from hoidata.physics.as_released import AsReleased
-from hoidata.physics.capsules import joined
-from hoidata.physics.realism import score, smoothness_m_s2
-from hoidata.physics.scene import Scene
-from hoidata.physics.standard_units import StandardUnits
+from hoidata.physics.realism import measure
 from hoidata.schema.clip import SIDES
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
@@ -158,15 +154,14 @@ def test_a_reference_file_without_nineteen_sound_capsules_is_refused(tree, tmp_p
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the recordings are not part of this repository")
 def test_cyl_med3_scores_as_published_facts_say_and_fails_without_hands() -> None:
     source = read_source_hands(RawTree(Path(ROOT)), "cyl_med3")
-    both = joined([source.capsules[side] for side in SIDES])
-    scene = Scene(source.model, source.poses, both, source.fps, np.array([0.0, -1.0, 0.0]))
+    scene = source.scene
     np.testing.assert_array_equal(scene.lifted, source.lifted)
-    standard, released = score(scene, StandardUnits()), score(scene, AsReleased())
-    assert 0.82 < standard.share < 0.87
-    assert 0.94 < released.share < 0.97
-    assert 0.0032 < standard.colliding_m < 0.0037
-    bare = scene.with_capsules(both.taken(slice(None), np.zeros(0, dtype=int)))
-    assert score(bare, StandardUnits()).share == 0.0
-    assert 0.16 < score(bare, AsReleased()).share < 0.20
-    smooth = [smoothness_m_s2(source.joints_m[side], source.wrist_rotmats[side], source.fps) for side in SIDES]
-    assert smooth == pytest.approx([1.27, 1.17], abs=0.01)
+    assert scene.capsules.radius_m.shape == (2 * N_CAPSULES,)
+    np.testing.assert_array_equal(scene.capsules.start_m[:, N_CAPSULES:], source.capsules["right"].start_m)
+    found = measure(scene, source.motions)
+    assert 0.82 < found.shares["SI"] < 0.87
+    assert 0.94 < found.shares["as released"] < 0.97
+    assert found.floors["SI"] == 0.0
+    assert 0.16 < found.floors["as released"] < 0.20
+    assert 0.0032 < found.penetration_m < 0.0037
+    assert found.smoothness_m_s2 == {"left": pytest.approx(1.27, abs=0.01), "right": pytest.approx(1.17, abs=0.01)}
