@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from hoidata.annotation import TextEncoder, refuse_other_encoder
-from hoidata.annotation.hand_choice import HandChoice, select_hand
+from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
@@ -61,11 +61,13 @@ def generate(
     sampler: SamplerConfig | None = None,
     frames: int | None = None,
     object_words: str | None = None,
+    hand_by: Method = "rules",
     threads: int = 2,
 ) -> GeneratedMotion:
     """A motion for ``text`` on ``object`` (metres), with the models in ``checkpoints/<model>``.
 
     hands and encoder must be the ones the models were trained with. frames: instead of the length model's answer.
+    hand_by: "rules", then similarity by a margin, then the share in training; or the paper's plain "similarity".
     Raises BadInput where a model is missing or was trained with other hands or another encoder.
     """
     torch.set_num_threads(threads)
@@ -73,7 +75,7 @@ def generate(
     loaded = {name: load_checkpoint(Path(checkpoints) / name, name) for name in MODELS}
     for checkpoint in loaded.values():
         _refuse_others(checkpoint, hands, encoder, Path(checkpoints))
-    choice = _chosen_hand(text, encoder, loaded["contact"].facts["hand_types"])
+    choice = _chosen_hand(text, encoder, loaded["contact"].facts["hand_types"], hand_by)
     draws = torch.Generator().manual_seed(seed)
     feature = torch.from_numpy(encoder.encode([text]))
     acts = torch.tensor([[choice.hand in (side, "both") for side in SIDES]])
@@ -151,10 +153,10 @@ def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder
     refuse_other_encoder(where, facts["encoder"], encoder.identity)
 
 
-def _chosen_hand(text: str, encoder: TextEncoder, counts: dict[HandType, int]) -> HandChoice:
+def _chosen_hand(text: str, encoder: TextEncoder, counts: dict[HandType, int], method: Method) -> HandChoice:
     """Rules first; where the text names no hand, the share of hands among the training clips decides, and is named."""
     total = max(sum(counts.values()), 1)
-    return select_hand(text, encoder, {hand: count / total for hand, count in counts.items()})
+    return choose_hand(text, encoder, {hand: count / total for hand, count in counts.items()}, method)
 
 
 def _length(checkpoint: Checkpoint, feature: Tensor, acts: Tensor, draws: torch.Generator) -> int:

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.annotation import load_encoder
+from hoidata.annotation.hand_choice import Method
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.lineage.graph import look_up, read_params
@@ -18,18 +19,20 @@ from pipelines.stages.base import Place, empty_reason, load_hands
 SMALLEST_M, LARGEST_M = 0.005, 2.0
 
 
-def generate_files(text: str, object: str | Path, seed: int, out: Path, place: Place) -> list[Path]:
+def generate_files(
+    text: str, object: str | Path, seed: int, out: Path, place: Place, hand_by: Method = "rules"
+) -> list[Path]:
     """Generate and write motion.npz, motion.glb and index.html; returns their paths.
 
-    object: a mesh file in metres, or the name of an object of the dataset. Raises MissingResource or BadInput that
-    says what is not there.
+    object: a mesh file in metres, or the name of an object of the dataset. hand_by: as in ``choose_hand``. Raises
+    MissingResource or BadInput that says what is not there.
     """
     if reason := why_not_trained(place):
         raise MissingResource(f"the models of {place} cannot generate: {reason}")
     hands = load_hands(place.profile)
     model = read_object(object) if isinstance(object, Path) else stored_object(object, place, hands)
     encoder = load_encoder(look_up(read_params(Path()), "annotate.encoder"))
-    motion = generate(text, model, place.checkpoints, hands, encoder, seed)
+    motion = generate(text, model, place.checkpoints, hands, encoder, seed, hand_by=hand_by)
     return write_generation(out, motion, hands)
 
 

@@ -24,6 +24,7 @@ TEMPLATES: dict[HandType, str] = {
 PHRASES: dict[HandType, str] = {"left": "with the left hand", "right": "with the right hand", "both": "with both hands"}
 MARGIN = 0.05
 Source = Literal["rule", "embedding", "prior", "unknown"]
+Method = Literal["rules", "similarity"]
 
 
 @dataclass(frozen=True)
@@ -62,6 +63,18 @@ def select_hand(
         hand, share = _most_likely(prior, mentions)
         return HandChoice(hand, "prior", share, f"{evidence}; {hand} in {share:.0%} of the training clips")
     return HandChoice(None, "unknown", 0.0, evidence)
+
+
+def choose_hand(
+    text: str, encoder: TextEncoder, prior: Mapping[HandType, float] | None = None, method: Method = "rules"
+) -> HandChoice:
+    """``select_hand``; or by "similarity" the paper's plain way: always the most similar of three templates."""
+    if method == "rules":
+        return select_hand(text, encoder, prior)
+    hand, margin = most_similar_hand(text, encoder)
+    return HandChoice(
+        hand, "embedding", margin, f"most like {TEMPLATES[hand]!r} by {margin:.3f}; no margin is asked for"
+    )
 
 
 def most_similar_hand(

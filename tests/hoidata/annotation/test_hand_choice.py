@@ -5,7 +5,7 @@ import pytest
 
 from hoidata.annotation.encoders import HashEncoder
 from hoidata.annotation.grammar import default_grammar
-from hoidata.annotation.hand_choice import HAND_TYPES, hand_prior, most_similar_hand, select_hand
+from hoidata.annotation.hand_choice import HAND_TYPES, choose_hand, hand_prior, most_similar_hand, select_hand
 from hoidata.annotation.prompts import read_prompt
 from hoidata.annotation.sentences import four_sentences
 
@@ -116,6 +116,18 @@ def test_a_prior_never_answers_with_a_hand_the_sentence_rules_out() -> None:
     prior = hand_prior(["right", "right", "both", "left"])
     assert select_hand("lift it without using your right hand", prior=prior).hand == "left"
     assert select_hand("one hand only", prior=hand_prior(["both", "both", "left"])).hand == "left"
+
+
+def test_the_papers_plain_choice_always_answers_where_the_rules_do_not() -> None:
+    """These name no hand that acts: the rules give the prior by name, the paper's arg-max one of the three."""
+    prior = hand_prior(["both", "both", "left"])
+    for text in ("Lift a book.", "pick up the cup", "do not use the left hand"):
+        assert choose_hand(text, HashEncoder(), prior).source == "prior"
+        plain = choose_hand(text, HashEncoder(), prior, "similarity")
+        assert (plain.hand, plain.confidence) == most_similar_hand(text, HashEncoder())
+        assert (plain.source, plain.hand in HAND_TYPES) == ("embedding", True)
+        assert "no margin is asked for" in plain.evidence
+    assert choose_hand("do not use the left hand", HashEncoder(), method="similarity").hand == "left"
 
 
 def test_the_papers_choice_is_the_most_similar_template() -> None:
