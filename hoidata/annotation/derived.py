@@ -43,8 +43,8 @@ class ObjectMotion:
     """What the rules look at, of one clip; metres and radians.
 
     hinge_rad: (frame,), None for a rigid object. height_m: (frame,) of the object's middle above its first, against
-    gravity, None without it. travelled_m: farthest from the first place, level where gravity is known, else in any
-    direction. turned_rad: the largest angle to the first orientation. shakes: whole swings to and fro, and
+    gravity, None without it. travelled_m: farthest from the first place, not counting what it rises where gravity is
+    known. turned_rad: the largest angle to the first orientation. shakes: whole swings to and fro, and
     shaken_frames: how many frames they take. touched: share of frames in which a hand is near.
     """
 
@@ -73,22 +73,22 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
 
 
 def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
-    """The measures of one clip. The object's middle is that of the bounding box of its base: a lid does not move it."""
-    model, track = clip.object.model, clip.object
-    base = model.vertices_m[model.part == 0] if model.is_articulated else model.vertices_m
-    middle_m = (base.min(axis=0) + base.max(axis=0)) / 2
+    """The measures of one clip. The object's middle is that of its bounding box at hinge angle zero: a lid that turns
+    does not move it."""
+    track, vertices_m = clip.object, clip.object.model.vertices_m
+    middle_m = (vertices_m.min(axis=0) + vertices_m.max(axis=0)) / 2
     rotation = rotvec_to_rotmat(track.rotvec.astype(np.float64))
     centre_m = rotation @ middle_m + track.translation_m.astype(np.float64)
     shift_m = centre_m - centre_m[0]
     up = None if clip.gravity is None else -np.asarray(clip.gravity, np.float64)
     height_m = None if up is None else shift_m @ up
-    level_m = shift_m if up is None or height_m is None else shift_m - height_m[:, None] * up
+    way_m = shift_m if up is None or height_m is None else shift_m - np.maximum(height_m, 0)[:, None] * up
     shakes, shaken = _shakes(centre_m)
     touched = np.any([evidence.near(side) for side in SIDES], axis=0)
     return ObjectMotion(
         hinge_rad=None if track.hinge_rad is None else track.hinge_rad.astype(np.float64),
         height_m=height_m,
-        travelled_m=float(np.linalg.norm(level_m, axis=1).max()),
+        travelled_m=float(np.linalg.norm(way_m, axis=1).max()),
         turned_rad=float(_angles(rotation[0].T @ rotation).max()),
         shakes=shakes,
         shaken_frames=shaken,

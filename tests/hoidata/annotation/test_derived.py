@@ -101,11 +101,17 @@ def test_what_rises_and_comes_back_is_lifted_either_way_round() -> None:
 
 
 def test_what_rises_a_little_is_grasped_and_what_moves_level_is_moved() -> None:
-    assert verb(clip(rigid(), path_m=along(2, 0.04 * SMOOTH))) == "grasp"
+    for rise in (0.02, 0.04, 0.09):
+        assert verb(clip(rigid(), path_m=along(2, rise * SMOOTH))) == "grasp"
     assert verb(clip(rigid(), path_m=along(2, 0.01 * SMOOTH))) == "hold"
     sliding = clip(rigid(), path_m=along(0, 0.12 * SMOOTH))
     assert verb(sliding) == verb(reversed_in_time(sliding)) == "move"
     assert verb(replace(sliding, gravity=np.array([-1.0, 0, 0]))) == "lift"
+
+
+def test_what_dips_and_comes_back_is_moved_and_not_placed() -> None:
+    assert verb(clip(rigid(), path_m=along(2, -0.08 * THERE_AND_BACK))) == "move"
+    assert verb(clip(rigid(), path_m=along(2, -0.08 * SMOOTH))) == "place"
 
 
 def test_without_gravity_a_rise_is_a_move() -> None:
@@ -125,6 +131,8 @@ def test_what_turns_on_the_spot_is_turned(degrees: float, expected: str) -> None
         (0.003, 4, 3, "hold"),
         (0.02, 0.6, 3, "grasp"),
         (0.02, 4, 0.5, "grasp"),
+        (0.02, 2, 1.0, "grasp"),
+        (0.05, 1.1, 3, "grasp"),
     ],
 )
 def test_three_fast_wide_swings_are_shaking(amplitude_m, per_second, seconds, expected) -> None:
@@ -150,6 +158,16 @@ def test_swings_in_less_than_a_fifth_of_the_clip_do_not_name_it() -> None:
 def test_at_rest_the_share_of_touched_frames_tells_hold_from_touch() -> None:
     assert verb(clip(rigid()), near=0.9) == "hold"
     assert verb(clip(rigid()), near=0.5) == "touch"
+
+
+def test_an_object_far_from_its_own_origin_moves_only_when_its_middle_does() -> None:
+    """A turn of 20 degrees about its middle swings the origin, half a metre away, by 17 cm."""
+    offset = np.array([0.0, 0.5, 0.0])
+    far = replace(rigid(), vertices_m=rigid().vertices_m + offset)
+    turning = clip(far, turn_rad=np.deg2rad(20) * SMOOTH)
+    origin = np.array([0.3, -0.2, 0.9]) - Rotation.from_rotvec(turning.object.rotvec).apply(offset)
+    track = replace(turning.object, translation_m=origin.astype(np.float32))
+    assert verb(replace(turning, object=track)) == "hold"
 
 
 def test_the_evidence_says_what_was_measured() -> None:

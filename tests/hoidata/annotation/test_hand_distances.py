@@ -124,10 +124,15 @@ def test_frames_are_judged_one_by_one(annotated: AnnotatedStore) -> None:
     assert not evidence.near("left").any()
 
 
-def test_a_store_that_was_opened_can_be_sent_to_a_worker(annotated: AnnotatedStore) -> None:
-    before = annotated.hand_evidence("toy/3")
-    sent = pickle.loads(pickle.dumps(annotated))
-    np.testing.assert_array_equal(sent.hand_evidence("toy/3").distance_m["left"], before.distance_m["left"])
+def test_a_worker_maps_the_distances_anew_and_is_not_sent_them(root: Path) -> None:
+    opened = load_annotated(root)
+    size = len(pickle.dumps(opened))
+    before = opened.hand_evidence("toy/3")
+    sent = pickle.dumps(opened)
+    assert len(sent) == size
+    np.testing.assert_array_equal(
+        pickle.loads(sent).hand_evidence("toy/3").distance_m["left"], before.distance_m["left"]
+    )
 
 
 def test_an_annotation_without_distances_names_its_stage(root: Path, tmp_path: Path) -> None:
