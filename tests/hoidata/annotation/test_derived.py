@@ -195,6 +195,33 @@ def test_a_world_that_is_turned_and_shifted_changes_no_verb(turn: tuple[float, .
     assert verb(replace(still, object=moved, gravity=world.apply(DOWN))) == verb(still)
 
 
+MOTIONS = {
+    "open": clip(hinged(), hinge_rad=0.1 + 0.5 * SMOOTH),
+    "close": clip(hinged(), hinge_rad=0.6 - 0.5 * SMOOTH),
+    "operate": clip(hinged(), hinge_rad=0.2 + 0.6 * THERE_AND_BACK),
+    "lift": clip(rigid(), path_m=along(2, 0.15 * SMOOTH)),
+    "place": clip(rigid(), path_m=along(2, -0.15 * SMOOTH)),
+    "turn": clip(rigid(), turn_rad=np.deg2rad(45) * SMOOTH),
+    "move": clip(rigid(), path_m=along(0, 0.12 * SMOOTH)),
+    "grasp": clip(rigid(), path_m=along(2, 0.04 * SMOOTH)),
+    "hold": clip(rigid()),
+}
+
+
+@pytest.mark.parametrize("expected", MOTIONS)
+def test_jitter_of_two_millimetres_and_one_degree_changes_no_verb(expected: str) -> None:
+    rng, track = np.random.default_rng(0), MOTIONS[expected].object
+    turn = Rotation.from_rotvec(rng.normal(size=(FRAMES, 3)) * np.deg2rad(1) / 3**0.5)
+    hinge = None if track.hinge_rad is None else track.hinge_rad + rng.normal(size=FRAMES) * np.deg2rad(1)
+    shaken = replace(
+        track,
+        rotvec=(turn * Rotation.from_rotvec(track.rotvec)).as_rotvec().astype(np.float32),
+        translation_m=(track.translation_m + rng.normal(size=(FRAMES, 3)) * 0.002).astype(np.float32),
+        hinge_rad=hinge,
+    )
+    assert verb(replace(MOTIONS[expected], object=shaken)) == expected
+
+
 def test_turning_points_of_a_zigzag() -> None:
     zigzag = np.array([0, 1, 2, 1, 1.2, 0.9, 0, 3, 2.9, 3.1, 0.0])
     assert turning_points(zigzag, 1.0) == [0, 2, 6, 9]
