@@ -19,8 +19,9 @@ from hoidata.objects.distance_grid import (
     lower_distances,
     mark_within,
     no_grid,
-    raise_depths,
+    sides,
 )
+from hoidata.objects.line_crossings import INSIDE, settle_sides
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, solid_of
 from hoidata.objects.triangle_tree import triangle_tree
@@ -99,7 +100,13 @@ class SurfaceIndex:
         depth = np.zeros(places_m.shape[:2])
         for part, surface in self._closed.items():
             places = self._in_part(places_m, hinge_rad, part)
-            raise_depths(surface.tree, surface.grid_for(places), places, depth.reshape(-1))
+            grid = surface.grid_for(places)
+            side = sides(surface.tree, grid, places)
+            settle_sides(surface.tree, places, side)
+            inside = np.flatnonzero(side == INSIDE)
+            own = np.full(len(inside), np.inf)
+            lower_distances(surface.tree, grid, places[inside], np.inf, own)
+            depth.reshape(-1)[inside] = np.maximum(depth.reshape(-1)[inside], own)
         return depth
 
     @property
