@@ -33,7 +33,7 @@ class Stretches(NamedTuple):
 def stretches_inside(tree: TriangleTree, cell_m: float) -> Stretches:
     """The lattice lies evenly about the middle of the surface's box."""
     low, high = tree.box[0, 1:3], tree.box[0, 4:]
-    shape = np.ceil((high - low) / cell_m).astype(np.int64)
+    shape = np.ceil((high - low) / cell_m - 1e-9).astype(np.int64)  # a size that is so many cells but for rounding
     corner = (low + high) / 2 - shape * cell_m / 2
     return Stretches(corner, cell_m, shape, *_stretches(tree, corner, cell_m, shape))
 
