@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from hoidata.annotation.derived import derive_verb, object_motion, turning_points
+from hoidata.annotation.grammar import default_grammar
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.schema.hand_evidence import HandEvidence
@@ -227,3 +228,7 @@ def test_turning_points_of_a_zigzag() -> None:
     assert turning_points(zigzag, 1.0) == [0, 2, 6, 9]
     assert turning_points(zigzag, 2.5) == [0, 9]
     assert turning_points(np.zeros(5), 1.0) == []
+
+
+def test_every_verb_that_is_derived_has_its_forms_in_the_word_table() -> None:
+    assert {*MOTIONS, "shake", "touch"} <= set(default_grammar().verbs)
