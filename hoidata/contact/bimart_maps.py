@@ -13,39 +13,29 @@ average (table 6).
 import numpy as np
 from numba import njit
 
-from hoidata.contact.proximity import joints_in_object, joints_in_part
+from hoidata.contact.proximity import joints_in_part
+from hoidata.contact.surface_contact import PlacedHand
+from hoidata.objects.model import Hinge
 from hoidata.objects.sampling import SampledPoints
-from hoidata.schema import Clip, ObjectTrack, Side
 
 REACH_M = 0.2
 STEP_M = 0.0008
 BEYOND = 255
 
 
-def bimart_map(clip: Clip, vertices_m: np.ndarray, points: SampledPoints, side: Side) -> np.ndarray:
+def bimart_map(hand: PlacedHand, points: SampledPoints, hinge: Hinge | None) -> np.ndarray:
     """(frame, point) float32 distance from each sampled point to the nearest vertex of one hand, metres.
 
-    vertices_m: (frame, vertex, 3) of that hand in the clip's world. points: of ``clip.object.model``; those of the
-    moving part go with the hinge. Infinite in frames where the hand is not valid, and everywhere beyond 20 cm.
+    points, hinge: of the object the hand is placed before; points of the moving part go with the hinge. Infinite in
+    frames where the hand is not valid, and everywhere beyond 20 cm.
     """
-    distances = np.full((clip.n_frames, len(points)), np.inf, np.float32)
-    valid = clip.hands[side].valid
-    rows = np.flatnonzero(valid)
-    if len(rows):
-        distances[rows] = point_distances_m(vertices_m[rows], points, _at(clip.object, rows))
-    return distances
-
-
-def point_distances_m(vertices_m: np.ndarray, points: SampledPoints, track: ObjectTrack) -> np.ndarray:
-    """(frame, point) float32 as :func:`bimart_map`, of every frame of ``vertices_m (frame, vertex, 3)``, world."""
-    distances = np.full((len(vertices_m), len(points)), np.inf, np.float32)
-    in_object = joints_in_object(vertices_m, track)
-    for part in np.unique(points.part):
-        places = joints_in_part(in_object, int(part), track.model.hinge, track.hinge_rad)
+    nearest = np.full((len(hand.vertices_m), len(points)), np.inf, np.float32)
+    for part in np.unique(points.part) if len(hand.vertices_m) else ():
+        places = joints_in_part(hand.vertices_m, int(part), hinge, hand.hinge_rad)
         members = np.flatnonzero(points.part == part)
         cloud = np.ascontiguousarray(points.points_m[members].T, np.float32)
-        distances[:, members] = _nearest_m(np.ascontiguousarray(places.transpose(0, 2, 1), np.float32), cloud)
-    return distances
+        nearest[:, members] = _nearest_m(np.ascontiguousarray(places.transpose(0, 2, 1), np.float32), cloud)
+    return hand.over_clip(nearest, np.inf)
 
 
 def clip_map(distances_m: np.ndarray) -> np.ndarray:
@@ -62,11 +52,6 @@ def packed_map(distances_m: np.ndarray) -> np.ndarray:
 def unpacked_map(packed: np.ndarray) -> np.ndarray:
     """float32 metres of :func:`packed_map`, at most 0.4 mm off; infinite beyond 20 cm."""
     return np.where(packed == BEYOND, np.inf, packed * STEP_M).astype(np.float32)
-
-
-def _at(track: ObjectTrack, rows: np.ndarray) -> ObjectTrack:
-    hinge = None if track.hinge_rad is None else track.hinge_rad[rows]
-    return ObjectTrack(track.model, track.rotvec[rows], track.translation_m[rows], hinge)
 
 
 def _nearest_m(places_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:

@@ -19,17 +19,18 @@ from rich.progress import Progress
 
 from hoidata.contact.bimart_maps import bimart_map, packed_map
 from hoidata.contact.proximity import joints_in_object
+from hoidata.contact.solid_overlap import SolidOverlap
+from hoidata.contact.surface_contact import TOUCH_M, PlacedHand, penetration, placed_hand, touched_vertices
 from hoidata.contact.surface_store import ClipSurface, SideSurface, SurfaceWriter
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
-from hoidata.hands import HandPair, track_vertices
+from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.schema.clip import SIDES, Clip, Side
 from hoidata.schema.store import Store, open_store
 
-TOUCH_M = 0.005
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 20_000
 
@@ -89,35 +90,50 @@ def measure_hand(
     clip: Clip,
     side: Side,
     joints_m: np.ndarray,
-    vertices_m: np.ndarray,
-    index: SurfaceIndex,
-    points: SampledPoints,
+    hands: HandPair,
+    shape: "ObjectShape",
     touch_m: float = TOUCH_M,
     stopwatch: "Stopwatch | None" = None,
 ) -> SideSurface:
-    """One hand of a clip against the object's surface.
+    """One hand of a clip against the object's surface; frames in which it is not valid are not looked at.
 
-    joints_m: (frame, 21, 3), vertices_m: (frame, 778, 3), both in the clip's world, metres. index, points: of
-    ``clip.object.model``. Frames in which the hand is not valid are not looked at.
+    joints_m: (frame, 21, 3) in the clip's world, metres. hands: the model of the clip's hands. shape: of
+    ``clip.object.model``.
     """
-    watch = stopwatch or Stopwatch()
-    rows = np.flatnonzero(clip.hands[side].valid)
-    frames, track = clip.n_frames, clip.object
-    touched = np.zeros((frames, vertices_m.shape[1]), bool)
-    depth, joint = np.full(frames, np.nan), np.full(frames, np.inf)
-    hinge = None if track.hinge_rad is None else track.hinge_rad[rows]
-    if len(rows):
-        vertices, joints = (joints_in_object(places, track)[rows] for places in (vertices_m, joints_m))
-        with watch("contact"):
-            touched[rows] = index.within(vertices, hinge, touch_m)
-        with watch("depth"):
-            if encloses_solid(index):
-                depth[rows] = index.depth_m(vertices, hinge).max(axis=1)
-        with watch("joints"):
-            joint[rows] = index.distance_m(joints, hinge).min(axis=1)
+    watch, index = stopwatch or Stopwatch(), shape.index
+    with watch("hands"):
+        hand = placed_hand(clip, side, hands)
+        joints = joints_in_object(joints_m, clip.object)[hand.frames]
+    with watch("contact"):
+        touched = touched_vertices(hand, index, touch_m)
+    with watch("depth"):
+        depth = penetration(hand, index).deepest_m if shape.overlap else np.full(clip.n_frames, np.nan)
+    with watch("volume"):
+        volume = _deepest_volume_m3(hand, depth, shape.overlap)
+    with watch("joints"):
+        joint = hand.over_clip(index.distance_m(joints, hand.hinge_rad).min(axis=1), np.inf)
     with watch("maps"):
-        packed = packed_map(bimart_map(clip, vertices_m, points, side))
-    return SideSurface(touched, depth, joint, packed)
+        packed = packed_map(bimart_map(hand, shape.points, clip.object.model.hinge))
+    return SideSurface(touched, depth, joint, packed, volume)
+
+
+def _deepest_volume_m3(hand: PlacedHand, depth_m: np.ndarray, overlap: SolidOverlap | None) -> float:
+    """Volume that hand and object share in the frame of the deepest vertex; NaN without the hand or an inside."""
+    of_hand = depth_m[hand.frames]
+    if overlap is None or not len(of_hand):
+        return np.nan
+    row = [int(of_hand.argmax())]
+    hinge = None if hand.hinge_rad is None else hand.hinge_rad[row]
+    return float(overlap.volume_m3(hand.vertices_m[row], hand.faces, hinge)[0]) if of_hand[row[0]] > 0 else 0.0
+
+
+class ObjectShape:
+    """What hands are held against, built once per object. overlap: None where nothing can be inside the object."""
+
+    def __init__(self, model: ObjectModel, points: SampledPoints, index: SurfaceIndex | None = None) -> None:
+        self.index = index or SurfaceIndex(model)
+        self.points = points
+        self.overlap = SolidOverlap(self.index) if encloses_solid(self.index) else None
 
 
 def encloses_solid(index: SurfaceIndex) -> bool:
@@ -148,33 +164,32 @@ class Stopwatch:
 
 @dataclass
 class _Bench:
-    """What a process needs to measure clips. Indices of objects are built once in each process that meets them."""
+    """What a process needs to measure clips. Shapes are built once in each process that meets them."""
 
     store: Store
     touch_m: float
     points: int
     left_out: Mapping[str, str]
-    objects: dict[str, tuple[SurfaceIndex, SampledPoints]] = field(default_factory=dict)
+    shapes: dict[str, ObjectShape] = field(default_factory=dict)
 
     def measure(self, clip_id: str) -> tuple[ClipSurface, dict[str, float]]:
         watch, clip = Stopwatch(), self.store.clip(clip_id)
         name = clip.object.model.name
         if clip_id in self.left_out:
             return ClipSurface(clip_id, name, clip.n_frames, self.left_out[clip_id], {}), watch.seconds
-        with watch("indices"):
-            index, points = self._object(clip.object.model)
+        with watch("objects"):
+            shape = self._shape(clip.object.model)
         sides: dict[Side, SideSurface] = {}
         for side in SIDES:
             with watch("hands"):
-                vertices = track_vertices(clip.hands[side], self.store.hand_pair()[side])
                 joints = self.store.joints(clip_id, side)
-            sides[side] = measure_hand(clip, side, joints, vertices, index, points, self.touch_m, watch)
+            sides[side] = measure_hand(clip, side, joints, self.store.hand_pair(), shape, self.touch_m, watch)
         return ClipSurface(clip_id, name, clip.n_frames, None, sides), watch.seconds
 
-    def _object(self, model: ObjectModel) -> tuple[SurfaceIndex, SampledPoints]:
-        if model.name not in self.objects:
-            self.objects[model.name] = SurfaceIndex(model), sample_points(model, self.points)
-        return self.objects[model.name]
+    def _shape(self, model: ObjectModel) -> ObjectShape:
+        if model.name not in self.shapes:
+            self.shapes[model.name] = ObjectShape(model, sample_points(model, self.points))
+        return self.shapes[model.name]
 
 
 def _in_order(bench: _Bench, jobs: int) -> Iterator[tuple[ClipSurface, dict[str, float]]]:

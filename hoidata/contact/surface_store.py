@@ -47,6 +47,7 @@ _SIDE_COLUMNS = [
     ("touching_frames", _COUNT),
     ("inside_frames", _COUNT),
     ("deepest_m", _NUMBER),
+    ("deepest_volume_m3", _NUMBER),
     ("nearest_joint_m", _NUMBER),
     ("map_row", _COUNT),
     ("map_first", _COUNT),
@@ -63,12 +64,15 @@ OBJECTS = pa.schema([("object", _TEXT), ("solid", pa.bool_()), ("note", _TEXT)])
 
 
 class SideSurface(NamedTuple):
-    """One hand of one clip: touched (frame, 778) bool; depth_m, joint_m (frame,); map (frame, point) uint8, packed."""
+    """One hand of one clip: touched (frame, 778) bool; depth_m, joint_m (frame,); map (frame, point) uint8, packed;
+    deepest_volume_m3: shared with the object in the frame of the deepest vertex, NaN where nothing can be inside.
+    """
 
     touched: np.ndarray
     depth_m: np.ndarray
     joint_m: np.ndarray
     map: np.ndarray
+    deepest_volume_m3: float
 
 
 class ClipSurface(NamedTuple):
@@ -154,6 +158,7 @@ def _summary(found: SideSurface) -> dict[str, Any]:
         "touching_frames": int(found.touched.any(axis=1).sum()),
         "inside_frames": int((depth > 0).sum()) if len(depth) else None,
         "deepest_m": float(depth.max()) if len(depth) else None,
+        "deepest_volume_m3": found.deepest_volume_m3 if np.isfinite(found.deepest_volume_m3) else None,
         "nearest_joint_m": nearest if np.isfinite(nearest) else None,
     }
 
@@ -240,7 +245,8 @@ class SurfaceStore:
     def hand(self, clip_id: str, side: Side) -> SideSurface:
         """All of one hand, as the stage measured it."""
         frames = self.touched(clip_id, side), self.depth_m(clip_id, side), self.joint_m(clip_id, side)
-        return SideSurface(*frames, self.packed_map(clip_id, side))
+        volume = self._row(clip_id)[f"{side}_deepest_volume_m3"]
+        return SideSurface(*frames, self.packed_map(clip_id, side), np.nan if volume is None else float(volume))
 
     def bimart_map(self, clip_id: str, side: Side) -> np.ndarray:
         """(frame, point) float32 metres, see ``hoidata.contact.bimart_maps``: at most half a step off."""

@@ -10,9 +10,10 @@ import numpy as np
 
 from hoidata.contact import HandEvidence
 from hoidata.contact.maps import LONGEST_CLIP
-from hoidata.contact.surface_stage import TOUCH_M, encloses_solid, measure_hand
+from hoidata.contact.surface_contact import TOUCH_M
+from hoidata.contact.surface_stage import ObjectShape, encloses_solid, measure_hand
 from hoidata.contact.surface_store import SideSurface, SurfaceStore
-from hoidata.hands import HandPair, track_joints, track_vertices
+from hoidata.hands import HandPair, track_joints
 from hoidata.objects.surface_index import surface_index
 from hoidata.quality.measures import placed
 from hoidata.schema.annotated import AnnotatedStore
@@ -80,13 +81,9 @@ def _read(stored: SurfaceStore, clip_id: str) -> dict[Side, SideSurface]:
 
 
 def _measured(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> dict[Side, SideSurface]:
-    points, index = annotated.points(annotated.object_key(clip.clip_id)), surface_index(clip.object.model)
-    found: dict[Side, SideSurface] = {}
-    for side in SIDES:
-        track, model = clip.hands[side], hands[side]
-        places = track_joints(track, model), track_vertices(track, model)
-        found[side] = measure_hand(clip, side, *places, index, points)
-    return found
+    model = clip.object.model
+    shape = ObjectShape(model, annotated.points(annotated.object_key(clip.clip_id)), surface_index(model))
+    return {side: measure_hand(clip, side, track_joints(clip.hands[side], hands[side]), hands, shape) for side in SIDES}
 
 
 def _touched(annotated: AnnotatedStore, clip: Clip, side: Side) -> np.ndarray:

@@ -17,7 +17,8 @@ class ObjectContact:
     """One object, or all of them, over the frames of its clips: each a text, "" where nothing can be inside.
 
     touching: share of frames in which a hand touches; inside, deep: in which a hand vertex lies inside, and deeper than
-    1 cm; deepest: in all frames. note: what was repaired of the mesh, or why it has no inside.
+    1 cm; deepest: in all frames; volume: the largest that a hand and the object share in the frame of the deepest
+    vertex of a clip. note: what was repaired of the mesh, or why it has no inside.
     """
 
     name: str
@@ -27,15 +28,19 @@ class ObjectContact:
     inside: str
     deep: str
     deepest: str
+    volume: str
     note: str
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """Of one clip: touching, (frame,) bool; depth_m (frame,) of the worse hand, NaN where neither can be inside."""
+    """Of one clip: touching, (frame,) bool; depth_m (frame,) of the worse hand and volume_m3, the larger one of its
+    deepest frames: NaN where nothing can be inside.
+    """
 
     touching: np.ndarray
     depth_m: np.ndarray
+    volume_m3: float
 
 
 def surface_beside(annotated: AnnotatedStore) -> SurfaceStore | None:
@@ -71,14 +76,16 @@ def _frames(store: SurfaceStore, clip_id: str) -> _Frames:
     touching = np.any([store.touched(clip_id, side).any(axis=1) for side in SIDES], axis=0)
     depth = np.array([store.depth_m(clip_id, side) for side in SIDES])
     if not store.is_solid(clip_id):
-        return _Frames(touching, np.full(len(touching), np.nan))
-    return _Frames(touching, np.nan_to_num(depth, nan=0.0).max(axis=0))
+        return _Frames(touching, np.full(len(touching), np.nan), np.nan)
+    volumes = [store.hand(clip_id, side).deepest_volume_m3 for side in SIDES]
+    return _Frames(touching, np.nan_to_num(depth, nan=0.0).max(axis=0), float(np.nan_to_num(volumes).max()))
 
 
 def _row(name: str, found: list[_Frames], note: str | None) -> ObjectContact:
     touching = np.concatenate([clip.touching for clip in found])
     depth = np.concatenate([clip.depth_m for clip in found])
     depth = depth[np.isfinite(depth)]
+    volumes = [clip.volume_m3 for clip in found if np.isfinite(clip.volume_m3)]
     return ObjectContact(
         name=name,
         clips=f"{len(found):,}",
@@ -87,6 +94,7 @@ def _row(name: str, found: list[_Frames], note: str | None) -> ObjectContact:
         inside=_share(depth > 0),
         deep=_share(depth > PENETRATION_M),
         deepest=f"{depth.max() * 1000:.1f}" if len(depth) else "",
+        volume=f"{max(volumes) * 1e6:.2f}" if volumes else "",
         note=note.removeprefix(f"{name}: ") if isinstance(note, str) else "",
     )
 

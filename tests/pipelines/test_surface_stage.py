@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hoidata.contact.surface_stage import TOUCH_M
+from hoidata.contact.surface_contact import TOUCH_M
 from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
 from hoidata.objects.sampling import POINT_COUNT

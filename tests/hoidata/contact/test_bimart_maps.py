@@ -7,6 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.contact.bimart_maps import BEYOND, REACH_M, bimart_map, clip_map, packed_map, unpacked_map
+from hoidata.contact.proximity import joints_in_object
+from hoidata.contact.surface_contact import PlacedHand, placed_hand
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
 from hoidata.schema import SIDES, Clip, ObjectTrack
@@ -25,6 +27,17 @@ def scene(request, make_clip):
     hands = load_embedded_hands()
     vertices = {side: track_vertices(clip.hands[side], hands[side]).astype(np.float64) for side in SIDES}
     return clip, vertices, sample_points(clip.object.model, POINTS)
+
+
+def placed(track: ObjectTrack, vertices: np.ndarray, valid: np.ndarray | None = None) -> PlacedHand:
+    """World vertices as the object sees them."""
+    frames = np.arange(len(vertices)) if valid is None else np.flatnonzero(valid)
+    hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
+    return PlacedHand(joints_in_object(vertices, track)[frames], frames, hinge, np.zeros((0, 3), int), len(vertices))
+
+
+def map_of(track: ObjectTrack, vertices: np.ndarray, points, valid: np.ndarray | None = None) -> np.ndarray:
+    return bimart_map(placed(track, vertices, valid), points, track.model.hinge)
 
 
 def world_points(track: ObjectTrack, points) -> np.ndarray:
@@ -54,7 +67,9 @@ def test_map_is_the_distance_to_the_nearest_hand_vertex(scene):
     for side in SIDES:
         truth = brute_force(clip.object, vertices[side], points)
         assert np.isfinite(truth).sum() > POINTS
-        np.testing.assert_allclose(bimart_map(clip, vertices[side], points, side), truth, atol=1e-6)
+        np.testing.assert_allclose(map_of(clip.object, vertices[side], points), truth, atol=1e-6)
+        hand = placed_hand(clip, side, load_embedded_hands())
+        np.testing.assert_allclose(bimart_map(hand, points, clip.object.model.hinge), truth, atol=1e-6)
 
 
 def test_map_is_unchanged_when_the_world_turns_and_shifts(scene):
@@ -64,15 +79,13 @@ def test_map_is_unchanged_when_the_world_turns_and_shifts(scene):
     track = replace(clip.object, rotvec=rotvec, translation_m=turn.apply(clip.object.translation_m) + shift)
     for side in SIDES:
         moved = turn.apply(vertices[side].reshape(-1, 3)).reshape(vertices[side].shape) + shift
-        before, after = (
-            bimart_map(clip, vertices[side], points, side),
-            bimart_map(replace(clip, object=track), moved, points, side),
-        )
+        before, after = map_of(clip.object, vertices[side], points), map_of(track, moved, points)
         np.testing.assert_array_equal(np.isfinite(before), np.isfinite(after))
         np.testing.assert_allclose(before, after, atol=1e-6)
 
 
 def test_mirrored_scene_has_the_maps_of_the_other_hand(scene):
+    """The mirrored right hand is a left one, before a mirrored object that turns and folds the other way round."""
     clip, vertices, points = scene
     track, model = clip.object, clip.object.model
     hinge = model.hinge and replace(
@@ -86,20 +99,20 @@ def test_mirrored_scene_has_the_maps_of_the_other_hand(scene):
         translation_m=track.translation_m @ MIRROR,
     )
     other_points = replace(points, points_m=points.points_m @ MIRROR.astype(np.float32))
-    for side, other in (SIDES, SIDES[::-1]):
-        found = bimart_map(replace(clip, object=mirrored), vertices[side] @ MIRROR, other_points, other)
-        np.testing.assert_allclose(found, bimart_map(clip, vertices[side], points, side), atol=1e-6)
+    for side in SIDES:
+        found = map_of(mirrored, vertices[side] @ MIRROR, other_points)
+        np.testing.assert_allclose(found, map_of(track, vertices[side], points), atol=1e-6)
 
 
 def test_frames_without_the_hand_are_beyond_and_do_not_count(scene):
     clip, vertices, points = scene
     valid = np.arange(clip.n_frames) % 3 != 0
-    hands = {**clip.hands, "right": replace(clip.hands["right"], valid=valid)}
-    whole = bimart_map(clip, vertices["right"], points, "right")
-    part = bimart_map(replace(clip, hands=hands), vertices["right"], points, "right")
+    whole = map_of(clip.object, vertices["right"], points)
+    part = map_of(clip.object, vertices["right"], points, valid)
     np.testing.assert_array_equal(part[valid], whole[valid])
     assert np.isinf(part[~valid]).all()
     np.testing.assert_array_equal(clip_map(part), whole[valid].min(axis=0))
+    assert np.isinf(map_of(clip.object, vertices["right"], points, np.zeros(clip.n_frames, bool))).all()
 
 
 def test_clip_map_is_the_nearest_the_hand_ever_comes():
@@ -116,7 +129,7 @@ def test_a_hand_too_far_away_gives_nothing_and_one_within_reach_is_seen(make_cli
     radius = np.linalg.norm(points.points_m, axis=1)
     for away, reached in ((0.19, True), (0.45, False)):
         hand = centre + away * beside
-        found = bimart_map(clip, np.broadcast_to(hand, (2, 778, 3)), points, "right")
+        found = map_of(clip.object, np.broadcast_to(hand, (2, 778, 3)), points)
         assert np.isfinite(found).any() == reached
     assert radius.max() < 0.1
 

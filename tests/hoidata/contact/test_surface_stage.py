@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.contact.bimart_maps import bimart_map
+from hoidata.contact.surface_contact import placed_hand
 from hoidata.contact.surface_stage import surface_store
 from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
@@ -96,7 +97,7 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
         clip = stored.clip(clip_id)
         points = sample_points(clip.object.model, POINTS)
         for side in SIDES:
-            exact = bimart_map(clip, track_vertices(clip.hands[side], hands[side]), points, side)
+            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model.hinge)
             found = store.bimart_map(clip_id, side)
             assert found.shape == exact.shape
             near = np.isfinite(exact)
@@ -127,6 +128,9 @@ def test_table_sums_up_the_frames_and_lists_what_was_left_out(written):
     assert row["right_touching_frames"] == store.touched("test/s1/through", "right").any(axis=1).sum()
     assert row["right_inside_frames"] == np.nansum(depth > 0)
     assert row["right_deepest_m"] == pytest.approx(np.nanmax(depth))
+    assert 0 < row["right_deepest_volume_m3"] < 8 * HALF_BOX_M.prod()
+    assert row["left_deepest_volume_m3"] == row["left_deepest_m"] == 0
+    assert store.hand("test/s1/through", "right").deepest_volume_m3 == row["right_deepest_volume_m3"]
     assert row["right_nearest_joint_m"] == pytest.approx(store.joint_m("test/s1/through", "right").min())
     assert report.counts["left_out"] == 1
     assert report.counts["frames"] == 29
@@ -181,7 +185,8 @@ def test_object_without_an_inside_has_no_depth_and_says_so(make_clip, tmp_path):
     assert np.isnan(store.depth_m(clip.clip_id, "right")).all()
     assert store.touched(clip.clip_id, "right").any()
     assert "open" in store.objects.loc[0, "note"]
-    assert pd.isna(store.clips.loc[clip.clip_id, "right_deepest_m"])
+    for name in ("inside_frames", "deepest_m", "deepest_volume_m3"):
+        assert pd.isna(store.clips.loc[clip.clip_id, f"right_{name}"])
 
 
 def test_store_without_clips_gives_a_folder_that_reads(tmp_path):

@@ -95,6 +95,9 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
     depth = np.nanmax([store.depth_m(clip.clip_id, side) for side in ("left", "right")], axis=0)
     assert (rows["box"].touching, rows["box"].inside, rows["box"].deep) == ("50.0 %", "50.0 %", "50.0 %")
     assert rows["box"].deepest == f"{depth.max() * 1000:.1f}"
+    volumes = [store.clips.at[clip.clip_id, f"{side}_deepest_volume_m3"] for side in ("left", "right")]
+    assert rows["box"].volume == f"{max(volumes) * 1e6:.2f}"
+    assert max(volumes) > 1e-6
     assert rows["lidded box"].touching == rows["lidded box"].inside == "0.0 %"
     assert (rows["all objects"].frames, rows["all objects"].touching) == ("54", f"{15 / 54 * 100:.1f} %")
 
@@ -115,7 +118,7 @@ def test_object_without_an_inside_has_no_depths_in_the_table(page_clip, hands, t
     )
     surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
     [row] = contact_by_object(open_surface(tmp_path / "surface"))
-    assert (row.inside, row.deep, row.deepest) == ("", "", "")
+    assert (row.inside, row.deep, row.deepest, row.volume) == ("", "", "", "")
     assert "open" in row.note
 
 
