@@ -167,6 +167,35 @@ def test_one_frozen_hand_and_a_frozen_recording_are_told_apart(good, frozen, exp
     assert (measured["frozen_hand_frames"], measured["frozen_all_frames"]) == expected
 
 
+HELD = np.r_[np.clip(np.arange(29), None, 9), np.arange(29, FRAMES)]  # still in frames 9 to 28
+
+
+def test_a_hand_is_frozen_while_only_the_other_one_moves(good):
+    still = {"rotvec": good.object.rotvec[:1].repeat(FRAMES, 0), "translation_m": np.zeros((FRAMES, 3), np.float32)}
+    clip = with_object(replace(good, hands={**good.hands, "right": _held(good.hands["right"], HELD)}), **still)
+    assert row(clip)["frozen_hand_frames"] == 20
+
+
+def test_nothing_is_frozen_while_another_object_or_the_lid_moves(make_clip):
+    clip = make_clip(n_frames=FRAMES, articulated=True, seed=3)
+    moving = clip.object
+    pose = {"rotvec": moving.rotvec[HELD], "translation_m": moving.translation_m[HELD]}
+    hands = {side: _held(track, HELD) for side, track in clip.hands.items()}
+    closed = replace(with_object(clip, **pose, hinge_rad=np.zeros(FRAMES, np.float32)), hands=hands)
+    assert row(closed)["frozen_all_frames"] == 20
+    assert row(replace(closed, other_objects=(moving,)))["frozen_all_frames"] == 0
+    assert row(with_object(closed, hinge_rad=moving.hinge_rad))["frozen_all_frames"] == 0
+
+
+def test_one_hand_is_enough(good):
+    """Left valid in the first 30 frames, right in frames 20 to 50: nobody is there in the last 10."""
+    frames = np.arange(FRAMES)
+    left = replace(good.hands["left"], valid=frames < 30)
+    measured = row(with_hand(replace(good, hands={**good.hands, "left": left}), valid=(frames >= 20) & (frames < 50)))
+    assert measured["handless_share"] == pytest.approx(10 / 60)
+    assert (measured["left_invalid_share"], measured["right_invalid_share"]) == (0.5, 0.5)
+
+
 def _held(track, held):
     names = ("wrist_m", "global_orient", "hand_pose")
     return replace(track, **{name: getattr(track, name)[held] for name in names})
@@ -197,6 +226,24 @@ def test_penetration_is_the_depth_of_the_deepest_vertex(make_clip):
     measured = row(sunken_hand(make_clip(n_frames=6)))
     assert 0.025 < measured["penetration_m"] <= 0.03
     assert measured["penetration_share"] == 1
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_deeper_hand_counts_whichever_it_is(make_clip, side):
+    clip = make_clip(n_frames=6)
+    sunken = replace(clip.hands[side], wrist_m=clip.object.translation_m.copy())
+    far = {other: replace(track, wrist_m=track.wrist_m + np.float32(2)) for other, track in clip.hands.items()}
+    assert row(replace(clip, hands={**far, side: sunken}))["penetration_m"] > 0.025
+
+
+def test_only_parts_with_an_inside_are_penetrated(make_clip):
+    """A box without one triangle, and its lid of 1 cm: a hand inside the box is at most 5 mm deep, in the lid."""
+    clip = sunken_hand(make_clip(n_frames=6, articulated=True))
+    model = replace(clip.object.model, faces=clip.object.model.faces[1:])
+    assert row(clip)["penetration_m"] > 0.02
+    measured = row(with_object(clip, model=model))
+    assert measured["penetration_m"] <= 0.005 + 1e-6
+    assert measured["note"] == "penetration measured in the 1 solid of 2 parts only"
 
 
 def test_penetration_looks_at_every_nth_frame_from_the_first_on(good):
