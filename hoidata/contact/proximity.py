@@ -35,7 +35,8 @@ class ProximityIndex:
 
     def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(frame,) the smallest of ``nearest_m`` of each frame: most joints need not be looked at closely for it."""
-        return closest_of_joints(self._places(joints_m, track), self._boxes())
+        motion, reach = part_motion(track, self.parts), CONTACT_THRESHOLD_M
+        return closest_of_joints(joints_m, motion, self._boxes(), self._grid(reach), reach)
 
     def entries(
         self, joints_m: np.ndarray, valid: np.ndarray, track: ObjectTrack, threshold_m: float = CONTACT_THRESHOLD_M
@@ -52,10 +53,13 @@ class ProximityIndex:
                 raise BadInput("distance map", f"at most {most} {name}s", f"{count}", "cut the sequence, or take fewer")
         if not len(self.parts):
             return np.zeros(0, ENTRY)
-        if threshold_m not in self._grids:
-            self._grids[threshold_m] = cell_grids(self._points_m, self._members, threshold_m)
         motion = part_motion(track, self.parts)
-        return near_entries(joints_m, valid, motion, self._grids[threshold_m], self.count, threshold_m)
+        return near_entries(joints_m, valid, motion, self._grid(threshold_m), self.count, threshold_m)
+
+    def _grid(self, reach_m: float) -> CellGrids:
+        if reach_m not in self._grids:
+            self._grids[reach_m] = cell_grids(self._points_m, self._members, reach_m)
+        return self._grids[reach_m]
 
     def _boxes(self) -> PointBoxes:
         if self._point_boxes is None:
