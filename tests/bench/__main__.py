@@ -6,13 +6,14 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from tests.bench import adapters, kernels, scale, store, whole
+from tests.bench import adapters, kernels, scale, store, surface, whole
 
 BENCHMARKS = {
     "adapters": adapters.main,
     "store": store.main,
     "scale": scale.main,
     "kernels": kernels.main,
+    "surface": surface.main,
     "whole": whole.main,
 }
 
