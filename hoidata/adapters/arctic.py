@@ -60,7 +60,7 @@ MOTION_PARTS = (
 )
 WITHHELD_SUBJECT = "s03"
 KINDS = ("mano.npy", "object.npy", "egocam.dist.npy", "smplx.npy")
-Stretches = Literal["described", "whole"]
+Stretches = Literal["described", "whole", "described-else-whole"]
 
 
 @dataclass(frozen=True)
@@ -82,8 +82,9 @@ class ArcticAdapter:
     """Raw root: the folder with ``raw_seqs/``, ``meta/`` and ``description/`` (or ``data/`` above them).
 
     clips: "described" gives one clip per line of Text2HOI's description files; "whole" one clip per sequence without
-    a verb, descriptions or not. margin_frames: frames kept before and after each described range. shortest_frames:
-    shorter ranges are no clips. all_pairs: keep the three pairs of verb and object that Text2HOI leaves out.
+    a verb, descriptions or not; "described-else-whole" the latter only where a sequence has no description.
+    margin_frames: frames kept before and after each described range. shortest_frames: shorter ranges are no clips.
+    all_pairs: keep the three pairs of verb and object that Text2HOI leaves out.
     trimmed_frames: left out at both ends of a whole sequence (ARCTIC's own baselines leave out 10, whose images are
     black). body: keep the parameters of the subject's SMPL-X body.
     """
@@ -116,7 +117,7 @@ class ArcticAdapter:
         """Descriptions are needed only where clips are cut by them."""
         files = _below_tops("description/s*/*/description.txt")
         where = "Text2HOI's description files (linked from its and ARCTIC's page)"
-        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional=self.clips == "whole"))
+        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional=self.clips != "described"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence that has any of its files; they are paired by name, never by position."""
@@ -133,6 +134,8 @@ class ArcticAdapter:
         if self.clips == "whole":
             return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
         where = _found(raw, f"description/{key.name}/description.txt")
+        if self.clips == "described-else-whole" and not raw.has(where):
+            return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
         descriptions, results = _read_descriptions(raw, where, key)
         motion = _read_motion(raw, key, hands, self.body)
         noun = motion.object.model.name
@@ -212,7 +215,10 @@ def _read_descriptions(
 ) -> tuple[list[Description], list[Clip | Quarantined]]:
     _refuse_withheld(raw, key)
     if not raw.has(where):
-        remedy = "nothing to do where none was published (espressomachine); else add Text2HOI's description files"
+        remedy = (
+            "add Text2HOI's description files; where none was published (espressomachine), nothing to do, or set "
+            "clips: described-else-whole"
+        )
         raise BadInput(where, "a description of the sequence's segments", "no file", remedy)
     described, problems = parse_descriptions(raw.read(where), where)
     return described, [Quarantined.from_error(f"{key}/line-{number:03d}", problem) for number, problem in problems]
