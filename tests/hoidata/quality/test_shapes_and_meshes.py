@@ -95,6 +95,19 @@ def test_collapsed_and_needle_triangles_are_degenerate():
     assert surface_facts(vertices, faces).degenerate_share == pytest.approx(2 / 14)
 
 
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e3])
+def test_needles_are_needles_in_every_unit(scale):
+    vertices = scale * np.concatenate([BOX.vertices, [[0, 0, 0], [1, 0, 0], [0.5, 1e-8, 0]]])
+    faces = np.concatenate([BOX.faces, [[8, 9, 10]]])
+    assert surface_facts(vertices, faces).degenerate_share == pytest.approx(1 / 13)
+
+
+def test_a_collapsed_triangle_beside_the_surface_is_no_shell():
+    vertices = np.concatenate([BOX.vertices, [[1.0, 1, 1], [1, 1, 2]]])
+    faces = np.concatenate([BOX.faces, [[8, 8, 9]]])
+    assert surface_facts(vertices, faces).shells == 1
+
+
 def hinged() -> ObjectModel:
     """A base box and a lid that lies on it, turning about the y axis through the lid's edge."""
     base, lid = trimesh.creation.box((0.2, 0.2, 0.1)), trimesh.creation.box((0.2, 0.2, 0.02))

@@ -168,6 +168,20 @@ def test_personal_templates_have_no_shape_to_compare(make_clip, tmp_path):
     assert rows["largest_beta"].tolist() == [0, 0, 0, 0]
 
 
+def test_a_shape_is_compared_with_clips_of_the_same_subject_only(make_clip, tmp_path):
+    """Two subjects of different hands, three clips each."""
+    shapes = {"s1": 0.9, "s2": -0.9}
+    clips = [
+        with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/{who}/{number}", subject=who), shape)
+        for who, shape in shapes.items()
+        for number in range(3)
+    ]
+    write_store(tmp_path / "clips", clips, generated_info("test"))
+    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
+    rows, _ = tables(tmp_path / "quality")
+    assert rows["beta_distance"].tolist() == pytest.approx([0.0] * 6, abs=1e-6)
+
+
 def test_shapes_of_frames_without_the_hand_are_not_read(make_clip, tmp_path):
     clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(4)]
     clips[2] = lost(clips[2], 50.0, slice(10, 50))

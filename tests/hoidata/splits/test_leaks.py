@@ -70,6 +70,16 @@ def test_a_copy_under_another_name_is_a_leak_whatever_was_promised():
     assert found.broken == ("motion",)
 
 
+def test_copies_within_one_part_are_no_leak():
+    found = leaks([row("a"), row("b")], {"a": "train", "b": "train"}, digests={"a": "1", "b": "1"})
+    assert found.shared["motion"] == ()
+
+
+def test_sequences_of_two_subjects_share_no_frames_though_they_have_one_name():
+    rows = [row("a", subject="s1", sequence="cup_1"), row("b", subject="s2", sequence="cup_1")]
+    assert leaks(rows, {"a": "train", "b": "test"}).shared["frame"] == ()
+
+
 def test_overlaps_are_seen_across_a_clip_in_between():
     """a lasts over b and reaches c: neighbours alone would miss it."""
     spans = {"a": (0, 100), "b": (10, 20), "c": (90, 120)}

@@ -72,6 +72,12 @@ def test_a_rule_by_time_tests_on_the_end_of_every_sequence():
     assert split.tolist()[20:] == ["train", "train", "validation", "test"]
 
 
+def test_shares_are_rounded_and_small_sequences_have_one_clip_of_each():
+    shares = {n: assign_split(table(one_sequence(n)), SplitRule(by="time")).tolist() for n in (2, 3, 12, 17)}
+    counts = {n: tuple(map(parts.count, ("train", "validation", "test"))) for n, parts in shares.items()}
+    assert counts == {2: (2, 0, 0), 3: (1, 1, 1), 12: (8, 2, 2), 17: (11, 3, 3)}  # 0.15 x 12 = 1.8, x 17 = 2.55
+
+
 def test_a_rule_by_rounds_spreads_the_held_out_clips_over_every_sequence():
     rows = one_sequence(11) + one_sequence(3, "mug")
     split = assign_split(table(rows), SplitRule(by="rounds"))

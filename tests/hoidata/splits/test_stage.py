@@ -191,3 +191,14 @@ def test_clips_that_differ_in_one_number_of_the_object_are_no_copies(make_clip, 
     values[3] += np.float32(0.01)
     assert motion_digest(clip) == motion_digest(replace(clip, clip_id="test/copy"))
     assert motion_digest(clip) != motion_digest(replace(clip, object=replace(clip.object, **{moved: values})))
+
+
+@pytest.mark.parametrize("moved", ["wrist_m", "global_orient", "hand_pose", "valid"])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_motion_is_told_apart_by_every_number_of_a_hand(make_clip, side, moved):
+    clip = make_clip(16)
+    track = clip.hands[side]
+    values = getattr(track, moved).copy()
+    values[3] = ~values[3] if moved == "valid" else values[3] + np.float32(0.01)
+    other = replace(clip, hands={**clip.hands, side: replace(track, **{moved: values})})
+    assert motion_digest(clip) != motion_digest(other)
