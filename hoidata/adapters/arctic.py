@@ -18,10 +18,10 @@ from hoidata.adapters.arctic_files import (
     parse_parts,
 )
 from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.adapters.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
 from hoidata.hands import HandPair
-from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.schema.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.schema.hand_parameters import HandConvention, SourceHand, to_track
@@ -291,7 +291,7 @@ def _hand(where: str, block: Any, side: Side, hands: HandPair) -> HandTrack:
 def _object_model(raw: RawTree, name: str) -> ObjectModel:
     mesh_path = _found(raw, f"meta/object_vtemplates/{name}/mesh.obj")
     part_path = _found(raw, f"meta/object_vtemplates/{name}/parts.json")
-    mesh = load_mesh(raw.file(mesh_path))
+    mesh = raw_mesh(raw, mesh_path)
     is_base = parse_parts(raw.read(part_path), part_path, len(mesh.vertices))
     hinge = Hinge(axis=np.array(HINGE_AXIS), origin_m=np.zeros(3))
     part = (~is_base).astype(np.uint8)

@@ -11,11 +11,11 @@ from hoidata.adapters import checks
 from hoidata.adapters.base import DatasetPart, Quarantined, RawTree, SequenceKey
 from hoidata.adapters.grab_contact import read_contact
 from hoidata.adapters.grab_words import object_words, verb_words
+from hoidata.adapters.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npz_objects
 from hoidata.files.array_pieces import npz_members
 from hoidata.hands import HandPair
-from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
 from hoidata.schema.clip import FPS, SIDES, BodyTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.schema.hand_parameters import HandConvention, SourceHand, to_track
@@ -239,12 +239,12 @@ def _fingers(where: str, params: Mapping[str, Any], n_frames: int) -> tuple[np.n
 
 
 def _template(raw: RawTree, path: str) -> np.ndarray:
-    vertices = load_mesh(raw.file(path)).vertices
+    vertices = raw_mesh(raw, path).vertices
     if vertices.shape != (778, 3):
         raise BadInput(path, "a hand mesh of 778 vertices", f"{len(vertices)}")
     return vertices
 
 
 def _mesh_model(raw: RawTree, name: str, path: str) -> ObjectModel:
-    mesh = load_mesh(raw.file(path))
+    mesh = raw_mesh(raw, path)
     return ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))

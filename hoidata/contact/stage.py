@@ -114,11 +114,14 @@ class _Writer:
             self._write_shard()
 
     def _write_shard(self) -> None:
-        entries = np.concatenate(self.pending) if self.pending else np.zeros(0, ENTRY)
-        columns = {name: np.ascontiguousarray(entries[name]) for name in ENTRY.names or ()}
+        columns = {name: self._column(name) for name in ENTRY.names or ()}
         write_npz(self.folder / f"distances-{self.shard:05d}.npz", columns)
         self.written_rows += self.pending_rows
         self.pending, self.pending_rows, self.shard = [], 0, self.shard + 1
+
+    def _column(self, name: str) -> np.ndarray:
+        """Straight from the clips: all rows of a shard take 75 MB once more."""
+        return np.concatenate([np.zeros(0, ENTRY[name]), *(entries[name] for entries in self.pending)])
 
     def finish(self) -> dict[str, int]:
         if self.pending or not self.shard:
