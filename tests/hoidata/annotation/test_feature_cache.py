@@ -107,6 +107,16 @@ def test_numbers_of_another_machine_are_noticed_by_one_text(tmp_path: Path, capl
     assert "gives other numbers" in caplog.text
 
 
+def test_features_changed_behind_a_sound_archives_back_are_noticed(tmp_path: Path) -> None:
+    """Written anew with correct checksums of its members, and with the first text's feature left as it was."""
+    first = DiskCachedEncoder(HashEncoder(), tmp_path).encode(TEXTS)
+    (path,) = files(tmp_path)
+    arrays = dict(np.load(path))
+    arrays["features"][5] *= 2
+    np.savez(path, **arrays)
+    assert DiskCachedEncoder(HashEncoder(), tmp_path).encode(TEXTS).tobytes() == first.tobytes()
+
+
 def test_many_small_files_become_one_and_nothing_is_lost(tmp_path: Path) -> None:
     for text in TEXTS[: MOST_FILES + 1]:
         DiskCachedEncoder(HashEncoder(), tmp_path).encode([text])

@@ -1,0 +1,114 @@
+"""Another text encoder, a tiny random CLIP, in a built project: words and models are made again, motion data is not."""
+
+import json
+import os
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from hoidata.lineage.provenance import read_checkpoint_metadata
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(find_spec("open_clip") is None, reason="hoidata[clip] is not installed"),
+]
+ENCODER = "clip:tiny.safetensors?quick_gelu=true"
+MOTION = ("raw", "convert", "quality", "contact", "surface")
+GENERATE = ("hoidata", "generate", "Lift it with the left hand.", "--object")
+
+
+def write_tiny_clip(path: Path) -> None:
+    """A random text tower of two layers, as open_clip builds and names it."""
+    import torch
+    from safetensors.torch import save_file
+
+    from hoidata.annotation.clip_encoder import ARCHITECTURE, import_open_clip
+
+    open_clip = import_open_clip()
+    size = {**open_clip.get_model_config(ARCHITECTURE)["text_cfg"], "width": 64, "heads": 1, "layers": 2}
+    torch.manual_seed(0)
+    tower = open_clip.model._build_text_tower(512, size, quick_gelu=True)
+    save_file({name: value.contiguous() for name, value in tower.state_dict().items()}, path)
+
+
+def lock(folder: Path) -> dict[str, dict]:
+    return yaml.safe_load((folder / "dvc.lock").read_text())["stages"]
+
+
+def outputs(stage: dict) -> dict[str, str]:
+    return {out["path"]: out["md5"] for out in stage["outs"]}
+
+
+@pytest.fixture(scope="module")
+def before_and_after(tmp_path_factory, project_tools) -> tuple[Path, dict, dict, str]:
+    """The project, its locks before and after the change of encoder, and what the second run said."""
+    folder = project_tools.copy_project(tmp_path_factory.mktemp("clip") / "project")
+    project_tools.set_present(folder, {"grab"})
+    first = project_tools.run(folder, "dvc", "repro")
+    assert first.returncode == 0, first.stdout + first.stderr
+    before = lock(folder)
+    write_tiny_clip(folder / "tiny.safetensors")
+    values = yaml.safe_load((folder / "params.yaml").read_text())
+    values["annotate"]["encoder"] = ENCODER
+    project_tools.write_params(folder, values)
+    second = project_tools.run(folder, "dvc", "repro", PYTHONPATH=os.environ.get("PYTHONPATH", ""))
+    assert second.returncode == 0, second.stdout + second.stderr
+    return folder, before, lock(folder), second.stdout
+
+
+def test_stages_of_the_motion_do_not_run_and_keep_their_outputs(before_and_after) -> None:
+    _, before, after, said = before_and_after
+    for name in before:
+        if name.startswith(MOTION):
+            assert after[name] == before[name]
+            assert f"Running stage '{name}'" not in said
+
+
+def test_words_and_models_are_made_again_and_the_parts_stay_the_same(before_and_after) -> None:
+    _, before, after, _ = before_and_after
+    changed = {path for name in before for path, digest in outputs(after[name]).items()
+               if outputs(before[name])[path] != digest}  # fmt: skip
+    models = ("contact", "length", "diffusion", "refiner")
+    assert changed >= {"data/embedded/grab/annotation", *(f"checkpoints/embedded/grab/{model}" for model in models)}
+    assert changed <= {"data/embedded/grab/annotation", *(f"checkpoints/embedded/grab/{model}" for model in models),
+                       "metrics/embedded/grab.json", "report/embedded"}  # fmt: skip
+
+
+def test_features_and_checkpoints_say_that_they_are_clips(before_and_after) -> None:
+    folder, _, _, _ = before_and_after
+    identity = json.loads((folder / "data/embedded/grab/annotation/info.json").read_text())["encoder"]
+    assert (identity["name"], identity["quick_gelu"], identity["dims"]) == ("clip-text-64x2", True, 512)
+    features = np.load(folder / "data/embedded/grab/annotation/embeddings.npz")["features"]
+    assert features.shape[1] == 512
+    assert np.ptp(features, axis=0).max() > 0
+    metadata = read_checkpoint_metadata(folder / "checkpoints/embedded/grab/contact/model.safetensors")
+    assert metadata["facts"]["encoder"] == identity
+    kept = folder / ".hoidata/features"
+    assert len(list(kept.iterdir())) == 2  # the first encoder's features lie apart
+
+
+def test_nothing_is_left_to_do_and_the_models_generate_with_their_own_encoder_alone(
+    before_and_after, project_tools, tmp_path: Path
+) -> None:
+    folder, *_ = before_and_after
+    assert "up to date" in project_tools.run(folder, "dvc", "repro").stdout
+    params = (folder / "params.yaml").read_text()
+    thing = str(pd.read_parquet(folder / "data/embedded/grab/clips/meta/objects.parquet")["object"][0])
+    generate = (*GENERATE, thing, "--dataset", "grab")
+    made = project_tools.run(folder, *generate, "--out", str(tmp_path / "made"))
+    assert made.returncode == 0, made.stdout + made.stderr
+    assert "left (decided by rule" in (tmp_path / "made" / "index.html").read_text()
+    plain = project_tools.run(folder, *generate, "--hand-by", "similarity", "--out", str(tmp_path / "plain"))
+    assert plain.returncode == 0, plain.stdout + plain.stderr
+    assert "(decided by embedding" in (tmp_path / "plain" / "index.html").read_text()
+    values = yaml.safe_load(params)
+    values["annotate"]["encoder"] = "hash"
+    project_tools.write_params(folder, values)
+    refused = project_tools.run(folder, *generate, "--out", str(tmp_path / "refused"))
+    (folder / "params.yaml").write_text(params)
+    assert refused.returncode == 1
+    assert "annotate.encoder back" in " ".join((refused.stdout + refused.stderr).split())
