@@ -1,0 +1,159 @@
+"""Sentences, prompts read back and text features of all three datasets, in one run on one thread.
+
+``python -m tests.bench.text``. Every distinct prompt of H2O, GRAB and ARCTIC in the paper's four forms and three hand
+types: all verbs with all objects of a dataset, which holds every real pair. The default encoder goes through all of
+them once; everything else takes turns on a sample. CLIP, where installed, has random weights of ViT-B/32's size.
+"""
+
+import re
+import sys
+import tempfile
+import time
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from hoidata.adapters.grab_words import INTENTS, OBJECTS
+from hoidata.adapters.h2o import ACTIONS
+from hoidata.annotation.encoders import CachedEncoder, HashEncoder, TextEncoder, UniversalSentenceEncoder
+from hoidata.annotation.feature_cache import DiskCachedEncoder
+from hoidata.annotation.grammar import default_grammar
+from hoidata.annotation.hand_choice import HAND_TYPES, select_hand
+from hoidata.annotation.prompts import Lexicon, grammar_lexicon
+from hoidata.annotation.sentences import four_sentences
+from tests.bench.harness import Times, medians, show
+
+RUNS, SAMPLE, CLIP_SAMPLE = 7, 400, 16
+GOAL_S = 60
+ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
+ARCTIC_OBJECTS = (
+    "box", "capsule machine", "espresso machine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
+    "scissors", "waffle iron",
+)  # fmt: skip
+VOCABULARIES = (
+    (sorted({verb for verb, _ in ACTIONS[1:]}), sorted({noun for _, noun in ACTIONS[1:]})),
+    (list(INTENTS.values()), list(OBJECTS.values())),
+    (ARCTIC_VERBS, ARCTIC_OBJECTS),
+)
+
+
+def prompts() -> list[str]:
+    """Every distinct prompt, in a fixed order."""
+    made = (
+        sentence
+        for verbs, nouns in VOCABULARIES
+        for verb, noun, hand in product(verbs, nouns, HAND_TYPES)
+        for sentence in four_sentences(verb, noun, hand)
+    )
+    return list(dict.fromkeys(made))
+
+
+class OneSearchPerForm:
+    """The plain way to find words: a regular expression for each form, all of them over every sentence."""
+
+    def __init__(self, lexicon: Lexicon) -> None:
+        forms = [form.words for found in (lexicon._verbs, lexicon._nouns) for each in found._by_start.values()
+                 for form in each]  # fmt: skip
+        self.patterns = [re.compile(rf"(?<![\w-]){re.escape(form)}(?![\w-])") for form in forms]
+
+    def read(self, text: str) -> list[tuple[int, int]]:
+        return [match.span() for pattern in self.patterns for match in pattern.finditer(text.lower())]
+
+
+def main() -> None:
+    """Print the table of every operation beside its baseline, and the one pass over all prompts."""
+    texts = prompts()
+    random = np.random.default_rng(0)
+    sample = [texts[number] for number in sorted(random.choice(len(texts), SAMPLE, replace=False))]
+    rows = [*_reading_rows(sample), *_feature_rows(sample), *_clip_rows(sample[:CLIP_SAMPLE])]
+    show("Text, one thread, ms of processor time per sentence", ["operation", "ours", "baseline", "times", ""], rows)
+    with tempfile.TemporaryDirectory() as folder:
+        _whole_pass(texts, Path(folder))
+
+
+def _reading_rows(sample: list[str]) -> list[list[str]]:
+    lexicon = grammar_lexicon(default_grammar())
+    plain = OneSearchPerForm(lexicon)
+    times = medians(
+        {
+            "words": lambda: [lexicon.read(text) for text in sample],
+            "searches": lambda: [plain.read(text) for text in sample],
+            "hand": lambda: [select_hand(text) for text in sample],
+        },
+        RUNS,
+    )
+    first = _row("verb and object of a prompt", times["words"], times["searches"], len(sample), "a search per form")
+    return [first, ["hand of a prompt", _ms(times["hand"], len(sample)), "", "", "rules alone"]]
+
+
+def _feature_rows(sample: list[str]) -> list[list[str]]:
+    encoder = UniversalSentenceEncoder()
+    with tempfile.TemporaryDirectory() as folder:
+        expected = DiskCachedEncoder(encoder, folder).encode(sample)
+        times = medians(
+            {
+                "kept": lambda: DiskCachedEncoder(encoder, folder).encode(sample),
+                "made": lambda: encoder.encode(sample),
+                "hash": lambda: HashEncoder().encode(sample),
+            },
+            RUNS,
+        )
+        same = DiskCachedEncoder(encoder, folder).encode(sample).tobytes() == expected.tobytes()
+    note = f"encoding again; {'the same bytes' if same else 'OTHER BYTES'}"
+    return [
+        _row("features from the disk", times["kept"], times["made"], len(sample), note),
+        ["features of 'hash'", _ms(times["hash"], len(sample)), "", "", "no semantics"],
+    ]
+
+
+def _clip_rows(sample: list[str]) -> list[list[str]]:
+    if find_spec("open_clip") is None:
+        return []
+    import torch
+    from safetensors.torch import save_file
+
+    from hoidata.annotation.clip_encoder import ARCHITECTURE, ClipEncoder, import_open_clip
+    from hoidata.annotation.clip_weights import WeightsName
+
+    torch.set_num_threads(1)
+    open_clip = import_open_clip()
+    config = open_clip.get_model_config(ARCHITECTURE)["text_cfg"]
+    whole = open_clip.model._build_text_tower(512, config, quick_gelu=True).eval()
+    tokens = open_clip.get_tokenizer(ARCHITECTURE)(sample)
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        path = Path(folder) / "random.safetensors"
+        save_file({name: value.contiguous() for name, value in whole.state_dict().items()}, path)
+        ours = ClipEncoder(WeightsName(str(path), True))
+        error = np.abs(ours.encode(sample) - whole(tokens).numpy()).max()
+        times = medians({"ours": lambda: ours.encode(sample), "whole": lambda: whole(tokens)}, RUNS)
+    note = f"77 tokens, {len(sample)} at once; largest difference {error:.0e}"
+    return [_row("CLIP ViT-B/32, random weights", times["ours"], times["whole"], len(sample), note)]
+
+
+def _whole_pass(texts: list[str], folder: Path) -> None:
+    encoder: TextEncoder = CachedEncoder(UniversalSentenceEncoder())
+    encoder.encode(texts[:1])
+    seconds = {}
+    for name, each in (("encoded", encoder), ("encoded and kept", None), ("from the disk", None)):
+        asked = each or DiskCachedEncoder(UniversalSentenceEncoder(), folder)
+        start = time.perf_counter(), time.process_time()
+        asked.encode(texts)
+        seconds[name] = time.perf_counter() - start[0], time.process_time() - start[1]
+    size = sum(path.stat().st_size for path in folder.rglob("*.npz")) / 1e6
+    rows = [[name, f"{wall:.1f}", f"{processor:.1f}"] for name, (wall, processor) in seconds.items()]
+    title = f"All {len(texts):,} distinct prompts, default encoder, s (goal {GOAL_S}); {size:.0f} MB on disk"
+    show(title, ["once", "clock", "processor"], rows)
+
+
+def _row(name: str, ours: Times, theirs: Times, count: int, note: str) -> list[str]:
+    return [name, _ms(ours, count), _ms(theirs, count), f"{theirs.processor / ours.processor:.1f}", note]
+
+
+def _ms(times: Times, count: int) -> str:
+    return f"{times.processor / count * 1e3:.3f}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
