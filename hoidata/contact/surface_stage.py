@@ -3,12 +3,8 @@
 The folder it writes is described in ``hoidata.contact.surface_store``.
 """
 
-import multiprocessing
-import time
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,19 +13,18 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.contact.bimart_maps import bimart_map, packed_map
-from hoidata.contact.proximity import joints_in_object
-from hoidata.contact.solid_overlap import SolidOverlap
-from hoidata.contact.surface_contact import TOUCH_M, PlacedHand, penetration, placed_hand, touched_vertices
+from hoidata.contact.surface_contact import TOUCH_M
+from hoidata.contact.surface_measure import ObjectShape, Stopwatch, encloses_solid, measure_hand
 from hoidata.contact.surface_store import ClipSurface, SideSurface, SurfaceWriter
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
+from hoidata.objects.sampling import POINT_COUNT, sample_points
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.schema.clip import SIDES, Clip, Side
+from hoidata.schema.clip import SIDES, Side
 from hoidata.schema.store import Store, open_store
+from hoidata.workers import WorkerLost, in_workers
 
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 20_000
@@ -78,88 +73,23 @@ def surface_store(
     jobs = min(jobs, 1 + sum(store.sequences["n_frames"].tolist()) // FRAMES_PER_JOB)
     with atomic_folder(out_folder) as part, Progress(console=Console(stderr=True), disable=not progress) as bar:
         writer = SurfaceWriter(part, points, touch_m)
-        for clip, spent in bar.track(_in_order(bench, jobs), len(store), description="surface"):
+        for clip, spent in _in_order(bar.track(_measured(bench, jobs), len(store), description="surface"), store.ids):
             writer.add(clip)
             for name, value in spent.items():
                 seconds[name] += value
-        counts = writer.finish(_object_row(SurfaceIndex(store.object_model(name))) for name in store.objects["object"])
+        counts = writer.finish(_object_row(store.object_model(name)) for name in store.objects["object"])
     return SurfaceReport(counts, dict(seconds))
 
 
-def measure_hand(
-    clip: Clip,
-    side: Side,
-    joints_m: np.ndarray,
-    hands: HandPair,
-    shape: "ObjectShape",
-    touch_m: float = TOUCH_M,
-    stopwatch: "Stopwatch | None" = None,
-) -> SideSurface:
-    """One hand of a clip against the object's surface; frames in which it is not valid are not looked at.
-
-    joints_m: (frame, 21, 3) in the clip's world, metres. hands: the model of the clip's hands. shape: of
-    ``clip.object.model``.
-    """
-    watch, index = stopwatch or Stopwatch(), shape.index
-    with watch("hands"):
-        hand = placed_hand(clip, side, hands)
-        joints = joints_in_object(joints_m, clip.object)[hand.frames]
-    with watch("contact"):
-        touched = touched_vertices(hand, index, touch_m)
-    with watch("depth"):
-        depth = penetration(hand, index).deepest_m if shape.overlap else np.full(clip.n_frames, np.nan)
-    with watch("volume"):
-        volume = _deepest_volume_m3(hand, depth, shape.overlap)
-    with watch("joints"):
-        joint = hand.over_clip(index.distance_m(joints, hand.hinge_rad).min(axis=1), np.inf)
-    with watch("maps"):
-        packed = packed_map(bimart_map(hand, shape.points, clip.object.model.hinge))
-    return SideSurface(touched, depth, joint, packed, volume)
-
-
-def _deepest_volume_m3(hand: PlacedHand, depth_m: np.ndarray, overlap: SolidOverlap | None) -> float:
-    """Volume that hand and object share in the frame of the deepest vertex; NaN without the hand or an inside."""
-    of_hand = depth_m[hand.frames]
-    if overlap is None or not len(of_hand):
-        return np.nan
-    row = [int(of_hand.argmax())]
-    hinge = None if hand.hinge_rad is None else hand.hinge_rad[row]
-    return float(overlap.volume_m3(hand.vertices_m[row], hand.faces, hinge)[0]) if of_hand[row[0]] > 0 else 0.0
-
-
-class ObjectShape:
-    """What hands are held against, built once per object. overlap: None where nothing can be inside the object."""
-
-    def __init__(self, model: ObjectModel, points: SampledPoints, index: SurfaceIndex | None = None) -> None:
-        self.index = index or SurfaceIndex(model)
-        self.points = points
-        self.overlap = SolidOverlap(self.index) if encloses_solid(self.index) else None
-
-
-def encloses_solid(index: SurfaceIndex) -> bool:
-    """Whether anything can be inside the object."""
+def _object_row(model: ObjectModel) -> dict[str, Any]:
     try:
-        index.check_solid()
-    except BadInput:
-        return False
-    return True
+        index = SurfaceIndex(model)
+    except BadInput as error:  # its clips are left out with the same words
+        return {"object": model.name, "solid": False, "note": str(error)}
+    return {"object": model.name, "solid": encloses_solid(index), "note": index.solid_note}
 
 
-def _object_row(index: SurfaceIndex) -> dict[str, Any]:
-    return {"object": index.model.name, "solid": encloses_solid(index), "note": index.solid_note}
-
-
-class Stopwatch:
-    """Processor time by operation, of all threads of this process."""
-
-    def __init__(self) -> None:
-        self.seconds: defaultdict[str, float] = defaultdict(float)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        start = time.process_time()
-        yield
-        self.seconds[name] += time.process_time() - start
+_Result = tuple[ClipSurface, dict[str, float]]
 
 
 @dataclass
@@ -172,13 +102,16 @@ class _Bench:
     left_out: Mapping[str, str]
     shapes: dict[str, ObjectShape] = field(default_factory=dict)
 
-    def measure(self, clip_id: str) -> tuple[ClipSurface, dict[str, float]]:
-        watch, clip = Stopwatch(), self.store.clip(clip_id)
+    def measure(self, clip_id: str) -> _Result:
+        watch, clip = Stopwatch(), self.store.clip(clip_id, motion_only=True)
         name = clip.object.model.name
         if clip_id in self.left_out:
             return ClipSurface(clip_id, name, clip.n_frames, self.left_out[clip_id], {}), watch.seconds
-        with watch("objects"):
-            shape = self._shape(clip.object.model)
+        try:
+            with watch("objects"):
+                shape = self._shape(clip.object.model)
+        except BadInput as error:
+            return ClipSurface(clip_id, name, clip.n_frames, str(error), {}), watch.seconds
         sides: dict[Side, SideSurface] = {}
         for side in SIDES:
             with watch("hands"):
@@ -192,27 +125,23 @@ class _Bench:
         return self.shapes[model.name]
 
 
-def _in_order(bench: _Bench, jobs: int) -> Iterator[tuple[ClipSurface, dict[str, float]]]:
-    if jobs <= 1:
-        yield from map(bench.measure, bench.store.ids)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=context, initializer=_start_worker, initargs=(bench,)) as pool:
-        yield from pool.map(_work, bench.store.ids, chunksize=4)
+def _measured(bench: _Bench, jobs: int) -> Iterator[tuple[str, _Result]]:
+    try:
+        yield from in_workers(bench.measure, bench.store.ids, jobs)
+    except WorkerLost as error:
+        where = ", ".join(map(str, error.in_flight)) or "surface"
+        remedy = "run it again; if memory ran out, set HOIDATA_JOBS=1"
+        expected, got = "worker processes that live until they are done", f"one lost ({error.cause})"
+        raise BadInput(where, expected, got, remedy) from error
 
 
-_bench_here: _Bench | None = None
-
-
-def _start_worker(bench: _Bench) -> None:
-    """Give a worker its store once, and one thread: the pool already uses the cores."""
-    import torch
-
-    torch.set_num_threads(1)
-    global _bench_here
-    _bench_here = bench
-
-
-def _work(clip_id: str) -> tuple[ClipSurface, dict[str, float]]:
-    assert _bench_here is not None
-    return _bench_here.measure(clip_id)
+def _in_order(found: Iterable[tuple[str, _Result]], clip_ids: Sequence[str]) -> Iterator[_Result]:
+    """Results in the order of the clips, each as soon as all before it are there."""
+    early: dict[str, _Result] = {}
+    waiting = iter(clip_ids)
+    wanted = next(waiting, None)
+    for clip_id, result in found:
+        early[clip_id] = result
+        while wanted in early:
+            yield early.pop(wanted)
+            wanted = next(waiting, None)

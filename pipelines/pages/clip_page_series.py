@@ -11,7 +11,7 @@ import numpy as np
 from hoidata.contact import HandEvidence
 from hoidata.contact.maps import LONGEST_CLIP
 from hoidata.contact.surface_contact import TOUCH_M
-from hoidata.contact.surface_stage import ObjectShape, encloses_solid, measure_hand
+from hoidata.contact.surface_measure import ObjectShape, encloses_solid, measure_hand
 from hoidata.contact.surface_store import SideSurface, SurfaceStore
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.surface_index import surface_index

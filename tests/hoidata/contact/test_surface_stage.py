@@ -16,6 +16,7 @@ from hoidata.files import canonical_json
 from hoidata.hands import load_embedded_hands, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
+from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.schema import SIDES, ObjectTrack
 from hoidata.schema.info import generated_info
 from hoidata.schema.store import open_store, write_store
@@ -187,6 +188,34 @@ def test_object_without_an_inside_has_no_depth_and_says_so(make_clip, tmp_path):
     assert "open" in store.objects.loc[0, "note"]
     for name in ("inside_frames", "deepest_m", "deepest_volume_m3"):
         assert pd.isna(store.clips.loc[clip.clip_id, f"right_{name}"])
+
+
+def test_object_of_metres_has_depths_but_no_volumes(make_clip, tmp_path):
+    clip = make_clip(4)
+    model = clip.object.model
+    vertices = model.vertices_m * np.array((1.0, 60.0, 40.0))
+    large = replace(clip, object=replace(clip.object, model=replace(model, vertices_m=vertices)))
+    write_store(tmp_path / "clips", [large], generated_info("grab"))
+    surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
+    row = open_surface(tmp_path / "surface").clips.iloc[0]
+    assert row["right_deepest_m"] > 0.01
+    assert pd.isna(row["right_deepest_volume_m3"])
+
+
+def test_one_mesh_without_a_surface_costs_its_own_clips_only(clips, tmp_path, monkeypatch):
+    def index_of(model):
+        if model.name == "hinged_box":
+            raise BadInput("mesh of 'hinged_box'", "at least one triangle", "none")
+        return SurfaceIndex(model)
+
+    for module in ("surface_stage", "surface_measure"):
+        monkeypatch.setattr(f"hoidata.contact.{module}.SurfaceIndex", index_of)
+    write_store(tmp_path / "clips", clips, generated_info("grab"))
+    report = surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
+    store = open_surface(tmp_path / "surface")
+    assert store.ids == ["test/s1/through", "test/s2/left"]
+    assert "at least one triangle" in store.clips.at["test/s1/both", "reason"]
+    assert report.counts["left_out"] == report.counts["objects_not_solid"] == 1
 
 
 def test_store_without_clips_gives_a_folder_that_reads(tmp_path):
