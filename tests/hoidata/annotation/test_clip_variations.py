@@ -176,6 +176,8 @@ def test_variations_follow_the_four_forms_and_leave_them_as_they_are(plain: Path
         np.testing.assert_array_equal(after.variation_features(key), encoder.encode(after.variations(key)))
     forms = pd.read_parquet(tmp_path / "annotation" / "text.parquet").groupby("clip_id")["form"].agg(list)
     assert set(map(tuple, forms)) == {(*FORMS, *["variation"] * 5)}
+    rows = [pd.read_parquet(root / "annotation" / "text.parquet") for root in (plain, tmp_path)]
+    assert rows[0]["text_row"].tolist() == rows[1].loc[rows[1]["form"] != "variation", "text_row"].tolist()
     facts = after.annotation_info["variations"]
     assert (facts["per_clip"], facts["kept"]) == (5, 5 * 14)
     assert 1 <= facts["slowly"] <= 3
