@@ -24,7 +24,8 @@ from hoidata.hands import load_embedded_hands
 from hoidata.objects.distance_grid import distance_grid
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import Hinge, ObjectModel, articulate
-from hoidata.objects.surface_index import SurfaceIndex
+from hoidata.objects.solid import Solid
+from hoidata.objects.surface_index import SurfaceIndex, in_part
 from hoidata.objects.triangle_tree import triangle_tree
 from tests.bench.harness import Times, medians, show
 
@@ -119,51 +120,46 @@ def warm_up(asked: Asked) -> float:
 
 
 def label_row(asked: Asked) -> list[str]:
-    return compared(asked, lambda index: index.within(asked.places_m, asked.hinge_rad, TOUCH_M), unsigned, labels_wrong)
+    return compared(asked, lambda index: index.within(asked.places_m, asked.hinge_rad, TOUCH_M), labels_wrong)
 
 
 def distance_row(asked: Asked) -> list[str]:
-    return compared(asked, lambda index: index.distance_m(asked.places_m, asked.hinge_rad), unsigned, largest_error)
+    return compared(asked, lambda index: index.distance_m(asked.places_m, asked.hinge_rad), largest_error)
 
 
 def depth_row(asked: Asked) -> list[str]:
-    if not SurfaceIndex(asked.model).is_solid:
-        return [asked.model.name, *("-" * 8)]
-    return compared(asked, lambda index: index.depth_m(asked.places_m, asked.hinge_rad), None, largest_depth_error)
+    return compared(asked, lambda index: index.depth_m(asked.places_m, asked.hinge_rad), depths_wrong, signed=True)
 
 
 def compared(
     asked: Asked,
     ours: Callable[[SurfaceIndex], np.ndarray],
-    kept: Callable[[Asked], Callable[[], np.ndarray]] | None,
-    wrong: Callable[[np.ndarray, np.ndarray], str],
+    wrong: Callable[[Asked, np.ndarray], str],
+    signed: bool = False,
 ) -> list[str]:
-    """One row; distances of libigl are thresholded by ``wrong`` where labels are compared."""
+    """One row; libigl gives distances, from which a label or a depth is one step."""
     with_grid, without = SurfaceIndex(asked.model, 0), SurfaceIndex(asked.model, 10**12)
-    plain = signed_each_call(asked) if kept is None else unsigned_each_call(asked)
     variants: dict[str, Callable[[], object]] = {
-        "libigl": plain,
+        "libigl": signed_each_call(asked) if signed else unsigned_each_call(asked),
         "no grid": lambda: ours(without),
         "grid": lambda: ours(with_grid),
     }
-    if kept is not None:
-        variants["kept"] = kept(asked)
+    if not signed:
+        variants["kept"] = tree_kept(asked)
     times = medians(variants, RUNS)
-    truth = plain()
-    found = [ours(index) for index in (with_grid, without)]
-    assert np.array_equal(*found)
-    own = times["grid"].processor
-    count = asked.places_m.shape[0] * asked.places_m.shape[1]
+    found = ours(with_grid)
+    assert np.array_equal(found, ours(without))
+    own, count = times["grid"].processor, found.size
     return [
         asked.model.name,
         per_place(times["libigl"], count),
         per_place(times["kept"], count) if "kept" in times else "-",
         per_place(times["no grid"], count),
         per_place(times["grid"], count),
-        f"{times['libigl'].processor / own:.0f}",
-        f"{times['kept'].processor / own:.0f}" if "kept" in times else "-",
+        f"{times['libigl'].processor / own:.1f}",
+        f"{times['kept'].processor / own:.1f}" if "kept" in times else "-",
         built(asked.model),
-        wrong(found[0], truth),
+        wrong(asked, found),
     ]
 
 
@@ -214,7 +210,7 @@ def unsigned_each_call(asked: Asked) -> Callable[[], np.ndarray]:
     return work
 
 
-def unsigned(asked: Asked) -> Callable[[], np.ndarray]:
+def tree_kept(asked: Asked) -> Callable[[], np.ndarray]:
     """libigl with its tree built beforehand, one per part; what is left of a frame's pose is moving the places."""
     faces, model, trees = parts_of(asked.model), asked.model, []
     for own in faces:
@@ -249,18 +245,28 @@ def signed_each_call(asked: Asked) -> Callable[[], np.ndarray]:
     return work
 
 
-def labels_wrong(labels: np.ndarray, distance_m: np.ndarray) -> str:
-    return f"{(labels != (distance_m < TOUCH_M)).sum()} of {labels.size:,} ({labels.mean():.0%} touch)"
+def labels_wrong(asked: Asked, labels: np.ndarray) -> str:
+    wrong = (labels != (tree_kept(asked)() < TOUCH_M)).sum()
+    return f"{wrong} of {labels.size:,} ({labels.mean():.0%} touch)"
 
 
-def largest_error(found_m: np.ndarray, distance_m: np.ndarray) -> str:
-    return f"{np.abs(found_m - distance_m).max():.0e} m"
+def largest_error(asked: Asked, distance_m: np.ndarray) -> str:
+    return f"{np.abs(distance_m - tree_kept(asked)()).max():.0e} m"
 
 
-def largest_depth_error(found_m: np.ndarray, depth_m: np.ndarray) -> str:
-    """Where the mesh had to be repaired, libigl has no sign to compare with: both figures are printed."""
-    differ = np.abs(found_m - depth_m) > 1e-9
-    return f"{differ.sum()} of {found_m.size:,} ({(found_m > 0).mean():.0%} inside)"
+def depths_wrong(asked: Asked, depth_m: np.ndarray) -> str:
+    """Against libigl's distances to the solids, where its winding number says inside."""
+    truth = np.zeros(depth_m.size)
+    for part, solid in SurfaceIndex(asked.model).solids.items():
+        if isinstance(solid, Solid):
+            places = np.ascontiguousarray(in_part(asked.model, asked.places_m, asked.hinge_rad, part).reshape(-1, 3))
+            maybe = ((places > solid.vertices_m.min(axis=0)) & (places < solid.vertices_m.max(axis=0))).all(axis=1)
+            own = places[maybe]
+            inside = igl.winding_number(solid.vertices_m, solid.faces, own) > 0.5
+            square = igl.point_mesh_squared_distance(own, solid.vertices_m, solid.faces)[0]
+            truth[maybe] = np.maximum(truth[maybe], np.where(inside, np.sqrt(square), 0))
+    wrong = (np.abs(depth_m.reshape(-1) - truth) > 1e-12).sum()
+    return f"{wrong} of {depth_m.size:,} ({(depth_m > 0).mean():.0%} inside)"
 
 
 def volume_row(asked: Asked, cell_m: float) -> list[str]:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.errors import BadInput
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import Hinge, ObjectModel, articulate
+from hoidata.objects.solid import Solid
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
@@ -202,7 +203,7 @@ def test_the_same_mesh_gives_the_same_index_and_another_hinge_another() -> None:
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the meshes are not part of this repository")
 @pytest.mark.slow
 @pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
-def test_every_label_on_manipnet_s_meshes_equals_libigl_s(grid_from: int) -> None:
+def test_every_label_and_depth_on_manipnet_s_meshes_equals_libigl_s(grid_from: int) -> None:
     asked = 0
     for path in sorted(Path(ROOT).glob("objects/*/*.obj.gz")):
         mesh = parse_obj(gzip.decompress(path.read_bytes()).decode(), path)
@@ -212,5 +213,10 @@ def test_every_label_on_manipnet_s_meshes_equals_libigl_s(grid_from: int) -> Non
         index = SurfaceIndex(model, grid_from)
         np.testing.assert_array_equal(index.within(places[None], None, THRESHOLD_M)[0], expected < THRESHOLD_M)
         np.testing.assert_allclose(index.distance_m(places[None], None)[0], expected, atol=1e-12)
+        solid, few = index.solids[0], places[:4000]
+        assert isinstance(solid, Solid)
+        inside = igl.winding_number(solid.vertices_m, solid.faces, few) > 0.5
+        depth = np.sqrt(igl.point_mesh_squared_distance(few, solid.vertices_m, solid.faces)[0])
+        np.testing.assert_allclose(index.depth_m(few[None], None)[0], np.where(inside, depth, 0), atol=1e-12)
         asked += len(places)
     assert asked >= 300_000
