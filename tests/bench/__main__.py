@@ -6,7 +6,7 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from tests.bench import adapters, kernels, scale, store, surface, text, whole
+from tests.bench import adapters, kernels, physics, realism, scale, store, surface, text, whole
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -14,6 +14,8 @@ BENCHMARKS = {
     "scale": scale.main,
     "kernels": kernels.main,
     "surface": surface.main,
+    "physics": physics.main,
+    "realism": realism.main,
     "text": text.main,
     "whole": whole.main,
 }

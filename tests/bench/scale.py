@@ -5,7 +5,6 @@ embedded corpora, repeated (see ``corpus``); nothing is read from a manifest. Ea
 so that its memory can be told apart; conversion on two workers, the others on one process, as the graph runs them.
 """
 
-import itertools
 import json
 import os
 import subprocess
@@ -19,6 +18,7 @@ from pathlib import Path
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.store import open_store
 from tests.bench.corpus import PAPER, embedded_root, replicate
+from tests.bench.growth import show_growth
 from tests.bench.harness import TreeMemory, show
 
 MEBI = 1 << 20
@@ -103,7 +103,7 @@ def run_share(source: Path, folder: Path, share: float, stages: tuple[str, ...] 
     clips = {name: len(store) for name, store in stores.items()}
     if clips != wanted:
         raise AssertionError(f"{clips} clips, wanted {wanted}")
-    frames = sum(int(store.sequences["n_frames"].sum()) for store in stores.values())
+    frames = sum(int(store.sequences["n_frames"].to_numpy().sum()) for store in stores.values())
     return {
         "share": share,
         "made_s": made_s,
@@ -111,9 +111,7 @@ def run_share(source: Path, folder: Path, share: float, stages: tuple[str, ...] 
         "sequences": sum(store.sequences["sequence"].nunique() for store in stores.values()),
         "frames": frames,
         "parameter_bytes": sum(parameter_bytes(store.folder) for store in stores.values()),
-        "bytes": {
-            part: sum(folder_bytes(out / name / part) for name in PAPER) for part in ("clips", "annotation", "contact")
-        },
+        "bytes": {part: sum(folder_bytes(out / name / part) for name in PAPER) for part in PARTS},
         "stages": {stage: asdict(value) for stage, value in found.items()},
     }
 
@@ -129,23 +127,10 @@ def folder_bytes(folder: Path) -> int:
 
 
 def report(figures: list[dict]) -> None:
-    rows = [(name, *(line(figure) for figure in figures), _growth(name, figures)) for name, line in LINES.items()]
-    columns = ["", *(f"share {figure['share']:g}" for figure in figures), "per further frame"]
-    show("Paper scale", columns, rows)
-
-
-def _growth(name: str, figures: list[dict]) -> str:
-    """What a further frame costs between the last two shares, beside the two before: 1.00 is linear growth.
-
-    What a run costs however small it is (starting processes, imports) drops out.
-    """
-    if len(figures) < 3 or name not in GROWING:
-        return ""
-    slopes = [
-        (GROWING[name](larger) - GROWING[name](smaller)) / (larger["frames"] - smaller["frames"])
-        for smaller, larger in itertools.pairwise(figures[-3:])
-    ]
-    return f"{slopes[1] / slopes[0]:.2f}" if slopes[0] else ""
+    rows = [(name, *(line(figure) for figure in figures)) for name, line in LINES.items()]
+    show("Paper scale", ["", *(f"share {figure['share']:g}" for figure in figures)], rows)
+    lines = {name: [size(figure) for figure in figures] for name, size in GROWING.items()}
+    show_growth("Growth with the number of clips", [figure["clips"] for figure in figures], lines)
 
 
 def _stage(stage: str, key: str) -> Callable[[dict], float]:
@@ -164,14 +149,19 @@ def _mebibytes(size: Callable[[dict], float]) -> Callable[[dict], str]:
     return lambda figure: f"{size(figure) / MEBI:,.1f} MiB"
 
 
-GROWING: dict[str, Callable[[dict], float]] = {
-    **{f"{stage}: wall / processor": _stage(stage, "processor_s") for stage in STAGES},
+BYTES: dict[str, Callable[[dict], float]] = {
     "bytes of parameters": lambda figure: figure["parameter_bytes"],
-    **{
-        f"bytes of {part}": lambda figure, part=part: figure["bytes"][part]
-        for part in ("clips", "annotation", "contact")
-    },
+    **{f"bytes of {part}": lambda figure, part=part: figure["bytes"][part] for part in PARTS},
     "bytes of all": lambda figure: sum(figure["bytes"].values()),
+}
+GROWING: dict[str, Callable[[dict], float]] = {
+    **{f"{name}, MiB": lambda figure, size=size: size(figure) / MEBI for name, size in BYTES.items()},
+    **{
+        f"{stage}, peak MiB": lambda figure, stage=stage: _stage(stage, "peak_at_once")(figure) / MEBI
+        for stage in STAGES
+    },
+    **{f"{stage}, processor s": _stage(stage, "processor_s") for stage in STAGES},
+    "all stages, processor s": lambda figure: sum(_stage(stage, "processor_s")(figure) for stage in STAGES),
 }
 LINES: dict[str, Callable[[dict], str]] = {
     "clips / sequences": lambda figure: f"{figure['clips']:,} / {figure['sequences']:,}",
@@ -181,11 +171,7 @@ LINES: dict[str, Callable[[dict], str]] = {
     "convert: frames per second": lambda figure: f"{figure['frames'] / _stage('convert', 'wall_s')(figure):,.0f}",
     **{f"{stage}: memory at once / no file's / sum of peaks": _peak(stage) for stage in STAGES},
     "parameters per frame": lambda figure: f"{figure['parameter_bytes'] / figure['frames']:.1f} bytes",
-    **{
-        name: lambda figure, size=size: f"{size(figure) / MEBI:,.1f} MiB"
-        for name, size in GROWING.items()
-        if "bytes" in name
-    },
+    **{name: _mebibytes(size) for name, size in BYTES.items()},
     "all per frame": lambda figure: f"{sum(figure['bytes'].values()) / figure['frames']:.1f} bytes",
 }
 

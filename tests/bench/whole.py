@@ -1,8 +1,9 @@
 """The whole corpus on one core: raw files of three datasets to the annotated store, seconds of the processor by stage.
 
-``python -m tests.bench.whole [SHARE ...]`` (1, the paper's 6,592 clips, when none is given). One process per stage and
-dataset, one worker. Imports are not counted. "checksums and files": digests of the raw files and reading them, done
-once more by themselves, which can be taken off conversion. HOIDATA_BENCH_CORPORA as in ``corpus``.
+``python -m tests.bench.whole [SHARE ...]`` (0.01, 0.1 and 1, the paper's 6,592 clips, when none is given). One process
+per stage and dataset, one worker. Imports are not counted, code compiled before is loaded. "checksums and files":
+digests of the raw files and reading them, done once more by themselves, which can be taken off conversion.
+HOIDATA_BENCH_CORPORA as in ``corpus``.
 """
 
 import hashlib
@@ -14,14 +15,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 from hoidata.schema.store import open_store
 from tests.bench.corpus import PAPER, embedded_root, replicate
+from tests.bench.growth import show_growth
 from tests.bench.harness import show
 from tests.bench.scale import annotate, contact
 
 GOAL_S, GOAL_MIB = 90, 2048
+DISK = "checksums and files"
 
 
 def convert(name: str, raw: Path, out: Path) -> None:
@@ -40,7 +44,7 @@ def read_and_digest(name: str, raw: Path, out: Path) -> None:
 
 
 STAGES: dict[str, Callable[[str, Path, Path], None]] = {
-    "checksums and files": read_and_digest,
+    DISK: read_and_digest,
     "convert": convert,
     "annotate": annotate,
     "contact": contact,
@@ -64,34 +68,58 @@ def measured(stage: str, name: str, raw: Path, out: Path) -> dict[str, float]:
     return found
 
 
-def run_share(source: Path, folder: Path, share: float) -> list[list[str]]:
-    """Rows of the table: a stage, its seconds per dataset and in all, its peak."""
+@dataclass(frozen=True)
+class ShareFigures:
+    """One share. clips, seconds (by stage): per dataset, in the order of ``PAPER``; peak_mib: by stage."""
+
+    share: float
+    clips: list[int]
+    frames: int
+    seconds: dict[str, list[float]]
+    peak_mib: dict[str, float]
+
+    @property
+    def counted_s(self) -> float:
+        """All stages, without checksums and reading files."""
+        return sum(sum(own) * (-1 if stage == DISK else 1) for stage, own in self.seconds.items())
+
+    def rows(self) -> list[list[str]]:
+        rows = [
+            [stage, *(f"{value:.1f}" for value in own), f"{sum(own):.1f}", f"{self.peak_mib[stage]:.0f}"]
+            for stage, own in self.seconds.items()
+        ]
+        counts = [f"{count:,}" for count in (*self.clips, sum(self.clips))]
+        goal = f"all without {DISK} (goal {GOAL_S * self.share:g} s, {GOAL_MIB} MiB)"
+        highest = max(self.peak_mib.values())
+        rows.append([f"share {self.share:g}: clips; {self.frames:,} frames", *counts, ""])
+        return [*rows, [goal, "", "", "", f"{self.counted_s:.1f}", f"{highest:.0f}"]]
+
+
+def run_share(source: Path, folder: Path, share: float) -> ShareFigures:
     raw, out = folder / "raw", folder / "out"
     replicate(source, raw, share)
-    rows, total, highest = [], 0.0, 0.0
-    for stage in STAGES:
-        found = [measured(stage, name, raw, out) for name in PAPER]
-        seconds, peak = sum(item["processor_s"] for item in found), max(item["peak_mib"] for item in found)
-        rows.append([stage, *(f"{item['processor_s']:.1f}" for item in found), f"{seconds:.1f}", f"{peak:.0f}"])
-        total += -seconds if stage == "checksums and files" else seconds
-        highest = max(highest, peak)
+    found = {stage: [measured(stage, name, raw, out) for name in PAPER] for stage in STAGES}
     stores = [open_store(out / name / "clips") for name in PAPER]
-    counts = [str(len(store)) for store in stores]
-    frames = sum(int(store.sequences["n_frames"].sum()) for store in stores)
-    rows.append([f"share {share:g}: clips; {frames:,} frames", *counts, str(sum(map(len, stores))), ""])
-    goal = f"all without checksums and files (goal {GOAL_S * share:g} s, {GOAL_MIB} MiB)"
-    rows.append([goal, "", "", "", f"{total:.1f}", f"{highest:.0f}"])
-    return rows
+    return ShareFigures(
+        share,
+        [len(store) for store in stores],
+        sum(int(store.sequences["n_frames"].to_numpy().sum()) for store in stores),
+        {stage: [item["processor_s"] for item in items] for stage, items in found.items()},
+        {stage: max(item["peak_mib"] for item in items) for stage, items in found.items()},
+    )
 
 
-def main(shares: tuple[float, ...] = (1.0,)) -> None:
+def main(shares: tuple[float, ...] = (0.01, 0.1, 1.0)) -> None:
     corpora = embedded_root()
-    rows = []
     # Beside the corpora: hard links do not leave a file system.
     with tempfile.TemporaryDirectory(prefix="bench-whole-", dir=corpora.parent) as folder:
-        for share in shares:
-            rows += run_share(corpora, Path(folder) / f"share-{share:g}", share)
+        figures = [run_share(corpora, Path(folder) / f"share-{share:g}", share) for share in shares]
+    rows = [row for figure in figures for row in figure.rows()]
     show("Raw files to annotated store, one core", ["processor s", *PAPER, "all", "peak MiB"], rows)
+    lines = {f"{stage}, processor s": [sum(figure.seconds[stage]) for figure in figures] for stage in STAGES}
+    lines["all without " + DISK + ", processor s"] = [figure.counted_s for figure in figures]
+    lines["peak memory, MiB"] = [max(figure.peak_mib.values()) for figure in figures]
+    show_growth("Growth with the number of clips", [sum(figure.clips) for figure in figures], lines)
 
 
 if __name__ == "__main__":
