@@ -51,6 +51,7 @@ BROKEN = {
     "a hinge angle without a hinge": (lambda c: with_object(c, hinge_rad=np.zeros(30)), "hinge_rad"),
     "an object of whole numbers": (lambda c: with_object(c, rotvec=np.zeros((30, 3), int)), "rotvec"),
     "frames that go back": (lambda c: replace(c, source_frames=c.source_frames[::-1]), "source_frames"),
+    "a frame twice": (lambda c: replace(c, source_frames=np.r_[0, 0:29].astype(np.int32)), "source_frames"),
     "no left hand": (lambda c: replace(c, hands={"right": c.hands["right"]}), "hands"),
     "a long gravity": (lambda c: replace(c, gravity=np.array([0, 0, -9.81])), "gravity"),
     "a flat gravity": (lambda c: replace(c, gravity=np.array([0.0, -1.0])), "gravity"),
@@ -86,6 +87,14 @@ def test_a_sound_clip_passes_and_comes_back(make_clip):
         with_body(replace(clip, gravity=None, gravity_note="not said"), expression=None), intrinsics=None
     )
     assert check_clip(bare) is bare
+
+
+def test_where_a_hand_that_is_not_there_lies_does_not_matter(make_clip):
+    clip, valid = make_clip(), np.arange(30) != 7
+    wrist = np.where(valid[:, None], clip.hands["right"].wrist_m, np.float32(1e6))
+    check_clip(with_hand(clip, wrist_m=wrist, valid=valid))
+    with pytest.raises(BadInput, match="wrist_m"):
+        check_clip(with_hand(clip, wrist_m=wrist))
 
 
 @pytest.mark.parametrize("name", BROKEN)
