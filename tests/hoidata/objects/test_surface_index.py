@@ -65,13 +65,15 @@ def brute_distance(corners_m: np.ndarray, places_m: np.ndarray) -> np.ndarray:
     for start, stop in ((0, 1), (1, 2), (2, 0)):
         way = a[:, :, stop] - a[:, :, start]
         from_start = places_m[:, None] - a[:, :, start]
-        along = np.clip((from_start * way).sum(-1) / (way**2).sum(-1), 0, 1)
+        square = (way**2).sum(-1)
+        along = np.clip((from_start * way).sum(-1) / np.where(square > 0, square, 1), 0, 1)
         best = np.minimum(best, np.linalg.norm(from_start - along[..., None] * way, axis=-1))
     normal = np.cross(a[:, :, 1] - a[:, :, 0], a[:, :, 2] - a[:, :, 0])
-    normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = np.linalg.norm(normal, axis=-1, keepdims=True)
+    normal = normal / np.where(length > 0, length, 1)
     height = ((places_m[:, None] - a[:, :, 0]) * normal).sum(-1)
     foot = places_m[:, None] - height[..., None] * normal
-    inside = np.ones(height.shape, bool)
+    inside = np.broadcast_to(length[..., 0] > 0, height.shape).copy()
     for start, stop in ((0, 1), (1, 2), (2, 0)):
         inside &= (np.cross(a[:, :, stop] - a[:, :, start], foot - a[:, :, start]) * normal).sum(-1) >= 0
     return np.where(inside, np.minimum(best, np.abs(height)), best).min(axis=1)
@@ -103,6 +105,27 @@ def test_distances_equal_brute_force() -> None:
     for grid_from in (AT_ONCE, NEVER):
         found = SurfaceIndex(model, grid_from).distance_m(places[None], None)[0]
         np.testing.assert_allclose(found, expected, atol=1e-14)
+
+
+def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
+    """On a coarse lattice triangles collapse to segments, coincide, cross, and places lie on them."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        corners = rng.integers(0, 4, (rng.integers(1, 30), 3)) * np.array([0.01, 0.02, rng.choice([0, 1e-7, 0.01])])
+        faces = rng.integers(0, len(corners), (rng.integers(1, 40), 3))
+        model = ObjectModel("soup", corners, faces, np.zeros(len(corners), np.uint8))
+        distinct = [len(np.unique(corners[face], axis=0)) == 3 for face in faces]
+        if not any(distinct):
+            continue
+        places = np.concatenate([rng.integers(-2, 6, (60, 3)) * 0.01, rng.uniform(-0.02, 0.08, (60, 3))])
+        expected = brute_distance(corners[faces[distinct]], places)
+        for grid_from in (AT_ONCE, NEVER):
+            index = SurfaceIndex(model, grid_from)
+            found = index.distance_m(places[None], None)[0]
+            np.testing.assert_allclose(found, expected, atol=1e-14)
+            for threshold_m in (0.01, 0.02, 1e-9):
+                within = index.within(places[None], None, threshold_m)[0]
+                np.testing.assert_array_equal(within, found < threshold_m)
 
 
 def test_a_grid_changes_no_bit_of_any_answer() -> None:
@@ -198,6 +221,16 @@ def test_the_same_mesh_gives_the_same_index_and_another_hinge_another() -> None:
     assert model.hinge is not None
     other = ObjectModel(model.name, model.vertices_m, model.faces, model.part, Hinge(model.hinge.axis, np.zeros(3)))
     assert surface_index(other) is not surface_index(model)
+
+
+def test_only_indices_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hoidata.objects.surface_index.MOST_TRIANGLES_KEPT", 30)
+    boxes = [rigid(trimesh.creation.box((0.1, 0.1, size)), f"box of {size}") for size in (0.1, 0.2, 0.3)]
+    first, second = surface_index(boxes[0]), surface_index(boxes[1])
+    assert surface_index(boxes[0]) is first
+    surface_index(boxes[2])
+    assert surface_index(boxes[0]) is first
+    assert surface_index(boxes[1]) is not second
 
 
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the meshes are not part of this repository")
