@@ -159,7 +159,7 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
         ("clip", clip.clip_id),
         ("dataset", f"{info['dataset']}, version {info['dataset_version']}"),
         ("subject, sequence", f"{clip.subject}, {clip.sequence}"),
-        ("verb", clip.verb or "no label in the source"),
+        ("verb", _verb(annotated, clip)),
         ("object", _object_words(clip)),
         ("other objects", ", ".join(track.model.name for track in clip.other_objects) or NOTHING),
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s at {FPS} per second"),
@@ -176,6 +176,14 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
 def source_rows(clip: Clip) -> Rows:
     """(path below the raw folder, bytes, SHA-256) of every raw file behind the clip."""
     return [(source.path, f"{source.size:,}", source.sha256) for source in clip.sources]
+
+
+def _verb(annotated: AnnotatedStore, clip: Clip) -> str:
+    """The source's word, or the one derived from the motion, marked as such, with what it rests on."""
+    row = annotated.hand_types.loc[clip.clip_id]
+    if row["verb_source"] == "derived":
+        return f"{row['verb']}, derived from the motion ({row['verb_evidence']}): the source has no label"
+    return clip.verb or "no label in the source"
 
 
 def _object_words(clip: Clip) -> str:

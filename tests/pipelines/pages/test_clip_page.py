@@ -242,6 +242,18 @@ def test_page_says_where_annotator_and_distances_disagree(dataset, hands, tmp_pa
     assert text.count('<div class="readout"') == 7
 
 
+def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp_path):
+    """A box lifted by 20 cm under the hand, of which its source says no word."""
+    root = tmp_path / "grab"
+    write_store(root / "clips", [replace(page_clip(), verb=None)], generated_info("grab", hands))
+    quality_store(root / "clips", root / "quality", progress=False)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=THRESHOLD_M)
+    contact_store(root / "clips", root / "contact", threshold_m=THRESHOLD_M)
+    split_store(root / "clips", root / "annotation", root / "splits", {**SPLIT, "test": []})
+    text = write_clip_page(tmp_path / "page.html", load_annotated(root, hands), "test/box_lift", hands).read_text()
+    assert re.search(r"<dd>lift, derived from the motion \(.+\): the source has no label</dd>", text)
+
+
 def test_clip_without_words_says_why_and_still_has_its_page(dataset, hands, tmp_path):
     text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/far", hands).read_text()
     assert "No sentences: no joint within 9 cm of the object" in text
@@ -319,3 +331,11 @@ def test_curves_and_contact_follow_the_player_in_chromium(dataset, hands, tmp_pa
         counts = [int(number) for number in re.findall(r"<b>(\d+)</b>", shown)]
         assert counts == [int(series.touched[side][frame].sum()) for side in ("left", "right")]
         assert f"frame {frame} of 23" in dom
+    painted = tmp_path / "painted.html"
+    text = page.read_text().replace('value="frame" checked', 'value="frame"')
+    painted.write_text(text.replace('value="left">', 'value="left" checked>'))
+    command = [chromium, *switches, f"{painted.as_uri()}#t=0.5"]
+    dom = subprocess.run(command, check=True, capture_output=True, text=True, timeout=180).stdout
+    # The legends change places after the object has been painted.
+    assert '<span class="legend" data-for="distance">' in dom
+    assert '<span class="legend" data-for="contact" hidden="">' in dom
