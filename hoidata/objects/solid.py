@@ -45,6 +45,8 @@ def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
         if len(single) < len(found):
             repairs.append(f"{len(found) - len(single)} triangles that lay double left out")
         found = _evenly_turned(single)
+        if len(single) == len(surface.faces) and not np.array_equal(found, single):
+            repairs.append("neighbouring triangles turned alike")
     holes = _holes(found)
     patched = bool(holes)
     if holes is None or not all(_is_small(vertices, found, hole) for hole in holes):
@@ -55,7 +57,7 @@ def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
     if not encloses(vertices, found):
         return NoSolid("it encloses nothing")
     if volume_m3(vertices, found) < 0:
-        repairs.append("turned outside out")
+        repairs.append("triangles turned outward")
         found = np.ascontiguousarray(found[:, ::-1])
     return Solid(vertices, found, ", ".join(repairs), patched)
 
