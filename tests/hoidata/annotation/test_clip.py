@@ -91,11 +91,20 @@ def test_a_silent_name_server_costs_no_more_than_the_time_given(monkeypatch: pyt
     assert time.perf_counter() - start < 1
 
 
-def test_a_listening_address_is_reachable_and_a_closed_port_is_not() -> None:
+def test_a_listening_address_is_reachable_and_a_closed_port_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(clip_weights, "getproxies", dict)
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         assert is_reachable(f"http://127.0.0.1:{port}")
-    assert not is_reachable(f"http://127.0.0.1:{port}")
+    assert not is_reachable(f"http://127.0.0.1:{port}", within_s=0.3)
+
+
+@pytest.mark.parametrize("scheme", ["", "http://"])
+def test_behind_a_proxy_it_is_the_proxy_that_is_asked(monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        proxy = f"{scheme}127.0.0.1:{server.getsockname()[1]}"
+        monkeypatch.setattr(clip_weights, "getproxies", lambda: {"https": proxy})
+        assert is_reachable("https://nowhere.invalid")
 
 
 ASK = """
