@@ -50,6 +50,19 @@ def test_the_motion_alone_is_the_clip_without_what_else_the_source_had(folder, c
     assert any(clip.camera and clip.body and clip.source_contact for clip in clips)
 
 
+def test_a_clip_may_be_changed_without_the_next_one_knowing(folder, clips):
+    store = open_store(folder)
+    for clip in clips:
+        taken = store.clip(clip.clip_id)
+        tracks = (*taken.hands.values(), taken.object, *taken.other_objects, taken.camera, taken.body)
+        tracks = (taken, *tracks, taken.source_contact)
+        arrays = [value for track in tracks if track for value in vars(track).values() if isinstance(value, np.ndarray)]
+        assert len(arrays) >= 14
+        for array in arrays:
+            array[...] = 1
+        assert_equal_values(store.clip(clip.clip_id), plain_arrays(clip))
+
+
 def plain_arrays(clip):
     """The clip with trimesh's tracked arrays replaced by NumPy ones."""
 
