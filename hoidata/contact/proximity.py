@@ -35,6 +35,8 @@ class ProximityIndex:
 
     def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(frame,) the smallest of ``nearest_m`` of each frame: most joints need not be looked at closely for it."""
+        if not self.parts:
+            return np.full(len(joints_m), np.inf)
         motion, reach = part_motion(track, self.parts), CONTACT_THRESHOLD_M
         return closest_of_joints(joints_m, motion, self._boxes(), self._grid(reach), reach)
 

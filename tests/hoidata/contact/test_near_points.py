@@ -141,6 +141,14 @@ def test_more_entries_than_room_was_made_for_are_all_there() -> None:
     np.testing.assert_array_equal(entries["joint"], np.tile(np.arange(JOINTS), FRAMES * 1000))
 
 
+def test_without_points_nothing_is_near_and_all_is_infinitely_far() -> None:
+    _, track, joints = scene(1, 5, False, 0.0)
+    index = ProximityIndex(sampled(np.zeros((0, 3)), np.zeros(0, np.uint8)))
+    assert len(index.entries(joints, np.ones(FRAMES, bool), track)) == 0
+    assert np.isinf(index.nearest_m(joints, track)).all()
+    assert index.closest_m(joints, track).tolist() == [np.inf] * FRAMES
+
+
 @pytest.mark.parametrize(
     ("shape", "n_points", "what"),
     [
