@@ -42,16 +42,17 @@ def in_box(places: np.ndarray, track: ObjectTrack) -> np.ndarray:
 
 @pytest.fixture
 def clips(make_clip):
-    """A right hand that goes through the box and away again and is not seen in two frames, and two further clips."""
+    """A right hand that comes from afar into the box and is not seen in two frames, the left one never; two others."""
     through = make_clip(20, hand_type="right", seed=3, clip_id="test/s1/through")
     hand = through.hands["right"]
     toward = through.object.translation_m - hand.wrist_m
     toward = toward / np.linalg.norm(toward, axis=1, keepdims=True)
-    path = np.concatenate([np.linspace(0.05, 0.0, 10), np.linspace(0.0, -0.6, 10)])[:, None] * toward
+    path = np.concatenate([np.linspace(-0.6, 0.0, 10), np.linspace(0.0, 0.05, 10)])[:, None] * toward
     valid = np.ones(20, bool)
     valid[[4, 15]] = False
     hand = replace(hand, wrist_m=(hand.wrist_m + path).astype(np.float32), valid=valid)
-    through = replace(through, hands={**through.hands, "right": hand})
+    unseen = replace(through.hands["left"], valid=np.zeros(20, bool))
+    through = replace(through, hands={"left": unseen, "right": hand})
     both = make_clip(9, hand_type="both", articulated=True, seed=5, clip_id="test/s1/both")
     left = make_clip(7, hand_type="left", seed=6, clip_id="test/s2/left")
     return [through, both, left]
@@ -106,7 +107,7 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
             assert np.abs(found[near] - exact[near]).max(initial=0) <= 0.0004 + 1e-6
             np.testing.assert_array_equal(store.clip_map(clip_id, side), found.min(axis=0))
     row = store.clips.loc["test/s1/through"]
-    assert 0 < row["right_map_stop"] - row["right_map_first"] < 20
+    assert 0 < row["right_map_first"] < row["right_map_stop"] == 20
     assert row["left_map_stop"] == 0
 
 
@@ -117,7 +118,7 @@ def test_hand_type_follows_from_the_kept_distances_at_any_threshold(written):
         acting = [side for side in SIDES if (store.joint_m("test/s1/both", side) < threshold).any()]
         assert evidence.hand_type == {0: None, 1: acting[0] if acting else None, 2: "both"}[len(acting)]
     assert store.hand_evidence("test/s1/both", 0.02).hand_type == "both"
-    assert store.hand_evidence("test/s1/through", 0.02).hand_type == "right"
+    assert store.hand_evidence("test/s1/through", 9.0).hand_type == "right"
 
 
 def test_table_sums_up_the_frames_and_lists_what_was_left_out(written):
@@ -130,7 +131,7 @@ def test_table_sums_up_the_frames_and_lists_what_was_left_out(written):
     assert row["right_inside_frames"] == np.nansum(depth > 0)
     assert row["right_deepest_m"] == pytest.approx(np.nanmax(depth))
     assert 0 < row["right_deepest_volume_m3"] < 8 * HALF_BOX_M.prod()
-    assert row["left_deepest_volume_m3"] == row["left_deepest_m"] == 0
+    assert row[["left_inside_frames", "left_deepest_m", "left_deepest_volume_m3", "left_nearest_joint_m"]].isna().all()
     assert store.hand("test/s1/through", "right").deepest_volume_m3 == row["right_deepest_volume_m3"]
     assert row["right_nearest_joint_m"] == pytest.approx(store.joint_m("test/s1/through", "right").min())
     assert report.counts["left_out"] == 1
