@@ -246,6 +246,10 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "a flat array": (change_arrays(FRAME_FILE, "object_rotvec", np.ravel), f"{FRAME_FILE}: object_rotvec"),
     "a scalar": (change_arrays(FRAME_FILE, "object_hinge_rad", lambda a: a[0]), f"{FRAME_FILE}: object_hinge_rad"),
     "a row less": (change_arrays(FRAME_FILE, "left_valid", lambda a: a[1:]), f"{FRAME_FILE}: left_valid"),
+    "flags of 2": (
+        change_arrays(FRAME_FILE, "left_valid", lambda a: (2 * a.astype(np.uint8)).view(bool)),
+        f"{FRAME_FILE}: left_valid",
+    ),
     "NaN in a hand that is not valid": (
         change_arrays(FRAME_FILE, "left_wrist_m", with_value((34, 0), np.nan)),
         f"{FRAME_FILE}: left_wrist_m",
