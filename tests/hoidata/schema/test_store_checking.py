@@ -111,6 +111,11 @@ def reverse_objects(folder: Path) -> None:
     pq.write_table(pq.read_table(path).take([1, 0]), path)
 
 
+def use_boxes_only(folder: Path) -> None:
+    change_table("sequences", "object", 1, "box")(folder)
+    change_table("sequences", "other_objects", 1, ["box", "box"])(folder)
+
+
 def repeat_all(folder: Path) -> None:
     path = folder / "meta" / "files.parquet"
     table = pq.read_table(path)
@@ -207,6 +212,7 @@ FAULTS: dict[str, tuple[Callable[[Path], None], str]] = {
     "an unknown template": (change_table("sequences", "right_template", 1, "00" * 8), TEMPLATES),
     "a hinge too many": (change_table("sequences", "articulated", 0, True), f"{SEQ}: articulated"),
     # objects
+    "an object of no clip": (use_boxes_only, f"{OBJ}: object"),
     "an object twice": (change_table("objects", "object", 1, "box"), f"{OBJ}: object"),
     "objects in another order": (reverse_objects, f"{OBJ}: object"),
     "another digest": (change_table("objects", "digest", 0, "ab" * 32), f"{OBJ}: digest of box"),
