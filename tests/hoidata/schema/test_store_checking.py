@@ -303,6 +303,14 @@ def test_a_fault_is_found_and_named_with_its_file(folder, name):
     assert all(problem.expected and problem.got and problem.remedy for problem in problems)
 
 
+def test_clips_stand_in_the_order_of_their_shards(clips, tmp_path, monkeypatch):
+    monkeypatch.setattr("hoidata.schema.shards.FRAMES_PER_SHARD", 1)
+    write_store(tmp_path / "clips", clips, generated_info("test"))
+    assert check_store(tmp_path / "clips") == []
+    swap_clips(tmp_path / "clips")
+    assert f"{SEQ}: shard" in [problem.where for problem in check_store(tmp_path / "clips")]
+
+
 def test_a_changed_template_is_found(folder):
     with np.load(folder / TEMPLATES) as archive:
         (name,) = archive.files
