@@ -17,9 +17,8 @@ import numpy as np
 from hoidata.annotation.grammar import Grammar
 from hoidata.annotation.sentences import UNLABELLED_VERB
 from hoidata.annotation.variations import Loss, Manner, SentenceMaker, manner_of
-from hoidata.schema import HandType
+from hoidata.schema import FPS, HandType
 
-FRAMES_PER_SECOND = 30
 # Speed over a tenth of a second: over one frame a millimetre of jitter alone would be 4 cm/s.
 STEP_FRAMES = 3
 # The slowest and the quickest fifth may say so, where they also differ from the middle by a quarter: of clips that are
@@ -164,7 +163,7 @@ def hand_speed_m_s(joints_m: Mapping[Any, np.ndarray], valid: Mapping[Any, np.nd
         steps = np.asarray(joints[STEP_FRAMES:], np.float64) - joints[:-STEP_FRAMES]
         speeds.append(np.linalg.norm(steps[sound], axis=-1).ravel())
     moved = np.concatenate(speeds) if speeds else np.zeros(0)
-    return float(moved.mean()) * FRAMES_PER_SECOND / STEP_FRAMES if len(moved) else None
+    return float(moved.mean()) * FPS / STEP_FRAMES if len(moved) else None
 
 
 def _drawn(clip_id: str, sentences: set[str]) -> list[str]:

@@ -34,12 +34,11 @@ from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import POINT_COUNT
 from hoidata.schema import SIDES, Clip, HandType, Side
+from hoidata.schema.annotated import VARIATION
 from hoidata.schema.store import Store, open_store
 
 Forms = Literal["paper", "reference"]
 VerbSource = Literal["source", "derived"]
-# The form of a sentence beyond the four; hoidata.schema.annotated keeps it apart from them.
-VARIATION = "variation"
 HAND_TYPE_SOURCE = "proximity"
 _TEXT = pa.string()
 TEXT_TABLE = pa.schema([("clip_id", _TEXT), ("form", _TEXT), ("sentence", _TEXT), ("text_row", pa.int32())])
@@ -103,13 +102,17 @@ def annotate_store(
     hands: as in ``open_store``. Clips without an acting hand, or without a word for their object, are listed with that
     reason and get no sentence. left_out: the same for further clips: reasons by clip id, as quality control found them.
     forms: the paper's four sentences as we write them, or as the reference does. variations: how many guarded
-    sentences follow those of each clip, by default none. Raises BadInput for other forms.
+    sentences follow those of each clip, by default none. Raises BadInput for other forms, and for a threshold that
+    is no length.
     derive_verbs: a clip whose source names no verb gets the one its motion shows (``derive_verb``), marked as derived
     with what it rests on; else its sentences say "move".
-    Returns counts: clips, annotated, left_out, sentences (distinct), labelled, agreeing, derived_verbs.
+    Returns counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled,
+    agreeing, derived_verbs.
     """
     if forms not in get_args(Forms):
         raise BadInput("forms of the sentences", " or ".join(get_args(Forms)), repr(forms), "choose one of them")
+    if not threshold_m > 0:
+        raise BadInput("threshold_m", "metres above 0", repr(threshold_m), "give a length such as 0.02")
     store = open_store(clips_folder, hands)
     encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
     encoder = encoder if features is None else DiskCachedEncoder(encoder, features)

@@ -2,9 +2,11 @@
 
 clips.parquet     clip_id, object, reason (why a clip is not measured), n_frames, shard, row (its first frame there);
                   per side: <side>_touching_frames, <side>_inside_frames, <side>_deepest_m (null where nothing can be
-                  inside), <side>_nearest_joint_m (null where the hand is never valid), and <side>_map_row,
-                  <side>_map_first, <side>_map_stop: rows of the shard's map from <side>_map_row on are the frames
-                  first to stop (exclusive); in all others the hand is beyond reach of every point
+                  inside), <side>_deepest_volume_m3 (shared with the object in the frame of the deepest vertex; null
+                  as well where the object is too large for it), <side>_nearest_joint_m (null where the hand is never
+                  valid), and <side>_map_row, <side>_map_first, <side>_map_stop: rows of the shard's map from
+                  <side>_map_row on are the frames first to stop (exclusive); in all others the hand is beyond reach
+                  of every point
 objects.parquet   object, solid (whether anything can be inside), note (what was repaired or left out, or null)
 surface-*.npz     stored, so that they can be mapped into memory; of both sides and of all frames of its clips
                   <side>_touched  (frame, 98) uint8: the 778 hand vertices closer than touch_m to the surface, packed

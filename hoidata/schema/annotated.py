@@ -8,7 +8,8 @@
                                       with it; derived: its motion shows it), verb_evidence (what that rests on)
                   hand_distance.npz   how near each hand is in every frame (``hoidata.schema.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
-                  info.json           encoder, threshold_m, forms, variations (and what their guard dropped), counts
+                  info.json           encoder, threshold_m, points, forms, variations (and what their guard
+                                      dropped), counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
                   contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
@@ -41,6 +42,7 @@ from hoidata.schema.hand_evidence import HandDistances, HandEvidence
 from hoidata.schema.mapped import map_npz
 from hoidata.schema.store import Store, open_store
 
+# The form of a sentence beyond the four.
 VARIATION = "variation"
 STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
 

@@ -205,6 +205,19 @@ def test_a_missing_stage_is_named(root: Path, tmp_path: Path) -> None:
             load_annotated(tmp_path)
 
 
+def test_a_clip_in_which_no_hand_acts_gets_no_verb_from_its_motion(tmp_path: Path) -> None:
+    root = write_all(tmp_path, [*clips(), clip(5, folder_model(), False, False, verb=None)])
+    found = pd.read_parquet(root / "annotation" / "hand_type.parquet").set_index("clip_id")
+    assert found["verb_source"].fillna("none").tolist() == ["source", "source", "derived", "source", "none"]
+    assert found.loc["toy/s5/5", ["verb", "verb_evidence"]].isna().all()
+
+
+def test_a_threshold_that_is_no_length_is_refused(root: Path, tmp_path: Path) -> None:
+    for wrong in (0.0, -0.02, float("nan")):
+        with pytest.raises(BadInput, match="metres above 0"):
+            annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", threshold_m=wrong)
+
+
 def test_a_clip_that_failed_quality_control_has_its_reason_and_no_sentence(root: Path, tmp_path: Path) -> None:
     (tmp_path / "clips").symlink_to(root / "clips")
     failed = {"toy/s1/1": "left out by quality control: a jump"}
