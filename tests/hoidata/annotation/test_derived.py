@@ -161,6 +161,39 @@ def test_at_rest_the_share_of_touched_frames_tells_hold_from_touch() -> None:
     assert verb(clip(rigid()), near=0.5) == "touch"
 
 
+def test_a_frame_is_touched_by_either_hand() -> None:
+    """The left hand is near in the first half, the right one in the second."""
+    distance: dict[Side, np.ndarray] = {
+        "left": np.where(PHASE < 0.5, 0.01, 0.1),
+        "right": np.where(PHASE < 0.5, 0.1, 0.01),
+    }
+    found = HandEvidence(None, distance, 0.02).at_threshold(0.02)
+    assert object_motion(clip(rigid()), found).touched == 1
+    assert derive_verb(clip(rigid()), found).verb == "hold"
+
+
+@pytest.mark.parametrize(("degrees", "expected"), [(13, "hold"), (17, "open")])
+def test_a_hinge_counts_from_fifteen_degrees_on(degrees: float, expected: str) -> None:
+    assert verb(clip(hinged(), hinge_rad=0.1 + np.deg2rad(degrees) * SMOOTH)) == expected
+
+
+SWING = along(0, 0.02 * np.sin(2 * np.pi * 4 * np.arange(FRAMES) / 30))
+TWO_AT_ONCE = {
+    "open": clip(hinged(), hinge_rad=0.1 + 0.5 * SMOOTH, path_m=SWING),
+    "shake": clip(rigid(), path_m=SWING + along(2, -0.15 * SMOOTH)),
+    "place": clip(rigid(), path_m=along(2, 0.3 * THERE_AND_BACK - 0.1 * SMOOTH)),
+    "lift": clip(rigid(), path_m=along(2, 0.15 * SMOOTH), turn_rad=np.deg2rad(45) * SMOOTH),
+    "turn": clip(rigid(), path_m=along(0, 0.12 * SMOOTH), turn_rad=np.deg2rad(45) * SMOOTH),
+    "move": clip(rigid(), path_m=along(0, 0.12 * SMOOTH) + along(2, 0.04 * SMOOTH)),
+}
+
+
+@pytest.mark.parametrize("expected", TWO_AT_ONCE)
+def test_of_two_rules_that_hold_the_earlier_one_names_the_verb(expected: str) -> None:
+    """Each motion is also that of the next rule: opened and shaken, shaken and put down, raised and put down, ..."""
+    assert verb(TWO_AT_ONCE[expected]) == expected
+
+
 def test_an_object_far_from_its_own_origin_moves_only_when_its_middle_does() -> None:
     """A turn of 20 degrees about its middle swings the origin, half a metre away, by 17 cm."""
     offset = np.array([0.0, 0.5, 0.0])
