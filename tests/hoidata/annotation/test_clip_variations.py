@@ -76,6 +76,23 @@ def test_every_variation_reads_back_and_what_does_not_is_counted_by_what_was_los
     assert facts["kept"] + sum(facts["dropped"].values()) == made
 
 
+@pytest.mark.parametrize(
+    ("things", "hand", "lost"),
+    [
+        (("right hand", "cup"), "left", "hand"),
+        (("right hand", "cup"), "both", "object"),
+        (("box", "the box"), "left", "object"),
+    ],
+)
+def test_a_sentence_that_names_another_hand_or_object_is_dropped_from_a_clip_too(things, hand, lost) -> None:
+    """What is called "right hand" is taken for the hand that acts, and "the box" beside a "box" for the other one."""
+    clips = [Wording(thing, "lift", thing, hand) for thing in things]
+    found, maker = clip_variations(clips, VariationSettings(1000)), SentenceMaker(["lift"], things)
+    for clip in clips:
+        assert all(maker.reads_back(text, "lift", clip.object_words, hand) for text in found.sentences[clip.clip_id])
+    assert found.facts()["dropped"][lost] > 0
+
+
 def test_slow_and_quick_are_the_outer_fifths_where_they_stand_out() -> None:
     """Forty clips of one verb at 1 to 40 cm/s: a fifth below and a fifth above; all within 10 %: none."""
     spread = [Wording(f"{n}", "lift", "box", "left", n / 100) for n in range(1, 41)]
@@ -84,6 +101,9 @@ def test_slow_and_quick_are_the_outer_fifths_where_they_stand_out() -> None:
     assert sorted(int(key) for key, manner in found.items() if manner == "quickly") == list(range(33, 41))
     assert manners([Wording(f"{n}", "lift", "box", "left", 1 + n / 400) for n in range(40)]) == {}
     assert manners(spread[:9]) == {}
+    # A hand that does not move at all counts as one.
+    found = manners([Wording(f"{n}", "lift", "box", "left", n / 100) for n in range(40)])
+    assert sorted(int(key) for key, manner in found.items() if manner == "slowly") == list(range(8))
     assert manners([Wording(f"{n}", "lift", "box", "left", None) for n in range(40)]) == {}
 
 
@@ -128,16 +148,19 @@ def hand(wrist_m: np.ndarray) -> HandTrack:
 
 
 def clip(number: int, **facts) -> Clip:
-    """The left hand lies on a small box and moves a little, the faster the higher the number."""
+    """The left hand lies on a small box and moves a little, the faster the higher the number; the right is far away
+    and moves the faster the lower the number.
+    """
     corners = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)])
     faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
                       [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
     model = ObjectModel("box", corners, faces, np.zeros(8, np.uint8))
     way = np.linspace(0, 1, FRAMES)[:, None] * np.array([0.001 * number, 0, 0])
+    other = np.linspace(0, 1, FRAMES)[:, None] * np.array([0.003 * (15 - number), 0, 0])
     still = np.zeros((FRAMES, 3), np.float32)
     return Clip(
         f"toy/s{number % 4}/{number:02d}", "toy", f"s{number % 4}", f"{number:02d}",
-        {"left": hand(way + np.array([0, 0, 0.04])), "right": hand(way + np.array([0, 0, 2]))},
+        {"left": hand(way + np.array([0, 0, 0.04])), "right": hand(other + np.array([0, 0, 2]))},
         ObjectTrack(model, still, still),
         np.arange(FRAMES, dtype=np.int32), np.array([0.0, 0, -1]), facts.get("verb", "lift"),
         facts.get("object_words", "box"), synthetic=True,
@@ -183,6 +206,13 @@ def test_variations_follow_the_four_forms_and_leave_them_as_they_are(plain: Path
     assert 1 <= facts["slowly"] <= 3
     assert 1 <= facts["quickly"] <= 3
     assert before.annotation_info["variations"]["kept"] == 0
+
+
+def test_only_the_hand_that_acts_makes_a_clip_slow_or_quick(plain: Path, tmp_path: Path) -> None:
+    after = annotated_as(plain, tmp_path, variations=VariationSettings(60))
+    said = {key: " ".join(after.variations(key)).lower() for key in after.ids()}
+    assert {int(key[-2:]) for key, text in said.items() if "slowly" in text} == {1, 2, 3}
+    assert {int(key[-2:]) for key, text in said.items() if "quickly" in text} == {12, 13, 14}
 
 
 def test_reference_forms_are_written_where_asked_for(plain: Path, tmp_path: Path) -> None:

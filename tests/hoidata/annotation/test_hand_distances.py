@@ -116,6 +116,11 @@ def test_a_threshold_just_above_and_at_the_smallest_distance(annotated: Annotate
     assert annotated.hand_evidence("toy/1", np.nextafter(smallest, 1)).hand_type == "left"
 
 
+def test_a_frame_at_the_threshold_is_not_near() -> None:
+    distance: dict[Side, np.ndarray] = {"left": np.array([0.02, np.nextafter(0.02, 0)]), "right": np.full(2, np.inf)}
+    assert HandEvidence(None, distance, 0.02).near("left").tolist() == [False, True]
+
+
 def test_frames_are_judged_one_by_one(annotated: AnnotatedStore) -> None:
     """The right hand is 6.5, 4.5, 2.5, 2.5, 4.5 cm above the box and then lost."""
     evidence = annotated.hand_evidence("toy/2", 0.05)
@@ -141,6 +146,9 @@ def test_an_annotation_without_distances_names_its_stage(root: Path, tmp_path: P
     with pytest.raises(BadInput, match=r"distances of 3 clips.*of 4"):
         HandDistances(root / "annotation" / "hand_distance.npz", 3)
     arrays = read_npz(root / "annotation" / "hand_distance.npz")
+    write_npz(tmp_path / "other.npz", {name: array for name, array in arrays.items() if name != "right_m"})
+    with pytest.raises(BadInput, match=r"arrays first_frame, left_m, right_m.*run the stage annotate again"):
+        HandDistances(tmp_path / "other.npz", 4)
     write_npz(tmp_path / "short.npz", {**arrays, "left_m": arrays["left_m"][:-1]})
     with pytest.raises(BadInput, match="run the stage annotate again"):
         HandDistances(tmp_path / "short.npz", 4)
@@ -193,5 +201,10 @@ def test_the_surface_test_follows_the_objects_motion() -> None:
             acting_hands_at_surface(still, joints, index).distance_m[side],
             atol=1e-7,
         )
+    far, all_of_it = (acting_hands_at_surface(still, joints, index, 0.026, most_m=most) for most in (0.03, np.inf))
+    assert far.hand_type == all_of_it.hand_type == "right"
+    for side in SIDES:
+        whole = all_of_it.distance_m[side]
+        np.testing.assert_array_equal(far.distance_m[side], np.where(whole > 0.03, np.inf, whole))
     with pytest.raises(BadInput, match="at least the threshold"):
         acting_hands_at_surface(still, joints, index, 0.02, most_m=0.01)
