@@ -1,0 +1,90 @@
+"""Stage annotate in the pipeline: every setting of params.yaml reaches the library."""
+
+import inspect
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import orjson
+import pandas as pd
+import pytest
+import yaml
+
+from hoidata.annotation.clip_variations import VariationSettings
+from hoidata.annotation.reference_mode import reference_sentences
+from hoidata.annotation.stage import annotate_store
+from hoidata.errors import BadInput
+from hoidata.schema.info import generated_info
+from hoidata.schema.store import write_store
+from pipelines.stages import annotate, quality
+from pipelines.stages.base import Place
+
+PROJECT = Path(__file__).parents[2]
+PLACE = Place("embedded", "grab")
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch, make_clip):
+    """A clip with a verb and one without in the current folder; the encoder that needs no weights."""
+    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
+    shutil.copy(PROJECT / "params.yaml", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
+    write_store(PLACE.clips, [clips[0], replace(clips[1], verb=None)], generated_info("grab"))
+    quality.run(PLACE)
+    return clips
+
+
+def annotated_with(**settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
+    """Hand types and sentences by clip, and the facts, of a run with these settings."""
+    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    params["annotate"] |= {"encoder": "hash", **settings}
+    Path("params.yaml").write_text(yaml.safe_dump(params))
+    annotate.run(PLACE)
+    hands, text = (pd.read_parquet(PLACE.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
+    return hands.set_index("clip_id"), text, orjson.loads((PLACE.annotation / "info.json").read_bytes())
+
+
+def test_params_hold_the_defaults_of_the_library() -> None:
+    params = yaml.safe_load((PROJECT / "params.yaml").read_text())["annotate"]
+    defaults = {name: item.default for name, item in inspect.signature(annotate_store).parameters.items()}
+    assert VariationSettings(**params.pop("variations")) == VariationSettings()
+    assert params == {name: defaults[name] for name in params}
+
+
+def test_threshold_and_points_decide_which_hand_acts(project) -> None:
+    hands, _, info = annotated_with(threshold_m=1e-6, points=64)
+    assert (info["threshold_m"], info["points"]) == (1e-6, 64)
+    assert hands["hand_type"].isna().all()
+
+
+def test_forms_are_those_asked_for(project) -> None:
+    hands, text, info = annotated_with(forms="reference")
+    clip = project[0]
+    found = text[text["clip_id"] == clip.clip_id]["sentence"].tolist()
+    assert found == list(reference_sentences(clip.verb, clip.object_words, hands.at[clip.clip_id, "hand_type"]))
+    assert info["forms"] == "reference"
+    with pytest.raises(BadInput, match="forms"):
+        annotated_with(forms="poem")
+
+
+def test_as_many_variations_are_written_as_asked_for(project) -> None:
+    _, text, info = annotated_with(variations={"per_clip": 3, "adverbs": False})
+    assert text.groupby("clip_id").size().tolist() == [7, 7]
+    assert (info["variations"]["per_clip"], info["variations"]["adverbs"]) == (3, False)
+    with pytest.raises(BadInput, match="per_clip"):
+        annotated_with(variations={"per_clip": -1, "adverbs": False})
+
+
+def test_verbs_from_motion_can_be_turned_off(project) -> None:
+    with_them, _, _ = annotated_with()
+    assert with_them["verb_source"].tolist() == ["source", "derived"]
+    without, plain, info = annotated_with(derive_verbs=False)
+    assert without["verb_source"].isna().tolist() == [False, True]
+    assert plain[plain["clip_id"] == "test/s1/1"]["sentence"].iloc[0].startswith("Move ")
+    assert info["counts"]["derived_verbs"] == 0
+
+
+def test_features_are_kept_where_they_are_said_to_be(project) -> None:
+    annotated_with()
+    assert len(list(Path(".hoidata/features").rglob("*.npz"))) == 1
