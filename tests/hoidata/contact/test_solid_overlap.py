@@ -41,6 +41,23 @@ def test_two_boxes_share_the_product_of_their_common_sides() -> None:
     assert expected[3] == 0
 
 
+@pytest.mark.parametrize("cell_m", [0.0005, 0.002])
+def test_the_size_of_a_cell_changes_no_volume_that_is_a_whole_number_of_cells(cell_m: float) -> None:
+    overlap, inner = overlap_of(box_at((0.1, 0.08, 0.06), (0, 0, 0)), cell_m), box_at((0.05, 0.04, 0.02), (0, 0, 0))
+    np.testing.assert_allclose(overlap.volume_m3(inner.vertices[None], inner.faces, None), 4e-5, atol=1e-12)
+
+
+def test_volumes_in_two_parts_are_added_up() -> None:
+    """A bar of 1 cm2 through both plates of 2 cm."""
+    base, lid = box_at((0.1, 0.1, 0.02), (0, 0, 0)), box_at((0.1, 0.1, 0.02), (0, 0, 0.03))
+    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([-0.05, 0, 0.015]))
+    vertices, faces = np.concatenate([base.vertices, lid.vertices]), np.concatenate([base.faces, lid.faces + 8])
+    model = ObjectModel("box", vertices, faces, np.repeat([0, 1], 8).astype(np.uint8), hinge)
+    bar = box_at((0.01, 0.01, 0.2), (0.02, 0, 0))
+    found = SolidOverlap(SurfaceIndex(model)).volume_m3(bar.vertices[None], bar.faces, np.zeros(1))
+    np.testing.assert_allclose(found, 4e-6, atol=1e-12)
+
+
 def test_two_balls_share_a_lens() -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.04)
     apart = 0.05

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.contact.solid_overlap import SolidOverlap
 from hoidata.contact.surface_contact import (
+    Penetration,
     PlacedHand,
     penetration,
     placed_hand,
@@ -60,6 +61,15 @@ def test_distances_equal_libigl_s_to_the_posed_mesh_in_the_world(
     assert np.nanmin(found) < 0
 
 
+def test_a_vertex_inside_has_its_depth_however_deep_and_one_outside_only_within_the_reach(make_clip) -> None:
+    clip = shifted(make_clip(n_frames=2), 0.04)
+    index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
+    whole, near = signed_distances_m(hand, index, 1.0), signed_distances_m(hand, index, 0.001)
+    assert whole.min() < -0.005
+    assert (whole > 0.001).any()
+    np.testing.assert_array_equal(near, np.where(whole > 0.001, np.inf, whole))
+
+
 def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip]) -> None:
     clip = shifted(make_clip(n_frames=6), 0.02)
     valid = np.array([False, True, True, False, True, True])
@@ -77,6 +87,31 @@ def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip
     nothing = penetration(placed_hand(gone, "right", HANDS), index, SolidOverlap(index, 0.002))
     assert np.isnan(nothing.share())
     assert np.isnan(nothing.deepest_m).all()
+
+
+def test_the_angle_of_a_hinge_is_that_of_its_own_frame_where_others_lack_the_hand(
+    make_clip: Callable[..., Clip],
+) -> None:
+    clip = shifted(make_clip(n_frames=6, articulated=True), 0.02)
+    track = replace(clip.object, hinge_rad=np.linspace(-0.5, 2.0, 6).astype(np.float32))
+    clip, valid = replace(clip, object=track), np.array([False, True, False, True, True, False])
+    some = replace(clip, hands={**clip.hands, "right": replace(clip.hands["right"], valid=valid)})
+    index = SurfaceIndex(clip.object.model)
+    overlap = SolidOverlap(index, 0.002)
+    whole, part = (placed_hand(each, "right", HANDS) for each in (clip, some))
+    np.testing.assert_array_equal(
+        signed_distances_m(part, index, 1.0)[valid], signed_distances_m(whole, index, 1.0)[valid]
+    )
+    volumes = [penetration(hand, index, overlap).volume_m3 for hand in (part, whole)]
+    assert volumes[0] is not None
+    assert volumes[1] is not None
+    np.testing.assert_array_equal(volumes[0][valid], volumes[1][valid])
+
+
+def test_a_frame_counts_as_entered_only_deeper_than_asked_for() -> None:
+    found = Penetration(np.array([[0.0, 0.0], [0.01, 0.002], [np.nan, np.nan], [0.02, 0.0]]), None)
+    assert found.share() == pytest.approx(2 / 3)
+    assert found.share(more_than_m=0.01) == pytest.approx(1 / 3)
 
 
 def test_deeper_hands_share_more_volume_and_a_far_hand_none(make_clip: Callable[..., Clip]) -> None:

@@ -8,11 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.contact.bimart_maps import bimart_map
-from hoidata.contact.surface_contact import placed_hand
+from hoidata.contact.solid_overlap import SolidOverlap
+from hoidata.contact.surface_contact import penetration, placed_hand
+from hoidata.contact.surface_measure import ObjectShape, measure_hand
 from hoidata.contact.surface_stage import surface_store
 from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import canonical_json
+from hoidata.files.arrays import read_npz
 from hoidata.hands import load_embedded_hands, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
@@ -103,6 +106,9 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
             found = store.bimart_map(clip_id, side)
             assert found.shape == exact.shape
             near = np.isfinite(exact)
+            row, seen = store.clips.loc[clip_id], np.flatnonzero(near.any(axis=1))
+            kept = [seen[0], seen[-1] + 1] if len(seen) else [0, 0]
+            assert [row[f"{side}_map_first"], row[f"{side}_map_stop"]] == kept
             np.testing.assert_array_equal(np.isfinite(found), near)
             assert np.abs(found[near] - exact[near]).max(initial=0) <= 0.0004 + 1e-6
             np.testing.assert_array_equal(store.clip_map(clip_id, side), found.min(axis=0))
@@ -116,6 +122,8 @@ def test_hand_type_follows_from_the_kept_distances_at_any_threshold(written):
     for threshold in (0.001, 0.01, 0.02, 0.2, 2.0):
         evidence = store.hand_evidence("test/s1/both", threshold)
         acting = [side for side in SIDES if (store.joint_m("test/s1/both", side) < threshold).any()]
+        exact = [store.clips.at["test/s1/both", f"{side}_nearest_joint_m"] for side in SIDES]
+        assert [evidence.closest_m(side) for side in SIDES] == exact
         assert evidence.hand_type == {0: None, 1: acting[0] if acting else None, 2: "both"}[len(acting)]
     assert store.hand_evidence("test/s1/both", 0.02).hand_type == "both"
     assert store.hand_evidence("test/s1/through", 9.0).hand_type == "right"
@@ -136,11 +144,47 @@ def test_table_sums_up_the_frames_and_lists_what_was_left_out(written):
     assert row["right_nearest_joint_m"] == pytest.approx(store.joint_m("test/s1/through", "right").min())
     assert report.counts["left_out"] == 1
     assert report.counts["frames"] == 29
+    touching = [
+        any(store.touched(clip_id, side).any() for side in SIDES) for clip_id in ("test/s1/through", "test/s1/both")
+    ]
+    assert report.counts["touching"] == sum(touching) == 2
+    assert not store.touched("test/s1/through", "left").any()
     assert "per 1,000 frames" in report.cost
     with pytest.raises(KeyError, match="was not measured: left out by quality control: so"):
         store.depth_m("test/s2/left", "left")
     with pytest.raises(KeyError, match="no clip 'test/s9'"):
         store.touched("test/s9", "left")
+
+
+def test_volume_is_that_of_the_deepest_frame_at_the_angle_of_that_frame(make_clip):
+    """A lidded box pushed into the right hand, farther from frame to frame, while the lid turns."""
+    clip, hands = make_clip(8, hand_type="both", articulated=True, seed=5), load_embedded_hands()
+    toward = clip.hands["right"].wrist_m - clip.object.translation_m
+    place = clip.object.translation_m + np.linspace(0.0, 0.4, 8)[:, None] * toward
+    angles = np.linspace(-0.5, 2.0, 8).astype(np.float32)
+    clip = replace(clip, object=replace(clip.object, translation_m=place.astype(np.float32), hinge_rad=angles))
+    right = replace(clip.hands["right"], valid=np.arange(8) > 1)
+    clip = replace(clip, hands={**clip.hands, "right": right})
+    model = clip.object.model
+    shape = ObjectShape(model, sample_points(model, POINTS))
+    found = measure_hand(clip, "right", track_joints(right, hands["right"]), hands, shape)
+    every = penetration(placed_hand(clip, "right", hands), shape.index, SolidOverlap(shape.index))
+    np.testing.assert_array_equal(found.depth_m, every.deepest_m)
+    assert every.volume_m3 is not None
+    deepest = int(np.nanargmax(found.depth_m))
+    assert deepest > 1
+    assert every.volume_m3[deepest] > 1e-7
+    assert found.deepest_volume_m3 == pytest.approx(every.volume_m3[deepest], rel=1e-12)
+
+
+def test_bits_of_touched_vertices_lie_as_the_layout_says(written):
+    """The first of 778 vertices in the highest bit of the first of 98 bytes; clips one after another."""
+    store = open_surface(written[0] / "surface")
+    packed = read_npz(written[0] / "surface" / "surface-00000.npz")["right_touched"]
+    touched = np.concatenate([store.touched(clip_id, "right") for clip_id in store.ids])
+    assert packed.shape == (29, 98)
+    for vertex in range(778):
+        np.testing.assert_array_equal((packed[:, vertex // 8] >> (7 - vertex % 8)) & 1, touched[:, vertex])
 
 
 def test_bytes_repeat_and_shards_do_not_change_what_is_read(written, monkeypatch):
@@ -161,6 +205,29 @@ def test_bytes_repeat_and_shards_do_not_change_what_is_read(written, monkeypatch
         for side in SIDES:
             for read in ("touched", "depth_m", "joint_m", "bimart_map"):
                 np.testing.assert_array_equal(getattr(parts, read)(clip_id, side), getattr(whole, read)(clip_id, side))
+
+
+def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_up(written, monkeypatch):
+    folder, asked = written[0], []
+
+    def backwards(bench, jobs):
+        asked.append(jobs)
+        for clip_id in reversed(bench.store.ids):
+            yield clip_id, (bench.measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
+
+    monkeypatch.setattr("hoidata.contact.surface_stage._measured", backwards)
+    left_out = {"test/s2/left": "left out by quality control: so"}
+    arguments = {"points": POINTS, "left_out": left_out, "progress": False}
+    report = surface_store(folder / "clips", folder / "backwards", jobs=8, **arguments)
+    for path in (folder / "surface").iterdir():
+        assert (folder / "backwards" / path.name).read_bytes() == path.read_bytes()
+    assert report.seconds == {"contact": 0.75, "maps": 3.0}
+    assert report.cost == "129.310 s per 1,000 frames of two hands (contact 25.862, maps 103.448)"
+    assert asked == [1]  # of 36 frames a second process would cost more than it saves
+    monkeypatch.setattr("hoidata.contact.surface_stage.FRAMES_PER_JOB", 18)
+    for jobs, expected in ((8, 3), (2, 2)):
+        surface_store(folder / "clips", folder / "again", jobs=jobs, **arguments)
+        assert asked.pop() == expected
 
 
 @pytest.mark.slow

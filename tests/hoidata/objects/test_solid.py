@@ -152,6 +152,34 @@ def test_triangles_turned_the_wrong_way_are_turned_back_and_it_is_said(which: sl
     assert volume_m3(found.vertices_m, found.faces) == pytest.approx(0.006)
 
 
+@pytest.mark.parametrize(("wall_m", "is_solid"), [(1e-4, True), (1e-5, False)])
+def test_a_cup_as_thin_as_paper_is_solid_and_two_sheets_a_hundredth_of_a_millimetre_apart_are_not(
+    wall_m, is_solid
+) -> None:
+    profile = [(0, 0), (0.04, 0), (0.04, 0.1), (0.04 - wall_m, 0.1), (0.04 - wall_m, wall_m), (0, wall_m)]
+    cup = trimesh.creation.revolve(np.array(profile))
+    found = solid_of(np.array(cup.vertices), np.array(cup.faces))
+    assert isinstance(found, Solid) if is_solid else found == NoSolid("it encloses nothing")
+
+
+def test_a_closed_surface_with_one_side_only_is_refused() -> None:
+    """The projective plane of six corners: each edge has two triangles, but they cannot all be turned alike."""
+    corners = np.random.default_rng(0).normal(size=(6, 3))
+    faces = [
+        (0, 1, 2),
+        (0, 2, 3),
+        (0, 3, 4),
+        (0, 4, 5),
+        (0, 5, 1),
+        (1, 2, 4),
+        (2, 3, 5),
+        (3, 4, 1),
+        (4, 5, 2),
+        (5, 1, 3),
+    ]
+    assert solid_of(corners, np.array(faces)) == NoSolid("its triangles do not meet at their edges two by two")
+
+
 def test_triangles_that_do_not_meet_two_by_two_are_refused() -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.3))
     fin = np.concatenate([box.vertices, [[0.5, 0.5, 0.5]]])

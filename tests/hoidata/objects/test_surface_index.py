@@ -214,13 +214,15 @@ def test_triangles_without_area_count_as_segments_and_places_without_numbers_are
     np.testing.assert_array_equal(index.within(places, None, 0.0035)[0], [True, False, False])
 
 
-def test_the_same_mesh_gives_the_same_index_and_another_hinge_another() -> None:
+def test_the_same_mesh_gives_the_same_index_and_another_hinge_or_part_another() -> None:
     model = laptop()
     again = ObjectModel(model.name, model.vertices_m.copy(), model.faces.copy(), model.part.copy(), model.hinge)
     assert surface_index(model) is surface_index(again)
     assert model.hinge is not None
     other = ObjectModel(model.name, model.vertices_m, model.faces, model.part, Hinge(model.hinge.axis, np.zeros(3)))
     assert surface_index(other) is not surface_index(model)
+    swapped = ObjectModel(model.name, model.vertices_m, model.faces, 1 - model.part, model.hinge)
+    assert surface_index(swapped) is not surface_index(model)
 
 
 def test_only_indices_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -102,6 +102,18 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
     assert (rows["all objects"].frames, rows["all objects"].touching) == ("54", f"{15 / 54 * 100:.1f} %")
 
 
+def test_frames_count_as_deep_from_a_centimetre_on(page_clip, hands, tmp_path, monkeypatch):
+    """The left hand is 3 mm deep in frames 5 to 14 and 11 mm in 15 to 17 of 30; the right 9.9 mm in the last two."""
+    write_store(tmp_path / "clips", [page_clip(frames=30)], generated_info("grab", hands))
+    surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
+    store = open_surface(tmp_path / "surface")
+    depth = {side: np.zeros(30) for side in ("left", "right")}
+    depth["left"][5:15], depth["left"][15:18], depth["right"][28:] = 0.003, 0.011, 0.0099
+    monkeypatch.setattr(store, "depth_m", lambda clip_id, side: depth[side])
+    [row] = contact_by_object(store)
+    assert (row.inside, row.deep, row.deepest) == ("50.0 %", "10.0 %", "11.0")
+
+
 def test_page_shows_contact_and_penetration_where_the_stage_ran(project, hands, tmp_path):
     surface_store(project / "clips", project / "surface", touch_m=0.02, progress=False)
     text = write_dataset_page(tmp_path / "out", project, "grab", hands, examples=0).read_text()
