@@ -126,6 +126,31 @@ def test_nothing_changes_when_the_world_turns_and_shifts(scene: tuple[Clip, Join
         np.testing.assert_allclose(before[side]["distance_m"], after[side]["distance_m"], atol=1e-8)
 
 
+def test_in_a_mirror_left_and_right_change_places(scene: tuple[Clip, Joints, SampledPoints]) -> None:
+    """The mirror turns x: the object's rotation and hinge run the other way round, each hand becomes the other one."""
+    clip, joints, points = scene
+    mirror, track, model = np.diag((-1.0, 1.0, 1.0)), clip.object, clip.object.model
+    hinge = model.hinge and Hinge(-mirror @ model.hinge.axis, mirror @ model.hinge.origin_m)
+    turn = mirror @ Rotation.from_rotvec(track.rotvec).as_matrix() @ mirror
+    image = replace(
+        track,
+        model=replace(model, vertices_m=model.vertices_m @ mirror, faces=model.faces[:, ::-1], hinge=hinge),
+        rotvec=Rotation.from_matrix(turn).as_rotvec(),
+        translation_m=track.translation_m @ mirror,
+    )
+    other_joints = {"left": joints["right"] @ mirror, "right": joints["left"] @ mirror}
+    other_points = replace(points, points_m=points.points_m @ mirror.astype(np.float32))
+    before = distance_entries(clip, joints, ProximityIndex(points))
+    after = distance_entries(replace(clip, object=image), other_joints, ProximityIndex(other_points))
+    maps, other_maps = contact_maps(before, POINTS), contact_maps(after, POINTS)
+    for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
+        for column in ("frame", "point", "joint"):
+            np.testing.assert_array_equal(before[side][column], after[opposite][column])
+        np.testing.assert_allclose(before[side]["distance_m"], after[opposite]["distance_m"], atol=1e-8)
+        np.testing.assert_array_equal(maps[side], other_maps[opposite])
+    assert not np.array_equal(maps["left"], maps["right"])
+
+
 def test_a_cut_clip_has_the_entries_of_its_own_frames_only(scene: tuple[Clip, Joints, SampledPoints]) -> None:
     clip, joints, points = scene
     index = ProximityIndex(points)
