@@ -69,8 +69,9 @@ def test_a_sentence_is_encoded_once() -> None:
 def test_features_of_two_encoders_are_never_mixed() -> None:
     use, hashed = load_encoder("use").identity, load_encoder("hash").identity
     refuse_other_encoder("prompt", use, dict(use))
-    with pytest.raises(BadInput, match="use one encoder for data and prompt"):
-        refuse_other_encoder("prompt", use, hashed)
+    for other in (hashed, {**use, "version": "2"}, {**use, "sha256": hashed["sha256"]}, {**use, "quick_gelu": True}):
+        with pytest.raises(BadInput, match="use one encoder for data and prompt"):
+            refuse_other_encoder("prompt", use, other)
 
 
 def test_missing_clip_weights_are_named_at_once_with_the_way_out() -> None:

@@ -126,6 +126,14 @@ def test_nothing_changes_when_the_world_turns_and_shifts(scene: tuple[Clip, Join
         np.testing.assert_allclose(before[side]["distance_m"], after[side]["distance_m"], atol=1e-8)
 
 
+def test_a_joint_exactly_at_the_threshold_gives_no_entry() -> None:
+    model = ObjectModel("dot", np.eye(3), np.array([[0, 1, 2]]), np.zeros(3, np.uint8))
+    still = ObjectTrack(model, np.zeros((3, 3)), np.zeros((3, 3)))
+    joints = np.array([0.02, np.nextafter(0.02, 0), np.nextafter(0.02, 1)])[:, None, None] * np.eye(3)[0]
+    found = ProximityIndex(sampled(np.zeros((1, 3)))).entries(joints, np.ones(3, bool), still, 0.02)
+    assert found["frame"].tolist() == [1]
+
+
 def test_in_a_mirror_left_and_right_change_places(scene: tuple[Clip, Joints, SampledPoints]) -> None:
     """The mirror turns x: the object's rotation and hinge run the other way round, each hand becomes the other one."""
     clip, joints, points = scene
