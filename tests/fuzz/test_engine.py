@@ -85,6 +85,7 @@ print(sorted(fault["what"][:8] for fault in outcome.faults), outcome.executions)
 """
 
 
+@pytest.mark.slow
 def test_exceptions_memory_and_slow_calls_are_faults_and_their_inputs_are_saved(tmp_path: Path):
     done = run_python("-c", FAULTS, str(tmp_path))
     assert done.stdout.strip().endswith("4"), done.stderr

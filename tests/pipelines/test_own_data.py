@@ -19,6 +19,7 @@ def manifest(folder: Path, name: str) -> dict:
     return json.loads((folder / "manifests/own" / f"{name}.json").read_text())
 
 
+@pytest.mark.slow
 def test_a_dataset_of_mano_parameters_is_refused_without_mano_with_instructions(project, tmp_path, project_tools):
     (tmp_path / "grab").mkdir()
     result = project_tools.run(project, "hoidata", "raw", "scan", "grab", "--root", str(tmp_path / "grab"))
@@ -28,6 +29,7 @@ def test_a_dataset_of_mano_parameters_is_refused_without_mano_with_instructions(
     assert not manifest(project, "grab")["present"]
 
 
+@pytest.mark.slow
 def test_repro_refuses_before_dvc_starts(project, project_tools):
     path = project / "manifests/own/grab.json"
     path.write_text(path.read_text().replace('"present": false', '"present": true'))
@@ -40,6 +42,7 @@ def test_repro_refuses_before_dvc_starts(project, project_tools):
     assert "Running stage" not in result.stdout
 
 
+@pytest.mark.slow
 def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, project_tools):
     mano = tmp_path / "mano"
     mano.mkdir()
@@ -54,6 +57,7 @@ def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, projec
     assert "profile: embedded" in (project / "params.yaml").read_text()
 
 
+@pytest.mark.slow
 def test_a_folder_without_sequences_is_not_registered(project, tmp_path, project_tools):
     (tmp_path / "empty").mkdir()
     result = project_tools.run(project, "hoidata", "raw", "scan", "manipnet", "--root", str(tmp_path / "empty"))

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import pytest
 import yaml
 
 PROJECT = Path(__file__).parents[2]
@@ -25,6 +26,7 @@ def test_no_derived_data_is_pushed_as_delivered():
     assert kept_here(PROJECT) == derived
 
 
+@pytest.mark.slow
 def test_sharing_is_switched_on_and_off_for_all_of_it(project, project_tools):
     before = (project / "dvc.yaml").read_text()
     shown = project_tools.run(project, "hoidata", "share", "--on")
@@ -34,6 +36,7 @@ def test_sharing_is_switched_on_and_off_for_all_of_it(project, project_tools):
     assert (project / "dvc.yaml").read_text() == before
 
 
+@pytest.mark.slow
 def test_dvc_push_sends_nothing_derived_until_it_is_shared(project, project_tools, tmp_path):
     built = project_tools.run(project, "dvc", "repro", "convert@embedded-manipnet")
     assert built.returncode == 0, built.stderr

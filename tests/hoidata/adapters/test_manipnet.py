@@ -347,6 +347,7 @@ def test_file_names_become_words(name: str, words: str) -> None:
     assert object_words(name) == words
 
 
+@pytest.mark.slow
 def test_a_margin_keeps_usable_frames_around_the_interaction_under_the_same_id_and_verb(tmp_path: Path) -> None:
     """The hand comes down on the object until frame 100, which is lifted from frame 150; frames 8 to 11 are a jump."""
     left, right, thing = lift_rows()

@@ -35,6 +35,7 @@ def test_a_feature_does_not_depend_on_its_neighbours_or_the_process_history(enco
         assert fresh.encode([sentence])[0].tobytes() == feature.tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", ["1", "2"])
 def test_features_are_the_same_on_any_number_of_processors(threads: str) -> None:
     code = "import sys; from hoidata.annotation.encoders import load_encoder as f; "

@@ -42,6 +42,7 @@ def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
     assert text.count("<svg") == 1
 
 
+@pytest.mark.slow
 def test_page_repeats_byte_for_byte(folders, hands, tmp_path):
     first, second = (write_report(tmp_path / name, "embedded", ["grab"], hands, folders) for name in "ab")
     assert first.read_bytes() == second.read_bytes()
