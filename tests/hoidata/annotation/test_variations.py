@@ -50,6 +50,7 @@ def test_there_are_many_distinct_sentences_for_every_pair_and_no_two_hands_share
         }
 
 
+@pytest.mark.slow
 def test_what_cannot_be_read_back_is_dropped_and_counted() -> None:
     maker = SentenceMaker(HOMOGRAPH_VERBS, HOMOGRAPH_OBJECTS)
     dropped = 0

@@ -61,6 +61,7 @@ def test_bars_count_every_clip_most_frequent_first():
     assert many.rest == "and 6 others with 12 clips"
 
 
+@pytest.mark.slow
 def test_page_counts_lists_and_links(project, hands, tmp_path):
     text = write_dataset_page(tmp_path / "out", project, "grab", hands, "GRAB").read_text()
     assert '<dt>box</dt><dd><i style="width:100.0%"></i><span>3</span></dd>' in text
@@ -114,6 +115,7 @@ def test_frames_count_as_deep_from_a_centimetre_on(page_clip, hands, tmp_path, m
     assert (row.inside, row.deep, row.deepest) == ("50.0 %", "10.0 %", "11.0")
 
 
+@pytest.mark.slow
 def test_page_shows_contact_and_penetration_where_the_stage_ran(project, hands, tmp_path):
     surface_store(project / "clips", project / "surface", touch_m=0.02, progress=False)
     text = write_dataset_page(tmp_path / "out", project, "grab", hands, examples=0).read_text()
