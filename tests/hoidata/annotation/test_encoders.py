@@ -7,9 +7,10 @@ import time
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.annotation import load_encoder, refuse_other_encoder
-from hoidata.annotation.encoders import CachedEncoder, HashEncoder
+from hoidata.annotation.encoders import CachedEncoder, HashEncoder, UniversalSentenceEncoder
 from hoidata.errors import BadInput, MissingResource
 
 SENTENCES = ["Lift a box with the left hand.", "Pour milk with both hands.", "A mug is grabbed by the right hand."]
@@ -43,6 +44,21 @@ def test_features_are_the_same_on_any_number_of_processors(threads: str) -> None
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": threads, "OMP_NUM_THREADS": threads}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, check=True)
     assert done.stdout == load_encoder("use").encode(SENTENCES).tobytes()
+
+
+def test_the_default_encoder_works_on_one_blas_thread_whatever_was_set(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Watched:
+        def encode(self, sentence: str) -> np.ndarray:
+            threads.append(max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+            return np.zeros(512)
+
+    threads: list[int] = []
+    encoder = UniversalSentenceEncoder()
+    monkeypatch.setattr(encoder, "_model", Watched())
+    with threadpool_limits(2, user_api="blas"):
+        Watched().encode("outside")
+        encoder.encode(["inside"])
+    assert threads == [2, 1]
 
 
 def test_the_default_encoder_hears_a_synonym() -> None:
