@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from hoidata.errors import HoidataError
-from hoidata.lineage.graph import read_params
-from hoidata.lineage.manifests import Manifest, read_manifest
+from pipelines.lineage.graph import read_params
+from pipelines.lineage.manifests import Manifest, read_manifest
 from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")

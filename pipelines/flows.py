@@ -4,7 +4,7 @@ from pathlib import Path
 
 from prefect import flow
 
-from hoidata.lineage.graph import read_params
+from pipelines.lineage.graph import read_params
 from pipelines.repro import reproduce
 
 

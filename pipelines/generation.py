@@ -8,11 +8,11 @@ from hoidata.annotation import load_encoder
 from hoidata.annotation.hand_choice import Method
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
-from hoidata.lineage.graph import look_up, read_params
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.store import open_store
-from models.generation import MODELS, generate
+from hoidata.store.store import open_store
+from models.text2hoi.generation import MODELS, generate
+from pipelines.lineage.graph import look_up, read_params
 from pipelines.pages.generation_page import write_generation
 from pipelines.stages.base import Place, empty_reason, load_hands
 

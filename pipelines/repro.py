@@ -6,8 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from hoidata.lineage.graph import read_graph, read_params
-from hoidata.lineage.manifests import read_manifest
+from pipelines.lineage.graph import read_graph, read_params
+from pipelines.lineage.manifests import read_manifest
 from pipelines.stages.base import Place, raw_root
 from pipelines.stages.raw import require_hand, write_generated
 

@@ -4,9 +4,9 @@ import difflib
 from pathlib import Path
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.lineage.graph import read_params
-from hoidata.schema.annotated import load_annotated
-from hoidata.schema.store import Store, open_store
+from hoidata.store.annotated import load_annotated
+from hoidata.store.store import Store, open_store
+from pipelines.lineage.graph import read_params
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.dataset_page import write_dataset_page
 from pipelines.pages.report import TITLES

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips import SIDES, Clip, HandTrack, HandType, ObjectTrack, Side
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema import SIDES, Clip, HandTrack, HandType, ObjectTrack, Side
 
 BOX_M = (0.10, 0.08, 0.06)
 TIP_GAP_M = 0.003

@@ -11,23 +11,23 @@ import numpy as np
 import pytest
 import torch
 
-from hoidata.adapters.grab_words import INTENTS, OBJECTS
-from hoidata.adapters.h2o import ACTIONS
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.sentences import FORMS, HAND_PHRASES, four_sentences
+from hoidata.batches.dataset import CONTACT_THRESHOLD_M as CROPPED_THRESHOLD_M
+from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
+from hoidata.clips import HandTrack
 from hoidata.contact import CONTACT_THRESHOLD_M
+from hoidata.datasets.grab.words import INTENTS, OBJECTS
+from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.lineage.graph import read_params
 from hoidata.objects.sampling import sample_points
-from hoidata.schema import HandTrack
-from hoidata.schema.dataset import CONTACT_THRESHOLD_M as CROPPED_THRESHOLD_M
-from hoidata.schema.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
 from hoidata.splits import definitions_for, published
-from models.contact import ContactConfig
-from models.diffusion import Condition, DiffusionConfig, DiffusionModel
-from models.length import LengthConfig
-from models.sampling import alphas_bar
-from models.transformer import Encoder, TransformerConfig
+from models.common.sampling import alphas_bar
+from models.common.transformer import Encoder, TransformerConfig
+from models.text2hoi.contact import ContactConfig
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
+from models.text2hoi.length import LengthConfig
+from pipelines.lineage.graph import read_params
 
 PROJECT = Path(__file__).parents[1]
 H2O_OBJECTS = {"book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino"}

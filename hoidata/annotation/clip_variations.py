@@ -17,7 +17,7 @@ import numpy as np
 from hoidata.annotation.grammar import Grammar
 from hoidata.annotation.sentences import UNLABELLED_VERB
 from hoidata.annotation.variations import Loss, Manner, SentenceMaker, manner_of
-from hoidata.schema import FPS, HandType
+from hoidata.clips import FPS, HandType
 
 # Speed over a tenth of a second: over one frame a millimetre of jitter alone would be 4 cm/s.
 STEP_FRAMES = 3

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from hoidata.clips import FPS, SIDES, Clip
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.schema import FPS, SIDES, Clip
-from hoidata.schema.hand_evidence import HandEvidence
+from hoidata.store.hand_evidence import HandEvidence
 
 # All thresholds are ours. A hinge that turns by less may do so because the object is held.
 HINGE_RAD = np.deg2rad(15)

@@ -12,7 +12,7 @@ import numpy as np
 
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.hand_mentions import HAND_WORD, SIDE_WORD, Mentions, find_mentions
-from hoidata.schema import SIDES, HandType
+from hoidata.clips import SIDES, HandType
 
 HAND_TYPES: tuple[HandType, ...] = ("left", "right", "both")
 TEMPLATES: dict[HandType, str] = {

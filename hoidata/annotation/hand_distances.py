@@ -1,6 +1,6 @@
 """How near each hand came, kept frame by frame, so that another threshold needs no new distances.
 
-``hand_distance.npz`` holds the frames (read by ``hoidata.schema.hand_evidence.HandDistances``), 8 bytes each for both
+``hand_distance.npz`` holds the frames (read by ``hoidata.store.hand_evidence.HandDistances``), 8 bytes each for both
 hands; ``hand_type.parquet`` the exact minima of each clip, from which hand types at other thresholds follow.
 """
 
@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from hoidata.clips import SIDES, HandType, Side
 from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
-from hoidata.schema import SIDES, HandType, Side
-from hoidata.schema.hand_evidence import FIRST_FRAME, HandEvidence, hand_type_of
+from hoidata.store.hand_evidence import FIRST_FRAME, HandEvidence, hand_type_of
 
 
 def write_hand_distances(path: Path, evidence: Sequence[HandEvidence]) -> None:

@@ -9,7 +9,7 @@ import re
 from dataclasses import dataclass, field
 
 from hoidata.annotation.grammar import default_grammar
-from hoidata.schema import Side
+from hoidata.clips import Side
 
 BLANK = " ¤ "
 _DET = r"(?:(?:the|your|my|his|her|their|its|our|one's|a|an)\s+)"

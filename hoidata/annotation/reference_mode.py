@@ -8,7 +8,7 @@ import re
 
 from hoidata.annotation.grammar import Grammar, default_grammar
 from hoidata.annotation.sentences import UNLABELLED_VERB, FourSentences
-from hoidata.schema import HandType
+from hoidata.clips import HandType
 
 HAND_WORDS: dict[HandType, str] = {"left": "left hand", "right": "right hand", "both": "both hands"}
 # What the reference calls an object, where its name differs from ours.

@@ -1,7 +1,7 @@
 """Four sentences for one interaction, in the forms of Text2HOI (Cha et al. 2024, supplement, section 6)."""
 
 from hoidata.annotation.grammar import Grammar, default_grammar
-from hoidata.schema import HandType
+from hoidata.clips import HandType
 
 FORMS = ("imperative", "passive", "subject", "gerund")
 HAND_PHRASES: dict[HandType, str] = {"left": "the left hand", "right": "the right hand", "both": "both hands"}

@@ -1,6 +1,6 @@
 """Stage annotate: hand type, sentences and text features of every clip.
 
-The folder it writes is described in ``hoidata.schema.annotated``.
+The folder it writes is described in ``hoidata.store.annotated``.
 """
 
 from collections import Counter
@@ -25,6 +25,7 @@ from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.hand_distances import write_hand_distances
 from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
+from hoidata.clips import SIDES, Clip, HandType, Side
 from hoidata.contact import CONTACT_THRESHOLD_M, HandEvidence, ProximityIndex, acting_hands
 from hoidata.contact.stage import sample_objects
 from hoidata.errors import BadInput
@@ -33,9 +34,8 @@ from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import POINT_COUNT
-from hoidata.schema import SIDES, Clip, HandType, Side
-from hoidata.schema.annotated import VARIATION
-from hoidata.schema.store import Store, open_store
+from hoidata.store.annotated import VARIATION
+from hoidata.store.store import Store, open_store
 
 Forms = Literal["paper", "reference"]
 VerbSource = Literal["source", "derived"]

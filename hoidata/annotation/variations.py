@@ -16,7 +16,7 @@ from typing import Literal
 from hoidata.annotation.grammar import Grammar, NounPhrase, VerbForms, default_grammar
 from hoidata.annotation.hand_choice import select_hand
 from hoidata.annotation.prompts import Lexicon
-from hoidata.schema import HandType
+from hoidata.clips import HandType
 
 Manner = Literal["slowly", "quickly"]
 Loss = Literal["hand", "verb", "object"]

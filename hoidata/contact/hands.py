@@ -4,11 +4,11 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hoidata.clips import SIDES, Clip, Side
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex, joints_in_object
 from hoidata.errors import BadInput
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.schema import SIDES, Clip, Side
-from hoidata.schema.hand_evidence import HandEvidence
+from hoidata.store.hand_evidence import HandEvidence
 
 
 def acting_hands(

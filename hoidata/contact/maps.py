@@ -4,9 +4,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from hoidata.clips import SIDES, Clip, Side
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.errors import BadInput
-from hoidata.schema import SIDES, Clip, Side
 
 LONGEST_CLIP = int(np.iinfo(np.int16).max)
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from hoidata.clips import ObjectTrack
 from hoidata.contact.intrinsics import fused
-from hoidata.schema import ObjectTrack
 
 _SMALL_RAD = 1e-3  # below it SciPy takes a series of sin(angle / 2) / angle
 

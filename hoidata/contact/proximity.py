@@ -6,6 +6,7 @@ one index per part serve every frame of every clip, and makes every result indep
 
 import numpy as np
 
+from hoidata.clips import ObjectTrack
 from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entries
 from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, nearest_of_each, point_boxes
 from hoidata.contact.part_frames import part_motion, part_places
@@ -13,7 +14,6 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.model import Hinge
 from hoidata.objects.sampling import SampledPoints
-from hoidata.schema import ObjectTrack
 
 CONTACT_THRESHOLD_M = 0.02
 

@@ -1,6 +1,6 @@
 """Stage contact: sampled points of every object, touched points and joint-point distances of every clip.
 
-The folder it writes is described in ``hoidata.schema.annotated``.
+The folder it writes is described in ``hoidata.store.annotated``.
 """
 
 from collections.abc import Iterator
@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from hoidata.clips import SIDES, Side
 from hoidata.contact.maps import distance_entries, touched_frames
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ENTRY, ProximityIndex
 from hoidata.files import atomic_folder, canonical_json
@@ -16,8 +17,7 @@ from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
-from hoidata.schema import SIDES, Side
-from hoidata.schema.store import Store, open_store
+from hoidata.store.store import Store, open_store
 
 ENTRIES_PER_SHARD = 1 << 23
 POINT_SHAPES = {

@@ -4,7 +4,7 @@ The one entry point is ``measure``, for MANO-layout hands of a clip (19 capsules
 
     measure(clip_scene(clip, hands), clip_motions(clip, hands))
 
-and for ManipNet's own hands (its 19 capsules and 17 joints, 120 Hz; ``hoidata.adapters.manipnet_source_hands``)::
+and for ManipNet's own hands (its 19 capsules and 17 joints, 120 Hz; ``hoidata.datasets.manipnet.source_hands``)::
 
     source = read_source_hands(raw, "cyl_med3")
     measure(source.scene, source.motions)
@@ -18,13 +18,13 @@ from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.hands import HandPair, track_joints
 from hoidata.physics.as_released import AsReleased
 from hoidata.physics.capsules import CapsuleContacts, capsule_contacts
 from hoidata.physics.mano_capsules import world_rotmats
 from hoidata.physics.scene import Scene
 from hoidata.physics.standard_units import StandardUnits
-from hoidata.schema.clip import SIDES, Clip
 
 LARGEST_PENETRATION_M = 0.015
 SMOOTHNESS_FPS = 60.0

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair
@@ -13,7 +14,6 @@ from hoidata.physics.capsules import Capsules, ObjectPoses, joined
 from hoidata.physics.contact_forces import GRAVITY_M_S2, MASS_KG, BodyMotion, required_wrench
 from hoidata.physics.mano_capsules import hand_capsules
 from hoidata.physics.surface import body_motion
-from hoidata.schema.clip import FPS, SIDES, Clip
 
 LIFTED_M = 0.015
 TABLE_PERCENTILE = 3

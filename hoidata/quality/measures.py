@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel, articulate, place
@@ -16,7 +17,6 @@ from hoidata.quality.penetration import depths_m, object_frame
 from hoidata.quality.shape import largest_beta, meant_betas
 from hoidata.quality.thresholds import Thresholds
 from hoidata.quality.timing import ObjectMotion, time_offset
-from hoidata.schema.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 
 NAN = float("nan")
 STILL_M = 0.001

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from hoidata.clips.clip import FPS
 from hoidata.geometry.stretches import runs, sudden_steps
-from hoidata.schema.clip import FPS
 
 # A tracker repeats its last numbers exactly; float32 storage of equal numbers stays within this.
 EQUAL = 1e-7

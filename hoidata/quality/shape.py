@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from hoidata.schema.clip import HandTrack
+from hoidata.clips.clip import HandTrack
 
 
 def meant_betas(track: HandTrack) -> np.ndarray:

@@ -17,6 +17,7 @@ import pyarrow as pa
 from rich.console import Console
 from rich.progress import Progress
 
+from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.tables import write_table
@@ -32,8 +33,7 @@ from hoidata.quality.thresholds import (
     reasons_of,
     verdict_of,
 )
-from hoidata.schema.clip import SIDES
-from hoidata.schema.store import Store, open_store
+from hoidata.store.store import Store, open_store
 from hoidata.workers import WorkerLost, in_workers
 
 # Below this a second process costs more to start than it saves.

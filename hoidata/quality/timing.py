@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial import KDTree
 
-from hoidata.schema.clip import FPS
+from hoidata.clips.clip import FPS
 
 NEAR_M = 0.05
 MOVING_M_S = 0.05

@@ -5,7 +5,7 @@
     info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is
     statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
 
-``hoidata.schema.annotated`` reads the chosen split from here.
+``hoidata.store.annotated`` reads the chosen split from here.
 """
 
 import hashlib
@@ -18,16 +18,16 @@ from typing import Any
 import pandas as pd
 import pyarrow as pa
 
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.files.tables import write_table
-from hoidata.schema.clip import SIDES, Clip
-from hoidata.schema.store import Store, open_store
 from hoidata.splits.definitions import Definition, choose, definitions_for
 from hoidata.splits.leaks import Leaks, find_leaks
 from hoidata.splits.published import published
 from hoidata.splits.rules import PARTS, assign_split
 from hoidata.splits.statistics import training_statistics
+from hoidata.store.store import Store, open_store
 
 CHOSEN = "split"
 Assignment = dict[str, str | None]

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotvec_to_rotmat
-from hoidata.schema.clip import SIDES, Clip, HandTrack, Side
-from hoidata.schema.store import Store
+from hoidata.store.store import Store
 
 QUANTILES = (0.01, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99)
 DIGITS = 9  # significant; the last bits of a sum depend on the processor

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from scipy.optimize import nnls
 
+from hoidata.clips.clip import Side
 from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.hands.tracks import kinematics_of
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import wrench_columns
 from hoidata.physics.surface import body_motion, hand_patches, patch_contacts, surface_distances
-from hoidata.schema.clip import Side
 from hoidata.synthetic.catalogue import ObjectSpec
 from hoidata.synthetic.closing import ClosedHands, Placement, close_fingers, draw_placements
 from hoidata.synthetic.field import Field, MirroredField, MovedField, NearestField, gradient, grid_field

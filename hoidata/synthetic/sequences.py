@@ -5,10 +5,10 @@ from typing import get_args
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, SIDES, HandTrack, HandType, ObjectTrack, Side
 from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel, articulate
-from hoidata.schema.clip import FPS, SIDES, HandTrack, HandType, ObjectTrack, Side
 from hoidata.synthetic.actions import LENGTH_DEVIATION, LONGEST_CLIP, MEAN_LENGTH, SHORTEST_CLIP, Action
 from hoidata.synthetic.catalogue import ObjectSpec
 from hoidata.synthetic.grasps import Grip

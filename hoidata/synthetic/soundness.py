@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.hands.model import TIP_VERTICES
@@ -18,7 +19,6 @@ from hoidata.physics.surface import (
     surface_distances,
     to_object_frame,
 )
-from hoidata.schema.clip import FPS, SIDES, Side
 from hoidata.synthetic.truth import GRAVITY, TruthSequence
 
 LARGEST_PENETRATION_M = 0.009

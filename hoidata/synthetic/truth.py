@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, SIDES, HandTrack, HandType, ObjectTrack, Side
 from hoidata.hands import HandPair, track_joints
-from hoidata.schema.clip import FPS, SIDES, HandTrack, HandType, ObjectTrack, Side
 
 GRAVITY = np.array([0.0, 0.0, -1.0])
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.hands import HandPair
-from hoidata.schema.clip import SIDES, HandTrack, Side
 from hoidata.synthetic.catalogue import ARCTIC_OBJECTS, object_model
 from hoidata.synthetic.generate import GAP_FRAMES
 from hoidata.synthetic.object_files import obj_text, write_npy, write_text

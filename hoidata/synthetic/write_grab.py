@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
+from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_vertices
 from hoidata.physics.surface import to_object_frame
-from hoidata.schema.clip import SIDES, HandTrack, Side
 from hoidata.synthetic.catalogue import GRAB_OBJECTS, object_model
 from hoidata.synthetic.object_files import write_npz, write_ply
 from hoidata.synthetic.shapes import sharp_box

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.hands import HandPair, track_joints
-from hoidata.schema.clip import SIDES, HandTrack
 from hoidata.synthetic.actions import H2O_ACTION_IDS, H2O_OBJECT_IDS, H2O_VERB_IDS
 from hoidata.synthetic.catalogue import H2O_OBJECTS, object_model
 from hoidata.synthetic.generate import GAP_FRAMES

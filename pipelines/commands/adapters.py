@@ -27,7 +27,7 @@ def list_adapters() -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from hoidata.adapters.registry import registered_adapters
+    from hoidata.datasets.registry import registered_adapters
 
     table = Table("name", "version", "licence", "may be shared", "from", show_lines=True)
     table.add_column("settings", overflow="fold")
@@ -56,8 +56,8 @@ def check(
     """
     from rich.console import Console
 
-    from hoidata.adapters.conformance import check_adapter
-    from hoidata.adapters.registry import get_adapter
+    from hoidata.conformance.check import check_adapter
+    from hoidata.datasets.registry import get_adapter
 
     adapter = get_adapter(name, **_settings(setting or []))
     hands, note = _hands(hand, adapter.needs_mano)

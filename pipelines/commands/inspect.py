@@ -35,7 +35,7 @@ def info(
     """Describe a store: clips by object and verb, conventions, licence, and what was left out and why."""
     from rich.console import Console
 
-    from hoidata.schema.store import open_store
+    from hoidata.store.store import open_store
     from pipelines.commands.store_facts import fact_rows, group_rows, left_out_rows
     from pipelines.stages.base import empty_reason
 
@@ -74,7 +74,7 @@ def lineage(
 ) -> None:
     """Print what a checkpoint was made from. Exit code 0 when all of it is still the same today, 1 when not."""
     project = enter_project()
-    from hoidata.lineage.tree import lineage_tree, overall_status
+    from pipelines.lineage.tree import lineage_tree, overall_status
 
     file = checkpoint / "model.safetensors" if checkpoint.is_dir() else checkpoint
     file = file.relative_to(project) if file.is_relative_to(project) else file
@@ -89,11 +89,11 @@ def lineage(
 def _print_json(tree, provenance: dict) -> None:
     import json as json_module
 
-    from hoidata.lineage.tree import overall_status, tree_as_json
+    from pipelines.lineage.tree import overall_status, tree_as_json
 
     kept = ("stage", "model", "config", "seed", "synthetic", "libraries", "clips", "params_digest", "code_digest")
     facts = {key: provenance[key] for key in kept if key in provenance}
-    values = {"schema": "hoidata.lineage/1", "status": overall_status(tree), **facts, "tree": tree_as_json(tree)}
+    values = {"schema": "pipelines.lineage/1", "status": overall_status(tree), **facts, "tree": tree_as_json(tree)}
     typer.echo(json_module.dumps(values, indent=2, ensure_ascii=False))
 
 
@@ -101,7 +101,7 @@ def _print_tree(tree, provenance: dict, show_clips: bool) -> None:
     from rich.console import Console
     from rich.tree import Tree
 
-    from hoidata.lineage.tree import overall_status
+    from pipelines.lineage.tree import overall_status
 
     console, top = Console(), Tree(_label(tree))
     for child in tree.children:

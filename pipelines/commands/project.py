@@ -21,7 +21,7 @@ def enter_project() -> Path:
 
 def current_profile() -> str:
     """The profile params.yaml chooses."""
-    from hoidata.lineage.graph import read_params
+    from pipelines.lineage.graph import read_params
 
     return read_params(Path())["profile"]
 

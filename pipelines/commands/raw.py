@@ -20,7 +20,7 @@ def scan(
 ) -> None:
     """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
     enter_project()
-    from hoidata.lineage.manifests import write_manifest
+    from pipelines.lineage.manifests import write_manifest
     from pipelines.stages.base import HAND, Place
 
     name = HAND if dataset == "mano" else dataset
@@ -39,8 +39,8 @@ def scan(
 
 def _scan_dataset(place, root: Path):
     from hoidata.errors import BadInput
-    from hoidata.lineage.graph import read_params
-    from hoidata.lineage.manifests import absent_manifest, scan_files
+    from pipelines.lineage.graph import read_params
+    from pipelines.lineage.manifests import absent_manifest, scan_files
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
 
@@ -58,7 +58,7 @@ def _scan_dataset(place, root: Path):
 
 def _ensure_manifests(adapter) -> None:
     """A dataset new to the project is absent from both profiles until it is scanned."""
-    from hoidata.lineage.manifests import absent_manifest, write_manifest
+    from pipelines.lineage.manifests import absent_manifest, write_manifest
     from pipelines.stages.base import Place
 
     for profile in ("embedded", "own"):
@@ -85,7 +85,7 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
     also: another problem to name behind that of the folder.
     """
     from hoidata.errors import BadInput
-    from hoidata.lineage.manifests import missing_parts
+    from pipelines.lineage.manifests import missing_parts
 
     missing = missing_parts(adapter, root)
     required = [part for part in missing if not part.optional]
@@ -108,10 +108,10 @@ def _state_terms(manifest) -> None:
 def _scan_hand(place, root: Path):
     from dataclasses import replace
 
+    from hoidata.clips.clip import SourceFile
     from hoidata.errors import BadInput
     from hoidata.files import sha256_file
-    from hoidata.lineage.manifests import read_manifest
-    from hoidata.schema.clip import SourceFile
+    from pipelines.lineage.manifests import read_manifest
 
     missing = [name for name in MANO_FILES if not (root / name).is_file()]
     if missing:
@@ -124,7 +124,7 @@ def _scan_hand(place, root: Path):
 def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
     """Compare raw files with the manifests of the current profile. Exit code 1 when they differ or are not there."""
     enter_project()
-    from hoidata.lineage.graph import read_params
+    from pipelines.lineage.graph import read_params
 
     names = [dataset] if dataset else read_params(Path())["datasets"]
     results = [_verify_one(name, asked_for=bool(dataset)) for name in names]
@@ -137,7 +137,7 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     asked_for: by name, so that its absence is a complaint.
     """
     from hoidata.errors import MissingResource
-    from hoidata.lineage.manifests import absent_manifest, read_manifest, verify_files
+    from pipelines.lineage.manifests import absent_manifest, read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.base import Place, raw_root
 
@@ -173,7 +173,7 @@ def _say_where_to_get(adapter) -> None:
 
 
 def _where_to_get(adapter, path: str) -> str:
-    from hoidata.lineage.manifests import part_of
+    from pipelines.lineage.manifests import part_of
 
     part = part_of(adapter, path)
     return f" ({part.what}, from {part.where})" if part else f" ({adapter.where_to_register})"

@@ -29,8 +29,8 @@ def share(
 
 def _terms() -> list[str]:
     """One line per dataset of the current profile whose licence does not let derived data be passed on."""
-    from hoidata.lineage.graph import read_params
-    from hoidata.lineage.manifests import read_manifest
+    from pipelines.lineage.graph import read_params
+    from pipelines.lineage.manifests import read_manifest
     from pipelines.stages.base import Place
 
     places = [Place(current_profile(), name) for name in read_params(Path())["datasets"]]

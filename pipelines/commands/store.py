@@ -10,8 +10,8 @@ Store = Annotated[Path, typer.Argument(help="A store of clips.", exists=True, fi
 
 def validate(store: Store) -> None:
     """Check every file, table and array of a store against the schema; exit code 1 when something is wrong."""
-    from hoidata.schema.checking import check_store
-    from hoidata.schema.store import open_store
+    from hoidata.store.store import open_store
+    from hoidata.store_check.check import check_store
     from pipelines.stages.base import empty_reason
 
     if reason := empty_reason(store):
@@ -29,8 +29,8 @@ def validate(store: Store) -> None:
 
 def migrate(store: Store) -> None:
     """Rewrite a store of an earlier schema version in today's, whole or not at all; ids and arrays stay."""
-    from hoidata.schema.migrate import is_current, migrate_store
-    from hoidata.schema.store import SCHEMA_VERSION
+    from hoidata.store.migrate import is_current, migrate_store
+    from hoidata.store.store import SCHEMA_VERSION
 
     found = migrate_store(store)
     done = "nothing to do" if is_current(found) else f"rewritten as {SCHEMA_VERSION}"

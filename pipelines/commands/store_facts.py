@@ -4,9 +4,9 @@ from typing import Any
 
 import pandas as pd
 
-from hoidata.schema.clip import FPS, SIDES
-from hoidata.schema.migrate import is_current
-from hoidata.schema.store import SCHEMA_VERSION, Store
+from hoidata.clips.clip import FPS, SIDES
+from hoidata.store.migrate import is_current
+from hoidata.store.store import SCHEMA_VERSION, Store
 
 Rows = list[tuple[str, ...]]
 

@@ -15,7 +15,7 @@ Dataset = Annotated[str, typer.Argument(help="h2o, grab or arctic; all three whe
 def write(dataset: Dataset = "") -> None:
     """Write the raw trees of the embedded corpora anew, as their committed recipes say."""
     enter_project()
-    from hoidata.lineage.manifests import read_manifest
+    from pipelines.lineage.manifests import read_manifest
     from pipelines.stages.base import Place
     from pipelines.stages.raw import write_generated
 
@@ -55,7 +55,7 @@ def check(
 
 def _chosen(dataset: str) -> list[str]:
     from hoidata.errors import MissingResource
-    from hoidata.lineage.manifests import read_manifest
+    from pipelines.lineage.manifests import read_manifest
 
     committed = [read_manifest(path) for path in sorted(Path("manifests/embedded").glob("*.json"))]
     generated = [item.dataset for item in committed if item.present and "size" in (item.recipe or {})]

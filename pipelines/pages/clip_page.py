@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.contact.bimart_maps import REACH_M, STEP_M
+from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.clip import SIDES, Clip, Side
+from hoidata.store.annotated import AnnotatedStore
+from hoidata.surface.bimart_maps import REACH_M, STEP_M
 from pipelines.pages.clip_page_facts import (
     clip_facts,
     clip_quality,

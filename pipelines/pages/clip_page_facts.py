@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.errors import MissingResource
 from hoidata.hands import JOINT_NAMES, HandPair
 from hoidata.quality.thresholds import CLIP_MEASURES
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.clip import FPS, SIDES, Clip, Side
+from hoidata.store.annotated import AnnotatedStore
 from pipelines.pages.clip_page_series import ClipSeries
 
 Rows = list[tuple[str, ...]]

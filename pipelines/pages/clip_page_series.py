@@ -8,16 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.contact import HandEvidence
 from hoidata.contact.maps import LONGEST_CLIP
-from hoidata.contact.surface_contact import TOUCH_M
-from hoidata.contact.surface_measure import ObjectShape, encloses_solid, measure_hand
-from hoidata.contact.surface_store import SideSurface, SurfaceStore
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.surface_index import surface_index
 from hoidata.quality.measures import placed
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.clip import FPS, SIDES, Clip, Side
+from hoidata.store.annotated import AnnotatedStore
+from hoidata.surface.contact import TOUCH_M
+from hoidata.surface.measure import ObjectShape, encloses_solid, measure_hand
+from hoidata.surface.store import SideSurface, SurfaceStore
 from pipelines.pages.surface_facts import surface_beside
 
 

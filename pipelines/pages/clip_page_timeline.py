@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hoidata.schema.clip import Side
+from hoidata.clips.clip import Side
 from pipelines.pages.clip_page_series import ClipSeries
 from pipelines.pages.curves import figure_svg
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pandas as pd
 
+from hoidata.clips.clip import FPS
 from hoidata.hands import HandPair
-from hoidata.schema.annotated import AnnotatedStore, load_annotated
-from hoidata.schema.clip import FPS
-from hoidata.schema.store import Store, open_store
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.store import Store, open_store
 
 MOST_FREQUENT = 12
 

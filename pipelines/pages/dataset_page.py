@@ -11,11 +11,11 @@ from markupsafe import Markup
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hoidata.clips.clip import FPS, SIDES
 from hoidata.errors import MissingResource
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
-from hoidata.schema.annotated import AnnotatedStore, load_annotated
-from hoidata.schema.clip import FPS, SIDES
+from hoidata.store.annotated import AnnotatedStore, load_annotated
 from pipelines.commands.store_facts import fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.curves import COLOURS, figure_svg

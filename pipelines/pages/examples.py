@@ -8,12 +8,12 @@ import numpy as np
 import torch
 
 from hoidata.annotation.encoders import Identity
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.hands import HandPair
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.clip import SIDES, Clip
-from models.checkpoints import FILE_NAME, Checkpoint, load_checkpoint
-from models.contact import ContactModel
-from models.generation import MODELS, GeneratedMotion, generate
+from hoidata.store.annotated import AnnotatedStore
+from models.common.checkpoints import FILE_NAME, Checkpoint, load_checkpoint
+from models.text2hoi.contact import ContactModel
+from models.text2hoi.generation import MODELS, GeneratedMotion, generate
 from pipelines.pages.surface import ContactPaint
 
 CONTACT_DRAWS = 32

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints, track_vertices
-from hoidata.schema.clip import FPS, SIDES, Clip
-from models.generation import GeneratedMotion
+from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import motion_player, write_motion_page
 from pipelines.pages.surface import ContactPaint

@@ -12,10 +12,10 @@ import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack
 from hoidata.files import atomic_file
 from hoidata.hands import JOINT_NAMES, HandModel, HandPair
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack
 from pipelines.pages.gltf import GltfBuilder, linear_from_srgb
 from pipelines.pages.surface import ContactPaint, Surface, display_surface
 

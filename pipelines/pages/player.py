@@ -16,10 +16,10 @@ import trimesh.resources
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import MissingResource
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
-from hoidata.schema.clip import SIDES, Clip
 from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import View, still_view, view_of

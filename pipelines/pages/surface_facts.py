@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hoidata.contact.surface_store import REMEDY, SurfaceStore, open_surface
+from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.clip import SIDES
+from hoidata.store.annotated import AnnotatedStore
+from hoidata.surface.store import REMEDY, SurfaceStore, open_surface
 
 PENETRATION_M = 0.01  # BimArt counts frames with a hand vertex deeper than this ("Pen 1cm")
 

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hoidata.clips.clip import FPS, Clip, ObjectTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.model import articulate, place
-from hoidata.schema.clip import FPS, Clip, ObjectTrack
 from pipelines.pages.glb import upright_rotation
 from pipelines.pages.surface import ContactPaint
 

@@ -4,8 +4,8 @@ from typing import Any
 
 from pydantic import Field
 
-from hoidata.adapters.base import Adapter
-from hoidata.adapters.registry import get_adapter
+from hoidata.datasets.base import Adapter
+from hoidata.datasets.registry import get_adapter
 from pipelines.stages.base import StageParams, load_params
 
 

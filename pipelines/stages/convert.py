@@ -1,7 +1,7 @@
 """Stage convert: raw files to a store of clips; sequences that cannot be used are left out with their reason."""
 
-from hoidata.adapters.convert import convert_dataset
-from hoidata.lineage.manifests import read_manifest
+from hoidata.conversion.convert import convert_dataset
+from pipelines.lineage.manifests import read_manifest
 from pipelines.stages.adapters import configured_adapter
 from pipelines.stages.base import Place, jobs, load_hands, note_empty, raw_root
 

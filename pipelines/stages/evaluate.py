@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from hoidata.lineage.graph import read_params
+from pipelines.lineage.graph import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, write_json
 
 
@@ -18,6 +18,6 @@ def run(place: Place) -> None:
 
 def evaluate(place: Place, params: dict[str, Any]) -> None:
     """Measure on the test split; the evaluation checks its own settings."""
-    from models.evaluation import evaluate_dataset
+    from models.common.evaluation import evaluate_dataset
 
     evaluate_dataset(place.data, place.checkpoints, place.metrics, params, hands=load_hands(place.profile))

@@ -2,12 +2,12 @@
 
 from pathlib import Path
 
+from hoidata.clips.clip import SourceFile
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_file
-from hoidata.lineage.digests import paths_digests, value_digest
-from hoidata.lineage.graph import read_graph
-from hoidata.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
-from hoidata.schema.clip import SourceFile
+from pipelines.lineage.digests import paths_digests, value_digest
+from pipelines.lineage.graph import read_graph
+from pipelines.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
 from pipelines.stages.adapters import configured_adapter
 from pipelines.stages.base import Place, jobs, raw_root, root_variable
 
@@ -40,7 +40,11 @@ def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
 def recipe_digest(place: Place, manifest: Manifest) -> str:
     """Digest of the recipe and of the code that follows it; adapters only say which of the files count."""
     project = Path()
-    code = [path for path in read_graph(project)[f"raw@{place}"].code if not path.startswith("hoidata/adapters")]
+    code = [
+        path
+        for path in read_graph(project)[f"raw@{place}"].code
+        if not path.startswith(("hoidata/datasets", "hoidata/conversion"))
+    ]
     return value_digest([manifest.recipe, paths_digests(project, code)])
 
 

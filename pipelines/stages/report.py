@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from hoidata.lineage.graph import read_params
+from pipelines.lineage.graph import read_params
 from pipelines.stages.base import Place, StageParams, load_hands, load_params
 
 

@@ -32,8 +32,8 @@ def run(place: Place) -> None:
 
 def measure(place: Place, params: SurfaceParams) -> None:
     """Clips to exact contact, depth and maps."""
-    from hoidata.contact.surface_stage import surface_store
     from hoidata.quality.verdicts import left_out_reasons
+    from hoidata.surface.stage import surface_store
 
     report = surface_store(
         place.clips,

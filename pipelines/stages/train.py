@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.files.atomic import atomic_folder
-from hoidata.lineage.graph import look_up, producers, read_graph
-from hoidata.lineage.provenance import build_provenance
+from pipelines.lineage.graph import look_up, producers, read_graph
+from pipelines.lineage.provenance import build_provenance
 from pipelines.stages.base import Place, StageParams, empty_reason, load_hands, load_params, write_empty
 
 NEEDS = {"contact": (), "length": (), "diffusion": ("contact",), "refiner": ("diffusion",)}
@@ -38,7 +38,7 @@ def run(place: Place) -> None:
 
 def train(place: Place, params: TrainParams, upstream: dict[str, Path]) -> None:
     """Train, and store with the weights what they were made from."""
-    from models.training import train_model
+    from models.common.training import train_model
 
     stage = producers(read_graph(Path()))[place.checkpoint.as_posix()].name
     with atomic_folder(place.checkpoint) as part:

@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hoidata.adapters import Adapter, RawTree, SequenceKey, get_adapter
-from hoidata.adapters.h2o_files import parse_rows
+from hoidata.clips.clip import SIDES, Clip
+from hoidata.clips.hand_parameters import hands_for
+from hoidata.datasets import Adapter, RawTree, SequenceKey, get_adapter
+from hoidata.datasets.h2o.files import parse_rows
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.schema.clip import SIDES, Clip
-from hoidata.schema.hand_parameters import hands_for
-from hoidata.schema.info import generated_info
-from hoidata.schema.mapped import map_npz
-from hoidata.schema.store import write_store
+from hoidata.store.info import generated_info
+from hoidata.store.mapped import map_npz
+from hoidata.store.store import write_store
 from tests.bench.corpus import embedded_root
 from tests.bench.harness import Times, medians, show
 from tests.bench.naive import READERS, NaiveHands, Poses

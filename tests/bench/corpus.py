@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.adapters.h2o import H2OAdapter
+from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.files import load_npy_object
 from hoidata.synthetic.corpus import write_corpus
 

@@ -18,12 +18,12 @@ import orjson
 import pandas as pd
 
 from hoidata.annotation.derived import derive_verb
+from hoidata.clips import SIDES, Clip, HandType, Side
 from hoidata.contact import HandEvidence, ProximityIndex, acting_hands
 from hoidata.contact.hands import acting_hands_at_surface
 from hoidata.contact.stage import sample_objects
 from hoidata.objects.surface_index import surface_index
-from hoidata.schema import SIDES, Clip, HandType, Side
-from hoidata.schema.store import Store, open_store
+from hoidata.store.store import Store, open_store
 from hoidata.synthetic.actions import ACTIONS
 from tests.bench.harness import show
 

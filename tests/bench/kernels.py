@@ -22,6 +22,7 @@ import numpy as np
 import torch
 import trimesh
 
+from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact import ProximityIndex
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M
 from hoidata.geometry.rotations import rotvec_to_rotmat
@@ -29,7 +30,6 @@ from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_
 from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints, farthest_points, sample_points
-from hoidata.schema import HandTrack, ObjectTrack
 from tests.bench.harness import Times, medians, show
 
 RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21

@@ -14,9 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.adapters.base import RawTree, SequenceKey
-from hoidata.adapters.manipnet_source_hands import read_source_hands
-from hoidata.adapters.registry import get_adapter
+from hoidata.clips.clip import Clip
+from hoidata.datasets.base import RawTree, SequenceKey
+from hoidata.datasets.manipnet.source_hands import read_source_hands
+from hoidata.datasets.registry import get_adapter
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.physics.as_released import AsReleased
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
@@ -25,7 +26,6 @@ from hoidata.physics.mano_capsules import THUMB_CAPSULES
 from hoidata.physics.realism import Realism, Variant, clip_motions, measure, score
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits
-from hoidata.schema.clip import Clip
 from tests.bench.corpus import embedded_root
 from tests.bench.harness import show
 

@@ -15,8 +15,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from hoidata.schema.mapped import map_npz
-from hoidata.schema.store import open_store
+from hoidata.store.mapped import map_npz
+from hoidata.store.store import open_store
 from tests.bench.corpus import PAPER, embedded_root, replicate
 from tests.bench.growth import show_growth
 from tests.bench.harness import TreeMemory, show
@@ -43,8 +43,8 @@ class Measured:
 
 
 def convert(name: str, raw: Path, out: Path) -> None:
-    from hoidata.adapters import get_adapter
-    from hoidata.adapters.convert import convert_dataset
+    from hoidata.conversion.convert import convert_dataset
+    from hoidata.datasets import get_adapter
     from hoidata.hands import load_embedded_hands
 
     convert_dataset(get_adapter(name), raw / name, load_embedded_hands(), out / name / "clips", 2, synthetic=True)

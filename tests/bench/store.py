@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack, SourceFile
 from hoidata.objects.model import ObjectModel
-from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack, SourceFile
-from hoidata.schema.info import generated_info
-from hoidata.schema.mapped import map_npz
-from hoidata.schema.store import Store, open_store, write_store
+from hoidata.store.info import generated_info
+from hoidata.store.mapped import map_npz
+from hoidata.store.store import Store, open_store, write_store
 
 CLIP_FRAMES, FETCHED, RUNS = 150, 64, 9
 

@@ -18,7 +18,6 @@ import igl
 import numpy as np
 import trimesh
 
-from hoidata.contact.solid_overlap import SolidOverlap
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.distance_grid import distance_grid
@@ -27,6 +26,7 @@ from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.solid import Solid
 from hoidata.objects.surface_index import SurfaceIndex, in_part
 from hoidata.objects.triangle_tree import triangle_tree
+from hoidata.surface.solid_overlap import SolidOverlap
 from tests.bench.harness import Times, medians, show
 
 RUNS, FRAMES, TOUCH_M = 7, 60, 0.005

@@ -15,14 +15,14 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.adapters.grab_words import INTENTS, OBJECTS
-from hoidata.adapters.h2o import ACTIONS
 from hoidata.annotation.encoders import CachedEncoder, HashEncoder, TextEncoder, UniversalSentenceEncoder
 from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.hand_choice import HAND_TYPES, select_hand
 from hoidata.annotation.prompts import Lexicon, grammar_lexicon
 from hoidata.annotation.sentences import four_sentences
+from hoidata.datasets.grab.words import INTENTS, OBJECTS
+from hoidata.datasets.h2o.adapter import ACTIONS
 from tests.bench.harness import Times, medians, show
 
 RUNS, SAMPLE, CLIP_SAMPLE = 7, 400, 16

@@ -18,7 +18,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from hoidata.schema.store import open_store
+from hoidata.store.store import open_store
 from tests.bench.corpus import PAPER, embedded_root, replicate
 from tests.bench.growth import show_growth
 from tests.bench.harness import show
@@ -30,8 +30,8 @@ DISK = "checksums and files"
 
 
 def convert(name: str, raw: Path, out: Path) -> None:
-    from hoidata.adapters import get_adapter
-    from hoidata.adapters.convert import convert_dataset
+    from hoidata.conversion.convert import convert_dataset
+    from hoidata.datasets import get_adapter
     from hoidata.hands import load_embedded_hands
 
     adapter, clips = get_adapter(name), out / name / "clips"

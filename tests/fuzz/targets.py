@@ -14,8 +14,12 @@ from typing import Any
 
 import yaml
 
-from hoidata.adapters import arctic_files, bvh, h2o_files, manipnet
-from hoidata.adapters.base import RawTree
+from hoidata.clips.clip import SourceFile
+from hoidata.datasets.arctic import files as arctic_files
+from hoidata.datasets.base import RawTree
+from hoidata.datasets.h2o import files as h2o_files
+from hoidata.datasets.manipnet import adapter as manipnet
+from hoidata.datasets.manipnet import bvh
 from hoidata.files import (
     array_pieces,
     arrays,
@@ -26,11 +30,10 @@ from hoidata.files import (
     torch_pickle,
 )
 from hoidata.hands import mano, model
-from hoidata.lineage import manifests
 from hoidata.objects import mesh
 from hoidata.objects import ply as ply_reader
-from hoidata.schema import mapped, store, versions
-from hoidata.schema.clip import SourceFile
+from hoidata.store import mapped, store, versions
+from pipelines.lineage import manifests
 from pipelines.stages import base
 from tests.fuzz import seeds
 from tests.fuzz.coverage import functions_of

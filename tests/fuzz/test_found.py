@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hoidata.adapters import RawTree, manipnet
+from hoidata.datasets import RawTree
+from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.errors import BadInput
 from hoidata.files.arrays import read_npz
-from hoidata.lineage.manifests import read_manifest
 from hoidata.objects.mesh import load_mesh
-from hoidata.schema.mapped import map_npz
-from hoidata.schema.store import open_store
+from hoidata.store.mapped import map_npz
+from hoidata.store.store import open_store
+from pipelines.lineage.manifests import read_manifest
 from pipelines.stages.base import StageParams, load_params, own_root
 
 

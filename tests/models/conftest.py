@@ -9,14 +9,14 @@ import torch
 import trimesh
 
 from hoidata.annotation.stage import annotate_store
+from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
+from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
 from hoidata.contact.stage import contact_store
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema.annotated import AnnotatedStore, load_annotated
-from hoidata.schema.clip import Clip, HandTrack, ObjectTrack
-from hoidata.schema.dataset import ClipBatch, HoiDataset, collate
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 
 torch.set_num_threads(1)
 GRASP_HEIGHT_M = 0.01

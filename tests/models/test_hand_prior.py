@@ -3,8 +3,8 @@
 import pytest
 
 from hoidata.hands import load_embedded_hands
-from hoidata.schema.annotated import AnnotatedStore
-from models.corpus import Corpus
+from hoidata.store.annotated import AnnotatedStore
+from models.common.corpus import Corpus
 
 
 @pytest.fixture

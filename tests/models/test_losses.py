@@ -5,14 +5,14 @@ import pytest
 import torch
 import trimesh
 
+from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.dataset import ClipBatch
 from models import losses
-from models.features import Hands, object_rotmat, place_points
-from models.fields import DistanceFields
-from models.surface import Surface
+from models.common.features import Hands, object_rotmat, place_points
+from models.common.fields import DistanceFields
+from models.common.surface import Surface
 
 
 @pytest.fixture(scope="module")

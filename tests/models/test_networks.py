@@ -6,17 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
 from hoidata.hands import load_embedded_hands
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.dataset import ClipBatch, HoiDataset, collate
-from models.contact import ContactConfig, ContactLossConfig, ContactModel, PointNetConfig, contact_loss
-from models.diffusion import Condition, DiffusionConfig, DiffusionModel
-from models.features import Hands, Normaliser
-from models.length import LengthConfig, LengthModel, length_loss
-from models.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
-from models.sampling import SamplerConfig, add_noise, alphas_bar, noise_schedule, sample_motion
-from models.surface import Surface
-from models.transformer import TransformerConfig, smoothed
+from hoidata.store.annotated import AnnotatedStore
+from models.common.features import Hands, Normaliser
+from models.common.sampling import SamplerConfig, add_noise, alphas_bar, noise_schedule, sample_motion
+from models.common.surface import Surface
+from models.common.transformer import TransformerConfig, smoothed
+from models.text2hoi.contact import ContactConfig, ContactLossConfig, ContactModel, PointNetConfig, contact_loss
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
+from models.text2hoi.length import LengthConfig, LengthModel, length_loss
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
 
 SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2

@@ -11,16 +11,16 @@ import trimesh
 from safetensors import safe_open
 
 from hoidata.annotation import load_encoder
+from hoidata.batches.dataset import HoiDataset
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.annotated import AnnotatedStore
-from hoidata.schema.dataset import HoiDataset
-from models.checkpoints import load_checkpoint, save_checkpoint
-from models.corpus import batches
-from models.evaluation import evaluate_dataset
-from models.generation import GeneratedMotion, generate
-from models.training import TrainingConfig, learning_rate_factor, train_model
+from hoidata.store.annotated import AnnotatedStore
+from models.common.checkpoints import load_checkpoint, save_checkpoint
+from models.common.corpus import batches
+from models.common.evaluation import evaluate_dataset
+from models.common.training import TrainingConfig, learning_rate_factor, train_model
+from models.text2hoi.generation import GeneratedMotion, generate
 
 POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
 TRANSFORMER = {

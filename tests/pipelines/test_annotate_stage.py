@@ -14,8 +14,8 @@ from hoidata.annotation.clip_variations import VariationSettings
 from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.stage import annotate_store
 from hoidata.errors import BadInput
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 from pipelines.stages import annotate, quality
 from pipelines.stages.base import Place
 

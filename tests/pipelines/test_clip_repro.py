@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from hoidata.lineage.provenance import read_checkpoint_metadata
+from pipelines.lineage.provenance import read_checkpoint_metadata
 
 pytestmark = [
     pytest.mark.slow,

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from hoidata.adapters.grab import GrabAdapter
+from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput
-from hoidata.lineage.graph import read_graph, read_params
+from pipelines.lineage.graph import read_graph, read_params
 from pipelines.stages.adapters import ConvertParams
 from pipelines.stages.base import load_params
 

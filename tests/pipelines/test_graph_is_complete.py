@@ -7,8 +7,8 @@ import grimp
 import pytest
 import yaml
 
-from hoidata.adapters.registry import adapter_names
-from hoidata.lineage.graph import read_graph, read_params
+from hoidata.datasets.registry import adapter_names
+from pipelines.lineage.graph import read_graph, read_params
 from pipelines.stages.__main__ import STAGES
 
 PROJECT = Path(__file__).parents[2]

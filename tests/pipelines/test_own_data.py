@@ -8,7 +8,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner, Result
 
-from hoidata.adapters import get_adapter
+from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
 from pipelines.stages.base import Place, load_params

@@ -11,8 +11,8 @@ import yaml
 from hoidata.errors import BadInput
 from hoidata.quality.stage import as_json
 from hoidata.quality.thresholds import Thresholds
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 from pipelines.stages import annotate, quality
 from pipelines.stages.base import Place, empty_reason, write_empty
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 import yaml
 
-from hoidata.lineage.provenance import read_checkpoint_metadata
+from pipelines.lineage.provenance import read_checkpoint_metadata
 
 pytestmark = pytest.mark.slow
 MODELS = ("contact", "length", "diffusion", "refiner")

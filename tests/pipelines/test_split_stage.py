@@ -9,10 +9,10 @@ import yaml
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.errors import BadInput
-from hoidata.lineage.graph import producers, read_graph
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
 from hoidata.splits import choose
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from pipelines.lineage.graph import producers, read_graph
 from pipelines.stages import split
 from pipelines.stages.base import Place
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-from hoidata.contact.surface_contact import TOUCH_M
-from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
 from hoidata.objects.sampling import POINT_COUNT
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from hoidata.surface.contact import TOUCH_M
+from hoidata.surface.store import open_surface
 from pipelines.stages import quality, surface
 from pipelines.stages.base import Place, empty_reason, write_empty
 

@@ -19,14 +19,14 @@ from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, four_sentences
 from hoidata.annotation.stage import annotate_store
 from hoidata.annotation.variations import SentenceMaker
+from hoidata.clips import Clip, HandTrack, ObjectTrack
 from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
-from hoidata.schema import Clip, HandTrack, ObjectTrack
-from hoidata.schema.annotated import load_annotated
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
+from hoidata.store.annotated import load_annotated
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 
 FRAMES = 12
 RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}

@@ -6,11 +6,11 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from hoidata.adapters import get_adapter
-from hoidata.adapters.convert import convert_dataset
 from hoidata.annotation.stage import annotate_store
+from hoidata.conversion.convert import convert_dataset
+from hoidata.datasets import get_adapter
 from hoidata.hands import load_embedded_hands
-from hoidata.schema.store import open_store
+from hoidata.store.store import open_store
 from hoidata.synthetic.corpus import write_corpus
 from hoidata.synthetic.truth import TruthSequence
 

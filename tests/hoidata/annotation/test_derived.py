@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.annotation.derived import derive_verb, object_motion, turning_points
 from hoidata.annotation.grammar import default_grammar
+from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack, Side
-from hoidata.schema.hand_evidence import HandEvidence
+from hoidata.store.hand_evidence import HandEvidence
 
 FRAMES = 90
 PHASE = np.linspace(0, 1, FRAMES)

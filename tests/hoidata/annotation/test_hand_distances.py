@@ -11,6 +11,7 @@ import trimesh
 
 from hoidata.annotation.hand_distances import hand_types_at, write_hand_distances
 from hoidata.annotation.stage import annotate_store
+from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.contact import ProximityIndex, acting_hands
 from hoidata.contact.hands import acting_hands_at_surface
 from hoidata.contact.stage import contact_store
@@ -19,12 +20,11 @@ from hoidata.files.arrays import read_npz, write_npz
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.objects.surface_index import surface_index
-from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack, Side
-from hoidata.schema.annotated import AnnotatedStore, load_annotated
-from hoidata.schema.hand_evidence import HandDistances, HandEvidence
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.hand_evidence import HandDistances, HandEvidence
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 
 RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
 HEIGHTS_M = {"toy/1": (0.012, 0.5), "toy/2": (0.5, 0.015), "toy/3": (0.033, 0.018), "toy/4": (0.3, 0.4)}

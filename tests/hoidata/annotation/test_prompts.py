@@ -6,12 +6,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from hoidata.adapters.grab_words import INTENTS, OBJECTS
-from hoidata.adapters.h2o import ACTIONS
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.prompts import Lexicon, read_prompt
 from hoidata.annotation.reference_mode import reference_sentences, reference_words
 from hoidata.annotation.sentences import four_sentences
+from hoidata.datasets.grab.words import INTENTS, OBJECTS
+from hoidata.datasets.h2o.adapter import ACTIONS
 
 ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
 ARCTIC_OBJECTS = (

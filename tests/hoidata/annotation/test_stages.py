@@ -10,16 +10,16 @@ import trimesh
 
 from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.stage import annotate_store
+from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack
 from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import Hinge, ObjectModel, articulate, place
 from hoidata.objects.sampling import sample_points
-from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack
-from hoidata.schema.annotated import AnnotatedStore, load_annotated
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import open_store, write_store
 from hoidata.splits import split_store
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.info import generated_info
+from hoidata.store.store import open_store, write_store
 
 FRAMES = 6
 RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}

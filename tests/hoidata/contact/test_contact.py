@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack
 from hoidata.contact import (
     ENTRY,
     ProximityIndex,
@@ -19,7 +20,6 @@ from hoidata.contact import (
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel, articulate, place
 from hoidata.objects.sampling import SampledPoints
-from hoidata.schema import SIDES, Clip, HandTrack, ObjectTrack
 
 FRAMES, POINTS = 12, 300
 Joints = dict[str, np.ndarray]

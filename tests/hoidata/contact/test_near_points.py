@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
+from hoidata.clips import ObjectTrack
 from hoidata.contact import ENTRY, ProximityIndex
 from hoidata.contact.near_points import cell_grids, near_entries
 from hoidata.contact.part_frames import PartMotion, part_motion, part_places
@@ -15,7 +16,6 @@ from hoidata.contact.proximity import joints_in_object, joints_in_part
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import SampledPoints
-from hoidata.schema import ObjectTrack
 
 FRAMES, JOINTS = 9, 21
 Scene = tuple[SampledPoints, ObjectTrack, np.ndarray]

@@ -8,10 +8,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hoidata.clips import HandTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, HandKinematics, HandModel, load_embedded_hands, track_joints, track_vertices
 from hoidata.hands.fast_joints import fast_track_joints
-from hoidata.schema import HandTrack
 
 HANDS = load_embedded_hands()
 

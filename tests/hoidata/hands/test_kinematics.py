@@ -3,9 +3,9 @@ import pytest
 import torch
 from scipy.linalg import expm
 
+from hoidata.clips import HandTrack
 from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import PARENTS, TIP_VERTICES, HandKinematics, load_embedded_hands, track_joints, track_vertices
-from hoidata.schema import HandTrack
 
 
 def random_track(n_frames, seed=0, betas_per_frame=False, template_m=None):

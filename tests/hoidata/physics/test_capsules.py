@@ -5,12 +5,12 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import HandTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_vertices
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts, joined
 from hoidata.physics.mano_capsules import N_CAPSULES, THUMB_CAPSULES, fit_capsules, hand_capsules
-from hoidata.schema.clip import HandTrack
 
 SIZE = np.array([0.1, 0.08, 0.06])
 

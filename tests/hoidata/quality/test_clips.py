@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from hoidata.clips import Clip
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
@@ -23,7 +24,6 @@ from hoidata.quality.thresholds import (
     reasons_of,
     verdict_of,
 )
-from hoidata.schema import Clip
 
 FRAMES = 60
 HANDS = load_embedded_hands()

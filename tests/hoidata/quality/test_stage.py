@@ -12,17 +12,17 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hoidata.adapters import get_adapter
-from hoidata.adapters.convert import convert_dataset
+from hoidata.clips import Clip, ObjectTrack
+from hoidata.conversion.convert import convert_dataset
+from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands
 from hoidata.quality import stage
 from hoidata.quality.stage import as_json, quality_store
 from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, MESH_MEASURES, Limit, Thresholds
 from hoidata.quality.verdicts import left_out_reasons
-from hoidata.schema import Clip, ObjectTrack
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import open_store, write_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import open_store, write_store
 from hoidata.synthetic.corpus import write_corpus
 
 FRAMES = 60

@@ -6,7 +6,7 @@ from collections import Counter
 import pandas as pd
 import pytest
 
-from hoidata.adapters.h2o import ACTIONS
+from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.errors import BadInput
 from hoidata.splits import assign_split, choose, definition_names, definitions_for, published
 

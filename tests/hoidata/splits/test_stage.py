@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from hoidata.clips import SourceContact, SourceFile
 from hoidata.errors import BadInput
-from hoidata.schema import SourceContact, SourceFile
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
 from hoidata.splits.stage import motion_digest
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 
 RULE = {"by": "subject", "train": ["s1"], "validation": ["s9"], "test": ["s10"]}
 

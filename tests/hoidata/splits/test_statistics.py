@@ -8,10 +8,10 @@ import pandas as pd
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.schema import SIDES
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import open_store, write_store
+from hoidata.clips import SIDES
 from hoidata.splits.statistics import QUANTILES, summary, training_statistics
+from hoidata.store.info import generated_info
+from hoidata.store.store import open_store, write_store
 
 
 def hand_types(clip_ids, nearest=0.01) -> pd.DataFrame:

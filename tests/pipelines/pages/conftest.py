@@ -8,9 +8,9 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.schema.clip import Clip, HandTrack, ObjectTrack
 
 FRAMES = 24
 GRAVITY = np.array((0.0, 0.0, -1.0))

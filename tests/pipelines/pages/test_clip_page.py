@@ -12,16 +12,16 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.annotation.stage import annotate_store
+from hoidata.clips.clip import CameraTrack, SourceFile
 from hoidata.contact.stage import contact_store
-from hoidata.contact.surface_stage import surface_store
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import track_joints, track_vertices
 from hoidata.quality.stage import quality_store
-from hoidata.schema.annotated import load_annotated
-from hoidata.schema.clip import CameraTrack, SourceFile
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
+from hoidata.store.annotated import load_annotated
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from hoidata.surface.stage import surface_store
 from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
 from pipelines.pages.clip_page_series import measure_clip
 from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline

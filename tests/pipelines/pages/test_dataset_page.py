@@ -8,16 +8,16 @@ import pytest
 import yaml
 
 from hoidata.annotation.stage import annotate_store
+from hoidata.clips.quarantine import Quarantined
 from hoidata.contact.stage import contact_store
-from hoidata.contact.surface_stage import surface_store
-from hoidata.contact.surface_store import open_surface
 from hoidata.errors import BadInput, MissingResource
 from hoidata.quality.stage import quality_store
-from hoidata.schema.annotated import load_annotated
-from hoidata.schema.info import generated_info
-from hoidata.schema.quarantine import Quarantined
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
+from hoidata.store.annotated import load_annotated
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from hoidata.surface.stage import surface_store
+from hoidata.surface.store import open_surface
 from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
 from pipelines.pages.report import ReportFolders, write_report
 from pipelines.pages.surface_facts import contact_by_object

@@ -3,7 +3,7 @@ import pytest
 
 from hoidata.hands import track_joints
 from hoidata.objects.sampling import sample_points
-from models.generation import GeneratedMotion
+from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.generation_page import ARRAYS, write_generation
 
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hoidata.clips.clip import ObjectTrack
 from hoidata.objects.model import ObjectModel
-from hoidata.schema.clip import ObjectTrack
 from pipelines.pages.player import motion_player, three_javascript, write_motion_page
 from pipelines.pages.view import view_of
 

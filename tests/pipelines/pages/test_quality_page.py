@@ -9,8 +9,8 @@ import pytest
 
 from hoidata.quality.stage import quality_store
 from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, MESH_MEASURES
-from hoidata.schema.info import generated_info
-from hoidata.schema.store import write_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
 from pipelines.pages.quality import measures_svg, read_quality
 from pipelines.pages.report import ReportFolders, write_report
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from hoidata.annotation.stage import annotate_store
+from hoidata.clips.quarantine import Quarantined
 from hoidata.contact.stage import contact_store
-from hoidata.schema.info import generated_info
-from hoidata.schema.quarantine import Quarantined
-from hoidata.schema.store import write_store
 from hoidata.splits import split_store
-from models.training import UPSTREAM, train_model
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from models.common.training import UPSTREAM, train_model
 from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
 from pipelines.pages.metrics_table import metrics_tables, number
@@ -104,7 +104,7 @@ def test_report_repeats_byte_for_byte_and_fetches_nothing(folders, hands, tmp_pa
 
 
 def test_shown_clips_are_held_out_ones(folders, hands):
-    from hoidata.schema.annotated import load_annotated
+    from hoidata.store.annotated import load_annotated
 
     assert shown_ids(load_annotated(folders.data / "grab", hands), 3) == ["test/s2/box"]
 

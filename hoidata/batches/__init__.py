@@ -1,0 +1,1 @@
+"""Clips as training sees them: samples, batches and the torch dataset."""

@@ -1,0 +1,376 @@
+"""Annotated clips as training samples: a torch Dataset with split, crop, padding and collate.
+
+A sample lives in the *model frame*: the clip's world turned so that things fall along -z (where the gravity direction
+is known) and moved so that the object's origin lies at zero in the first frame. The stored clips are never changed;
+``world_from_model`` takes every sample back.
+
+Features follow Text2HOI (Cha et al. 2024, Sec. 3.2.1). One hand, 99 numbers per frame: wrist position (3, metres), then
+16 local rotations in 6D, the global one first, absolute. One object, 10 numbers: position (3), rotation in 6D, hinge
+angle (radians, 0 for rigid objects). Sides are ordered left, right.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotmat_to_rot6d, rotvec_to_rotmat
+from hoidata.hands import track_rotmats
+from hoidata.objects.model import ObjectModel
+from hoidata.store.distances import DistanceEntries
+
+HAND_FEATURES, OBJECT_FEATURES, N_ROTATIONS = 99, 10, 16
+MAX_FRAMES = 150
+CONTACT_THRESHOLD_M = 0.02
+Crop = Literal["random", "start"]
+
+
+@dataclass(frozen=True)
+class ObjectPoints:
+    """The sampled points of one object, in its own frame: points_m, normals (1024, 3), part (1024,) 0 or 1."""
+
+    points_m: np.ndarray
+    normals: np.ndarray
+    part: np.ndarray
+
+
+@dataclass(frozen=True)
+class ClipSample:
+    """One clip in the model frame; NumPy arrays, axes (side, frame, ...), metres and radians.
+
+    hands (2, F, 99), object (F, 10), joints_m (2, F, 21, 3): features and true joints, with the clip's own hand shape.
+    valid (2, F): frames in which a side was tracked. acts (2,): the sides that take part in the interaction.
+    contact (2, 1024): points that came within 2 cm of a joint of that acting side in these frames.
+    text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
+    start: first frame within the clip. world_from_model (4, 4).
+    """
+
+    clip_id: str
+    dataset: str
+    verb: str | None
+    object_words: str
+    object_key: str
+    object_model: ObjectModel
+    hand_type: str
+    sentences: tuple[str, ...]
+    synthetic: bool
+    start: int
+    hands: np.ndarray
+    object: np.ndarray
+    joints_m: np.ndarray
+    valid: np.ndarray
+    acts: np.ndarray
+    betas: np.ndarray
+    template_m: np.ndarray | None
+    text: np.ndarray
+    points: ObjectPoints
+    contact: np.ndarray
+    distances: DistanceEntries
+    world_from_model: np.ndarray
+
+    @property
+    def length(self) -> int:
+        return len(self.object)
+
+    @property
+    def touched(self) -> np.ndarray:
+        """(1024,) bool contact map of Text2HOI: the points touched by any acting hand."""
+        return np.logical_or(self.contact[0], self.contact[1])
+
+    def crop(self, start: int, length: int) -> "ClipSample":
+        """``length`` frames from ``start``; contact map and distances are restricted to them. The frame stays."""
+        stop = start + length
+        distances = self.distances.window(start, stop)
+        return replace(
+            self,
+            start=self.start + start,
+            hands=self.hands[:, start:stop],
+            object=self.object[start:stop],
+            joints_m=self.joints_m[:, start:stop],
+            valid=self.valid[:, start:stop],
+            contact=contact_of(distances, len(self.points.points_m)),
+            distances=distances,
+        ).recentred()
+
+    def recentred(self) -> "ClipSample":
+        """The same frames with the object's origin at zero in the first of them."""
+        shift = self.object[0, :3].copy()
+        hands, objects = self.hands.copy(), self.object.copy()
+        hands[..., :3] -= shift
+        objects[:, :3] -= shift
+        move = np.eye(4)
+        move[:3, 3] = shift
+        return replace(
+            self,
+            hands=hands,
+            object=objects,
+            joints_m=self.joints_m - shift,
+            world_from_model=self.world_from_model @ move,
+        )
+
+
+class Annotated(Protocol):
+    """What a dataset needs of ``hoidata.store.annotated.AnnotatedStore``."""
+
+    def split_ids(self, split: str) -> list[str]: ...
+    def clip(self, clip_id: str) -> Clip: ...
+    def joints(self, clip_id: str, side: Side) -> np.ndarray: ...
+    def hand_type(self, clip_id: str) -> str: ...
+    def sentences(self, clip_id: str) -> Sequence[str]: ...
+    def text_embedding(self, clip_id: str) -> np.ndarray: ...
+    def object_key(self, clip_id: str) -> str: ...
+    def points(self, object_key: str) -> Any: ...
+    def distances(self, clip_id: str) -> Any: ...
+
+
+class HoiDataset(Dataset):
+    """Clips of one split as :class:`ClipSample`, at most ``max_frames`` long.
+
+    crop: "random" draws a window anew for every epoch (see ``set_epoch``) from (seed, epoch, index), so that the same
+    seed gives the same windows in any order of access; "start" takes the first frames. Samples are kept in memory.
+    """
+
+    def __init__(
+        self, annotated: Annotated, split: str, max_frames: int = MAX_FRAMES, crop: Crop = "random", seed: int = 0
+    ) -> None:
+        if crop not in ("random", "start"):
+            raise BadInput("HoiDataset crop", '"random" or "start"', repr(crop), "name one of them")
+        self.annotated, self.split = annotated, split
+        self.max_frames, self.crop, self.seed = max_frames, crop, seed
+        self.epoch = 0
+        self.ids = list(annotated.split_ids(split))
+        self._samples: dict[str, ClipSample] = {}
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __iter__(self) -> Iterator[ClipSample]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> ClipSample:
+        whole = self.whole(self.ids[index])
+        spare = whole.length - self.max_frames
+        if spare <= 0:
+            return whole
+        if self.crop == "start":
+            return whole.crop(0, self.max_frames)
+        generator = np.random.default_rng([self.seed, self.epoch, index])
+        return whole.crop(int(generator.integers(0, spare + 1)), self.max_frames)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose which random windows the next accesses get."""
+        self.epoch = epoch
+
+    def whole(self, clip_id: str) -> ClipSample:
+        """The uncropped sample of a clip."""
+        if clip_id not in self._samples:
+            self._samples[clip_id] = load_sample(self.annotated, clip_id)
+        return self._samples[clip_id]
+
+
+def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
+    """The whole clip as a sample in the model frame."""
+    clip = annotated.clip(clip_id)
+    hand_type = annotated.hand_type(clip_id)
+    acts = np.array([hand_type in (side, "both") for side in SIDES])
+    rotation = upright(clip.gravity)
+    origin = clip.object.translation_m[0].astype(np.float64)
+    points = _points(annotated, annotated.object_key(clip_id))
+    distances = _acting_entries(annotated.distances(clip_id), acts)
+    tracks = [clip.hands[side] for side in SIDES]
+    joints = np.stack([(annotated.joints(clip_id, side) - origin) @ rotation.T for side in SIDES])
+    return ClipSample(
+        clip_id=clip_id,
+        dataset=clip.dataset,
+        verb=clip.verb,
+        object_words=clip.object_words,
+        object_key=annotated.object_key(clip_id),
+        object_model=clip.object.model,
+        hand_type=hand_type,
+        sentences=tuple(annotated.sentences(clip_id)),
+        synthetic=clip.synthetic,
+        start=0,
+        hands=np.stack([hand_features(track, rotation, origin) for track in tracks]),
+        object=object_features(clip.object, rotation, origin),
+        joints_m=joints.astype(np.float32),
+        valid=np.stack([track.valid for track in tracks]).astype(bool),
+        acts=acts,
+        betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
+        template_m=_templates(tracks),
+        text=np.asarray(annotated.text_embedding(clip_id), dtype=np.float32),
+        points=points,
+        contact=contact_of(distances, len(points.points_m)),
+        distances=distances,
+        world_from_model=_world_from_model(rotation, origin),
+    )
+
+
+def hand_features(track: HandTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
+    """(frame, 99) float32 features in the model frame: rotation ``model_from_world`` (3, 3) about ``origin_m`` (3,)."""
+    rotmats = track_rotmats(track).astype(np.float64)
+    rotmats[:, 0] = model_from_world @ rotmats[:, 0]
+    wrist = (track.wrist_m - origin_m) @ model_from_world.T
+    return np.concatenate((wrist, rotmat_to_rot6d(rotmats).reshape(len(wrist), -1)), axis=1, dtype=np.float32)
+
+
+def object_features(track: ObjectTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
+    """(frame, 10) float32 features in the model frame; the hinge angle of a rigid object is 0."""
+    rotation = model_from_world @ rotvec_to_rotmat(track.rotvec.astype(np.float64))
+    position = (track.translation_m - origin_m) @ model_from_world.T
+    hinge = np.zeros(len(position)) if track.hinge_rad is None else track.hinge_rad
+    return np.concatenate((position, rotmat_to_rot6d(rotation), hinge[:, None]), axis=1, dtype=np.float32)
+
+
+def upright(gravity: np.ndarray | None) -> np.ndarray:
+    """(3, 3) smallest rotation that turns the gravity direction (3,) to -z; the identity where it is unknown."""
+    if gravity is None:
+        return np.eye(3)
+    down = np.asarray(gravity, dtype=np.float64) / np.linalg.norm(gravity)
+    axis = np.cross(down, (0.0, 0.0, -1.0))
+    sine, cosine = float(np.linalg.norm(axis)), float(-down[2])
+    if sine < 1e-9:
+        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
+    return rotvec_to_rotmat(axis / sine * np.arctan2(sine, cosine))
+
+
+def contact_of(distances: DistanceEntries, n_points: int) -> np.ndarray:
+    """(2, point) bool: points within 2 cm of a joint of each side in any frame of the entries."""
+    contact = np.zeros((2, n_points), dtype=bool)
+    near = distances.distance_m < CONTACT_THRESHOLD_M
+    contact[distances.side[near], distances.point[near]] = True
+    return contact
+
+
+def _world_from_model(rotation: np.ndarray, origin: np.ndarray) -> np.ndarray:
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation.T, origin
+    return matrix
+
+
+def _templates(tracks: list[HandTrack]) -> np.ndarray | None:
+    left, right = (track.template_m for track in tracks)
+    return None if left is None or right is None else np.stack((left, right)).astype(np.float32)
+
+
+def _points(annotated: Annotated, object_key: str) -> ObjectPoints:
+    stored = annotated.points(object_key)
+    return ObjectPoints(
+        np.asarray(stored.points_m, np.float32), np.asarray(stored.normals, np.float32), np.asarray(stored.part)
+    )
+
+
+def _acting_entries(stored: Any, acts: np.ndarray) -> DistanceEntries:
+    index = {name: np.asarray(getattr(stored, name), np.int64) for name in ("side", "frame", "joint", "point")}
+    entries = DistanceEntries(**index, distance_m=np.asarray(stored.distance_m, np.float32))
+    return entries.select(acts[entries.side])
+
+
+@dataclass(frozen=True)
+class ClipBatch:
+    """Clips padded to the longest of them; tensors with axes (clip, side, frame, ...), padding is zero.
+
+    frames (B, F): True where a clip has a frame. present (B, 2, F): the side acts and is tracked in the frame.
+    acts (B, 2). entries: (entry, 5) int64 rows (clip, side, frame, joint, point) and their distances (entry,).
+    hinge_axis, hinge_origin_m (B, 3), zero for rigid objects; articulated (B,). template_m (B, 2, 778, 3) or None.
+    """
+
+    samples: tuple[ClipSample, ...]
+    hands: Tensor
+    object: Tensor
+    joints_m: Tensor
+    frames: Tensor
+    present: Tensor
+    acts: Tensor
+    lengths: Tensor
+    betas: Tensor
+    template_m: Tensor | None
+    text: Tensor
+    points_m: Tensor
+    normals: Tensor
+    part: Tensor
+    contact: Tensor
+    entries: Tensor
+    entry_distance_m: Tensor
+    hinge_axis: Tensor
+    hinge_origin_m: Tensor
+    articulated: Tensor
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @property
+    def touched(self) -> Tensor:
+        """(B, 1024) contact map as 0 or 1, float32: both acting hands together."""
+        return self.contact.any(1).float()
+
+    def to(self, device: torch.device | str) -> "ClipBatch":
+        """The batch with every tensor on ``device``."""
+        parts = {field.name: getattr(self, field.name) for field in fields(self)}
+        return replace(self, **{name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)})
+
+
+def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
+    """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
+    n_frames = max(sample.length for sample in samples)
+    frames = np.zeros((len(samples), n_frames), dtype=bool)
+    for row, sample in enumerate(samples):
+        frames[row, : sample.length] = True
+    valid = np.stack([_padded(sample.valid, 1, n_frames) for sample in samples])
+    acts = np.stack([sample.acts for sample in samples])
+    hinges = [sample.object_model.hinge for sample in samples]
+    rows, distance = _entry_rows(samples if with_entries else ())
+    arrays = {
+        "hands": np.stack([_padded(sample.hands, 1, n_frames) for sample in samples]),
+        "object": np.stack([_padded(sample.object, 0, n_frames) for sample in samples]),
+        "joints_m": np.stack([_padded(sample.joints_m, 1, n_frames) for sample in samples]),
+        "frames": frames,
+        "present": valid & acts[:, :, None] & frames[:, None],
+        "acts": acts,
+        "lengths": np.array([sample.length for sample in samples]),
+        "betas": np.stack([sample.betas for sample in samples]),
+        "text": np.stack([sample.text for sample in samples]),
+        "points_m": np.stack([sample.points.points_m for sample in samples]),
+        "normals": np.stack([sample.points.normals for sample in samples]),
+        "part": np.stack([sample.points.part for sample in samples]).astype(np.int64),
+        "contact": np.stack([sample.contact for sample in samples]),
+        "entries": rows,
+        "entry_distance_m": distance,
+        "hinge_axis": np.stack([np.zeros(3) if h is None else h.axis for h in hinges]).astype(np.float32),
+        "hinge_origin_m": np.stack([np.zeros(3) if h is None else h.origin_m for h in hinges]).astype(np.float32),
+        "articulated": np.array([hinge is not None for hinge in hinges]),
+    }
+    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    return ClipBatch(samples=tuple(samples), template_m=_batch_templates(samples), **tensors)
+
+
+def _padded(array: np.ndarray, axis: int, n_frames: int) -> np.ndarray:
+    widths = [(0, 0)] * array.ndim
+    widths[axis] = (0, n_frames - array.shape[axis])
+    return np.pad(array, widths)
+
+
+def _entry_rows(samples: Sequence[ClipSample]) -> tuple[np.ndarray, np.ndarray]:
+    rows, distances = [np.zeros((0, 5), np.int64)], [np.zeros(0, np.float32)]
+    for index, sample in enumerate(samples):
+        entries = sample.distances
+        clip = np.full(len(entries.frame), index)
+        rows.append(np.stack((clip, entries.side, entries.frame, entries.joint, entries.point), axis=1))
+        distances.append(entries.distance_m)
+    return np.concatenate(rows), np.concatenate(distances)
+
+
+def _batch_templates(samples: Sequence[ClipSample]) -> Tensor | None:
+    templates = [sample.template_m for sample in samples]
+    if all(template is None for template in templates):
+        return None
+    if any(template is None for template in templates):
+        raise BadInput(
+            "collate", "personal hand templates in all clips or in none", "a mixture", "batch one dataset at a time"
+        )
+    return torch.from_numpy(np.stack([template for template in templates if template is not None]))

@@ -1,0 +1,187 @@
+"""Rules every clip of an adapter keeps, whatever the dataset: ids, words, times, units, frames, sources."""
+
+import re
+from collections.abc import Callable
+from itertools import chain
+from typing import Literal
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.validation import check_clip
+from hoidata.conformance.loading import Loaded
+from hoidata.conformance.report import Finding, finding
+from hoidata.datasets.base import Adapter, Quarantined
+from hoidata.errors import BadInput
+from hoidata.objects.model import ObjectModel
+
+VERB = re.compile(r"[a-z]+( [a-z]+)*")
+NOUN = re.compile(r"[A-Z]?[a-z]+([ '-][A-Z]?[a-z]+)*")  # a proper name may be among them: Stanford bunny
+UP_AXES = {f"{sign}{axis}": i for i, axis in enumerate("xyz") for sign in "+-"}
+LARGEST_FIT_ERROR_M = 0.015
+FEWEST_VALID = 0.5
+
+ClipRule = Callable[[Adapter, Clip], list[str]]
+
+
+def clip_findings(adapter: Adapter, loaded: list[Loaded]) -> list[Finding]:
+    """The rules over all results of some sequences."""
+    clips = list(chain.from_iterable(item.clips for item in loaded))
+    return [
+        finding("results are clips or left-out stretches", _kinds(loaded)),
+        finding("ids come from the sequence's key and are unique", _ids(loaded)),
+        _per_clip("clips say where they come from", _origin, adapter, clips),
+        finding("clips name the files they were made from", _sources(loaded)),
+        finding("files that are read belong to a declared part", _undeclared(adapter, loaded)),
+        _per_clip("clips are valid: shapes, finite numbers, possible sizes", _validity, adapter, clips),
+        _per_clip("frames are 1/30 s apart by the source's own clock", _clock, adapter, clips),
+        _per_clip("words are words: a lower-case verb or None, and a noun", _words, adapter, clips),
+        _per_clip("gravity is as declared, or None with a note", _gravity, adapter, clips),
+        _per_clip("the way back to the source is a similarity", _way_back, adapter, clips),
+        _per_clip("hands are from parameters, or fitted with a stated error", _hands_from, adapter, clips),
+        _per_clip("object meshes are not turned inside out (mirrored)", _mirrored, adapter, clips, "warn"),
+        finding("both hands are there", _both_hands(clips), "warn"),
+    ]
+
+
+def _per_clip(
+    rule: str, check: ClipRule, adapter: Adapter, clips: list[Clip], outcome: Literal["fail", "warn"] = "fail"
+) -> Finding:
+    return finding(rule, [f"{clip.clip_id}: {text}" for clip in clips for text in check(adapter, clip)], outcome)
+
+
+def _kinds(loaded: list[Loaded]) -> list[str]:
+    wrong = [(item.key, type(result)) for item in loaded for result in item.results]
+    return [f"{key}: a {kind.__name__}" for key, kind in wrong if not issubclass(kind, Clip | Quarantined)]
+
+
+def _ids(loaded: list[Loaded]) -> list[str]:
+    problems, seen = [], set()
+    for item in loaded:
+        names = [clip.clip_id for clip in item.clips]
+        left_out = [result.source_key for result in item.results if isinstance(result, Quarantined)]
+        for name in names + left_out:
+            if name != str(item.key) and not name.startswith(f"{item.key}/"):
+                problems.append(f"{name} does not begin with {item.key}")
+        problems += [f"{name} is there twice" for name in names if name in seen or names.count(name) > 1]
+        seen.update(names)
+    return problems
+
+
+def _origin(adapter: Adapter, clip: Clip) -> list[str]:
+    problems = [] if clip.dataset == adapter.name else [f"its dataset is {clip.dataset!r}"]
+    if not clip.subject:
+        problems.append("it has no subject")
+    if not clip.sequence or not clip.clip_id.startswith(f"{adapter.name}/{clip.sequence}"):
+        problems.append(f"its sequence is {clip.sequence!r}")
+    return problems
+
+
+def _sources(loaded: list[Loaded]) -> list[str]:
+    problems = []
+    for item in loaded:
+        known = {source.path: source for source in item.sources}
+        for clip in item.clips:
+            if not clip.sources:
+                problems.append(f"{clip.clip_id}: none")
+            problems += [f"{clip.clip_id}: {s.path} was not read" for s in clip.sources if known.get(s.path) != s]
+    return problems
+
+
+def _undeclared(adapter: Adapter, loaded: list[Loaded]) -> list[str]:
+    paths = sorted({source.path for item in loaded for source in item.sources})
+    undeclared = [path for path in paths if not any(part.holds(path) for part in adapter.parts)]
+    return [f"{path} matches no pattern of parts: `raw scan` would leave it out" for path in undeclared]
+
+
+def _validity(adapter: Adapter, clip: Clip) -> list[str]:
+    try:
+        check_clip(clip)
+    except BadInput as error:
+        return [f"{error.where.removeprefix(f'{clip.clip_id}: ')}: expected {error.expected}, got {error.got}"]
+    except Exception as error:  # a missing or foreign array can break the check itself
+        return [f"it cannot be checked: {error!r}"]
+    return []
+
+
+def _clock(adapter: Adapter, clip: Clip) -> list[str]:
+    if len(clip.source_frames) != clip.object.n_frames:
+        return [f"{len(clip.source_frames)} source frames for {clip.object.n_frames} frames"]
+    if not 1 <= clip.source_fps <= 1000:
+        return [f"source_fps is {clip.source_fps}"]
+    passed_s = (clip.source_frames - clip.source_frames[0]) / clip.source_fps
+    drift_s = np.abs(passed_s - np.arange(clip.n_frames) / FPS).max()
+    if drift_s > 1 / FPS + 1e-6:
+        seconds = f"{clip.n_frames} frames at {FPS} per second are {(clip.n_frames - 1) / FPS:.2f} s"
+        return [f"{seconds}, its source frames at {clip.source_fps:g} {passed_s[-1]:.2f} s"]
+    return []
+
+
+def _words(adapter: Adapter, clip: Clip) -> list[str]:
+    problems = []
+    if clip.verb is not None and not VERB.fullmatch(clip.verb):
+        problems.append(f"the verb {clip.verb!r}")
+    if not NOUN.fullmatch(clip.object_words):
+        problems.append(f"the object {clip.object_words!r}")
+    return problems
+
+
+def _gravity(adapter: Adapter, clip: Clip) -> list[str]:
+    frame = adapter.frame
+    if clip.gravity is None:
+        problems = [] if clip.gravity_note else ["no gravity, and no note why"]
+        return problems + (["no gravity, though the frame states it"] if frame.gravity == "stated" else [])
+    if frame.gravity == "unknown":
+        return [f"gravity {clip.gravity}, though the frame says it is unknown"]
+    if frame.gravity == "estimated":
+        return [] if clip.gravity_note else ["no note on how gravity was estimated"]
+    down = np.zeros(3)
+    if frame.up_axis is not None:
+        down[UP_AXES[frame.up_axis]] = -1.0 if frame.up_axis[0] == "+" else 1.0
+    return [] if np.allclose(clip.gravity, down, atol=1e-6) else [f"gravity {clip.gravity}, up is {frame.up_axis}"]
+
+
+def _way_back(adapter: Adapter, clip: Clip) -> list[str]:
+    matrix = np.asarray(clip.source_from_world, dtype=np.float64)
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all() or not np.allclose(matrix[3], (0, 0, 0, 1)):
+        return ["source_from_world is no 4x4 matrix that shifts and turns points"]
+    square = matrix[:3, :3] @ matrix[:3, :3].T
+    scale = np.trace(square) / 3
+    is_similar = scale > 0 and np.allclose(square, scale * np.eye(3), atol=1e-4 * scale)
+    return [] if is_similar else ["source_from_world shears"]
+
+
+def _hands_from(adapter: Adapter, clip: Clip) -> list[str]:
+    fitted = clip.hands_from == "keypoints"  # a setting may ask for it where a source has parameters too
+    if adapter.hand_convention.shape == "fitted" and not fitted:
+        return [f"hands_from is {clip.hands_from!r}, the declared shape 'fitted'"]
+    if (clip.fit_error_m is None) == fitted:
+        return ["fit_error_m is to be stated where hands are fitted, and only there"]
+    if clip.fit_error_m is not None and not 0 <= clip.fit_error_m <= LARGEST_FIT_ERROR_M:
+        return [f"the fit misses the joints by {clip.fit_error_m * 1e3:.1f} mm: joint order, side or unit?"]
+    return []
+
+
+def _mirrored(adapter: Adapter, clip: Clip) -> list[str]:
+    tracks = (clip.object, *clip.other_objects)
+    return [track.model.name for track in tracks if _is_inside_out(track.model)]
+
+
+def _is_inside_out(model: ObjectModel) -> bool:
+    """The volume by the divergence theorem is below minus 1 % of the bounding box: open meshes give vague volumes."""
+    corners = (model.vertices_m - model.vertices_m.mean(axis=0))[model.faces]
+    volume = np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    return bool(volume < -0.01 * np.ptp(model.vertices_m, axis=0).prod())
+
+
+def _both_hands(clips: list[Clip]) -> list[str]:
+    problems = []
+    for side in SIDES:
+        if not any(clip.hands[side].valid.any() for clip in clips if side in clip.hands):
+            problems.append(f"the {side} hand is valid in no frame")
+    empty = [clip.clip_id for clip in clips if _valid_share(clip) < FEWEST_VALID]
+    return problems + [f"{name}: no hand is valid in most frames" for name in empty]
+
+
+def _valid_share(clip: Clip) -> float:
+    return float(np.any([track.valid for track in clip.hands.values()], axis=0).mean())

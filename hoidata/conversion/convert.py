@@ -1,0 +1,183 @@
+"""One dataset from raw files to the store: every sequence converts or is listed with its reason.
+
+Each sequence's results are kept as soon as they are made (``finished``); when all are there, they become the store in
+the order of the keys. So a run that was killed goes on where it was, at most one sequence per worker is in memory, and
+the bytes depend neither on the number of workers nor on how often the run was killed.
+"""
+
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+
+from hoidata.clips.clip import Clip, SourceFile
+from hoidata.clips.hand_parameters import hands_for
+from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.validation import check_clip
+from hoidata.conversion.finished import FinishedWork, job_of
+from hoidata.datasets.base import Adapter, RawTree, SequenceKey
+from hoidata.errors import BadInput
+from hoidata.files.atomic import exclusive, remove_leftovers
+from hoidata.hands import HandPair
+from hoidata.store.info import store_info
+from hoidata.store.store import open_store, write_store
+from hoidata.workers import WorkerLost, in_workers
+
+DEFECT = "report this defect of hoidata"
+GENERATED_LICENCE = "CC0-1.0"
+
+
+@dataclass(frozen=True)
+class ConversionSummary:
+    """What a conversion did.
+
+    left_out: every sequence, or stretch of one, that gave no clip, with its reason. taken_up: sequences an interrupted
+    run had finished before.
+    """
+
+    dataset: str
+    sequences: int
+    clips: int
+    frames: int
+    left_out: tuple[Quarantined, ...]
+    empty_reason: str | None = None
+    taken_up: int = 0
+
+    def __str__(self) -> str:
+        if self.empty_reason:
+            return f"{self.dataset}: empty ({self.empty_reason})"
+        head = f"{self.dataset}: {self.clips} clips, {self.frames} frames from {self.sequences} sequences"
+        head += f" ({self.taken_up} finished before)" if self.taken_up else ""
+        lines = [f"{head}; {len(self.left_out)} left out{':' if self.left_out else ''}"]
+        for item in self.left_out:
+            lines.append(f"  {item.source_key}: {item.where}: expected {item.expected}, got {item.got}; {item.remedy}")
+        return "\n".join(lines)
+
+
+def convert_dataset(
+    adapter: Adapter,
+    root: str | Path | None,
+    hands: HandPair,
+    out: str | Path,
+    jobs: int = 1,
+    manifest: Mapping[str, SourceFile] | Iterable[SourceFile] | None = None,
+    progress: bool = True,
+    synthetic: bool = False,
+) -> ConversionSummary:
+    """Convert every sequence below ``root`` and write the store ``out``.
+
+    root: None, or a folder without sequences, gives a valid empty store that says why. jobs: worker processes; order
+    and bytes of the result do not depend on it. manifest: each file read must be listed with its SHA-256.
+    synthetic: the raw data was generated; every clip and the store say so. progress: a bar on stderr and the summary
+    on stdout.
+
+    A run that ends early, even by ``kill -9``, leaves ``.<name>.work`` beside ``out``; the next one takes up what was
+    finished there if neither raw files, code nor settings have changed. Raises BadInput when a worker process is
+    lost, when ``out`` is being written by another run, or when there is no room.
+    """
+    hands = hands_for(adapter.hand_convention, hands)
+    keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
+    reason = None if keys else _why_empty(adapter, root)
+    files = manifest.values() if isinstance(manifest, Mapping) else manifest
+    listed = None if files is None else {item.path: item for item in files}
+    out, root = Path(out), Path(root or ".")
+    work = FinishedWork(out.with_name(f".{out.name}.work"), root)
+    convert = SequenceConverter(adapter, root, hands, listed, synthetic, work)
+    with exclusive(out) as lock:
+        remove_leftovers(out)
+        work.open(job_of(adapter, hands, root, keys, listed, synthetic))
+        taken_up = _convert_all(convert, keys, jobs, lock, progress)
+        items = (item for key in keys for item in work.read(key))
+        counts = write_store(out, items, _store_info(adapter, hands, synthetic, reason))
+        work.remove()
+        # Read back: the store leaves out clips of its own accord, too (an id that is given twice).
+        left_out = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
+    summary = ConversionSummary(adapter.name, len(keys), counts["clips"], counts["frames"], left_out, reason, taken_up)
+    if progress:
+        print(summary, file=sys.stdout)
+    return summary
+
+
+@dataclass(frozen=True)
+class SequenceConverter:
+    """What a worker needs: called with a key, it leaves that sequence's results in ``work``."""
+
+    adapter: Adapter
+    root: Path
+    hands: HandPair
+    manifest: Mapping[str, SourceFile] | None
+    synthetic: bool
+    work: FinishedWork
+
+    def __call__(self, key: SequenceKey) -> None:
+        raw = RawTree(self.root, self.manifest)
+        try:
+            results = [self._checked(item) for item in self.adapter.load(raw, key, self.hands)]
+        except BadInput as error:
+            self.work.keep(key, [_left_out(key, self.root, error)], None)
+        except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
+            problem = BadInput(str(key), "a sequence the adapter can read", repr(error), DEFECT)
+            self.work.keep(key, [_left_out(key, self.root, problem)], None)
+        else:
+            self.work.keep(key, results, raw.sources)
+
+    def _checked(self, item: Clip | Quarantined) -> Clip | Quarantined:
+        return item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
+
+
+def _convert_all(convert: SequenceConverter, keys: Sequence[SequenceKey], jobs: int, lock: int, progress: bool) -> int:
+    """Convert every sequence that was not finished before; how many were."""
+    missing = [key for key in keys if not convert.work.holds(key)]
+    taken_up = len(keys) - len(missing)
+    title = f"convert {convert.adapter.name}" + (f" ({taken_up} finished before)" if taken_up else "")
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        task = bar.add_task(title, total=len(keys), completed=taken_up)
+        done = 0
+        try:
+            for _ in in_workers(convert, missing, jobs, lock):
+                done += 1
+                bar.advance(task)
+        except WorkerLost as error:
+            raise _worker_lost(error, taken_up + done, len(keys)) from error
+    return taken_up
+
+
+def _worker_lost(error: WorkerLost, finished: int, total: int) -> BadInput:
+    remedy = (
+        f"run it again: {finished} of {total} sequences are finished and kept; if memory ran out, set HOIDATA_JOBS=1"
+    )
+    where = ", ".join(map(str, error.in_flight)) or "conversion"
+    return BadInput(where, "worker processes that live until they are done", f"one lost ({error.cause})", remedy)
+
+
+def _left_out(key: SequenceKey, root: Path, error: BadInput) -> Quarantined:
+    """The error with paths below the raw root, so that the store does not depend on where the raw data lies."""
+    prefix = f"{root}/"
+    where, got = error.where.replace(prefix, ""), error.got.replace(prefix, "")
+    return Quarantined(str(key), where, error.expected.replace(prefix, ""), got, error.remedy)
+
+
+def _why_empty(adapter: Adapter, root: str | Path | None) -> str:
+    if root is None:
+        return f"no raw folder was given; register at {adapter.where_to_register}"
+    what = "has no sequences" if Path(root).is_dir() else "does not exist"
+    return f"the raw folder {Path(root).name} {what}; register at {adapter.where_to_register}"
+
+
+def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str | None) -> dict[str, object]:
+    return store_info(
+        adapter.name,
+        hands,
+        frame=adapter.frame,
+        hand_convention=adapter.hand_convention,
+        dataset_version=adapter.version,
+        licence=f"{GENERATED_LICENCE} (generated in the files of {adapter.name})" if synthetic else adapter.licence,
+        may_be_shared=synthetic or adapter.may_be_shared,
+        source_fps=adapter.source_fps,
+        synthetic=synthetic,
+        where_to_register=adapter.where_to_register,
+        empty_reason=reason,
+    )

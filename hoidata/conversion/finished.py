@@ -1,0 +1,185 @@
+"""Finished sequences of a conversion, kept beside the store until it is whole, so that a killed run can go on.
+
+    .clips.work/job.json             what decides every result: adapter and settings, hands, schema, code, libraries
+    .clips.work/sequences/<key>.npz  sources (their state when they were read), results and data (see ``packing``)
+    .clips.work/shared/<sha256>.npz  one mesh or hand template, however many sequences have it
+
+Every file appears whole or not at all, written by the worker that made it: results never pass between processes.
+"""
+
+import inspect
+import json
+import os
+import shutil
+import zipfile
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import Clip, SourceFile
+from hoidata.clips.quarantine import Quarantined
+from hoidata.conversion.packing import Packer, unpack
+from hoidata.datasets.base import Adapter, SequenceKey
+from hoidata.errors import BadInput
+from hoidata.files import canonical_json, sha256_bytes, sha256_file
+from hoidata.files.arrays import read_npz, write_npz
+from hoidata.hands import HandPair
+from hoidata.store.store import SCHEMA_VERSION
+
+# The code a conversion runs: these rooms of hoidata, and the adapter's own file wherever it lies.
+ROOMS = ("adapters", "schema", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
+LIBRARIES = ("numpy", "scipy", "torch", "trimesh")
+_CACHED_ARRAYS = 32
+
+
+@dataclass(frozen=True)
+class FinishedWork:
+    """The folder of finished sequences of one job. root: of the raw files."""
+
+    folder: Path
+    root: Path
+    _arrays: dict[str, np.ndarray] = field(default_factory=dict, repr=False, compare=False)
+
+    def open(self, job: Mapping[str, Any]) -> None:
+        """Keep what is there if it comes from an equal ``job``, else start anew. Only under ``exclusive``."""
+        stated, text = self.folder / "job.json", canonical_json(job)
+        if not stated.is_file() or stated.read_text(encoding="utf-8") != text:
+            self.remove()
+            self.folder.mkdir(parents=True)
+            stated.write_text(text, encoding="utf-8")
+        for name in ("sequences", "shared"):
+            (self.folder / name).mkdir(exist_ok=True)
+            for part in (self.folder / name).glob(".*.part"):
+                part.unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Delete the folder; a kill meanwhile leaves none that could be taken for a whole one."""
+        dead = self.folder.with_suffix(".dead.part")  # a name that ``remove_leftovers`` knows
+        if self.folder.exists():
+            shutil.rmtree(dead, ignore_errors=True)
+            os.replace(self.folder, dead)
+        shutil.rmtree(dead, ignore_errors=True)
+
+    def keep(self, key: SequenceKey, results: list[Clip | Quarantined], sources: Sequence[SourceFile] | None) -> None:
+        """Write the results of one sequence. sources: what was read; None for one that failed and is to be redone."""
+        packer = Packer(self._share)
+        try:
+            packed = packer.pack(results)
+            state = None if sources is None else self._state([source.path for source in sources])
+            members = {
+                "sources": _text(canonical_json({"state": state, "shared": sorted(packer.shared)})),
+                "results": _text(json.dumps(packed)),
+                "data": np.frombuffer(b"".join(packer.blocks), np.uint8),
+            }
+            write_npz(self._file(key), members)
+        except OSError as error:
+            remedy = "make room there and run again: finished sequences are kept"
+            raise BadInput(self.folder, "a folder that can be written", str(error), remedy) from error
+
+    def holds(self, key: SequenceKey) -> bool:
+        """Whether the sequence was finished, and its sources are still as they were then."""
+        try:
+            # Opened here: NumPy leaves the file open when it is no archive.
+            with open(self._file(key), "rb") as stream, np.load(stream, allow_pickle=False) as archive:
+                stated = json.loads(archive["sources"].tobytes())
+            if stated["state"] is None or not all(self._shared_file(name).is_file() for name in stated["shared"]):
+                return False
+            return stated["state"] == self._state(stated["state"]["files"])
+        except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
+            return False  # not there, or damaged: it is made again
+
+    def read(self, key: SequenceKey) -> list[Clip | Quarantined]:
+        """The results of one finished sequence, equal in every bit to those that were kept."""
+        arrays = read_npz(self._file(key))
+        return unpack(json.loads(arrays["results"].tobytes()), arrays["data"], self._shared)
+
+    def _file(self, key: SequenceKey) -> Path:
+        return self.folder / "sequences" / f"{sha256_bytes(str(key).encode())[:32]}.npz"
+
+    def _shared_file(self, name: str) -> Path:
+        return self.folder / "shared" / f"{name}.npz"
+
+    def _share(self, array: np.ndarray) -> str:
+        head = f"{array.dtype.str}{array.shape}".encode()
+        name = sha256_bytes(head + array.tobytes())
+        if not self._shared_file(name).is_file():
+            write_npz(self._shared_file(name), {"array": array})
+        return name
+
+    def _shared(self, name: str) -> np.ndarray:
+        if name not in self._arrays:
+            if len(self._arrays) >= _CACHED_ARRAYS:
+                self._arrays.clear()
+            self._arrays[name] = read_npz(self._shared_file(name))["array"]
+        return self._arrays[name]
+
+    def _state(self, paths: Iterable[str]) -> dict[str, Any]:
+        """Sizes and times of the sources, and of the folders above them: a file that is added changes its folder."""
+        paths = sorted(paths)
+        above = sorted({parent.as_posix() for path in paths for parent in Path(path).parents})
+        return {
+            "files": {path: _stamp(self.root / path) for path in paths},
+            "folders": {path: os.stat(self.root / path).st_mtime_ns for path in above},
+        }
+
+
+def job_of(
+    adapter: Adapter,
+    hands: HandPair,
+    root: Path,
+    keys: Sequence[SequenceKey],
+    manifest: Mapping[str, SourceFile] | None,
+    synthetic: bool,
+) -> dict[str, Any]:
+    """All that decides the results of a conversion but the raw files themselves, as JSON values."""
+    kind = type(adapter)
+    listed = None if manifest is None else [[path, manifest[path].sha256] for path in sorted(manifest)]
+    return {
+        "adapter": f"{kind.__module__}:{kind.__qualname__}",
+        "settings": {name: repr(value) for name, value in sorted(_settings(adapter).items())},
+        "hands": hands.digest,
+        "schema": SCHEMA_VERSION,
+        "code": _code_digest(kind),
+        "libraries": {name: version(name) for name in LIBRARIES},
+        "root": str(root.resolve()),
+        "keys": sha256_bytes("\n".join(map(str, keys)).encode()),
+        "manifest": None if listed is None else sha256_bytes(canonical_json(listed).encode()),
+        "synthetic": synthetic,
+    }
+
+
+def _settings(adapter: Adapter) -> dict[str, Any]:
+    try:
+        return {item.name: getattr(adapter, item.name) for item in fields(adapter)}  # type: ignore[arg-type]
+    except TypeError:  # no dataclass
+        return vars(adapter)
+
+
+def _code_digest(kind: type) -> str:
+    """Digest of every Python file of the rooms a conversion uses, and of the files of the adapter's classes."""
+    house = Path(__file__).parents[1]
+    files = {path for room in ROOMS for path in ((house / room).rglob("*.py"), [house / room])[room.endswith(".py")]}
+    for ancestor in kind.__mro__[:-1]:
+        try:
+            files.add(Path(inspect.getfile(ancestor)))
+        except (TypeError, OSError):  # built into Python, or typed at a prompt
+            continue
+    return sha256_bytes("".join(f"{sha256_file(path)}  {path}\n" for path in sorted(files)).encode())
+
+
+def _stamp(path: Path) -> Any:
+    """Size and time of a file; of a folder of frame files, a digest of those of all its files."""
+    facts = os.stat(path)
+    if not path.is_dir():
+        return [facts.st_size, facts.st_mtime_ns]
+    with os.scandir(path) as items:
+        lines = sorted(f"{item.name} {item.stat().st_size} {item.stat().st_mtime_ns}" for item in items)
+    return sha256_bytes("\n".join(lines).encode())
+
+
+def _text(text: str) -> np.ndarray:
+    return np.frombuffer(text.encode(), np.uint8)

@@ -1,0 +1,1 @@
+"""ARCTIC: adapter and facts."""

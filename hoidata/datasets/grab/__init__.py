@@ -1,0 +1,1 @@
+"""GRAB: adapter and facts."""

@@ -1,0 +1,250 @@
+"""GRAB (Taheri et al. 2020): one NPZ per sequence at 120 Hz, personal hand meshes, objects posed with row vectors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, BodyTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
+from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.datasets import checks
+from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.grab.contact import read_contact
+from hoidata.datasets.grab.words import object_words, verb_words
+from hoidata.datasets.known_meshes import raw_mesh
+from hoidata.errors import BadInput
+from hoidata.files import load_npz_objects
+from hoidata.files.array_pieces import npz_members
+from hoidata.hands import HandPair
+from hoidata.objects.model import ObjectModel
+
+ROOTS = ("", "GRAB")
+FRAME = WorldFrame("+z", "stated", "GRAB's motion-capture world, right-handed, z up, metres")
+CONVENTION = HandConvention(
+    translation="transl",
+    fingers="absolute",
+    shape="personal mesh",
+    left_shape="unused",
+    note="MANO: absolute axis-angles, the subject's own rest mesh without betas, translation added to its rest wrist",
+)
+PARTS = (
+    DatasetPart("sequences", ("grab/s*/*.npz", "GRAB/grab/s*/*.npz"), "grab__s1.zip to grab__s10.zip"),
+    DatasetPart(
+        "meshes of objects and table",
+        ("tools/object_meshes/*/*.ply", "GRAB/tools/object_meshes/*/*.ply"),
+        "object_meshes.zip",
+    ),
+    DatasetPart(
+        "the subjects' hand meshes",
+        ("tools/subject_meshes/*/*.ply", "GRAB/tools/subject_meshes/*/*.ply"),
+        "tools__subject_meshes.zip",
+    ),
+)
+MEMBERS = ("obj_name", "motion_intent", "framerate", "n_frames", "lhand", "rhand", "object")
+BODY_COLUMNS = {"transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
+MOST_COMPONENTS = 45
+
+
+@dataclass(frozen=True)
+class GrabAdapter:
+    """Raw root: ``grab/sN/<object>_<action>_<n>.npz`` and ``tools/`` beside it, as the official unzip leaves them.
+
+    margin_frames: frames (of 30 fps) kept before the first and after the last frame with contact.
+    contact: keep GRAB's own contact labels (9 bytes per touched vertex and frame: about 10 MB per clip of real data).
+    body: keep the parameters of the person's SMPL-X body.
+    """
+
+    margin_frames: int = 0
+    contact: bool = True
+    body: bool = False
+    name: str = "grab"
+    version: str = "1.0"
+    licence: str = "GRAB licence (MPI): non-commercial research, no redistribution"
+    where_to_register: str = "https://grab.is.tue.mpg.de (GRAB parts and object_meshes.zip)"
+    needs_mano: bool = True
+    source_fps: float = 120.0
+    may_be_shared: bool = False
+    frame: WorldFrame = FRAME
+    hand_convention: HandConvention = CONVENTION
+    parts: tuple[DatasetPart, ...] = PARTS
+
+    def __post_init__(self) -> None:
+        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
+        checks.switch_setting(self.name, "contact", self.contact)
+        checks.switch_setting(self.name, "body", self.body)
+
+    def sequences(self, root: Path) -> list[SequenceKey]:
+        """One key per ``grab/sN/*.npz``."""
+        found = {path for top in ROOTS for path in (Path(root) / top / "grab").glob("s*/*.npz")}
+        keys = {SequenceKey(self.name, path.parent.name, f"{path.parent.name}/{path.stem}") for path in found}
+        return sorted(keys)
+
+    def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
+        """One clip: every 4th frame, from the first to the last of them with object contact, both included."""
+        file = _open(raw, key, self.body)
+        model = _mesh_model(raw, file.text("obj_name"), file.beside("object", "object_mesh"))
+        step = file.fps // FPS
+        contact = read_contact(file.place, file.path, file.n_frames, len(model.vertices_m), step, self.contact)
+        start, stop = _contact_range(file, contact.touched, self.margin_frames)
+        frames = np.arange(start * step, stop * step, step)
+        clip = Clip(
+            clip_id=str(key),
+            dataset=self.name,
+            subject=key.subject,
+            sequence=key.name,
+            hands={side: _hand(raw, file, side, frames, hands) for side in SIDES},
+            object=_object_track(file, "object", model, frames),
+            other_objects=_table(raw, file, frames),
+            source_frames=frames.astype(np.int32),
+            gravity=np.array([0.0, 0.0, -1.0]),
+            verb=verb_words(file.text("motion_intent")),
+            object_words=object_words(model.name),
+            source_fps=float(file.fps),
+            source_contact=contact.cut(start, stop),
+            body=_body(file, frames) if self.body else None,
+        )
+        return [replace(clip, sources=raw.sources)]
+
+
+@dataclass(frozen=True)
+class _SequenceFile:
+    """The entries of one NPZ but for its contact labels.
+
+    top: the folder that holds ``grab/`` and ``tools/``; path: of the file below the raw root; place: where it lies.
+    """
+
+    top: str
+    path: str
+    place: Path
+    data: dict[str, Any]
+
+    @property
+    def n_frames(self) -> int:
+        return self._count("n_frames")
+
+    @property
+    def fps(self) -> int:
+        fps = self._count("framerate")
+        if fps % FPS:
+            raise BadInput(f"{self.path}: framerate", f"a multiple of {FPS} frames per second", f"{fps}")
+        return fps
+
+    def params(self, member: str) -> Mapping[str, Any]:
+        """``member.params``, known to hold ``global_orient`` and ``transl``."""
+        params = checks.entry(f"{self.path}: {member}", checks.entry(self.path, self.data, member), "params")
+        for name in ("global_orient", "transl"):
+            checks.entry(f"{self.path}: {member}.params", params, name)
+        return params
+
+    def text(self, *keys: str) -> str:
+        value: Any = self.data
+        for key in keys:
+            value = checks.entry(self.path, value, key)
+        if not isinstance(value, str):
+            raise BadInput(f"{self.path}: {'.'.join(keys)}", "text", type(value).__name__)
+        return str(value)
+
+    def beside(self, *keys: str) -> str:
+        """The path named by a text entry, which counts from the folder that holds ``grab/`` and ``tools/``."""
+        return _below(self.top, self.text(*keys))
+
+    def _count(self, key: str) -> int:
+        value = np.asarray(checks.entry(self.path, self.data, key))
+        if value.shape or value.dtype.kind not in "fiu" or not 1 <= value < np.inf or value != round(float(value)):
+            raise BadInput(f"{self.path}: {key}", "a whole number of 1 or more", repr(value)[:40])
+        return int(value)
+
+
+def _open(raw: RawTree, key: SequenceKey, with_body: bool) -> _SequenceFile:
+    top = next((top for top in ROOTS if raw.has(_below(top, f"grab/{key.name}.npz"))), ROOTS[0])
+    path = _below(top, f"grab/{key.name}.npz")
+    place = raw.file(path)
+    optional = npz_members(place) & {"table"}
+    members = {*MEMBERS, *optional, *(("body",) if with_body else ())}
+    return _SequenceFile(top, path, place, load_npz_objects(place, members))
+
+
+def _below(top: str, path: str) -> str:
+    return f"{top}/{path}" if top else path
+
+
+def _contact_range(file: _SequenceFile, touched: np.ndarray, margin: int) -> tuple[int, int]:
+    """First kept frame and the one after the last, in frames of 30 fps: cut to the contact, both ends included."""
+    frames = np.flatnonzero(touched)
+    if not len(frames):
+        remedy = "nothing to do: nobody touches the object"
+        raise BadInput(f"{file.path}: contact.object", "contact in at least one frame", "none", remedy)
+    return max(0, int(frames[0]) - margin), min(len(touched), int(frames[-1]) + 1 + margin)
+
+
+def _object_track(file: _SequenceFile, member: str, model: ObjectModel, frames: np.ndarray) -> ObjectTrack:
+    """GRAB poses objects as x_world = x R + t with row vectors: the column-vector rotation is the transpose."""
+    where, pose = f"{file.path}: {member}", file.params(member)
+    orient = checks.table(f"{where}.global_orient", pose["global_orient"], 3, file.n_frames)[frames]
+    transl = checks.table(f"{where}.transl", pose["transl"], 3, file.n_frames)[frames]
+    return ObjectTrack(model, -orient.astype(np.float32), transl.astype(np.float32))
+
+
+def _table(raw: RawTree, file: _SequenceFile, frames: np.ndarray) -> tuple[ObjectTrack, ...]:
+    """The table the object lies on, where the file has one and its mesh was downloaded."""
+    if "table" not in file.data or not raw.has(mesh := file.beside("table", "table_mesh")):
+        return ()
+    return (_object_track(file, "table", _mesh_model(raw, "table", mesh), frames),)
+
+
+def _body(file: _SequenceFile, frames: np.ndarray) -> BodyTrack:
+    where, params = f"{file.path}: body", file.params("body")
+    values = {
+        name: checks.table(f"{where}.{name}", checks.entry(where, params, name), columns, file.n_frames)[frames]
+        for name, columns in {**BODY_COLUMNS, "expression": 10}.items()
+    }
+    values = {name: value.astype(np.float32) for name, value in values.items()}
+    return BodyTrack(
+        transl_m=values["transl"],
+        global_orient=values["global_orient"],
+        body_pose=values["body_pose"],
+        face_pose=np.concatenate([values[name] for name in ("jaw_pose", "leye_pose", "reye_pose")], axis=1),
+        expression=values["expression"],
+    )
+
+
+def _hand(raw: RawTree, file: _SequenceFile, side: Side, frames: np.ndarray, hands: HandPair) -> HandTrack:
+    member = {"left": "lhand", "right": "rhand"}[side]
+    where, params = f"{file.path}: {member}", file.params(member)
+    template = _template(raw, file.beside(member, "vtemp"))
+    orient = checks.table(f"{where}.global_orient", params["global_orient"], 3, file.n_frames)
+    transl = checks.table(f"{where}.transl", params["transl"], 3, file.n_frames)
+    fingers, convention = _fingers(where, params, file.n_frames)
+    source = SourceHand(
+        translation_m=transl[frames],
+        global_orient=orient[frames],
+        fingers=fingers[frames],
+        betas=np.zeros((1, 10)),  # the personal mesh already has the subject's shape
+        template_m=template,
+    )
+    return to_track(source, convention, hands[side])
+
+
+def _fingers(where: str, params: Mapping[str, Any], n_frames: int) -> tuple[np.ndarray, HandConvention]:
+    """Finger angles ``fullpose`` (frame, 45), or without them however many principal components there are."""
+    if "fullpose" in params:
+        return checks.table(f"{where}.fullpose", params["fullpose"], 45, n_frames), CONVENTION
+    coefficients = np.asarray(checks.entry(where, params, "hand_pose"))
+    columns = coefficients.shape[1] if coefficients.ndim == 2 else 0
+    columns = columns if 1 <= columns <= MOST_COMPONENTS else 24
+    pose = checks.table(f"{where}.hand_pose", coefficients, columns, n_frames)
+    return pose, replace(CONVENTION, components=columns)
+
+
+def _template(raw: RawTree, path: str) -> np.ndarray:
+    vertices = raw_mesh(raw, path).vertices
+    if vertices.shape != (778, 3):
+        raise BadInput(path, "a hand mesh of 778 vertices", f"{len(vertices)}")
+    return vertices
+
+
+def _mesh_model(raw: RawTree, name: str, path: str) -> ObjectModel:
+    mesh = raw_mesh(raw, path)
+    return ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))

@@ -1,0 +1,272 @@
+"""H2O (Kwon et al. 2021): per-frame text files of five cameras; hands and objects in the camera's frame.
+
+Only the head camera (cam4) is read, because action labels exist only there. Its pose files are camera-to-world.
+The world's axes are not documented: gravity is estimated from objects at rest, sequence by sequence.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple, get_args
+
+import numpy as np
+
+from hoidata.clips.clip import CameraTrack, Clip, ObjectTrack, SourceFile, WorldFrame
+from hoidata.clips.hand_parameters import HandConvention
+from hoidata.datasets import checks
+from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
+from hoidata.datasets.h2o.files import (
+    ACTIONS,
+    LISTS,
+    OBJECTS,
+    HandSource,
+    SequenceFrames,
+    listed_segments,
+    read_frames,
+)
+from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.hands import HandPair
+from hoidata.objects.mesh import load_mesh
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.resting import Footing, footing
+
+CAMERA = "cam4"
+OLD_NAMES = {"spray": "lotion_spray", "cocoa": "ovomaltine", "chips": "pringles", "cappuccino": "starbucks"}
+FRAME = WorldFrame(None, "estimated", "H2O's camera-rig world, right-handed, metres; its axes are not documented")
+PARTS = (
+    DatasetPart("pose files of the head camera", ("subject*/*/*/cam4/*/*.txt",), "subjectN_pose_v1_1.tar.gz"),
+    DatasetPart("object meshes", ("object/*/*.obj",), "object.zip"),
+    DatasetPart("the head camera's lens", ("subject*/*/*/cam4/*.txt",), "subjectN_pose_v1_1.tar.gz", optional=True),
+    DatasetPart("segments of all subjects", ("label_split/action_*.txt",), "label_split.zip", optional=True),
+)
+
+
+class _Run(NamedTuple):
+    """Frames ``start`` to ``stop`` (exclusive) of one action. verb: None where labels are withheld."""
+
+    start: int
+    stop: int
+    verb: str | None
+    noun: str
+
+
+class _Object(NamedTuple):
+    model: ObjectModel
+    footing: Footing
+
+
+class _Sequence(NamedTuple):
+    """What the clips of one sequence share. sources: every file behind them; gravity depends on all the meshes."""
+
+    key: SequenceKey
+    frames: SequenceFrames
+    hands: SequenceHands
+    objects: dict[str, _Object]
+    gravity: GravityEstimate
+    sources: tuple[SourceFile, ...]
+
+
+@dataclass(frozen=True)
+class H2OAdapter:
+    """Raw root: ``object/<name>/<name>.obj`` and ``subjectN/<place>/<number>/cam4/<kind>/NNNNNN.txt``.
+
+    margin_frames: frames kept before and after each run. shortest_frames: runs must be this long or longer.
+    hands: "mano" reads MANO parameters, which need the licensed MANO files; "keypoints" fits the given hand to the 21
+    joints instead and needs none.
+    Runs are those of the per-frame action labels; for a sequence without any (subject4, whose labels are withheld) the
+    segments of ``label_split``. A run is split where the tracked object is not the one its label names, or, without
+    a label, not the one that is tracked most.
+    """
+
+    margin_frames: int = 0
+    shortest_frames: int = 21
+    hands: HandSource = "mano"
+    name: str = "h2o"
+    version: str = "1.1"
+    licence: str = "research use after registration; no licence text is published with the files"
+    where_to_register: str = "https://h2odataset.ethz.ch (subjectN_pose_v1_1.tar.gz, object.zip)"
+    source_fps: float = 30.0
+    may_be_shared: bool = False
+    frame: WorldFrame = FRAME
+    parts: tuple[DatasetPart, ...] = PARTS
+
+    def __post_init__(self) -> None:
+        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
+        checks.whole_setting(self.name, "shortest_frames", self.shortest_frames)
+        checks.choice_setting(self.name, "hands", self.hands, get_args(HandSource))
+
+    @property
+    def needs_mano(self) -> bool:
+        return self.hands == "mano"
+
+    @property
+    def hand_convention(self) -> HandConvention:
+        return PARAMETERS if self.needs_mano else FITTED
+
+    def sequences(self, root: Path) -> list[SequenceKey]:
+        """One key per ``subjectN/<place>/<number>`` that has a cam4 folder."""
+        found = sorted(Path(root).glob(f"subject*/*/*/{CAMERA}"))
+        parts = [path.relative_to(root).parts for path in found if path.is_dir()]
+        return [SequenceKey(self.name, part[0], "/".join(part[:3])) for part in parts]
+
+    def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
+        """One clip per run of frames of one action on the object tracked there; runs that give none, with reasons."""
+        frames = read_frames(raw, f"{key.name}/{CAMERA}", self.hands)
+        found = list(self._runs(raw, key, frames))
+        runs = [item for item in found if isinstance(item, _Run)]
+        if not runs:
+            return [item for item in found if isinstance(item, Quarantined)]
+        paths = {noun: _mesh_path(raw, noun) for noun in sorted({run.noun for run in runs})}
+        objects = {noun: _object(noun, raw.file(path), raw.recorded(path)[0].sha256) for noun, path in paths.items()}
+        own_hands = ParameterHands(frames, hands) if self.needs_mano else KeypointHands(frames, hands)
+        gravity = estimate_gravity(_tracked_objects(frames, objects), own_hands.joints_m(), frames.camera[:, :3, :3])
+        sources = raw.recorded(frames.folder, LISTS, *paths.values())
+        sequence = _Sequence(key, frames, own_hands, objects, gravity, sources)
+        return [item if isinstance(item, Quarantined) else self._clip(sequence, item) for item in found]
+
+    def _runs(self, raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[_Run | Quarantined]:
+        """Runs of the labels, or the list's segments, cut to the frames in which their object is tracked."""
+        known: set[tuple[int, int]] = set()
+        for start, stop, label, where in _wanted(raw, key, frames):
+            clip_id = _clip_id(key, frames, start, stop)
+            try:
+                for piece in _tracked_pieces(frames, start, stop, label, self.shortest_frames, where):
+                    if (piece.start, piece.stop) in known:
+                        raise BadInput(where, "each stretch once", f"{clip_id} twice", "correct the list")
+                    known.add((piece.start, piece.stop))
+                    yield piece
+            except BadInput as problem:
+                yield Quarantined.from_error(clip_id, problem)
+
+    def _clip(self, sequence: _Sequence, run: _Run) -> Clip:
+        frames = sequence.frames
+        start, stop = _with_margin(frames, run.start, run.stop, self.margin_frames)
+        world_from_object = frames.camera[start:stop] @ frames.objects[start:stop]
+        tracks, fit_error_m = sequence.hands.tracks(start, stop)
+        source_frames = np.arange(frames.first + start, frames.first + stop, dtype=np.int32)
+        return Clip(
+            clip_id=_clip_id(sequence.key, frames, run.start, run.stop),
+            dataset=self.name,
+            subject=sequence.key.subject,
+            sequence=sequence.key.name,
+            hands=tracks,
+            object=ObjectTrack(
+                sequence.objects[run.noun].model,
+                rotmat_to_rotvec(world_from_object[:, :3, :3]).astype(np.float32),
+                world_from_object[:, :3, 3].astype(np.float32),
+            ),
+            source_frames=source_frames,
+            gravity=sequence.gravity.direction,
+            gravity_note=sequence.gravity.note,
+            verb=run.verb,
+            object_words=run.noun,
+            source_fps=self.source_fps,
+            sources=sequence.sources,
+            hands_from="parameters" if self.needs_mano else "keypoints",
+            fit_error_m=fit_error_m,
+            camera=_camera_track(frames, start, stop, source_frames),
+        )
+
+
+def label_runs(label: np.ndarray) -> list[tuple[int, int]]:
+    """Half-open ranges of one non-zero label. label: (frame,) int."""
+    edges = np.flatnonzero(np.diff(label)) + 1
+    starts, stops = np.r_[0, edges], np.r_[edges, len(label)]
+    return [(int(a), int(b)) for a, b in zip(starts, stops, strict=True) if label[a] != 0]
+
+
+def _wanted(raw: RawTree, key: SequenceKey, frames: SequenceFrames) -> Iterator[tuple[int, int, int | None, str]]:
+    """Start, stop (exclusive), action and its source of each run, as the labels say, or else the segment lists.
+
+    Raises BadInput where neither is there, or the list speaks of frames that are not.
+    """
+    if frames.label is not None and frames.label.any():
+        for start, stop in label_runs(frames.label):
+            yield start, stop, int(frames.label[start]), f"{frames.folder}/action_label"
+        return
+    segments, path = listed_segments(raw, key.name)
+    if not segments and frames.label is not None:
+        return
+    if not segments:
+        expected = f"action labels, or {key.name} in a segment list {LISTS}/action_*.txt"
+        remedy = f"unpack label_split.zip here: the labels of subject4 are withheld, its segments are in {LISTS}"
+        raise BadInput(f"{frames.folder}/action_label", expected, "neither", remedy)
+    for segment in segments:
+        start, stop = segment.start - frames.first, segment.last + 1 - frames.first
+        if start < 0 or stop > len(frames):
+            expected = f"frames {frames.first} to {frames.first + len(frames) - 1}, as {frames.folder} has them"
+            got = f"segment {segment.start} to {segment.last} of {key.name}"
+            raise BadInput(path, expected, got, "download the pose archive of this subject again")
+        yield start, stop, segment.label, path
+
+
+def _tracked_pieces(
+    frames: SequenceFrames, start: int, stop: int, label: int | None, shortest: int, where: str
+) -> list[_Run]:
+    """The parts of a run, ``shortest`` frames or longer, in which its object is tracked. Raises BadInput for none.
+
+    The object is the one the label names; without a label the one tracked in most frames (the first of equals).
+    """
+    named_frames = f"frames {frames.first + start} to {frames.first + stop - 1}"
+    if stop - start < shortest:
+        got, remedy = f"{stop - start} ({named_frames})", "nothing to do: it is left out"
+        raise BadInput(where, f"a run of {shortest} frames or more", got, remedy)
+    classes = frames.classes[start:stop]
+    counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))
+    wanted = int(counts.argmax()) if label is None else OBJECTS.index(ACTIONS[label][1])
+    runs = [(first, last) for first, last in label_runs((classes == wanted).astype(int)) if last - first >= shortest]
+    if not counts.any() or not runs:
+        thing = "one object" if label is None else f"class {wanted} ({OBJECTS[wanted]}), the object of action {label},"
+        got = f"classes {np.unique(classes).tolist()} ({named_frames})"
+        expected = f"{thing} for {shortest} frames or more"
+        raise BadInput(f"{frames.folder}/obj_pose_rt", expected, got, "check the annotation")
+    verb = None if label is None else ACTIONS[label][0]
+    return [_Run(start + first, start + last, verb, OBJECTS[wanted]) for first, last in runs]
+
+
+def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) -> str:
+    return f"{key}/{frames.first + start:06d}-{frames.first + stop - 1:06d}"
+
+
+def _with_margin(frames: SequenceFrames, start: int, stop: int, margin: int) -> tuple[int, int]:
+    """The piece and up to ``margin`` frames on both sides, as far as the same object is tracked."""
+    same = frames.classes == frames.classes[start]
+    first, last = max(0, start - margin), min(len(same), stop + margin)
+    others = np.flatnonzero(~same)
+    before, after = others[others < start], others[others >= stop]
+    return max(first, before[-1] + 1 if len(before) else 0), min(last, after[0] if len(after) else len(same))
+
+
+def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndarray) -> CameraTrack:
+    poses = frames.camera[start:stop]
+    rotvec = rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32)
+    return CameraTrack(CAMERA, rotvec, poses[:, :3, 3].astype(np.float32), images, frames.intrinsics)
+
+
+def _tracked_objects(frames: SequenceFrames, objects: dict[str, _Object]) -> list[TrackedObject]:
+    # A frame without an object may hold anything.
+    poses = frames.camera @ np.where(frames.classes[:, None, None] == 0, np.eye(4), frames.objects)
+    return [
+        TrackedObject(thing.footing, frames.classes == OBJECTS.index(noun), poses) for noun, thing in objects.items()
+    ]
+
+
+def _mesh_path(raw: RawTree, name: str) -> str:
+    for known in (name, OLD_NAMES.get(name, name)):
+        exact = f"{known}.obj"
+        names = raw.names(f"object/{known}", ".obj")
+        if names:
+            return f"object/{known}/{exact if exact in names else names[0]}"
+    raise BadInput(f"object/{name}/{name}.obj", "the object's mesh", "nothing there", "unpack object.zip here")
+
+
+@lru_cache(maxsize=16)
+def _object(name: str, place: Path, sha256: str) -> _Object:
+    """The mesh read from ``place``; sha256 tells whether it is still the same file: sequences share few objects."""
+    mesh = load_mesh(place)
+    model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
+    return _Object(model, footing(mesh.vertices, mesh.faces))

@@ -1,0 +1,244 @@
+"""H2O's text files: frame files of one line of numbers, and the lists of segments in label_split.
+
+Layouts: Kwon et al. 2021, README of the dataset; a hand's MANO block has 62 numbers, not the 59 printed there.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+import orjson
+
+from hoidata.datasets import checks
+from hoidata.datasets.base import RawTree
+from hoidata.errors import BadInput
+
+OBJECTS = ("", "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")  # by class id
+_SHELF = OBJECTS[1:]
+ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is background
+    ("", ""),
+    *(("grab", noun) for noun in _SHELF),
+    *(("place", noun) for noun in _SHELF),
+    *(("open", noun) for noun in ("lotion", "milk", "chips")),
+    *(("close", noun) for noun in ("lotion", "milk", "chips")),
+    ("pour", "milk"),
+    *(("take out", noun) for noun in ("espresso", "cocoa", "chips", "cappuccino")),
+    *(("put in", noun) for noun in ("espresso", "cocoa", "cappuccino")),
+    *(("apply", noun) for noun in ("lotion", "spray")),
+    *(("read", noun) for noun in ("book", "espresso")),
+    ("spray", "spray"),
+    ("squeeze", "lotion"),
+)
+HandSource = Literal["mano", "keypoints"]
+HAND_FOLDERS: dict[HandSource, tuple[str, int]] = {"mano": ("hand_pose_mano", 124), "keypoints": ("hand_pose", 128)}
+LISTS = "label_split"
+INTRINSICS = "cam_intrinsics.txt"
+_FRAME_FILE = re.compile(r"\d{6}\.txt")
+_LIST_FILE = re.compile(r"action_\w+\.txt")
+_SEQUENCE = re.compile(r"subject\d+/\w+/\d+")
+_LIST_COLUMNS = ("id", "path", "action_label", "start_act", "end_act", "start_frame", "end_frame")
+_LONGEST_NUMBER = 9  # digits of a frame number that is one
+
+
+@dataclass(frozen=True)
+class SequenceFrames:
+    """The numbers of one sequence, frame axis first, as in the files (camera frame, metres).
+
+    folder: of the camera; first: number of the first frame. camera: (frame, 4, 4) world from camera.
+    hands: (frame, 124) of hand_pose_mano or (frame, 128) of hand_pose. classes: (frame,) int class of the tracked
+    object, 0 for none; objects: (frame, 4, 4) camera from object. label: (frame,) int action, or None where action
+    labels are withheld. intrinsics: (6,) or None.
+    """
+
+    folder: str
+    first: int
+    camera: np.ndarray
+    hands: np.ndarray
+    classes: np.ndarray
+    objects: np.ndarray
+    label: np.ndarray | None
+    intrinsics: np.ndarray | None
+
+    def __len__(self) -> int:
+        return len(self.classes)
+
+
+class Segment(NamedTuple):
+    """One row of a segment list. label: action, None where it is withheld; frame numbers, both ends inclusive."""
+
+    sequence: str
+    label: int | None
+    start: int
+    last: int
+    first_frame: int
+    last_frame: int
+
+
+def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
+    """All frame files of one camera's folder. Raises BadInput that names the file that is missing or cannot be used."""
+    hand_folder, hand_columns = HAND_FOLDERS[hands]
+    kinds = {kind: _folder_of(raw, folder, kind) for kind in ("cam_pose", hand_folder, "obj_pose_rt", "action_label")}
+    labelled = bool(_frame_files(raw, kinds["action_label"]))
+    files = _common_files(raw, [place for kind, place in kinds.items() if labelled or kind != "action_label"])
+    camera = _read(raw, kinds["cam_pose"], files, 16).reshape(-1, 4, 4)
+    objects = _read(raw, kinds["obj_pose_rt"], files, 17)
+    hand_numbers = _read(raw, kinds[hand_folder], files, hand_columns)
+    _check_ids(kinds["obj_pose_rt"], files, objects[:, 0], len(OBJECTS))
+    checks.rigid_transforms(kinds["cam_pose"], files, camera)
+    tracked = np.flatnonzero(objects[:, 0])
+    poses = objects[:, 1:].reshape(-1, 4, 4)
+    checks.rigid_transforms(kinds["obj_pose_rt"], [files[frame] for frame in tracked], poses[tracked])
+    return SequenceFrames(
+        folder=folder,
+        first=int(files[0][:6]),
+        camera=camera,
+        hands=hand_numbers,
+        classes=objects[:, 0].astype(int),
+        objects=poses,
+        label=_read_labels(raw, kinds["action_label"], files) if labelled else None,
+        intrinsics=_read_intrinsics(raw, folder),
+    )
+
+
+def parse_rows(contents: Sequence[bytes], columns: int, folder: str, names: Sequence[str]) -> np.ndarray:
+    """(file, column) float64 from the first line of each file, bit for bit what ``np.loadtxt`` reads there.
+
+    folder and names say whose bytes these are. Raises BadInput for another count of numbers, or ones not finite.
+    """
+    lines = [data.partition(b"\n")[0].strip() for data in contents]
+    values = _parse_as_json(lines, columns)
+    if values is None:
+        rows = [_parse_line(line, columns, f"{folder}/{name}") for line, name in zip(lines, names, strict=True)]
+        values = np.array(rows, dtype=np.float64).reshape(-1, columns)
+    good = np.isfinite(values).all(axis=1)
+    if not good.all():
+        raise BadInput(f"{folder}/{names[int(np.argmin(good))]}", "finite numbers", "NaN or infinity")
+    return values
+
+
+def parse_segments(data: bytes, where: str) -> list[Segment]:
+    """Rows of action_train.txt, action_val.txt or action_test.txt (the last without labels); blank lines are ignored.
+
+    Raises BadInput that names the line for another header or a row that does not fit it.
+    """
+    try:
+        lines = data.decode("utf-8").split("\n")
+    except UnicodeDecodeError as error:
+        raise BadInput(where, "UTF-8 text", str(error)) from error
+    header = lines[0].split()
+    if tuple(header) not in (_LIST_COLUMNS, tuple(name for name in _LIST_COLUMNS if name != "action_label")):
+        raise BadInput(
+            where, f"the header {' '.join(_LIST_COLUMNS)}, or that without action_label", repr(lines[0][:80])
+        )
+    numbered = ((f"{where}:{number}", line.split()) for number, line in enumerate(lines[1:], 2))
+    return [_segment(header, words, place) for place, words in numbered if words]
+
+
+def listed_segments(raw: RawTree, sequence: str) -> tuple[list[Segment], str]:
+    """The segments of one sequence and the list they stand in; none and "" where no list names it."""
+    for name in raw.names(LISTS, ".txt"):
+        if _LIST_FILE.fullmatch(name):
+            path = f"{LISTS}/{name}"
+            own = [segment for segment in parse_segments(raw.read(path), path) if segment.sequence == sequence]
+            if own:
+                return sorted(own, key=lambda segment: segment.start), path
+    return [], ""
+
+
+def _parse_as_json(lines: list[bytes], columns: int) -> np.ndarray | None:
+    """All lines in one go; None where a line is not plain JSON numbers with single spaces between.
+
+    Only characters of numbers are let through, so that JSON cannot mean anything else; "-0" has no sign in JSON.
+    """
+    if b"".join(lines).translate(None, b"0123456789+-.eE "):
+        return None
+    text = b"[[" + b"],[".join(lines).replace(b" ", b",") + b"]]"
+    if b"-0," in text or b"-0]" in text:
+        return None
+    try:
+        rows = orjson.loads(text)
+    except orjson.JSONDecodeError:
+        return None
+    return np.array(rows, dtype=np.float64) if set(map(len, rows)) == {columns} else None
+
+
+def _parse_line(line: bytes, columns: int, where: str) -> list[float]:
+    words = line.split()
+    if len(words) != columns:
+        raise BadInput(where, f"{columns} numbers", f"{len(words)}")
+    try:
+        if b"_" in line:  # float() takes 1_0 for 10
+            raise ValueError(f"could not convert {line[:40]!r}")
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise BadInput(where, f"{columns} numbers", str(error)[:120]) from error
+
+
+def _read(raw: RawTree, folder: str, files: list[str], columns: int) -> np.ndarray:
+    return parse_rows(raw.read_folder(folder, files), columns, folder, files)
+
+
+def _read_labels(raw: RawTree, folder: str, files: list[str]) -> np.ndarray:
+    label = _read(raw, folder, files, 1)[:, 0]
+    _check_ids(folder, files, label, len(ACTIONS))
+    return label.astype(int)
+
+
+def _read_intrinsics(raw: RawTree, folder: str) -> np.ndarray | None:
+    if not raw.has(f"{folder}/{INTRINSICS}"):
+        return None
+    return parse_rows([raw.read(f"{folder}/{INTRINSICS}")], 6, folder, [INTRINSICS])[0]
+
+
+def _folder_of(raw: RawTree, folder: str, kind: str) -> str:
+    """The real name of a folder whose case differs between releases (hand_pose_mano, hand_pose_MANO)."""
+    place = raw.root / folder
+    found = sorted(item.name for item in place.iterdir() if item.name.lower() == kind)
+    return f"{folder}/{found[-1] if found else kind}"
+
+
+def _frame_files(raw: RawTree, folder: str) -> set[str]:
+    return {name for name in raw.names(folder) if _FRAME_FILE.fullmatch(name)}
+
+
+def _common_files(raw: RawTree, folders: list[str]) -> list[str]:
+    """Names of the frame files, the same in every folder and without a gap; else BadInput names the missing one."""
+    names = {folder: _frame_files(raw, folder) for folder in folders}
+    for folder, found in names.items():
+        if not found:
+            raise BadInput(folder, "a folder of NNNNNN.txt files", "none", "download the pose archive of this subject")
+    numbers = sorted(int(name[:6]) for name in set().union(*names.values()))
+    expected = [f"{number:06d}.txt" for number in range(numbers[0], numbers[-1] + 1)]
+    for folder, found in names.items():
+        missing = next((name for name in expected if name not in found), None)
+        if missing is not None:
+            raise BadInput(f"{folder}/{missing}", f"one file for each of {len(expected)} frames", "nothing there")
+    return expected
+
+
+def _check_ids(folder: str, files: list[str], values: np.ndarray, count: int) -> None:
+    known = np.isin(values, np.arange(count))
+    if not known.all():
+        at = int(np.argmin(known))
+        raise BadInput(f"{folder}/{files[at]}", f"a whole number from 0 to {count - 1}", f"{values[at]}")
+
+
+def _segment(header: list[str], words: list[str], where: str) -> Segment:
+    if len(words) != len(header):
+        raise BadInput(where, f"{len(header)} words", f"{len(words)}")
+    row = dict(zip(header, words, strict=True))
+    path = row.pop("path")
+    if not _SEQUENCE.fullmatch(path):
+        raise BadInput(where, "a path like subject1/h1/0", repr(path[:80]))
+    for name, word in row.items():
+        if not (word.isascii() and word.isdigit() and len(word) <= _LONGEST_NUMBER):
+            raise BadInput(where, f"a whole number as {name}", repr(word[:80]))
+    numbers = {name: int(word) for name, word in row.items()}
+    label = numbers.get("action_label")
+    if label is not None and not 0 < label < len(ACTIONS):
+        raise BadInput(where, f"an action label from 1 to {len(ACTIONS) - 1}", f"{label}")
+    if numbers["start_act"] > numbers["end_act"]:
+        raise BadInput(where, "a first frame before the last", f"{numbers['start_act']} to {numbers['end_act']}")
+    return Segment(path, label, *(numbers[name] for name in _LIST_COLUMNS[3:]))

@@ -1,0 +1,1 @@
+"""ManipNet: adapter and facts."""

@@ -1,0 +1,1 @@
+"""TACO: adapter and facts."""

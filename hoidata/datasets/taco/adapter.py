@@ -1,0 +1,250 @@
+"""TACO (Liu et al. 2024): two hands, a tool and a target; pickled torch tensors, meshes in centimetres, 30 fps.
+
+Each recording belongs to a triplet folder named ``(action, tool, object)``, which gives verb and words. The tool is the
+clip's object, the target its other object.
+"""
+
+import re
+from collections.abc import Hashable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import SIDES, Clip, ObjectTrack, Side, WorldFrame
+from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.datasets import checks
+from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.errors import BadInput
+from hoidata.files import load_npy, load_torch_pickle
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands import HandPair, track_joints
+from hoidata.objects.distance import closest_points
+from hoidata.objects.mesh import load_mesh
+from hoidata.objects.model import ObjectModel
+
+CENTIMETRES = 1e-2
+TOUCH_M = 0.02
+HANDS, OBJECTS, MODELS = "Hand_Poses", "Object_Poses", "Object_Models"
+TRIPLET = re.compile(r"\(([^,()]+),([^,()]+),([^,()]+)\)")
+FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, or a word before it
+FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
+GRAVITY_NOTE = "TACO's world frame differs from day to day and its axes are not documented"
+CONVENTION = HandConvention(
+    translation="wrist",
+    fingers="absolute",
+    shape="betas per sequence",
+    left_shape="as released",
+    note="MANO: absolute axis-angles, own betas for each side, the translation is the wrist (manopth, center_idx 0)",
+)
+PARTS = (
+    DatasetPart("hand motion and shapes", (f"{HANDS}/*/*/*.pkl",), "Hand_Poses.zip"),
+    DatasetPart("object motion", (f"{OBJECTS}/*/*/*.npy",), "Object_Poses.zip"),
+    DatasetPart("object meshes", (f"{MODELS}/*_cm.obj",), "Object_Models.zip"),
+)
+
+Poses = Mapping[Hashable, Any]  # by frame key: {"hand_pose": (48,), "hand_trans": (3,)}
+
+
+@dataclass(frozen=True)
+class TacoAdapter:
+    """Raw root: ``Hand_Poses/``, ``Object_Poses/`` (``<triplet>/<recording>/``) and ``Object_Models/<id>_cm.obj``.
+
+    margin_frames: frames kept before the first and after the last one with a hand within 2 cm of the tool.
+    The source names no persons: a recording's subject is its day, the part of its name before the first underscore.
+    """
+
+    margin_frames: int = 0
+    name: str = "taco"
+    version: str = "1.0"
+    licence: str = "CC BY 4.0"
+    where_to_register: str = "no registration: links on https://taco2024.github.io (hand poses, object poses, models)"
+    needs_mano: bool = True
+    source_fps: float = 30.0
+    may_be_shared: bool = True
+    frame: WorldFrame = FRAME
+    hand_convention: HandConvention = CONVENTION
+    parts: tuple[DatasetPart, ...] = PARTS
+
+    def __post_init__(self) -> None:
+        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
+
+    def sequences(self, root: Path) -> list[SequenceKey]:
+        """One key per recording that has hand or object poses, in a folder named as a triplet."""
+        found = {path for kind in (HANDS, OBJECTS) for path in Path(root).glob(f"{kind}/(*)/*") if path.is_dir()}
+        names = {f"{path.parent.name}/{path.name}" for path in found}
+        return sorted(SequenceKey(self.name, _day(name), name) for name in names)
+
+    def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
+        """One clip, from the first to the last frame with a hand at the tool."""
+        verb, tool_word, _ = triplet(key.name)
+        tool, target = (_object(raw, key, kind) for kind in ("tool", "target"))
+        if target.n_frames != tool.n_frames:
+            raise BadInput(f"{OBJECTS}/{key.name}/target", f"{tool.n_frames} frames as the tool", f"{target.n_frames}")
+        whole = Clip(
+            clip_id=str(key),
+            dataset=self.name,
+            subject=key.subject,
+            sequence=key.name,
+            hands={side: to_track(hand, CONVENTION, hands[side]) for side, hand in _hands(raw, key, tool).items()},
+            object=tool,
+            other_objects=(target,),
+            source_frames=np.arange(tool.n_frames, dtype=np.int32),
+            gravity=None,
+            gravity_note=GRAVITY_NOTE,
+            verb=verb,
+            object_words=tool_word,
+            source_fps=self.source_fps,
+        )
+        start, stop = _touched(whole, hands)
+        clip = whole.cut(max(0, start - self.margin_frames), min(whole.n_frames, stop + self.margin_frames))
+        return [replace(clip, sources=raw.sources)]
+
+
+def triplet(name: str) -> tuple[str, str, str]:
+    """Action, tool and object in words of ``(put in, spoon, bowl)/20230927_034``. Raises BadInput for another form."""
+    folder = name.partition("/")[0]
+    found = TRIPLET.fullmatch(folder)
+    if found is None:
+        raise BadInput(f"{HANDS}/{folder}", "a folder named (action, tool, object)", folder, "restore its name")
+    action, tool, thing = (" ".join(word.replace("_", " ").split()) for word in found.groups())
+    return action.lower(), tool, thing
+
+
+def frames_of(where: str, keys: Mapping[Side, list[Hashable]], n_frames: int) -> dict[Side, dict[Hashable, int]]:
+    """The frame each key of each side stands for; keys are numbers, of which one side may lack some.
+
+    Sorted keys as many as frames stand for them in turn. Where there are fewer, the other side's tell the numbering, or
+    the first and last number: from 0 to n - 1, or from 1 to n. Raises BadInput where neither tells it.
+    """
+    numbers: dict[Side, dict[Hashable, int]] = {
+        side: _numbers(f"{where}/{side}_hand.pkl", keys[side], n_frames) for side in SIDES
+    }
+    complete = next((sorted(found.values()) for found in numbers.values() if len(found) == n_frames), None)
+    if complete is None:
+        first = _first_number(where, {number for found in numbers.values() for number in found.values()}, n_frames)
+        complete = list(range(first, first + n_frames))
+    frame = {number: index for index, number in enumerate(complete)}
+    placed: dict[Side, dict[Hashable, int]] = {}
+    for side, found in numbers.items():
+        unknown = sorted(set(found.values()) - set(frame))
+        if unknown and len(found) < n_frames:
+            expected = f"frame numbers {complete[0]} to {complete[-1]}"
+            raise BadInput(f"{where}/{side}_hand.pkl", expected, f"{unknown[0]}")
+        placed[side] = _placed(found, frame, n_frames)
+    return placed
+
+
+def _placed(numbers: Mapping[Hashable, int], frame: Mapping[int, int], n_frames: int) -> dict[Hashable, int]:
+    if len(numbers) == n_frames:
+        return {key: index for index, key in enumerate(sorted(numbers, key=lambda key: numbers[key]))}
+    return {key: frame[number] for key, number in numbers.items()}
+
+
+def _numbers(where: str, keys: list[Hashable], n_frames: int) -> dict[Hashable, int]:
+    found = {key: FRAME_KEY.fullmatch(str(key)) for key in keys}
+    numbers = {key: int(match[1]) for key, match in found.items() if match is not None}
+    if len(numbers) < len(keys):
+        wrong = next(key for key in keys if key not in numbers)
+        raise BadInput(where, "frame numbers as keys", repr(wrong)[:40])
+    if len(set(numbers.values())) < len(keys):
+        raise BadInput(where, "one entry per frame", "a frame number twice")
+    if len(keys) > n_frames:
+        raise BadInput(where, f"at most {n_frames} frames as the tool", f"{len(keys)}")
+    return numbers
+
+
+def _first_number(where: str, numbers: set[int], n_frames: int) -> int:
+    if numbers and 0 in numbers and max(numbers) < n_frames:
+        return 0
+    if numbers and min(numbers) > 0 and max(numbers) == n_frames:
+        return 1
+    got = f"{len(numbers)} numbers, {min(numbers)} to {max(numbers)}" if numbers else "none"
+    remedy = "nothing to do: both hands lack frames, and which ones cannot be told"
+    raise BadInput(where, f"hand poses numbered 0 to {n_frames - 1} or 1 to {n_frames}", got, remedy)
+
+
+def _hands(raw: RawTree, key: SequenceKey, tool: ObjectTrack) -> dict[Side, SourceHand]:
+    folder = f"{HANDS}/{key.name}"
+    poses: dict[Side, Poses] = {side: _dictionary(raw, f"{folder}/{side}_hand.pkl") for side in SIDES}
+    frames = frames_of(folder, {side: list(poses[side]) for side in SIDES}, tool.n_frames)
+    return {side: _hand(raw, folder, side, poses[side], frames[side], tool.n_frames) for side in SIDES}
+
+
+def _hand(
+    raw: RawTree, folder: str, side: Side, poses: Poses, frames: Mapping[Hashable, int], n_frames: int
+) -> SourceHand:
+    where, shape_path = f"{folder}/{side}_hand.pkl", f"{folder}/{side}_hand_shape.pkl"
+    pose, translation_m = np.zeros((n_frames, 48)), np.zeros((n_frames, 3))
+    valid = np.zeros(n_frames, dtype=bool)
+    for key, frame in frames.items():
+        place = f"{where}: {key}"
+        pose[frame] = _row(f"{place}.hand_pose", checks.entry(place, poses[key], "hand_pose"), 48)
+        translation_m[frame] = _row(f"{place}.hand_trans", checks.entry(place, poses[key], "hand_trans"), 3)
+        valid[frame] = True
+    shape = checks.entry(shape_path, _dictionary(raw, shape_path), "hand_shape")
+    betas = _row(f"{shape_path}: hand_shape", shape, 10)[None]
+    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid)
+
+
+def _dictionary(raw: RawTree, path: str) -> Mapping[Hashable, Any]:
+    value = load_torch_pickle(raw.read(path), path)
+    if not isinstance(value, dict):
+        raise BadInput(path, "a dictionary", type(value).__name__)
+    return value
+
+
+def _row(where: str, value: Any, columns: int) -> np.ndarray:
+    """(column,) float64 from a tensor of that many numbers, with or without a leading axis of 1."""
+    array = np.asarray(value)
+    return checks.table(where, array[None] if array.ndim == 1 else array, columns, rows=1, row="row")[0]
+
+
+def _object(raw: RawTree, key: SequenceKey, kind: str) -> ObjectTrack:
+    folder = f"{OBJECTS}/{key.name}"
+    names = [name for name in raw.names(folder, ".npy") if name.startswith(f"{kind}_")]
+    if len(names) != 1:
+        raise BadInput(
+            f"{folder}/{kind}_<id>.npy", "poses of one object", f"{len(names)}: {', '.join(names) or 'none'}"
+        )
+    path = f"{folder}/{names[0]}"
+    poses = load_npy(raw.file(path))
+    if poses.dtype.kind != "f" or poses.ndim != 3 or poses.shape[1:] != (4, 4) or not len(poses):
+        raise BadInput(path, "matrices of shape (frames, 4, 4)", f"{poses.dtype} of shape {poses.shape}")
+    poses = poses.astype(np.float64)
+    checks.finite(path, poses)
+    checks.rigid_transforms(path, [f"frame {frame}" for frame in range(len(poses))], poses)
+    model_path = f"{MODELS}/{names[0].removeprefix(f'{kind}_').removesuffix('.npy')}_cm.obj"
+    return ObjectTrack(
+        _model(raw, model_path),
+        rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32),
+        poses[:, :3, 3].astype(np.float32),
+    )
+
+
+def _model(raw: RawTree, path: str) -> ObjectModel:
+    mesh = load_mesh(raw.file(path))
+    name = Path(path).name.removesuffix("_cm.obj")
+    return ObjectModel(name, mesh.vertices * CENTIMETRES, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
+
+
+def _touched(clip: Clip, hands: HandPair) -> tuple[int, int]:
+    """Half-open range from the first to the last frame with a joint or tip of a hand within 2 cm of the tool."""
+    rotation = rotvec_to_rotmat(clip.object.rotvec.astype(np.float64))
+    near = np.zeros(clip.n_frames, dtype=bool)
+    for side in SIDES:
+        joints = track_joints(clip.hands[side], hands[side]).astype(np.float64)
+        local = (joints - clip.object.translation_m[:, None]) @ rotation
+        model = clip.object.model
+        distance = closest_points(model.vertices_m, model.faces, local.reshape(-1, 3)).distance_m
+        near |= clip.hands[side].valid & (distance.reshape(local.shape[:2]) < TOUCH_M).any(axis=1)
+    if not near.any():
+        remedy = "nothing to do if nobody touches it; check that the MANO files are the ones TACO used"
+        raise BadInput(f"{HANDS}/{clip.sequence}", "a hand within 2 cm of the tool", "none in any frame", remedy)
+    touched = np.flatnonzero(near)
+    return int(touched[0]), int(touched[-1]) + 1
+
+
+def _day(name: str) -> str:
+    return name.partition("/")[2].partition("_")[0]

@@ -1,0 +1,1 @@
+"""The Parquet + NPZ store of clips, and the annotated store over it."""

@@ -1,0 +1,222 @@
+"""The annotated dataset of one profile and source: clips, words, contacts, read from the four folders stages write.
+
+    clips/        the store (see ``hoidata.store.store``)
+    annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip the four
+                                      forms, then its variations, if any were asked for
+                  hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
+                                      reason (why a clip is left out), verb, verb_source (source: the clip came
+                                      with it; derived: its motion shows it), verb_evidence (what that rests on)
+                  hand_distance.npz   how near each hand is in every frame (``hoidata.store.hand_evidence``)
+                  embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
+                  info.json           encoder, threshold_m, points, forms, variations (and what their guard
+                                      dropped), counts
+    contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
+                  clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
+                  contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
+                  distances-*.npz     frame int16, point int16, joint int8, distance_m float32: one row per entry
+                  info.json           threshold_m, points, counts
+    splits/       splits.parquet      clip_id, split (the chosen one), one column per named split
+                  info.json           definitions, clips per part, leak checks
+                  statistics.json     of every stored quantity over the training part
+
+A clip without an acting hand, or without words, has a row with the reason in hand_type.parquet and no sentence; it
+belongs to no part of a split, and neither does a clip that no part of the split covers.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import pandas as pd
+
+from hoidata.clips.clip import SIDES, Clip, HandType, Side
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.arrays import read_npz
+from hoidata.hands import HandPair
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.sampling import SampledPoints
+from hoidata.store.distances import DistanceEntries
+from hoidata.store.hand_evidence import HandDistances, HandEvidence
+from hoidata.store.mapped import map_npz
+from hoidata.store.store import Store, open_store
+
+# The form of a sentence beyond the four.
+VARIATION = "variation"
+STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
+
+
+def load_annotated(root: str | Path, hands: HandPair | None = None) -> "AnnotatedStore":
+    """Open ``root/clips``, ``root/annotation``, ``root/contact`` and ``root/splits`` for reading.
+
+    hands: as in ``open_store``. Raises MissingResource naming the stage whose folder is not there.
+    """
+    root = Path(root)
+    for folder, stage in STAGES.items():
+        if not (root / folder).is_dir():
+            raise MissingResource(f"{root / folder} is not there: run the stage '{stage}' of this dataset first")
+    return AnnotatedStore(root, open_store(root / "clips", hands))
+
+
+class AnnotatedStore:
+    """Clips with their words and contacts, by clip id. ``ids()`` are the clips that have sentences."""
+
+    def __init__(self, root: Path, store: Store) -> None:
+        self.root = root
+        self.store = store
+        annotation, contact = root / "annotation", root / "contact"
+        self.text = pd.read_parquet(annotation / "text.parquet")
+        self.hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
+        chosen = pd.read_parquet(root / "splits" / "splits.parquet", columns=["clip_id", "split"])
+        self.splits: dict[str, str | None] = {
+            clip_id: None if pd.isna(part) else str(part) for clip_id, part in chosen.itertuples(index=False)
+        }
+        self.split_info: dict[str, Any] = orjson.loads((root / "splits" / "info.json").read_bytes())
+        self.annotation_info: dict[str, Any] = orjson.loads((annotation / "info.json").read_bytes())
+        self.contact_info: dict[str, Any] = orjson.loads((contact / "info.json").read_bytes())
+        embeddings = read_npz(annotation / "embeddings.npz")
+        self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
+        self._features = embeddings["features"]
+        self._sentences = _by_clip(self.text.query("form != @VARIATION"))
+        self._variations = _by_clip(self.text.query("form == @VARIATION"))
+        self._objects = pd.read_parquet(contact / "objects.parquet").set_index("object")
+        self._clips = pd.read_parquet(contact / "clips.parquet").set_index("clip_id")
+        self._points = read_npz(contact / "points.npz")
+        self._contact = read_npz(contact / "contact.npz")
+        self._distances: dict[int, dict[str, np.ndarray]] = {}
+        self._hand_distances: HandDistances | None = None
+        self._refuse_other_clips()
+
+    def __len__(self) -> int:
+        return len(self.ids())
+
+    def ids(self, split: str | None = None) -> list[str]:
+        """Clips of one part of the chosen split, or all, in the store's order; clips without sentences are left out."""
+        return [key for key in self._sentences if split is None or self.splits[key] == split]
+
+    def split_ids(self, split: str) -> list[str]:
+        """Clips of one part of the chosen split, in the store's order."""
+        return self.ids(split)
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """The store's ``meta/info.json``: dataset, synthetic, hand model, licence."""
+        return self.store.info
+
+    def clip(self, clip_id: str) -> Clip:
+        return self.store.clip(clip_id)
+
+    def joints(self, clip_id: str, side: Side) -> np.ndarray:
+        """(frame, 21, 3) float32 world joints of one hand, metres."""
+        return self.store.joints(clip_id, side)
+
+    def hand_type(self, clip_id: str) -> HandType:
+        """The hand the proximity test found. Raises KeyError with the reason for a clip in which none acts."""
+        found = self.hand_types.at[clip_id, "hand_type"]
+        if found not in ("left", "right", "both"):
+            raise KeyError(f"no hand acts in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")
+        return found
+
+    def hand_evidence(self, clip_id: str, threshold_m: float | None = None) -> HandEvidence:
+        """How near each hand comes in every frame, and the hand type at ``threshold_m``, by default the stage's own.
+
+        Kept by the stage annotate: nothing is computed. Per-frame distances are rounded to float32 (1 nm at 2 cm); the
+        clip's hand type rests on the exact smallest ones.
+        """
+        if self._hand_distances is None:
+            self._hand_distances = HandDistances(self.root / "annotation" / "hand_distance.npz", len(self.store.ids))
+        row = self.hand_types.index.get_loc(clip_id)
+        assert isinstance(row, int)
+        smallest: dict[Side, float] = {}
+        for side in SIDES:
+            value = self.hand_types.at[clip_id, f"min_{side}_m"]
+            smallest[side] = np.inf if pd.isna(value) else float(value)
+        judged_m: float = self.annotation_info["threshold_m"] if threshold_m is None else threshold_m
+        return HandEvidence(None, self._hand_distances.of(row), judged_m, smallest).at_threshold(judged_m)
+
+    def sentences(self, clip_id: str) -> tuple[str, ...]:
+        """Imperative, passive, subject and gerund form."""
+        return tuple(self._sentences[clip_id]["sentence"])
+
+    def text_features(self, clip_id: str) -> np.ndarray:
+        """(4, 512) float32 features of the four sentences, of the encoder ``encoder_identity``."""
+        return self._features[self._sentences[clip_id]["text_row"].to_numpy()]
+
+    def text_embedding(self, clip_id: str) -> np.ndarray:
+        """The same as :meth:`text_features`."""
+        return self.text_features(clip_id)
+
+    def variations(self, clip_id: str) -> tuple[str, ...]:
+        """Further sentences that say the same, as many as the stage was asked for; by default none."""
+        return tuple(self._variations[clip_id]["sentence"]) if clip_id in self._variations else ()
+
+    def variation_features(self, clip_id: str) -> np.ndarray:
+        """(variation, 512) float32 features of :meth:`variations`."""
+        rows = self._variations[clip_id]["text_row"].to_numpy() if clip_id in self._variations else []
+        return self._features[np.asarray(rows, np.int64)]
+
+    def object_key(self, clip_id: str) -> str:
+        """Name of the manipulated object within this dataset."""
+        return str(self.store.sequences.at[clip_id, "object"])
+
+    def object_model(self, object_key: str) -> ObjectModel:
+        return self.store.object_model(object_key)
+
+    def points(self, object_key: str) -> SampledPoints:
+        """The sampled points of an object, in its own frame with the hinge at zero."""
+        row = int(self._objects.at[object_key, "row"])
+        arrays = {name: array[row] for name, array in self._points.items()}
+        return SampledPoints(**arrays, method=self._objects.at[object_key, "method"])
+
+    def contact_of(self, clip_id: str, side: Side) -> np.ndarray:
+        """(1024,) uint8: points one hand touches in any frame of the clip."""
+        return (self.touched_frames(clip_id, side) > 0).astype(np.uint8)
+
+    def contact(self, clip_id: str) -> np.ndarray:
+        """(1024,) uint8: points any hand touches in any frame of the clip, Text2HOI's contact map."""
+        return np.maximum(self.contact_of(clip_id, "left"), self.contact_of(clip_id, "right"))
+
+    def touched_frames(self, clip_id: str, side: Side) -> np.ndarray:
+        """(1024,) uint16: in how many frames one hand touches each point."""
+        return self._contact[f"{side}_frames"][int(self._clips.at[clip_id, "row"])]
+
+    def distances(self, clip_id: str, side: Side | None = None) -> DistanceEntries:
+        """All joint-point distances under the threshold, of one hand or of both (left first)."""
+        sides = SIDES if side is None else (side,)
+        parts = [self._entries(clip_id, name) for name in sides]
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return DistanceEntries(*columns)
+
+    def _entries(self, clip_id: str, side: Side) -> tuple[np.ndarray, ...]:
+        row = self._clips.loc[clip_id]
+        rows = slice(int(row[f"{side}_start"]), int(row[f"{side}_stop"]))
+        shard = self._shard(int(row["shard"]))
+        frame, joint, point = (shard[name][rows].astype(np.int64) for name in ("frame", "joint", "point"))
+        number = np.full(len(frame), SIDES.index(side), np.int64)
+        return number, frame, joint, point, np.array(shard["distance_m"][rows])
+
+    def _shard(self, number: int) -> dict[str, np.ndarray]:
+        if number not in self._distances:
+            self._distances[number] = map_npz(self.root / "contact" / f"distances-{number:05d}.npz")
+        return self._distances[number]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workers map the distances anew: a pickled memory map would carry all of them."""
+        return {**self.__dict__, "_distances": {}, "_hand_distances": None}
+
+    def _refuse_other_clips(self) -> None:
+        """Raise BadInput when a stage's output belongs to another conversion than the clips beside it."""
+        tables = {"annotation": self.hand_types.index, "contact": self._clips.index, "splits": self.splits}
+        for folder, found in tables.items():
+            _same_ids(self.root / folder, self.store.ids, list(found))
+
+
+def _by_clip(text: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    return {str(key): rows for key, rows in text.groupby("clip_id", sort=False)}
+
+
+def _same_ids(folder: Path, expected: Sequence[str], found: Sequence[str]) -> None:
+    if list(expected) != list(found):
+        got = f"{len(found)}, {len(set(found) & set(expected))} of them among these"
+        raise BadInput(folder, f"the {len(expected)} clips of the store beside it", got, "run its stage again")

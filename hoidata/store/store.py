@@ -1,0 +1,258 @@
+"""The unified store of one dataset: a folder of Parquet tables and stored NPZ arrays.
+
+    meta/info.json            schema_version, dataset, synthetic, fps, hand_model, units, axes, licence, frame and
+                              hand_convention (what the source's frame and hand parameters mean)
+    meta/sequences.parquet    one row per clip: id, words, and where its rows lie in the arrays
+    meta/objects.parquet      one row per object     meta/files.parquet       one row per raw file
+    meta/quarantine.parquet   what was left out, with the reason
+    arrays/frames-00000.npz   one member per array, the clips of a shard one after another; never compressed
+    arrays/body-00000.npz     SMPL-X body parameters, where the source has them
+    arrays/source_contact-00000.npz  contact labels of the source, where it has them
+    arrays/objects.npz        <object>/vertices_m, <object>/faces, <object>/part; arrays/templates.npz personal hands
+
+``hoidata/store/README.md`` describes every field. In one line:
+``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_drink_1")``. With plain NumPy::
+
+    rows = pandas.read_parquet("clips/meta/sequences.parquet").set_index("clip_id")
+    row = rows.loc["grab/s1/mug_drink_1"]
+    arrays = numpy.load(f"clips/arrays/frames-{row.shard:05d}.npz")
+    wrist_m = arrays["left_wrist_m"][row.first_row : row.first_row + row.n_frames]
+
+Betas start at ``<side>_betas_row`` and have 1 row or one per frame (``<side>_betas_count``); the k-th further object
+starts at ``other_row + k * n_frames`` of the ``other_*`` arrays; camera, body and contact rows start at their own
+``*_row``, -1 for a clip that has none.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+import pandas as pd
+import pyarrow.parquet as pq
+
+from hoidata.clips.clip import (
+    SIDES,
+    BodyTrack,
+    CameraTrack,
+    Clip,
+    HandTrack,
+    ObjectTrack,
+    Side,
+    SourceContact,
+    SourceFile,
+)
+from hoidata.clips.quarantine import Quarantined
+from hoidata.errors import BadInput, MissingResource
+from hoidata.hands import HandPair, load_embedded_hands
+from hoidata.hands.fast_joints import fast_track_joints
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.store.fields import SCHEMA_VERSION, SEQUENCES, TABLES
+from hoidata.store.mapped import map_npz
+from hoidata.store.reading import FrameShard, clip_rows
+from hoidata.store.versions import checked_version, filled_info, filled_table
+from hoidata.store.writing import write_store
+
+__all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"]
+
+
+def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
+    """Open a store for reading.
+
+    hands: the hand model its parameters belong to; not needed when that is the embedded one, or when no joints are
+    asked for. A store of an earlier minor version is read with what later ones added filled in; nothing is written.
+    Raises MissingResource when ``folder`` is no store, BadInput for another major version or other hands.
+    """
+    folder = Path(folder)
+    info = read_info(folder)
+    path = folder / "meta" / "info.json"
+    version = checked_version(folder, info["schema_version"])
+    model = info.get("hand_model", {})
+    if not isinstance(model, dict):
+        raise BadInput(path, "a hand_model with name and digest", repr(model)[:80], "run the conversion again")
+    written = model.get("digest")
+    if hands is not None and written and hands.digest != written:
+        remedy = "open it with the hands it was converted with"
+        raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
+    sequences, objects, files, quarantine = (_read_table(folder / file.path) for file in TABLES.values())
+    sequences = filled_table(SEQUENCES, sequences, version).set_index("clip_id", drop=False).rename_axis(None)
+    return Store(folder, filled_info(info, version), sequences, objects, files, quarantine, hands)
+
+
+def read_info(folder: str | Path) -> dict[str, Any]:
+    """``meta/info.json`` as it is on disk.
+
+    Raises MissingResource when ``folder`` is no store, BadInput when the file is no JSON object with a schema_version.
+    """
+    path = Path(folder) / "meta" / "info.json"
+    if not path.is_file():
+        raise MissingResource(f"{folder} is no store: {path} is missing; run the conversion of this dataset first")
+    try:
+        info = orjson.loads(path.read_bytes())
+        _ = info["schema_version"]
+    except (ValueError, KeyError, TypeError, OSError) as error:
+        raise BadInput(path, "JSON with a schema_version", str(error), "run the conversion again") from error
+    return info
+
+
+def _read_table(path: Path) -> pd.DataFrame:
+    try:
+        return pq.read_table(path, memory_map=True, use_threads=False).to_pandas()
+    except (OSError, ValueError) as error:  # pyarrow's errors are both
+        raise BadInput(path, "a Parquet table of the store", str(error), "run the conversion again") from error
+
+
+@dataclass
+class Store:
+    """One dataset's clips. sequences (indexed by clip id), objects, files, quarantine: pandas tables; info: a dict."""
+
+    folder: Path
+    info: dict[str, Any]
+    sequences: pd.DataFrame
+    objects: pd.DataFrame
+    files: pd.DataFrame
+    quarantine: pd.DataFrame
+    hands: HandPair | None = None
+    _arrays: dict[str, dict[str, np.ndarray]] = field(default_factory=dict, repr=False)
+    _models: dict[str, ObjectModel] = field(default_factory=dict, repr=False)
+    _shards: dict[int, FrameShard] = field(default_factory=dict, repr=False)
+    _rows: dict[str, dict[str, Any]] = field(default_factory=dict, repr=False)
+    _sources: list[SourceFile] = field(default_factory=list, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workers open the array files anew: a pickled memory map would carry the whole dataset."""
+        return {**self.__dict__, "_arrays": {}, "_models": {}, "_shards": {}, "_rows": {}, "_sources": []}
+
+    def __len__(self) -> int:
+        return len(self.sequences)
+
+    @property
+    def ids(self) -> list[str]:
+        return self.sequences["clip_id"].tolist()
+
+    def clip(self, clip_id: str, *, motion_only: bool = False) -> Clip:
+        """The clip as it was written, float32. Raises KeyError when there is none of that id.
+
+        motion_only: without camera, body and the source's contact labels, which can be larger than all the rest.
+        """
+        row = self._row(clip_id)
+        frames, shard, gravity = row["frames"], self._frames(row["shard"]), row["gravity"]
+        return Clip(
+            hands={side: self._hand(row, side) for side in SIDES},
+            object=self._object(row["object"], shard.object, frames),
+            other_objects=self._other_objects(row, shard) if row["other_objects"] else (),
+            source_frames=shard.source_frames[frames].copy(),
+            gravity=None if gravity is None else gravity.copy(),
+            source_from_world=row["source_from_world"].copy(),
+            sources=self._sources_of(row),
+            camera=None if motion_only else self._camera(row, shard),
+            body=None if motion_only else self._body(row),
+            source_contact=None if motion_only else self._source_contact(row),
+            **row["facts"],
+        )
+
+    def joints(self, clip_id: str, side: Side) -> np.ndarray:
+        """(frame, 21, 3) float32 world joints of one hand, metres, valid frames or not (see ``HandTrack.valid``)."""
+        return fast_track_joints(self._hand(self._row(clip_id), side), self.hand_pair()[side])
+
+    def hand_pair(self) -> HandPair:
+        """The hand model of this store. Raises MissingResource when it needs the user's MANO files."""
+        if self.hands is None:
+            embedded = load_embedded_hands()
+            if self.info.get("hand_model", {}).get("digest") != embedded.digest:
+                name = self.info.get("hand_model", {}).get("name", "another hand model")
+                raise MissingResource(
+                    f"{self.folder} was converted with {name}: open_store(folder, hands=...) needs it"
+                )
+            self.hands = embedded
+        return self.hands
+
+    def object_model(self, name: str) -> ObjectModel:
+        """The canonical mesh of an object of this store, by its key in ``objects``."""
+        if name not in self._models:
+            match = self.objects.loc[self.objects["object"] == name]
+            if match.empty:
+                raise KeyError(f"no object {name!r} in {self.folder}; there are: {', '.join(self.objects['object'])}")
+            facts = match.iloc[0]
+            arrays = {key: self._file("objects")[f"{name}/{key}"].copy() for key in ("vertices_m", "faces", "part")}
+            hinge = None
+            if facts["articulated"]:
+                hinge = Hinge(axis=np.array(facts["hinge_axis"]), origin_m=np.array(facts["hinge_origin_m"]))
+            self._models[name] = ObjectModel(name, hinge=hinge, **arrays)
+        return self._models[name]
+
+    def _row(self, clip_id: str) -> dict[str, Any]:
+        if not self._rows:
+            self._rows = clip_rows(self.sequences)
+        if clip_id not in self._rows:
+            raise KeyError(f"no clip {clip_id!r} in {self.folder}, which has {len(self)} clips")
+        return self._rows[clip_id]
+
+    def _frames(self, number: int) -> FrameShard:
+        if number not in self._shards:
+            self._shards[number] = FrameShard.open(self.folder / "arrays" / f"frames-{number:05d}.npz")
+        return self._shards[number]
+
+    def _file(self, name: str) -> dict[str, np.ndarray]:
+        if name not in self._arrays:
+            self._arrays[name] = map_npz(self.folder / "arrays" / f"{name}.npz")
+        return self._arrays[name]
+
+    def _hand(self, row: dict[str, Any], side: Side) -> HandTrack:
+        wrist_m, global_orient, hand_pose, betas, valid = self._frames(row["shard"]).hands[side]
+        frames, (betas_rows, template) = row["frames"], row["hands"][side]
+        return HandTrack(
+            wrist_m[frames].copy(),
+            global_orient[frames].copy(),
+            hand_pose[frames].copy(),
+            betas[betas_rows].copy(),
+            valid[frames].copy(),
+            None if template is None else self._file("templates")[template].copy(),
+        )
+
+    def _object(self, name: str, pose: tuple[np.ndarray, ...], rows: slice) -> ObjectTrack:
+        model = self.object_model(name)
+        rotvec, translation_m, hinge_rad = pose
+        hinge = hinge_rad[rows].copy() if model.is_articulated else None
+        return ObjectTrack(model, rotvec[rows].copy(), translation_m[rows].copy(), hinge)
+
+    def _other_objects(self, row: dict[str, Any], shard: FrameShard) -> tuple[ObjectTrack, ...]:
+        first, length = row["other_row"], row["n_frames"]
+        starts = range(first, first + length * len(row["other_objects"]), length)
+        pairs = zip(row["other_objects"], starts, strict=True)
+        return tuple(self._object(name, shard.other, slice(start, start + length)) for name, start in pairs)
+
+    def _camera(self, row: dict[str, Any], shard: FrameShard) -> CameraTrack | None:
+        first, intrinsics = row["camera_row"], row["camera_intrinsics"]
+        if first < 0:
+            return None
+        rotvec, position_m, images = (array[first : first + row["n_frames"]].copy() for array in shard.camera)
+        intrinsics = None if intrinsics is None else np.array(intrinsics)
+        return CameraTrack(row["camera_name"], rotvec, position_m, images, intrinsics)
+
+    def _body(self, row: dict[str, Any]) -> BodyTrack | None:
+        if row["body_row"] < 0:
+            return None
+        shard = self._file(f"body-{row['shard']:05d}")
+        rows = slice(row["body_row"], row["body_row"] + row["n_frames"])
+        expressions = slice(row["expression_row"], row["expression_row"] + row["n_frames"])
+        return BodyTrack(
+            **{name: shard[name][rows].copy() for name in ("transl_m", "global_orient", "body_pose", "face_pose")},
+            expression=None if row["expression_row"] < 0 else shard["expression"][expressions].copy(),
+        )
+
+    def _source_contact(self, row: dict[str, Any]) -> SourceContact | None:
+        first, count = row["source_contact_row"], row["source_contact_count"]
+        if first < 0:
+            return None
+        if count == 0:
+            return SourceContact(np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, np.uint8))
+        shard = self._file(f"source_contact-{row['shard']:05d}")
+        return SourceContact(**{name: shard[name][first : first + count].copy() for name in shard})
+
+    def _sources_of(self, row: dict[str, Any]) -> tuple[SourceFile, ...]:
+        if not self._sources and len(self.files):
+            columns = (self.files[name].tolist() for name in ("path", "size", "sha256"))
+            self._sources = [SourceFile(*values) for values in zip(*columns, strict=True)]
+        return tuple(self._sources[number] for number in row["source_files"])

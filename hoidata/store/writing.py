@@ -1,0 +1,191 @@
+"""Writing a store: clips stream in, at most one shard of them is in memory, equal clips give equal bytes."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import orjson
+
+from hoidata.clips.clip import (
+    FPS,
+    SIDES,
+    BodyTrack,
+    CameraTrack,
+    Clip,
+    HandTrack,
+    ObjectTrack,
+    SourceContact,
+    SourceFile,
+)
+from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.validation import check_clip
+from hoidata.files import atomic_folder, canonical_json, sha256_bytes
+from hoidata.files.arrays import write_npz
+from hoidata.files.tables import write_table
+from hoidata.store.fields import (
+    AXES,
+    BODY,
+    FRAMES,
+    SCHEMA_VERSION,
+    SOURCE_CONTACT,
+    TABLES,
+    UNITS,
+    arrow_schema,
+)
+from hoidata.store.info import check_info
+from hoidata.store.meshes import MeshWriter
+from hoidata.store.shards import ShardWriter
+
+
+def write_store(folder: str | Path, clips: Iterable[Clip | Quarantined], info: dict[str, Any]) -> dict[str, int]:
+    """Write clips, in the order given, as the store ``folder``; it appears whole or not at all.
+
+    info: the facts of ``hoidata.store.info.store_info``, and whatever else belongs into ``meta/info.json``.
+    A clip under an id that an earlier one has is left out: it becomes a row of the quarantine table.
+    Returns the counts: clips, frames, objects, files, quarantined. Raises BadInput for a clip that breaks the schema
+    and for an info that lacks a required fact.
+    """
+    check_info(info)
+    with atomic_folder(folder) as part:
+        (part / "meta").mkdir()
+        (part / "arrays").mkdir()
+        writer = _Writer(part)
+        for item in clips:
+            if isinstance(item, Quarantined):
+                writer.quarantined.append(vars(item))
+            else:
+                writer.add(check_clip(item))
+        return writer.finish(info)
+
+
+class _Writer:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.shards = ShardWriter(folder)
+        self.meshes = MeshWriter(folder)
+        self.rows: dict[str, dict[str, Any]] = {}
+        self.quarantined: list[dict[str, Any]] = []
+        self.templates: dict[str, np.ndarray] = {}
+        self.files: dict[SourceFile, int] = {}
+
+    def add(self, clip: Clip) -> None:
+        if clip.clip_id in self.rows:
+            self.quarantined.append(vars(_second_of_an_id(clip, self.rows[clip.clip_id])))
+            return
+        row = self._facts(clip)
+        row["first_row"] = self.shards.append(FRAMES, "source_frames", clip.source_frames)
+        for side in SIDES:
+            row |= self._add_hand(side, clip.hands[side])
+        self._add_pose("object", clip.object)
+        row["other_row"] = self.shards.rows(FRAMES, "other_rotvec")
+        for track in clip.other_objects:
+            self._add_pose("other", track)
+        row |= self._add_camera(clip.camera) | self._add_body(clip.body) | self._add_contact(clip.source_contact)
+        self.rows[clip.clip_id] = row
+        self.shards.end_clip()
+
+    def _facts(self, clip: Clip) -> dict[str, Any]:
+        names = ("clip_id", "dataset", "subject", "sequence", "verb", "object_words", "labelled_hand", "n_frames")
+        further = ("source_fps", "synthetic", "gravity_note", "hands_from", "fit_error_m")
+        return {name: getattr(clip, name) for name in (*names, *further)} | {
+            "shard": self.shards.number,
+            "object": self.meshes.add(clip.object.model),
+            "other_objects": [self.meshes.add(track.model) for track in clip.other_objects],
+            "articulated": clip.object.is_articulated,
+            "gravity": None if clip.gravity is None else clip.gravity.tolist(),
+            "source_from_world": clip.source_from_world.ravel().tolist(),
+            "first_source_frame": int(clip.source_frames[0]),
+            "last_source_frame": int(clip.source_frames[-1]),
+            "source_files": [self.files.setdefault(source, len(self.files)) for source in clip.sources],
+        }
+
+    def _add_hand(self, side: str, track: HandTrack) -> dict[str, Any]:
+        names = ("wrist_m", "global_orient", "hand_pose", "valid")
+        self.shards.append_all(FRAMES, {f"{side}_{name}": getattr(track, name) for name in names})
+        return {
+            f"{side}_betas_row": self.shards.append(FRAMES, f"{side}_betas", track.betas),
+            f"{side}_betas_count": len(track.betas),
+            f"{side}_template": self._add_template(track.template_m),
+            f"{side}_valid_frames": int(track.valid.sum()),
+        }
+
+    def _add_template(self, template_m: np.ndarray | None) -> str | None:
+        if template_m is None:
+            return None
+        template_m = np.ascontiguousarray(template_m, dtype=np.float32)
+        key = template_key(template_m)
+        self.templates[key] = template_m
+        return key
+
+    def _add_pose(self, prefix: str, track: ObjectTrack) -> None:
+        hinge = np.zeros(track.n_frames) if track.hinge_rad is None else track.hinge_rad
+        arrays = {"rotvec": track.rotvec, "translation_m": track.translation_m, "hinge_rad": hinge}
+        self.shards.append_all(FRAMES, {f"{prefix}_{name}": array for name, array in arrays.items()})
+
+    def _add_camera(self, track: CameraTrack | None) -> dict[str, Any]:
+        if track is None:
+            return {"camera_name": None, "camera_intrinsics": None, "camera_row": -1}
+        arrays = {f"camera_{name}": getattr(track, name) for name in ("rotvec", "position_m", "images")}
+        return {
+            "camera_name": track.name,
+            "camera_intrinsics": None if track.intrinsics is None else track.intrinsics.tolist(),
+            "camera_row": self.shards.append_all(FRAMES, arrays),
+        }
+
+    def _add_body(self, track: BodyTrack | None) -> dict[str, Any]:
+        if track is None:
+            return {"body_row": -1, "expression_row": -1}
+        names = ("transl_m", "global_orient", "body_pose", "face_pose")
+        given = track.expression
+        return {
+            "body_row": self.shards.append_all(BODY, {name: getattr(track, name) for name in names}),
+            "expression_row": -1 if given is None else self.shards.append(BODY, "expression", given),
+        }
+
+    def _add_contact(self, contact: SourceContact | None) -> dict[str, Any]:
+        if contact is None:
+            return {"source_contact_row": -1, "source_contact_count": 0}
+        return {
+            "source_contact_row": self.shards.append_all(SOURCE_CONTACT, vars(contact)),
+            "source_contact_count": len(contact.frame),
+        }
+
+    def finish(self, info: dict[str, Any]) -> dict[str, int]:
+        self.shards.finish()
+        names = self.meshes.names()
+        rows = [_with_names(row, names) for row in self.rows.values()]
+        objects = self.meshes.finish(self.folder / "arrays" / "objects.npz")
+        write_npz(self.folder / "arrays" / "templates.npz", dict(sorted(self.templates.items())))
+        files = [vars(item) for item in self.files]
+        tables = {"sequences": rows, "objects": objects, "files": files, "quarantine": self.quarantined}
+        for name, table in tables.items():
+            write_table(self.folder / TABLES[name].path, table, arrow_schema(TABLES[name]))
+        counts = {
+            "clips": len(rows),
+            "frames": sum(row["n_frames"] for row in rows),
+            "objects": len(objects),
+            "files": len(files),
+            "quarantined": len(self.quarantined),
+        }
+        own = {"schema_version": SCHEMA_VERSION, "fps": FPS, "units": UNITS, "axes": AXES, "counts": counts}
+        text = orjson.dumps(orjson.loads(canonical_json(info | own)), option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS)
+        (self.folder / "meta" / "info.json").write_bytes(text + b"\n")
+        return counts
+
+
+def template_key(template_m: np.ndarray) -> str:
+    """The name of a personal rest mesh (778, 3) float32 in templates.npz."""
+    return sha256_bytes(np.ascontiguousarray(template_m).tobytes())[:16]
+
+
+def _with_names(row: dict[str, Any], names: dict[tuple[str, str], str]) -> dict[str, Any]:
+    """The row with the final names of its objects."""
+    return row | {"object": names[row["object"]], "other_objects": [names[key] for key in row["other_objects"]]}
+
+
+def _second_of_an_id(clip: Clip, first: dict[str, Any]) -> Quarantined:
+    frames = f"{first['first_source_frame']} to {first['last_source_frame']} of {first['sequence']}"
+    got = f"a second one, frames {clip.source_frames[0]} to {clip.source_frames[-1]} of {clip.sequence}"
+    remedy = "the first was kept; rename the sequence, or report it as a defect of the adapter"
+    return Quarantined(clip.clip_id, "clip_id", f"one clip of this id (frames {frames})", got, remedy)

@@ -1,0 +1,246 @@
+"""The array files of a store against the field table and against the rows that point into them."""
+
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import SIDES
+from hoidata.errors import BadInput
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.store.fields import (
+    BODY,
+    FRAMES,
+    OBJECT_ARRAYS,
+    OBJECTS,
+    SEQUENCES,
+    SOURCE_CONTACT,
+    TEMPLATES,
+    Field,
+    StoreFile,
+    Version,
+)
+from hoidata.store.mapped import map_npz
+from hoidata.store.meshes import mesh_digest
+from hoidata.store.writing import template_key
+from hoidata.store_check.tables import REMEDY, Columns
+
+Arrays = dict[str, np.ndarray]
+_STEP = 1 << 20  # rows whose finiteness is looked at in one go
+
+
+@dataclass(frozen=True)
+class _Range:
+    """Rows of a member that belong to a clip: from the number in ``column``, as many as ``count`` (of the clip's row).
+
+    A column that may be -1 says that the clip has none.
+    """
+
+    file: StoreFile
+    member: str
+    column: str
+    count: Callable[[dict[str, Any]], int]
+
+
+def _frames(row: dict[str, Any]) -> int:
+    return row["n_frames"]
+
+
+_RANGES = (
+    _Range(FRAMES, "source_frames", "first_row", _frames),
+    _Range(FRAMES, "left_betas", "left_betas_row", lambda row: row["left_betas_count"]),
+    _Range(FRAMES, "right_betas", "right_betas_row", lambda row: row["right_betas_count"]),
+    _Range(FRAMES, "other_rotvec", "other_row", lambda row: row["n_frames"] * len(row["other_objects"])),
+    _Range(FRAMES, "camera_rotvec", "camera_row", _frames),
+    _Range(BODY, "transl_m", "body_row", _frames),
+    _Range(BODY, "expression", "expression_row", _frames),
+    _Range(SOURCE_CONTACT, "frame", "source_contact_row", lambda row: row["source_contact_count"]),
+)
+
+
+def read_shards(
+    folder: Path, file: StoreFile, paths: Iterable[str], version: Version
+) -> tuple[dict[int, Arrays], list[BadInput]]:
+    """The shards of one kind whose members are as documented, by number; and what is wrong with the others.
+
+    paths: of all files the store has.
+    """
+    start, end = file.path.split("*")
+    shards, problems = {}, []
+    for path in sorted(path for path in paths if path.startswith(start)):
+        arrays, found = _read_members(folder, path, {field.name: field for field in file.fields_of(version)})
+        problems += found
+        if arrays is not None:
+            found = list(_equal_lengths(path, file.fields_of(version), arrays))
+            problems += found
+            if not found:
+                shards[int(path.removeprefix(start).removesuffix(end))] = arrays
+    return shards, problems
+
+
+def _read_members(folder: Path, path: str, fields: dict[str, Field]) -> tuple[Arrays | None, list[BadInput]]:
+    if not (folder / path).is_file():
+        return None, []  # listed with the missing files
+    try:
+        arrays = map_npz(folder / path)
+    except BadInput as error:
+        return None, [BadInput(path, error.expected, error.got, REMEDY)]
+    problems = [
+        BadInput(f"{path}: {name}", "a member", "nothing there", REMEDY) for name in fields if name not in arrays
+    ]
+    for name, array in arrays.items():
+        if name not in fields:
+            problems.append(BadInput(f"{path}: {name}", "only the members of the schema", "a further one", REMEDY))
+            continue
+        problems += _member_problems(f"{path}: {name}", fields[name], array)
+    problems = problems or list(_checksum_problems(folder, path))
+    return (None if problems else arrays), problems
+
+
+def _checksum_problems(folder: Path, path: str) -> Iterator[BadInput]:
+    """Numbers changed where they lie may all be plausible, and reading them through a map compares no checksum."""
+    try:
+        with zipfile.ZipFile(folder / path) as archive:
+            damaged = archive.testzip()
+    except Exception as error:  # what zipfile raises on damaged archives has no common base
+        yield BadInput(path, "an archive whose members can be read", str(error), REMEDY)
+        return
+    if damaged is not None:
+        name = damaged.removesuffix(".npy")
+        yield BadInput(f"{path}: {name}", "the bytes that were written", "another checksum (CRC-32)", REMEDY)
+
+
+def _member_problems(where: str, field: Field, array: np.ndarray) -> Iterator[BadInput]:
+    first = field.shape[0]
+    shape = (first if isinstance(first, int) else len(array) if array.ndim else 0, *field.row_shape)
+    if array.dtype != np.dtype(field.dtype):
+        yield BadInput(where, field.dtype, f"{array.dtype}", REMEDY)
+    elif array.shape != shape:
+        text = " x ".join(str(length) for length in field.shape)
+        yield BadInput(where, f"shape {text}", f"{array.shape}", REMEDY)
+    elif array.dtype.kind == "f":
+        wrong = sum(int((~np.isfinite(array[at : at + _STEP])).sum()) for at in range(0, len(array), _STEP))
+        if wrong:
+            yield BadInput(where, "finite numbers", f"{wrong} that are NaN or infinite", REMEDY)
+    elif array.dtype == bool and array.view(np.uint8).max(initial=0) > 1:
+        yield BadInput(where, "bytes 0 and 1", f"{array.view(np.uint8).max()}", REMEDY)
+
+
+def _equal_lengths(path: str, fields: Iterable[Field], arrays: Arrays) -> Iterator[BadInput]:
+    """Members that count the same rows must have equally many."""
+    lengths: dict[Any, tuple[str, int]] = {}
+    for field in fields:
+        name, length = lengths.setdefault(field.shape[0], (field.name, len(arrays[field.name])))
+        if length != len(arrays[field.name]):
+            expected = f"{length} rows as in {name}"
+            yield BadInput(f"{path}: {field.name}", expected, f"{len(arrays[field.name])}", REMEDY)
+
+
+def shard_problems(
+    file: StoreFile, shards: dict[int, Arrays], tables: dict[str, Columns], version: Version
+) -> Iterator[BadInput]:
+    """Rows that point outside, overlap, or leave some of a shard to nobody; and rows that say otherwise than arrays."""
+    columns = tables["sequences"]
+    rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
+    for number, arrays in shards.items():
+        clips = [row for row in rows if row["shard"] == number]
+        found = [
+            problem
+            for kind in _RANGES
+            if kind.file is file and kind.column in columns
+            for problem in _range_problems(kind, number, clips, len(arrays[kind.member]))
+        ]
+        yield from found
+        if file is FRAMES and not found:
+            yield from _frame_problems(clips, arrays)
+
+
+def _range_problems(kind: _Range, number: int, clips: list[dict[str, Any]], length: int) -> Iterator[BadInput]:
+    """The clips of a shard must fill it one after another, in their order."""
+    at, path = 0, kind.file.path.replace("*", f"{number:05d}")
+    for row in clips:
+        if row[kind.column] == -1:
+            continue
+        if row[kind.column] != at:
+            where = f"{SEQUENCES.path}: {kind.column} of {row['clip_id']}"
+            yield BadInput(where, f"{at}, where the clip before it ends in {path}", f"{row[kind.column]}", REMEDY)
+            return
+        at += kind.count(row)
+    if at != length:
+        yield BadInput(f"{path}: {kind.member}", f"{at} rows for the clips of {SEQUENCES.path}", f"{length}", REMEDY)
+
+
+def _frame_problems(clips: list[dict[str, Any]], arrays: Arrays) -> Iterator[BadInput]:
+    for row in clips:
+        where = f"{SEQUENCES.path}: {{}} of {row['clip_id']}"
+        frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
+        source = arrays["source_frames"][frames]
+        if np.any(np.diff(source) <= 0):
+            yield BadInput(f"{FRAMES.path}: source_frames of {row['clip_id']}", "rising numbers", "others", REMEDY)
+        found = {
+            "first_source_frame": int(source[0]),
+            "last_source_frame": int(source[-1]),
+            **{f"{side}_valid_frames": int(arrays[f"{side}_valid"][frames].sum()) for side in SIDES},
+        }
+        for name, value in found.items():
+            if row[name] != value:
+                yield BadInput(where.format(name), f"{value} as in its shard", f"{row[name]}", REMEDY)
+        if not row["articulated"] and arrays["object_hinge_rad"][frames].any():
+            where = f"{FRAMES.path}: object_hinge_rad of {row['clip_id']}"
+            yield BadInput(where, "0 for a rigid object", "other angles", REMEDY)
+
+
+@dataclass(frozen=True)
+class MeshesAndTemplates:
+    """objects.npz and templates.npz of a store, against the rows that name their members."""
+
+    folder: Path
+    tables: dict[str, Columns]
+
+    def problems(self) -> Iterator[BadInput]:
+        objects = self.tables["objects"]
+        names = objects["object"]
+        fields = {f"{name}/{field.name}": field for name in names for field in OBJECT_ARRAYS.fields}
+        arrays, found = _read_members(self.folder, OBJECT_ARRAYS.path, fields)
+        yield from found
+        if arrays is not None:
+            for values in zip(*objects.values(), strict=True):
+                yield from _mesh_problems(dict(zip(objects, values, strict=True)), arrays)
+        yield from self._template_problems()
+
+    def _template_problems(self) -> Iterator[BadInput]:
+        sequences = self.tables["sequences"]
+        names = {name for side in SIDES for name in sequences[f"{side}_template"] if name is not None}
+        arrays, found = _read_members(
+            self.folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)}
+        )
+        yield from found
+        for name, template_m in (arrays or {}).items():
+            if template_key(template_m) != name:
+                where = f"{TEMPLATES.path}: {name}"
+                yield BadInput(where, "a name that is the start of its SHA-256", template_key(template_m), REMEDY)
+
+
+def _mesh_problems(row: dict[str, Any], arrays: Arrays) -> Iterator[BadInput]:
+    name = row["object"]
+    mesh = {field.name: np.array(arrays[f"{name}/{field.name}"]) for field in OBJECT_ARRAYS.fields}
+    where = f"{OBJECT_ARRAYS.path}: {name}"
+    for column, member in (("n_vertices", "vertices_m"), ("n_faces", "faces"), ("n_vertices", "part")):
+        if row[column] != len(mesh[member]):
+            expected = f"{row[column]} rows as in {OBJECTS.path}"
+            yield BadInput(f"{where}/{member}", expected, f"{len(mesh[member])}", REMEDY)
+    faces = mesh["faces"]
+    if not faces.size or faces.min() < 0 or faces.max() >= len(mesh["vertices_m"]):
+        expected = f"triangles of vertices 0 to {len(mesh['vertices_m']) - 1}"
+        yield BadInput(f"{where}/faces", expected, "none" if not faces.size else "other numbers", REMEDY)
+    if mesh["part"].max(initial=0) > 1:
+        yield BadInput(f"{where}/part", "0 and 1", f"{mesh['part'].max()}", REMEDY)
+    hinge = None
+    if row["hinge_axis"] is not None and row["hinge_origin_m"] is not None:
+        hinge = Hinge(np.array(row["hinge_axis"]), np.array(row["hinge_origin_m"]))
+    digest = mesh_digest(mesh, ObjectModel(name, hinge=hinge, **mesh))
+    if digest != row["digest"]:
+        yield BadInput(f"{OBJECTS.path}: digest of {name}", f"{digest} as its mesh says", f"{row['digest']}", REMEDY)

@@ -1,0 +1,119 @@
+"""Checking a store on disk, byte by byte as it lies there, against the field table."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from hoidata.clips.validation import check_clip
+from hoidata.errors import BadInput, MissingResource
+from hoidata.store.fields import BODY, FRAMES, INFO, SOURCE_CONTACT, STORE_FILES, TABLES, StoreFile, Version
+from hoidata.store.info import info_problems
+from hoidata.store.store import open_store, read_info
+from hoidata.store.versions import CURRENT, checked_version
+from hoidata.store_check.arrays import MeshesAndTemplates, read_shards, shard_problems
+from hoidata.store_check.tables import REMEDY, Columns, is_whole, read_columns, reference_problems, table_problems
+
+
+def check_store(folder: str | Path) -> list[BadInput]:
+    """Everything that is wrong with the store ``folder``: file and field, expected, got, remedy; none when it is sound.
+
+    A store of an earlier minor version is held to that version's fields. Places are given below ``folder``. Raises
+    MissingResource when ``folder`` is no store.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise MissingResource(f"{folder} is no folder: give the folder of a store")
+    try:
+        info = read_info(folder)
+        version = checked_version(folder, info["schema_version"])
+    except BadInput as problem:
+        return [BadInput(INFO.path, problem.expected, problem.got, problem.remedy)]
+    if version > CURRENT:
+        expected = f"schema version {CURRENT[0]}.{CURRENT[1]} or earlier"
+        remedy = "upgrade hoidata (pip install --upgrade hoidata)"
+        return [BadInput(INFO.path, expected, info["schema_version"], remedy)]
+    problems = info_problems(info, version)
+    tables: dict[str, Columns] = {}
+    for name, file in TABLES.items():
+        columns, found = read_columns(folder, file, version)
+        problems += found
+        if columns is not None:
+            tables[name] = columns
+            problems += table_problems(name, file, columns)
+    if len(tables) < len(TABLES) or not all(is_whole(TABLES[name], columns) for name, columns in tables.items()):
+        return problems  # what else is wrong cannot be told before this is mended
+    problems += reference_problems(tables)
+    problems += _count_problems(info, tables)
+    problems += _file_problems(folder, tables["sequences"], version)
+    problems += _array_problems(folder, tables, version)
+    return problems or list(_clip_problems(folder))
+
+
+def _count_problems(info: dict[str, Any], tables: dict[str, Columns]) -> Iterator[BadInput]:
+    """What info.json counts against what the tables hold."""
+    counts = info.get("counts")
+    found = {
+        "clips": len(tables["sequences"]["clip_id"]),
+        "frames": sum(tables["sequences"]["n_frames"]),
+        "objects": len(tables["objects"]["object"]),
+        "files": len(tables["files"]["path"]),
+        "quarantined": len(tables["quarantine"]["source_key"]),
+    }
+    for name, number in found.items():
+        if isinstance(counts, dict) and counts.get(name) != number:
+            yield BadInput(f"{INFO.path}: counts.{name}", f"{number}", f"{counts.get(name)}", REMEDY)
+
+
+def expected_files(sequences: Columns, version: Version) -> set[str]:
+    """The path of every file a store with these clips has."""
+    shards = set(sequences["shard"]) or {0}
+    with_rows = {
+        FRAMES.path: shards,
+        BODY.path: _shards_where(sequences, "body_row", -1),
+        SOURCE_CONTACT.path: _shards_where(sequences, "source_contact_count", 0),
+    }
+    paths = set()
+    for file in STORE_FILES:
+        if file.since <= version:
+            numbers = with_rows.get(file.path)
+            paths |= {file.path} if numbers is None else {shard_path(file, number) for number in numbers}
+    return paths
+
+
+def shard_path(file: StoreFile, number: int) -> str:
+    return file.path.replace("*", f"{number:05d}")
+
+
+def _shards_where(sequences: Columns, column: str, above: int) -> set[int]:
+    if column not in sequences:
+        return set()
+    return {shard for shard, value in zip(sequences["shard"], sequences[column], strict=True) if value > above}
+
+
+def _file_problems(folder: Path, sequences: Columns, version: Version) -> Iterator[BadInput]:
+    expected = expected_files(sequences, version)
+    found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
+    for path in sorted(expected - found):
+        yield BadInput(path, "a file", "nothing there", REMEDY)
+    for path in sorted(found - expected):
+        yield BadInput(path, "only the files of the schema", "a further file", "move it out of the store")
+
+
+def _array_problems(folder: Path, tables: dict[str, Columns], version: Version) -> Iterator[BadInput]:
+    paths = expected_files(tables["sequences"], version)
+    for file in (FRAMES, BODY, SOURCE_CONTACT):
+        if file.since <= version:
+            shards, found = read_shards(folder, file, paths, version)
+            yield from found
+            yield from shard_problems(file, shards, tables, version)
+    yield from MeshesAndTemplates(folder, tables).problems()
+
+
+def _clip_problems(folder: Path) -> Iterator[BadInput]:
+    """The rules of ``Clip`` itself: plausible places and sizes, rising frames, what goes with what."""
+    store = open_store(folder)
+    for clip_id in store.ids:
+        try:
+            check_clip(store.clip(clip_id))
+        except BadInput as problem:
+            yield BadInput(problem.where, problem.expected, problem.got, REMEDY)

@@ -1,0 +1,1 @@
+"""Exact contact of hand and object surface: touched vertices, depth, shared volume, BimArt's maps."""

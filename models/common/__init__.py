@@ -1,0 +1,1 @@
+"""What every model family shares: features, transformer, sampling, training loop, checkpoints."""

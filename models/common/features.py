@@ -1,0 +1,159 @@
+"""Motion features to rotations, joints and placed points, in torch; and the normalisation learnt from training clips.
+
+Feature layout: ``hoidata.batches.dataset``. Axes (batch, side, frame, ...); sides left, right; metres, model frame.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hoidata.batches.dataset import HAND_FEATURES, N_ROTATIONS, OBJECT_FEATURES, ClipBatch, ClipSample
+from hoidata.clips.clip import SIDES
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_to_rotmat
+from hoidata.hands import HandKinematics, HandPair
+
+# A feature that hardly varies in training is scaled as if it varied this much, so that noise in it stays harmless.
+SMALLEST_SCALE = 0.05
+
+
+def scaled_text(text: Tensor) -> Tensor:
+    """Sentence features (..., D) at a length of sqrt(D): numbers near one, whatever length an encoder gives them."""
+    return nn.functional.normalize(text, dim=-1) * text.shape[-1] ** 0.5
+
+
+def hand_wrist_m(hands: Tensor) -> Tensor:
+    """Wrist positions (..., 3) of hand features (..., 99)."""
+    return hands[..., :3]
+
+
+def hand_rotmats(hands: Tensor) -> Tensor:
+    """Local rotations (..., 16, 3, 3) of hand features (..., 99), the global one first."""
+    return rot6d_to_rotmat(hands[..., 3:].reshape(*hands.shape[:-1], N_ROTATIONS, 6))
+
+
+def object_position_m(objects: Tensor) -> Tensor:
+    """Positions (..., 3) of object features (..., 10)."""
+    return objects[..., :3]
+
+
+def object_rotmat(objects: Tensor) -> Tensor:
+    """Rotations (..., 3, 3) of object features (..., 10)."""
+    return rot6d_to_rotmat(objects[..., 3:9])
+
+
+def object_hinge_rad(objects: Tensor) -> Tensor:
+    """Hinge angles (...,) of object features (..., 10)."""
+    return objects[..., 9]
+
+
+def proper_hands(hands: Tensor) -> Tensor:
+    """Hand features (..., 99) with every 6D part made the first two columns of a rotation."""
+    return torch.cat((hands[..., :3], rotmat_to_rot6d(hand_rotmats(hands)).flatten(-2)), -1)
+
+
+def proper_object(objects: Tensor) -> Tensor:
+    """Object features (..., 10) with the 6D part made the first two columns of a rotation."""
+    return torch.cat((objects[..., :3], rotmat_to_rot6d(object_rotmat(objects)), objects[..., 9:]), -1)
+
+
+def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:
+    """World points (..., point, 3) in the frame of the object (..., 10): ``R^T (p - t)``."""
+    return (points_m - object_position_m(objects)[..., None, :]) @ object_rotmat(objects)
+
+
+def place_points(batch: ClipBatch, objects: Tensor) -> Tensor:
+    """The sampled object points at each pose (B, F, 10): (B, F, 1024, 3), the moving part turned about its hinge."""
+    turn = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
+    origin = batch.hinge_origin_m[:, None, None]
+    still = batch.points_m[:, None].expand(-1, objects.shape[1], -1, -1)
+    moved = (still - origin) @ turn.transpose(-1, -2) + origin
+    moves = ((batch.part == 1) & batch.articulated[:, None])[:, None, :, None]
+    articulated = torch.where(moves, moved, still)
+    return articulated @ object_rotmat(objects).transpose(-1, -2) + object_position_m(objects)[..., None, :]
+
+
+class Hands(nn.Module):
+    """Both sides of a hand model as one layer over hand features; it has no weights of its own to learn."""
+
+    def __init__(self, pair: HandPair) -> None:
+        super().__init__()
+        self.digest = pair.digest
+        self.kinematics = nn.ModuleList([HandKinematics(pair[side]) for side in SIDES])
+
+    def joints(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> Tensor:
+        """(B, 2, F, 21, 3) joints, metres, of features (B, 2, F, 99); betas (B, 2, 10), template (B, 2, 778, 3)."""
+        sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
+        joints = [layer.joints(*given) for layer, given in zip(self._layers(), sides, strict=True)]
+        return torch.stack([side.reshape(len(hands), hands.shape[2], 21, 3) for side in joints], 1)
+
+    def vertices(self, hands: Tensor, betas: Tensor, template_m: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(B, 2, F, 778, 3) vertices and (B, 2, F, 21, 3) joints; arguments as in ``joints``."""
+        sides = [self._arguments(hands, betas, template_m, side) for side in range(2)]
+        both = [layer(*given) for layer, given in zip(self._layers(), sides, strict=True)]
+        shape = (len(hands), hands.shape[2], -1, 3)
+        vertices, joints = zip(*[(mesh.reshape(shape), joint.reshape(shape)) for mesh, joint in both], strict=True)
+        return torch.stack(vertices, 1), torch.stack(joints, 1)
+
+    def _layers(self) -> list[HandKinematics]:
+        return [layer for layer in self.kinematics if isinstance(layer, HandKinematics)]
+
+    def _arguments(self, hands: Tensor, betas: Tensor, template_m: Tensor | None, side: int) -> tuple:
+        flat = hands[:, side].reshape(-1, HAND_FEATURES)
+        n_frames = hands.shape[2]
+        own_betas = betas[:, side].repeat_interleave(n_frames, 0)
+        template = None if template_m is None else template_m[:, side].repeat_interleave(n_frames, 0)
+        return hand_wrist_m(flat), hand_rotmats(flat), own_betas, template
+
+
+@dataclass(frozen=True)
+class Normaliser:
+    """Mean and spread of every feature over the training frames: hand (2, 99) by side, object (10,)."""
+
+    hand_mean: Tensor
+    hand_scale: Tensor
+    object_mean: Tensor
+    object_scale: Tensor
+
+    @classmethod
+    def of(cls, samples: Sequence[ClipSample]) -> "Normaliser":
+        """From training samples; frames of a side that does not act are left out."""
+        means, scales = np.zeros((2, HAND_FEATURES)), np.ones((2, HAND_FEATURES))
+        for side in range(2):
+            frames = [s.hands[side][s.valid[side]] for s in samples if s.acts[side]]
+            means[side], scales[side] = _moments(frames, HAND_FEATURES)
+        object_mean, object_scale = _moments([sample.object for sample in samples], OBJECT_FEATURES)
+        arrays = (means, scales, object_mean, object_scale)
+        return cls(*(torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in arrays))
+
+    def encode(self, hands: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+        """Features (B, 2, F, 99) and (B, F, 10) to zero mean and unit spread."""
+        hands = (hands - self.hand_mean[:, None]) / self.hand_scale[:, None]
+        return hands, (objects - self.object_mean) / self.object_scale
+
+    def decode(self, hands: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+        """The inverse of ``encode``."""
+        hands = hands * self.hand_scale[:, None] + self.hand_mean[:, None]
+        return hands, objects * self.object_scale + self.object_mean
+
+    def to(self, device: torch.device | str) -> "Normaliser":
+        """The same numbers on ``device``."""
+        return Normaliser(*(tensor.to(device) for tensor in self.tensors().values()))
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The four tensors by field name, to store in a checkpoint."""
+        return {name: getattr(self, name) for name in ("hand_mean", "hand_scale", "object_mean", "object_scale")}
+
+
+def _moments(frames: list[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
+    rows = np.concatenate([np.zeros((0, size)), *frames]).astype(np.float64)
+    if not len(rows):
+        return np.zeros(size), np.ones(size)
+    scale = rows.std(axis=0)
+    groups = ((0, 3),) if size == HAND_FEATURES else ((0, 3), (3, 9))
+    for start, stop in groups:
+        # One scale per position (and per object rotation) keeps directions comparable.
+        scale[start:stop] = np.sqrt((scale[start:stop] ** 2).mean())
+    return rows.mean(axis=0), np.maximum(scale, SMALLEST_SCALE)

@@ -1,0 +1,103 @@
+"""Losses of generator and refiner: Text2HOI eq. 5-7 and 9-11, as means over what is present.
+
+All geometry is in metres in the model frame. Distances to surfaces come from ``models.common.fields``, whose gradient
+reaches the query points only. Masks are 0/1 tensors; an empty mask gives zero.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from hoidata.batches.dataset import CONTACT_THRESHOLD_M
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of ``values`` where ``mask`` (broadcast to them) is set."""
+    mask = mask.to(values.dtype).expand_as(values)
+    return (values * mask).sum() / mask.sum().clamp_min(1.0)
+
+
+def simple_loss(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """Mean squared error of features (..., D) over the frames of ``mask`` (...): eq. 5 and 9."""
+    return masked_mean((predicted - target).square(), mask[..., None])
+
+
+def distance_map_loss(
+    joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor, scale_m: float = CONTACT_THRESHOLD_M
+) -> Tensor:
+    """Eq. 6: squared error of the joint-to-point distances that are below 2 cm in the truth, in units of ``scale_m``.
+
+    joints_m (B, 2, F, 21, 3), points_m (B, F, 1024, 3), entries (entry, 5): clip, side, frame, joint, point.
+    """
+    if not len(entries):
+        return joints_m.sum() * 0
+    clip, side, frame, joint, point = entries.unbind(1)
+    apart = joints_m[clip, side, frame, joint] - points_m[clip, frame, point]
+    predicted = (apart.square().sum(-1) + 1e-10).sqrt()
+    return ((predicted - distance_m) / scale_m).square().mean()
+
+
+def relative_orientation_loss(
+    hand: Tensor, objects: Tensor, true_hand: Tensor, true_object: Tensor, mask: Tensor
+) -> Tensor:
+    """Eq. 7: squared Frobenius distance of ``R_object^T R_hand`` to the true one, which no motion of the world changes.
+
+    hand (B, 2, F, 3, 3), object (B, F, 3, 3), mask (B, 2, F).
+    """
+    predicted = objects[:, None].transpose(-1, -2) @ hand
+    true = true_object[:, None].transpose(-1, -2) @ true_hand
+    return masked_mean((predicted - true).square().sum((-1, -2)), mask)
+
+
+def penetration_loss(signed_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
+    """Eq. 10: squared depth of the hand vertices inside the object, summed over vertices, in units of ``scale_m``.
+
+    signed_distance_m (B, 2, F, V), negative inside; mask (B, 2, F).
+    """
+    depth = (-signed_distance_m).clamp_min(0) / scale_m
+    return masked_mean(depth.square().sum(-1), mask)
+
+
+def contact_loss(distance_m: Tensor, true_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
+    """Eq. 11: joints that touch (within 2 cm of the surface in the truth) come as near as they truly are.
+
+    Signed distances (B, 2, F, 21), mask (B, 2, F). A joint lies a finger's radius below its skin: pulling it onto the
+    surface itself, as the paper does, would push the skin inside. Squared up to 3 cm of error, linear beyond (Huber).
+    """
+    near = touching_joints(true_distance_m) & (mask[..., None] > 0)
+    apart = (distance_m - true_distance_m) / scale_m
+    return masked_mean(2 * functional.huber_loss(apart, torch.zeros_like(apart), reduction="none", delta=3.0), near)
+
+
+def touching_joints(distance_m: Tensor) -> Tensor:
+    """Joints within 2 cm of the surface, on either side of it."""
+    return distance_m.abs() < CONTACT_THRESHOLD_M
+
+
+def pick_frames(frames: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """(B, count) frames drawn among each clip's own (B, F), one from each of ``count`` equal stretches."""
+    place = torch.rand(len(frames), count, generator=generator)
+    lengths = frames.sum(1).cpu()
+    chosen = ((torch.arange(count) + place) / count * lengths[:, None]).long()
+    return torch.minimum(chosen, lengths[:, None] - 1).to(frames.device)
+
+
+def take_frames(x: Tensor, chosen: Tensor, axis: int) -> Tensor:
+    """The chosen frames (B, K) of ``x``, whose frame axis is ``axis`` (1 or 2)."""
+    rows = torch.arange(len(x), device=x.device)[:, None]
+    return x[rows, chosen] if axis == 1 else x.transpose(1, 2)[rows, chosen].transpose(1, 2)
+
+
+def entries_of_frames(
+    entries: Tensor, distance_m: Tensor, chosen: Tensor, n_frames: int, at_most: int, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """The entries in chosen frames (B, K), with the frame replaced by its place 0..K-1; ``at_most`` of them."""
+    slot = torch.full((len(chosen), n_frames), -1, device=chosen.device)
+    slot.scatter_(1, chosen, torch.arange(chosen.shape[1], device=chosen.device).expand_as(chosen))
+    place = slot[entries[:, 0], entries[:, 2]]
+    kept = torch.nonzero(place >= 0)[:, 0]
+    if len(kept) > at_most:
+        kept = kept[torch.randint(len(kept), (at_most,), generator=generator).to(kept.device)]
+    rows = entries[kept].clone()
+    rows[:, 2] = place[kept]
+    return rows, distance_m[kept]

@@ -1,0 +1,151 @@
+"""The hand refiner: moves generated hands out of the object and onto its surface.
+
+Text2HOI Sec. 3.3 and supplement, Table S10: a Transformer over left- and right-hand tokens gives a residual on the
+coarse hands; the object stays. Deviations: everything is seen and corrected in the object's frame, where the same
+touch always looks the same; the displacement to the surface enters with its sign beside the attention map, without
+which inside and outside look alike; only the output layers start at zero (a residual of zero), so every layer learns
+from the first step.
+"""
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from hoidata.batches.dataset import HAND_FEATURES
+from models.common.features import object_position_m, object_rotmat, proper_hands
+from models.common.transformer import (
+    Encoder,
+    TransformerConfig,
+    agent_codes,
+    sinusoid,
+    smoothed,
+    to_frames,
+    to_tokens,
+    tokens_seen,
+)
+
+JOINT_FEATURES = 63
+ATTENTION_RATE_PER_M = 50.0
+REACH_M = 0.05
+
+
+@dataclass(frozen=True)
+class RefinerConfig:
+    """transformer: its sizes. contact_map: also read the raw contact map and the norms of the placed points (paper).
+
+    wrist_reach_m, rotation_reach: what an output of one means for the wrist and for a 6D number. smoothing_frames: the
+    residual is smoothed over time by a Gaussian of this deviation, so that corrections never jitter.
+    """
+
+    transformer: TransformerConfig = field(default_factory=TransformerConfig)
+    contact_map: bool = True
+    points: int = 1024
+    wrist_reach_m: float = 0.05
+    rotation_reach: float = 0.3
+    smoothing_frames: float = 0.0
+
+
+@dataclass(frozen=True)
+class CoarseMotion:
+    """What the refiner sees: hands (B, 2, F, 99) and object (B, F, 10) in metres; and in the object's frame joints_m
+    (B, 2, F, 21, 3), their signed distance_m (B, 2, F, 21) and offset_m to the nearest surface point (B, 2, F, 21, 3).
+
+    present (B, 2, F) masks; points_m (B, N, 3) the object's sampled points; touched (B, N) the contact map.
+    """
+
+    hands: Tensor
+    object: Tensor
+    joints_m: Tensor
+    distance_m: Tensor
+    offset_m: Tensor
+    present: Tensor
+    points_m: Tensor
+    touched: Tensor
+
+
+def attention_map(offset_m: Tensor) -> Tensor:
+    """exp(-50 |D|) per axis of the displacement to the nearest surface point (Text2HOI Sec. 3.3; GRIP)."""
+    return torch.exp(-ATTENTION_RATE_PER_M * offset_m.abs())
+
+
+def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
+    """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation; fingers unchanged."""
+    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
+    return _moved(hands, rotation.transpose(-1, -2), position)
+
+
+def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
+    """The inverse of :func:`hands_in_object_frame`."""
+    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
+    back = -(position[..., None, :] @ rotation)[..., 0, :]
+    return _moved(hands, rotation, back)
+
+
+def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
+    """Wrist and global 6D turned by ``rotation`` about ``origin``."""
+    wrist = (rotation @ (hands[..., :3] - origin)[..., None])[..., 0]
+    columns = rotation @ hands[..., 3:9].unflatten(-1, (3, 2))
+    return torch.cat((wrist, columns.flatten(-2), hands[..., 9:]), -1)
+
+
+class RefinerModel(nn.Module):
+    """Refined hands (B, 2, F, 99), metres, from a :class:`CoarseMotion`."""
+
+    reach: Tensor
+
+    def __init__(self, config: RefinerConfig) -> None:
+        super().__init__()
+        self.config = config
+        width, k = config.transformer.width, config.transformer.frames_per_token
+        inputs = HAND_FEATURES + 3 * JOINT_FEATURES + 21 + (2 * config.points if config.contact_map else 0)
+        self.hands_in = nn.ModuleList([nn.Linear(inputs * k, width) for _ in range(2)])
+        self.encoder = Encoder(config.transformer)
+        self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * k) for _ in range(2)])
+        for layer in self.hands_out:
+            nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
+            nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
+        reach = torch.full((HAND_FEATURES,), config.rotation_reach)
+        reach[:3] = config.wrist_reach_m
+        self.register_buffer("reach", reach, persistent=False)
+
+    def forward(self, coarse: CoarseMotion) -> Tensor:
+        """Hands that are absent, and padding, neither influence anything nor mean anything in the result."""
+        k, n_frames = self.config.transformer.frames_per_token, coarse.hands.shape[2]
+        local = hands_in_object_frame(coarse.hands, coarse.object)
+        inputs = self._inputs(coarse, local) * coarse.present[..., None]
+        agents = [layer(to_tokens(inputs[:, side], k)) for side, layer in enumerate(self.hands_in)]
+        tokens = torch.stack(agents, 1)
+        place = torch.arange(tokens.shape[2], device=tokens.device) * k
+        width = self.config.transformer.width
+        tokens = tokens + sinusoid(place, width) + agent_codes(width, tokens.device)[:2, None]
+        seen = tokens_seen(coarse.present, k).flatten(1)
+        # A clip without any present hand still needs one key to attend to; its result is masked anyway.
+        seen[:, 0] |= ~seen.any(1)
+        both = self.encoder(tokens.flatten(1, 2), seen).unflatten(1, tokens.shape[1:3]).unbind(1)
+        change = [to_frames(layer(x), n_frames, k) for layer, x in zip(self.hands_out, both, strict=True)]
+        residual = smoothed(torch.stack(change, 1), coarse.present.any(1), self.config.smoothing_frames)
+        return hands_in_world(local + residual * self.reach, coarse.object)
+
+    def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:
+        scaled = torch.cat((local[..., :3] * 10, local[..., 3:]), -1)
+        offset = coarse.offset_m / (coarse.offset_m.norm(dim=-1, keepdim=True) + REACH_M)
+        parts = [
+            scaled,
+            (coarse.joints_m * 10).flatten(-2),
+            attention_map(coarse.offset_m).flatten(-2),
+            offset.flatten(-2) * 2,
+            (coarse.distance_m / REACH_M).clamp(-2, 2),
+        ]
+        if self.config.contact_map:
+            shape = (*local.shape[:-1], self.config.points)
+            # In the object's frame the norms of the points do not change with the motion.
+            norms = coarse.points_m.norm(dim=-1)[:, None, None].expand(shape)
+            parts += [norms, coarse.touched[:, None, None].expand(shape)]
+        return torch.cat(parts, -1)
+
+
+@torch.no_grad()
+def refine(network: RefinerModel, coarse: CoarseMotion) -> Tensor:
+    """Refined hands (B, 2, F, 99), metres, with proper rotations."""
+    return proper_hands(network(coarse))

@@ -1,0 +1,102 @@
+"""What a checkpoint carries about its making: only what follows from content, so that equal inputs give equal bytes.
+
+No time, host, user or commit is recorded; those would change the file's digest without changing what it is.
+"""
+
+import json
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from hoidata.errors import BadInput
+from pipelines.lineage.digests import path_digest, value_digest
+from pipelines.lineage.graph import Stage, look_up, producers, read_graph, read_params
+
+SCHEMA = "hoidata.provenance/1"
+METADATA_KEY = "hoidata"
+LIBRARIES = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "lemminflect", "safetensors")
+MAX_HEADER_BYTES = 100_000_000
+
+
+def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict[str, Any]:
+    """The provenance of what ``stage_name`` is about to make from the working tree at ``root``.
+
+    facts: what the stage itself knows (model, config, seed, clips by split, synthetic). Every stage behind it is
+    recorded with the values of its params and the digests of its code, inputs and outputs.
+    """
+    graph = read_graph(root)
+    if stage_name not in graph:
+        raise BadInput("dvc.yaml", f"a stage named {stage_name}", f"{len(graph)} others", "check params.yaml")
+    params, known = read_params(root), {}
+    behind = _stages_behind(graph, stage_name)
+    stages = {name: _record(root, graph[name], params, known) for name in behind}
+    stages[stage_name].pop("outputs")
+    return {
+        "schema": SCHEMA,
+        "stage": stage_name,
+        **facts,
+        "params_digest": value_digest({name: stages[name]["params"] for name in behind}),
+        "code_digest": value_digest(stages[stage_name]["code"]),
+        "libraries": library_versions(),
+        "stages": stages,
+    }
+
+
+def _stages_behind(graph: dict[str, Stage], name: str) -> list[str]:
+    """The stage and all whose outputs it is made from, nearest first, each once."""
+    made_by, order = producers(graph), [name]
+    for current in order:
+        inputs = (made_by.get(path) for path in graph[current].data)
+        order += [stage.name for stage in dict.fromkeys(filter(None, inputs)) if stage.name not in order]
+    return order
+
+
+def _record(root: Path, stage: Stage, params: dict[str, Any], known: dict[str, str | None]) -> dict[str, Any]:
+    def digests(paths: tuple[str, ...]) -> dict[str, str | None]:
+        for path in paths:
+            if path not in known:
+                known[path] = path_digest(root / path)
+        return {path: known[path] for path in sorted(paths)}
+
+    return {
+        "params": {key: look_up(params, key) for key in sorted(stage.params)},
+        "code": digests(stage.code),
+        "inputs": digests(stage.data),
+        "outputs": digests(stage.outs),
+    }
+
+
+def library_versions() -> dict[str, str]:
+    """Versions of the libraries whose results end up in a checkpoint."""
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def read_checkpoint_metadata(path: Path) -> dict[str, Any]:
+    """The ``hoidata`` entry of a safetensors file's header, read without torch. Raises BadInput when there is none."""
+    with open(path, "rb") as stream:
+        length = int.from_bytes(stream.read(8), "little")
+        if not 2 <= length <= MAX_HEADER_BYTES:
+            raise BadInput(path, "a safetensors file", f"a header of {length} bytes", "train it again")
+        header = stream.read(length)
+    try:
+        metadata = json.loads(header)["__metadata__"]
+        return json.loads(metadata[METADATA_KEY])
+    except (ValueError, KeyError, TypeError) as error:
+        raise BadInput(path, "a checkpoint with hoidata's provenance", "none", "train it with `dvc repro`") from error
+
+
+def read_provenance(path: Path) -> dict[str, Any]:
+    """The provenance a checkpoint carries. Raises BadInput when there is none of a schema known here."""
+    if not path.is_file():
+        raise BadInput(path, "a checkpoint", "no file", "make it with `dvc repro`")
+    values = read_checkpoint_metadata(path)
+    values = values.get("provenance", values)
+    if values.get("schema") != SCHEMA:
+        raise BadInput(path, f"provenance of schema {SCHEMA}", str(values.get("schema")), "train it with `dvc repro`")
+    return values

@@ -1,0 +1,189 @@
+"""Clips as samples: the model frame and back, crops, padding, collate."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from hoidata.batches.dataset import HoiDataset, collate, upright
+from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.sampling import SampledPoints, sample_points
+from hoidata.store.distances import DistanceEntries
+
+GRAVITY = np.array([0.0, -1.0, 0.0])
+
+
+def make_clip(number: int, frames: int) -> Clip:
+    draws = np.random.default_rng(number)
+    box = trimesh.creation.box((0.05, 0.06, 0.07))
+    model = ObjectModel("box", box.vertices, box.faces, np.zeros(8, np.uint8))
+    hands = {
+        side: HandTrack(
+            draws.normal(size=(frames, 3)).astype(np.float32),
+            draws.normal(size=(frames, 3)).astype(np.float32),
+            draws.normal(size=(frames, 45)).astype(np.float32) * 0.3,
+            draws.normal(size=(1, 10)).astype(np.float32),
+            np.arange(frames) != 2,
+        )
+        for side in ("left", "right")
+    }
+    track = ObjectTrack(model, draws.normal(size=(frames, 3)), draws.normal(size=(frames, 3)) + 5)
+    return Clip(
+        f"toy/{number}",
+        "toy",
+        "s1",
+        f"{number}",
+        hands,
+        track,
+        np.arange(frames, dtype=np.int32),
+        GRAVITY,
+        "lift",
+        "box",
+    )
+
+
+@dataclass
+class Clips:
+    """Clips in memory with what annotation would add: the right hand acts, and touches point f in frame f."""
+
+    clips: dict[str, Clip]
+    sampled: dict[str, SampledPoints] = field(default_factory=dict)
+
+    def split_ids(self, split: str) -> list[str]:
+        return list(self.clips) if split == "train" else []
+
+    def clip(self, clip_id: str) -> Clip:
+        return self.clips[clip_id]
+
+    def joints(self, clip_id: str, side: str) -> np.ndarray:
+        return track_joints(self.clips[clip_id].hands[side], load_embedded_hands()[side])
+
+    def hand_type(self, clip_id: str) -> str:
+        return "right"
+
+    def sentences(self, clip_id: str) -> list[str]:
+        return ["a", "b", "c", "d"]
+
+    def text_embedding(self, clip_id: str) -> np.ndarray:
+        return np.zeros((4, 512), np.float32)
+
+    def object_key(self, clip_id: str) -> str:
+        return "box"
+
+    def points(self, object_key: str) -> SampledPoints:
+        if object_key not in self.sampled:
+            self.sampled[object_key] = sample_points(next(iter(self.clips.values())).object.model)
+        return self.sampled[object_key]
+
+    def distances(self, clip_id: str) -> DistanceEntries:
+        frames = np.arange(self.clips[clip_id].n_frames)
+        both = [np.concatenate((frames, frames)) for _ in range(3)]
+        side = np.repeat([0, 1], len(frames))
+        return DistanceEntries(side, both[0], both[1] % 21, both[2], np.full(2 * len(frames), 0.01, np.float32))
+
+
+@pytest.fixture(scope="module")
+def clips() -> Clips:
+    return Clips({f"toy/{number}": make_clip(number, frames) for number, frames in enumerate((30, 12, 45))})
+
+
+def test_a_sample_goes_back_to_the_world_it_came_from(clips: Clips) -> None:
+    for crop in ("start", "random"):
+        sample = HoiDataset(clips, "train", 20, crop, seed=1)[0]
+        clip = clips.clip(sample.clip_id).cut(sample.start, sample.start + sample.length)
+        rotation, origin = sample.world_from_model[:3, :3], sample.world_from_model[:3, 3]
+        for number, side in enumerate(("left", "right")):
+            world = sample.hands[number, :, :3] @ rotation.T + origin
+            np.testing.assert_allclose(world, clip.hands[side].wrist_m, atol=1e-5)
+            joints = track_joints(clip.hands[side], load_embedded_hands()[side])
+            np.testing.assert_allclose(sample.joints_m[number] @ rotation.T + origin, joints, atol=1e-5)
+        np.testing.assert_allclose(sample.object[:, :3] @ rotation.T + origin, clip.object.translation_m, atol=1e-5)
+        turned = rotation.T @ rotvec_to_rotmat(clip.object.rotvec)
+        np.testing.assert_allclose(sample.object[:, 3:9], turned[:, :, :2].reshape(-1, 6), atol=1e-5)
+
+
+def test_the_model_frame_is_upright_with_the_object_at_zero(clips: Clips) -> None:
+    sample = HoiDataset(clips, "train")[0]
+    np.testing.assert_allclose(sample.object[0, :3], 0, atol=1e-6)
+    np.testing.assert_allclose(sample.world_from_model[:3, :3].T @ GRAVITY, [0, 0, -1], atol=1e-9)
+
+
+@pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 0, 1), (0, -1, 0), (1, 2, -3), None])
+def test_upright_is_a_rotation_that_turns_gravity_down(gravity: tuple | None) -> None:
+    rotation = upright(None if gravity is None else np.array(gravity))
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    if gravity is None or gravity == (0, 0, -1):
+        np.testing.assert_array_equal(rotation, np.eye(3))
+    else:
+        np.testing.assert_allclose(rotation @ gravity / np.linalg.norm(gravity), [0, 0, -1], atol=1e-12)
+
+
+def test_contact_and_distances_are_restricted_to_the_crop_and_to_acting_hands(clips: Clips) -> None:
+    sample = HoiDataset(clips, "train").whole("toy/0").crop(5, 10)
+    assert np.flatnonzero(sample.touched).tolist() == list(range(5, 15))
+    assert not sample.contact[0].any()
+    assert set(sample.distances.side) == {1}
+    assert sample.distances.frame.tolist() == list(range(10))
+    assert sample.start == 5
+
+
+def test_random_crops_repeat_with_the_seed_and_reach_the_last_window(clips: Clips) -> None:
+    def starts(seed: int) -> list[int]:
+        dataset = HoiDataset(clips, "train", 28, seed=seed)
+        found = []
+        for epoch in range(30):
+            dataset.set_epoch(epoch)
+            found.append(dataset[0].start)
+        return found
+
+    assert starts(1) == starts(1)
+    assert starts(1) != starts(2)
+    assert set(starts(1)) == {0, 1, 2}
+
+
+def test_collate_pads_with_zeros_and_masks_what_is_missing(clips: Clips) -> None:
+    samples = list(HoiDataset(clips, "train"))
+    batch = collate(samples)
+    assert batch.hands.shape == (3, 2, 45, 99)
+    assert batch.lengths.tolist() == [30, 12, 45]
+    assert batch.frames.sum(1).tolist() == [30, 12, 45]
+    assert not batch.hands.transpose(1, 2)[~batch.frames].any()
+    assert not batch.present[:, 0].any()
+    assert batch.present[1, 1].tolist() == [frame < 12 and frame != 2 for frame in range(45)]
+    assert torch.equal(batch.touched[1].nonzero()[:, 0], torch.arange(12))
+    clip, side, frame, joint, point = batch.entries.T
+    assert torch.equal(torch.bincount(clip), batch.lengths)
+    assert torch.equal(point, frame)
+    assert torch.equal(joint, frame % 21)
+    assert (side == 1).all()
+    assert len(collate(samples, with_entries=False).entries) == 0
+
+
+def test_a_batch_moves_to_a_device_with_all_its_tensors(clips: Clips) -> None:
+    batch = collate(list(HoiDataset(clips, "train"))).to("meta")
+    assert batch.hands.device.type == batch.entries.device.type == "meta"
+
+
+def test_personal_templates_come_along_or_are_refused_in_a_mixture(clips: Clips) -> None:
+    template = load_embedded_hands().left.template_m
+    whole = clips.clip("toy/0")
+    hands = {side: replace(track, template_m=template) for side, track in whole.hands.items()}
+    own = HoiDataset(Clips({"toy/0": replace(whole, hands=hands)}), "train")[0]
+    assert own.template_m is not None
+    batch = collate([own])
+    assert batch.template_m is not None
+    assert batch.template_m.shape == (1, 2, 778, 3)
+    with pytest.raises(BadInput, match="mixture"):
+        collate([own, HoiDataset(clips, "train")[1]])
+
+
+def test_an_unknown_crop_is_refused(clips: Clips) -> None:
+    with pytest.raises(BadInput, match="random"):
+        HoiDataset(clips, "train", crop="middle")  # pyright: ignore[reportArgumentType]

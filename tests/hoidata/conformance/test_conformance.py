@@ -1,0 +1,397 @@
+"""The conformance check: every built-in adapter and the walk-through's example pass; each kind of mistake is caught."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import count
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from hoidata.clips.clip import Clip
+from hoidata.conformance.check import Finding, check_adapter
+from hoidata.conformance.loading import first_difference, opened_files
+from hoidata.datasets import DatasetPart, RawTree, SequenceKey, get_adapter
+from hoidata.datasets.arctic.adapter import ArcticAdapter
+from hoidata.datasets.grab.adapter import GrabAdapter
+from hoidata.datasets.h2o.adapter import H2OAdapter
+from hoidata.datasets.registry import BUILT_IN
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.synthetic.corpus import write_corpus
+
+
+def load_kitchen() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("kitchen", Path(__file__).with_name("kitchen.py"))
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+kitchen = load_kitchen()
+HANDS = load_embedded_hands()
+
+
+@pytest.fixture(scope="module")
+def kitchen_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return kitchen.write_kitchen(tmp_path_factory.mktemp("raw"), HANDS)
+
+
+@pytest.fixture(scope="module")
+def example(tmp_path_factory: pytest.TempPathFactory) -> type:
+    """The walk-through's adapter class."""
+    return kitchen.import_example(tmp_path_factory.mktemp("package")).KitchenAdapter
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The small embedded corpus of a dataset, written once."""
+    folder = tmp_path_factory.mktemp("corpora")
+
+    def written(name: str) -> Path:
+        if not (folder / name).is_dir():
+            write_corpus(name, folder / name, 0, "small", 1)
+        return folder / name
+
+    return written
+
+
+def check(adapter, root: Path, **options) -> list[Finding]:
+    return check_adapter(adapter, root, HANDS, worker=False, **options)
+
+
+def not_passed(findings: list[Finding]) -> dict[str, str]:
+    """Rule -> detail of everything that failed or warned."""
+    return {item.rule: f"{item.outcome}: {item.detail}" for item in findings if item.outcome in ("fail", "warn")}
+
+
+def changed(example: type, change: Callable[[Clip], Clip]) -> object:
+    """The adapter with a mistake made to every clip."""
+
+    def load(self, raw: RawTree, key: SequenceKey, hands) -> list:
+        return [change(item) for item in example.load(self, raw, key, hands)]
+
+    return mistaken(example, {"load": load})
+
+
+def mistaken(example: type, methods: dict) -> object:
+    """An adapter with other methods than the example's; its class lies in this module so that it can be pickled."""
+    kind = dataclass(frozen=True)(type("MistakenAdapter", (example,), methods | {"__module__": __name__}))
+    globals()["MistakenAdapter"] = kind
+    return kind()
+
+
+def test_the_walk_throughs_example_keeps_every_rule(example: type, kitchen_root: Path) -> None:
+    findings = check(example(), kitchen_root)
+    assert not_passed(findings) == {}
+    assert len(findings) >= 36
+    assert len({item.rule for item in findings}) == len(findings)
+    assert [item.rule for item in findings if item.outcome == "skip"] == ["a worker process gives the same"]
+
+
+@pytest.mark.slow
+def test_the_command_checks_an_adapter_of_another_package(tmp_path: Path, kitchen_root: Path) -> None:
+    kitchen.write_package(tmp_path / "site")
+    run = partial_run(tmp_path / "site")
+    listed = run("list")
+    assert listed.returncode == 0
+    for text in ("kitchen-hoi 2.5", "CC BY 4.0", "shortest_frames=10", "built in", "margin_frames=0"):
+        assert text in listed.stdout
+    good = run("check", "kitchen", "--root", str(kitchen_root))
+    assert good.returncode == 0, good.stdout + good.stderr
+    assert "36 pass" in good.stdout
+    module = tmp_path / "site" / kitchen.PACKAGE / "__init__.py"
+    module.write_text(module.read_text().replace("return sorted(", "return list("))
+    module.write_text(module.read_text().replace("clip_id=str(key)", 'clip_id=f"{key}".upper()'))
+    bad = run("check", "kitchen", "--root", str(kitchen_root), "--setting", "shortest_frames=5")
+    assert bad.returncode == 1
+    assert "does not begin with kitchen/p01/lift_cup_1" in " ".join(bad.stdout.split())
+    wrong = run("check", "kitchen", "--root", str(kitchen_root), "--setting", "fps=5")
+    assert wrong.returncode == 1
+    assert "expected some of shortest_frames, got fps" in " ".join(wrong.stderr.split())
+
+
+def partial_run(site: Path) -> Callable[..., subprocess.CompletedProcess]:
+    """``hoidata adapters ...`` with a folder of packages on the path."""
+    environment = os.environ | {"PYTHONPATH": f"{site}{os.pathsep}{os.environ.get('PYTHONPATH', '')}", "COLUMNS": "300"}
+    command = [sys.executable, "-m", "pipelines.cli", "adapters"]
+    return lambda *words: subprocess.run([*command, *words], capture_output=True, text=True, env=environment)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(set(BUILT_IN) & {"h2o", "grab", "arctic"}))
+def test_a_built_in_adapter_keeps_every_rule_on_its_embedded_corpus(name: str, corpus) -> None:
+    findings = check_adapter(get_adapter(name), corpus(name), HANDS)
+    assert not_passed(findings) == {}
+    assert {item.rule for item in findings if item.outcome == "skip"} <= {"held objects turn with the hand"}
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("HOIDATA_MANIPNET" not in os.environ, reason="HOIDATA_MANIPNET names the folder of real recordings")
+def test_manipnet_keeps_every_rule_on_its_recordings_but_shares_one_shape_among_them() -> None:
+    findings = check_adapter(get_adapter("manipnet"), Path(os.environ["HOIDATA_MANIPNET"]), HANDS, sequences=2)
+    assert [item.outcome for item in findings].count("fail") == 0
+    shared = {
+        "clips stay the same when another sequence is removed",
+        "other sequences go on when a file is cut short",
+    }
+    assert set(not_passed(findings)) <= shared
+
+
+# Mistakes in what clips hold. Each: the change, and words of the finding it must give.
+def transposed(clip: Clip) -> Clip:
+    return replace(clip, object=replace(clip.object, rotvec=-clip.object.rotvec))
+
+
+def without_mean(clip: Clip) -> Clip:
+    hands = {s: replace(t, hand_pose=(t.hand_pose - HANDS[s].mean_pose).astype("f4")) for s, t in clip.hands.items()}
+    return replace(clip, hands=hands)
+
+
+def mean_twice(clip: Clip) -> Clip:
+    hands = {s: replace(t, hand_pose=(t.hand_pose + HANDS[s].mean_pose).astype("f4")) for s, t in clip.hands.items()}
+    return replace(clip, hands=hands)
+
+
+def transl_for_wrist(clip: Clip) -> Clip:
+    hands = {
+        s: replace(t, wrist_m=(t.wrist_m - HANDS[s].wrist_offset_m(t.betas, t.template_m)).astype("f4"))
+        for s, t in clip.hands.items()
+    }
+    return replace(clip, hands=hands)
+
+
+def sides_exchanged(clip: Clip) -> Clip:
+    return replace(clip, hands={"left": clip.hands["right"], "right": clip.hands["left"]})
+
+
+def hands_in_millimetres(clip: Clip) -> Clip:
+    return replace(clip, hands={s: replace(t, wrist_m=t.wrist_m * 1000) for s, t in clip.hands.items()})
+
+
+def mesh_times(scale) -> Callable[[Clip], Clip]:
+    def change(clip: Clip) -> Clip:
+        model = replace(clip.object.model, vertices_m=clip.object.model.vertices_m * np.asarray(scale))
+        return replace(clip, object=replace(clip.object, model=model))
+
+    return change
+
+
+def every_frame_of_the_source(clip: Clip) -> Clip:
+    return replace(clip, source_frames=np.arange(clip.n_frames, dtype=np.int32))
+
+
+COUNTER = count()
+WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
+    "transposed": (transposed, "transposed by 0.0"),
+    "mean missing": (without_mean, "with the mean pose added"),
+    "mean twice": (mean_twice, "with the mean pose taken"),
+    "transl for wrist": (transl_for_wrist, "with J0 added to the wrist"),
+    "sides": (sides_exchanged, "sides exchanged, or mirrored?"),
+    "sides, seen at the tips": (sides_exchanged, "with left and right exchanged"),
+    "hand unit": (hands_in_millimetres, "expected places within 100 m"),
+    "mesh unit": (mesh_times(1000), "expected a mesh 0.001 to 10 m long"),
+    "mesh in centimetres": (mesh_times(100), "wrists are within 0.3 m"),
+    "mirrored mesh": (mesh_times((-1, 1, 1)), "turned inside out"),
+    "not resampled": (
+        every_frame_of_the_source,
+        "24 frames at 30 per second are 0.77 s, its source frames at 60 0.38 s",
+    ),
+    "shift of frames": (lambda c: replace(c, source_frames=c.source_frames // 2 * 2 + np.arange(24) % 2), ""),
+    "verb": (lambda c: replace(c, verb="Lift_up"), "the verb 'Lift_up'"),
+    "noun": (lambda c: replace(c, object_words="cup_01"), "the object 'cup_01'"),
+    "gravity": (lambda c: replace(c, gravity=np.array([0.0, -1.0, 0.0])), "up is +z"),
+    "no gravity": (lambda c: replace(c, gravity=None), "no gravity, and no note why"),
+    "way back": (lambda c: replace(c, source_from_world=np.diag([1.0, 2.0, 1.0, 1.0])), "shears"),
+    "sources": (lambda c: replace(c, sources=()), "clips name the files"),
+    "half the sources": (lambda c: replace(c, sources=c.sources[1:]), "meshes/cup.obj"),
+    "id": (lambda c: replace(c, clip_id=f"kitchen/{next(COUNTER):04d}"), "does not begin with kitchen/"),
+    "dataset": (lambda c: replace(c, dataset="cellar"), "its dataset is 'cellar'"),
+    "fitted": (lambda c: replace(c, hands_from="keypoints"), "fit_error_m is to be stated"),
+    "NaN": (lambda c: replace(c, object=replace(c.object, rotvec=c.object.rotvec * np.nan)), "finite floats"),
+}
+NO_MISTAKE = {"shift of frames"}  # one source frame early or late, as where clocks differ
+
+
+@pytest.mark.parametrize("mistake", WRONG_CLIPS)
+def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root: Path) -> None:
+    change, words = WRONG_CLIPS[mistake]
+    found = not_passed(check(changed(example, change), kitchen_root, sequences=2))
+    if mistake in NO_MISTAKE:
+        assert found == {}
+    else:
+        assert words in str(found)
+
+
+@pytest.mark.parametrize(
+    ("base", "name", "change", "words"),
+    [
+        (H2OAdapter, "h2o", transposed, "held objects turn with the hand"),
+        (GrabAdapter, "grab", sides_exchanged, "sides exchanged, or mirrored?"),
+        (ArcticAdapter, "arctic", without_mean, "with the mean pose added"),
+        (ArcticAdapter, "arctic", transposed, "with object rotations transposed"),
+    ],
+)
+@pytest.mark.slow
+def test_a_wrong_convention_shows_on_the_embedded_corpora(base, name, change, words, corpus) -> None:
+    found = not_passed(check(changed(base, change), corpus(name), sequences=8))
+    assert words in str(found)
+
+
+@pytest.mark.slow
+def test_exchanged_parts_of_an_object_show_on_arctic(corpus) -> None:
+    def exchanged(clip: Clip) -> Clip:
+        model = replace(clip.object.model, part=(1 - clip.object.model.part).astype(np.uint8))
+        return replace(clip, object=replace(clip.object, model=model))
+
+    found = not_passed(check(changed(ArcticAdapter, exchanged), corpus("arctic"), sequences=8))
+    assert "with the object's parts exchanged" in str(found)
+
+
+# Mistakes in how files are found and read. Each gives the methods of a class below the example.
+def unsorted_keys(example: type) -> dict:
+    return {"sequences": lambda self, root: example.sequences(self, root)[::-1]}
+
+
+def opening_files(example: type) -> dict:
+    def sequences(self, root: Path) -> list[SequenceKey]:
+        keys = example.sequences(self, root)
+        return [key for key in keys if (Path(root) / "recordings" / f"{key.name}.json").read_text()]
+
+    return {"sequences": sequences}
+
+
+def numbered_ids(example: type) -> dict:
+    def load(self, raw, key, hands) -> list:
+        number = self.sequences(raw.root).index(key)
+        return [replace(clip, clip_id=f"{clip.clip_id}/{number}") for clip in example.load(self, raw, key, hands)]
+
+    return {"load": load}
+
+
+def reading_behind(example: type) -> dict:
+    def load(self, raw, key, hands) -> list:
+        size = len((raw.root / "recordings" / "p02" / "lift_cup_1.json").read_bytes())
+        return [replace(clip, gravity_note=str(size)) for clip in example.load(self, raw, key, hands)]
+
+    return {"load": load}
+
+
+def counting(example: type) -> dict:
+    seen = count()
+    return {"load": lambda *given: [replace(c, verb="lift" + "s" * next(seen)) for c in example.load(*given)]}
+
+
+def naming_the_root(example: type) -> dict:
+    def load(self, raw, key, hands) -> list:
+        return [replace(clip, gravity_note=str(raw.root)) for clip in example.load(self, raw, key, hands)]
+
+    return {"load": load}
+
+
+def raising(make: Callable[[], Exception]) -> Callable[[type], dict]:
+    def methods(example: type) -> dict:
+        def load(*given) -> list:
+            try:
+                return example.load(*given)
+            except BadInput as error:
+                raise make() from error
+
+        return {"load": load}
+
+    return methods
+
+
+def giving_text(example: type) -> dict:
+    return {"load": lambda *given: [*example.load(*given), "a clip"]}
+
+
+def finding_nothing(example: type) -> dict:
+    return {"load": lambda *given: []}
+
+
+@pytest.mark.parametrize(
+    ("methods", "rule", "words"),
+    [
+        (unsorted_keys, "sequences are sorted, unique and named as they should be", "not sorted"),
+        (opening_files, "sequences are found by name: no file is opened", "recordings/p01/lift_cup_1.json is opened"),
+        (numbered_ids, "clips stay the same when another sequence is removed", "differs in"),
+        (reading_behind, "files are read through the RawTree only", "recordings/p02/lift_cup_1.json is opened behind"),
+        (counting, "a second run gives the same", "differs in kitchen/p01/lift_cup_1.verb"),
+        (naming_the_root, "a copy of the named source files in another folder gives the same", "gravity_note"),
+        (raising(lambda: KeyError("trans")), "a damaged file raises BadInput, or gives valid clips", "KeyError"),
+        (
+            raising(lambda: BadInput("a recording", "a good one", "a bad one", "")),
+            "errors name the file and say what was expected, what came and what to do",
+            "a recording",
+        ),
+        (giving_text, "results are clips or left-out stretches", "kitchen/p01/lift_cup_1: a str"),
+        (finding_nothing, "at least one sequence gives a clip", "everything in it is left out"),
+    ],
+)
+def test_a_mistake_in_finding_or_reading_files_is_caught(methods, rule, words, example, kitchen_root) -> None:
+    found = not_passed(check(mistaken(example, methods(example)), kitchen_root))
+    assert found[rule].startswith("fail")
+    assert words in found[rule]
+
+
+@pytest.mark.parametrize(
+    ("facts", "words"),
+    [
+        ({"name": "Kitchen 2"}, "lower-case letters"),
+        ({"licence": ""}, "licence is not stated"),
+        ({"licence": "research only, no redistribution"}, "may_be_shared is True"),
+        ({"source_fps": 0.0}, "source_fps is 0.0"),
+        ({"needs_mano": "yes"}, "needs_mano is 'yes'"),
+        ({"parts": ()}, "parts is empty"),
+        ({"parts": (DatasetPart("recordings", ("recordings/*/*.json",), "zip"),)}, "meshes/cup.obj matches no pattern"),
+    ],
+)
+def test_missing_or_contradicting_facts_are_caught(facts, words, example, kitchen_root) -> None:
+    assert words in str(not_passed(check(example(**facts), kitchen_root, sequences=1)))
+
+
+def test_conventions_that_exclude_each_other_are_caught(example: type, kitchen_root: Path) -> None:
+    adapter = example()
+    convention = replace(adapter.hand_convention, left_shape="unused")
+    frame = replace(adapter.frame, up_axis=None)
+    found = str(not_passed(check(replace(adapter, hand_convention=convention, frame=frame), kitchen_root, sequences=1)))
+    assert "they exclude each other" in found
+    assert "not which axis is up" in found
+
+
+def test_an_object_that_is_no_adapter_is_told_what_it_lacks() -> None:
+    (found,) = check(object(), Path())
+    assert (found.outcome, "no parts" in found.detail or "no name" in found.detail) == ("fail", True)
+
+
+def test_the_raw_folder_is_left_as_it_was(example: type, kitchen_root: Path) -> None:
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in kitchen_root.rglob("*.*")}
+    check(example(), kitchen_root)
+    assert before == {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in kitchen_root.rglob("*.*")}
+
+
+def test_a_difference_is_named_by_its_place(make_clip) -> None:
+    clip = make_clip()
+    assert first_difference((clip,), (make_clip(),)) is None
+    other = replace(clip, object=replace(clip.object, rotvec=clip.object.rotvec + 1e-7))
+    assert first_difference((clip,), (other,)) == f"{clip.clip_id}.object.rotvec"
+    assert first_difference((clip,), (clip, clip)) == "the number of results (1 and 2)"
+
+
+def test_opened_files_below_a_folder_are_seen_however_they_are_opened(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.zeros(3))
+    (tmp_path / "b.txt").write_text("b")
+    with opened_files(tmp_path) as opened:
+        np.load(tmp_path / "a.npy")
+        os.close(os.open(tmp_path / "b.txt", os.O_RDONLY))
+        sorted(tmp_path.iterdir())
+        Path(__file__).read_bytes()
+    assert opened == {"a.npy", "b.txt"}

@@ -1,0 +1,171 @@
+"""Conversions that can be killed at a chosen moment. Run as a program it is a server: one JSON order a line.
+
+Each order is a conversion in a forked process group of its own. Its workers import this file anew, so that they too
+die where ``KILL_AT`` says: at the n-th rename, after it, or with half of an array file written.
+"""
+
+import io
+import json
+import os
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hoidata.conversion.convert import convert_dataset
+from hoidata.datasets.grab.adapter import GrabAdapter
+from hoidata.errors import HoidataError
+from hoidata.hands import load_embedded_hands
+
+KILL_AT = "HOIDATA_TEST_KILL_AT"
+LOADED = "HOIDATA_TEST_LOADED"
+N_FRAMES = 40
+IS_WORKER = __name__ == "__mp_main__"  # how a spawned process names the program it belongs to
+
+
+def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES, fps: int = 120) -> None:
+    """Sequences of two subjects and two objects in GRAB's format, in turn; the touch begins at frame 12."""
+    meshes = root / "tools" / "meshes"
+    meshes.mkdir(parents=True)
+    for side in ("left", "right"):
+        lines = [f"v {x} {y} {z}" for x, y, z in hands[side].template_m]
+        faces = [f"f {a} {b} {c}" for a, b, c in hands[side].faces + 1]
+        (meshes / f"{side}.obj").write_text("\n".join(lines + faces))
+    for name, size in (("mug", 0.1), ("bowl", 0.2)):
+        corners = f"v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nv 0 0 {size}\n"
+        (meshes / f"{name}.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
+    for number in range(n_sequences):
+        write_sequence(root, number, n_frames, fps)
+
+
+def write_sequence(root: Path, number: int, n_frames: int, fps: int) -> None:
+    rng, mesh = np.random.default_rng(number), ("mug", "bowl")[number % 2]
+    path = root / "grab" / f"s{number % 2 + 1}" / f"{mesh}_lift_{number:03d}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    columns = {"global_orient": 3, "transl": 3, "fullpose": 45}
+    blocks: dict = {
+        member: {"params": {name: rng.normal(size=(n_frames, width)) for name, width in columns.items()}}
+        for member in ("lhand", "rhand", "object")
+    }
+    blocks["rhand"]["vtemp"], blocks["lhand"]["vtemp"] = "tools/meshes/right.obj", "tools/meshes/left.obj"
+    blocks["object"]["object_mesh"] = f"tools/meshes/{mesh}.obj"
+    touched = np.arange(n_frames) >= 12
+    blocks["contact"] = {"object": np.repeat(touched[:, None], 4, axis=1).astype(np.int8)}
+    objects = {key: np.array(block, dtype=object) for key, block in blocks.items()}
+    np.savez(path, obj_name=mesh, motion_intent="lift", framerate=fps, n_frames=n_frames, **objects)
+
+
+@dataclass(frozen=True)
+class LoggedGrab(GrabAdapter):
+    """Writes down each sequence it is asked for, and takes a moment, so that there are moments to die at."""
+
+    def load(self, raw, key, hands):
+        with open(os.environ[LOADED], "a") as log:
+            log.write(f"{key.name}\n")
+        time.sleep(0.01)
+        return super().load(raw, key, hands)
+
+
+def die_at(order: dict | None) -> dict[str, int]:
+    """Make this process kill itself, or its whole group, at the n-th call of what the order names; counts the calls.
+
+    at: "rename" before it happens, "renamed" after, "write" with half of an array file written.
+    """
+    calls = {"made": 0}
+    if not order or order.get("only") not in (None, "worker" if IS_WORKER else "parent"):
+        return calls
+    replace, savez = os.replace, np.savez
+
+    def is_the_one() -> bool:
+        calls["made"] += 1
+        return calls["made"] == order["n"]
+
+    def die() -> None:
+        os.killpg(0, signal.SIGKILL) if order["who"] == "group" else os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(60)
+
+    def dying_replace(source, target) -> None:
+        now = is_the_one()
+        if now and order["at"] == "rename":
+            die()
+        replace(source, target)
+        if now:
+            die()
+
+    def dying_savez(stream, **arrays) -> None:
+        if is_the_one():
+            whole = io.BytesIO()
+            savez(whole, **arrays)
+            stream.write(whole.getvalue()[: len(whole.getvalue()) // 2])
+            stream.flush()
+            die()
+        savez(stream, **arrays)
+
+    if order["at"] == "write":
+        np.savez = dying_savez
+    else:
+        os.replace = dying_replace
+    return calls
+
+
+if IS_WORKER:
+    die_at(json.loads(os.environ[KILL_AT]))
+
+
+def run(order: dict) -> int:
+    """One conversion; the exit code, 1 with the error on stderr."""
+    try:
+        convert_dataset(
+            LoggedGrab(**order.get("settings", {})),
+            order["root"],
+            load_embedded_hands(),
+            order["out"],
+            jobs=order["jobs"],
+            progress=False,
+        )
+    except HoidataError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    return 0
+
+
+def start(order: dict) -> int:
+    """The process id of a new group that runs the order."""
+    child = os.fork()
+    if child:
+        return child
+    os.setsid()
+    os.dup2(os.open(order["stderr"], os.O_CREAT | os.O_WRONLY | os.O_TRUNC), 2)
+    os.environ[LOADED], os.environ[KILL_AT] = order["loaded"], json.dumps(order.get("kill"))
+    calls = die_at(order.get("kill"))
+    code = run(order)
+    Path(order["counted"]).write_text(str(calls["made"]))
+    os._exit(code)
+
+
+def serve() -> None:
+    for line in sys.stdin:
+        order = json.loads(line)
+        loaded = Path(order["loaded"])
+        loaded.write_text("")
+        child = start(order)
+        if "after_s" in order:  # counted from the first sequence
+            while not loaded.stat().st_size:
+                time.sleep(0.001)
+            time.sleep(order["after_s"])
+            target = os.killpg if order["who"] == "group" else os.kill
+            target(child, order["signal"])
+        begun = time.monotonic()
+        status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        print(json.dumps({"status": status, "ended_s": time.monotonic() - begun}), flush=True)
+
+
+if __name__ == "__main__":
+    # A test run in the background of a script may ignore Ctrl-C, and its children would too.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    serve()

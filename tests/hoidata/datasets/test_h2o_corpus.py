@@ -1,0 +1,41 @@
+"""H2O on the embedded corpus: gravity and hands from joints alone beside the truth."""
+
+import numpy as np
+import pytest
+
+from hoidata.datasets.h2o.adapter import H2OAdapter
+from hoidata.hands import track_joints
+from hoidata.synthetic.corpus import write_corpus
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    root = tmp_path_factory.mktemp("h2o") / "raw"
+    write_corpus("h2o", root, seed=0, size="small", jobs=1)
+    return root
+
+
+def test_gravity_is_straight_down_where_it_is_known_and_says_how_it_was_found(root, load_all):
+    clips = load_all(H2OAdapter(), root)
+    known = [clip for clip in clips if clip.gravity is not None]
+    assert len(known) >= 0.7 * len(clips)
+    for clip in known:
+        np.testing.assert_allclose(clip.gravity, (0, 0, -1), atol=1e-3)
+        assert clip.gravity_note.startswith("estimated from")
+    for clip in clips:
+        assert clip.gravity is not None or clip.gravity_note.startswith("unknown: ")
+
+
+def test_hands_fitted_to_the_joints_are_those_of_the_parameters(root, load_all, hands):
+    fitted, given = load_all(H2OAdapter(hands="keypoints"), root), load_all(H2OAdapter(), root)
+    assert [clip.clip_id for clip in fitted] == [clip.clip_id for clip in given]
+    for ours, theirs in zip(fitted, given, strict=True):
+        np.testing.assert_array_equal(ours.source_frames, theirs.source_frames)
+        assert ours.fit_error_m < 5e-4
+        for side, track in ours.hands.items():
+            valid = track.valid
+            np.testing.assert_array_equal(valid, theirs.hands[side].valid)
+            apart = track_joints(track, hands[side]) - track_joints(theirs.hands[side], hands[side])
+            assert not valid.any() or np.linalg.norm(apart[valid], axis=-1).mean() < 1e-3

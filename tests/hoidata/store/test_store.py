@@ -1,0 +1,249 @@
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from hoidata.clips import SIDES
+from hoidata.errors import BadInput, MissingResource
+from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from hoidata.store.info import generated_info
+from hoidata.store.store import open_store, write_store
+from hoidata.store_check.check import check_store
+
+
+def assert_equal_values(one, two) -> None:
+    assert type(one) is type(two)
+    if hasattr(one, "__dataclass_fields__"):
+        for name in one.__dataclass_fields__:
+            assert_equal_values(getattr(one, name), getattr(two, name))
+    elif isinstance(one, np.ndarray):
+        np.testing.assert_array_equal(one, two)
+    elif isinstance(one, dict):
+        assert list(one) == list(two)
+        for key in one:
+            assert_equal_values(one[key], two[key])
+    elif isinstance(one, tuple):
+        assert len(one) == len(two)
+        for first, second in zip(one, two, strict=True):
+            assert_equal_values(first, second)
+    else:
+        assert one == two
+
+
+def test_a_clip_comes_back_as_it_was_written(folder, clips):
+    store = open_store(folder)
+    assert store.ids == [clip.clip_id for clip in clips]
+    for clip in clips:
+        as_trimesh_gave_it = clip.object.model.vertices_m
+        assert type(store.clip(clip.clip_id).object.model.vertices_m) is np.ndarray
+        assert_equal_values(store.clip(clip.clip_id), plain_arrays(clip))
+        np.testing.assert_array_equal(store.clip(clip.clip_id).object.model.vertices_m, as_trimesh_gave_it)
+
+
+def test_the_motion_alone_is_the_clip_without_what_else_the_source_had(folder, clips):
+    store = open_store(folder)
+    for clip in clips:
+        bare = replace(plain_arrays(clip), camera=None, body=None, source_contact=None)
+        assert_equal_values(store.clip(clip.clip_id, motion_only=True), bare)
+    assert any(clip.camera and clip.body and clip.source_contact for clip in clips)
+
+
+def test_a_clip_may_be_changed_without_the_next_one_knowing(folder, clips):
+    store = open_store(folder)
+    for clip in clips:
+        taken = store.clip(clip.clip_id)
+        tracks = (*taken.hands.values(), taken.object, *taken.other_objects, taken.camera, taken.body)
+        tracks = (taken, *tracks, taken.source_contact)
+        arrays = [value for track in tracks if track for value in vars(track).values() if isinstance(value, np.ndarray)]
+        assert len(arrays) >= 14
+        for array in arrays:
+            array[...] = 1
+        assert_equal_values(store.clip(clip.clip_id), plain_arrays(clip))
+
+
+def plain_arrays(clip):
+    """The clip with trimesh's tracked arrays replaced by NumPy ones."""
+
+    def plain(track):
+        model = replace(track.model, vertices_m=np.array(track.model.vertices_m), faces=np.array(track.model.faces))
+        return replace(track, model=model)
+
+    return replace(clip, object=plain(clip.object), other_objects=tuple(map(plain, clip.other_objects)))
+
+
+def test_joints_are_those_of_the_clip(folder, clips):
+    store = open_store(folder)
+    for clip in clips:
+        for side in SIDES:
+            expected = track_joints(clip.hands[side], load_embedded_hands()[side])
+            np.testing.assert_array_equal(store.joints(clip.clip_id, side), expected)
+
+
+def test_the_same_clips_give_the_same_bytes(folder, clips, left_out, tmp_path):
+    write_store(tmp_path / "again", [clips[0], left_out, *clips[1:]], generated_info("test"))
+    for path in sorted(folder.rglob("*.*")):
+        assert path.read_bytes() == (tmp_path / "again" / path.relative_to(folder)).read_bytes(), path.name
+
+
+def test_what_is_read_from_a_store_writes_the_same_store(folder, left_out, tmp_path):
+    store = open_store(folder)
+    again = [store.clip(clip_id) for clip_id in store.ids]
+    write_store(tmp_path / "again", [again[0], left_out, *again[1:]], generated_info("test"))
+    for path in sorted(folder.rglob("*.*")):
+        assert path.read_bytes() == (tmp_path / "again" / path.relative_to(folder)).read_bytes(), path.name
+
+
+def test_plain_numpy_and_pandas_can_read_it(folder, clips):
+    row = pd.read_parquet(folder / "meta" / "sequences.parquet").set_index("clip_id").loc[clips[2].clip_id]
+    with np.load(folder / "arrays" / f"frames-{row.shard:05d}.npz", allow_pickle=False) as arrays:
+        wrist = arrays["left_wrist_m"][row.first_row : row.first_row + row.n_frames]
+    np.testing.assert_array_equal(wrist, clips[2].hands["left"].wrist_m)
+
+
+def test_many_clips_go_to_several_shards(tmp_path, make_clip, monkeypatch):
+    monkeypatch.setattr("hoidata.store.shards.FRAMES_PER_SHARD", 50)
+    clips = [make_clip(30, seed=number, clip_id=f"test/s1/{number}") for number in range(5)]
+    write_store(tmp_path / "clips", clips, generated_info("test"))
+    store = open_store(tmp_path / "clips")
+    assert store.sequences["shard"].tolist() == [0, 0, 1, 1, 2]
+    for clip in clips:
+        np.testing.assert_array_equal(store.clip(clip.clip_id).object.rotvec, clip.object.rotvec)
+
+
+def test_the_tables_say_what_was_left_out_and_what_was_read(folder, left_out):
+    store = open_store(folder)
+    assert store.quarantine.to_dict("records") == [vars(left_out)]
+    assert store.files["path"].tolist() == ["s2/b.npz", "mesh.obj"]
+    assert store.objects["object"].tolist() == ["box", "hinged_box"]
+    assert store.info["counts"] == {"clips": 3, "frames": 90, "objects": 2, "files": 2, "quarantined": 1}
+
+
+def test_an_empty_store_opens_and_has_all_columns(tmp_path, folder):
+    write_store(tmp_path / "empty", [], generated_info("test"))
+    store = open_store(tmp_path / "empty")
+    assert store.ids == []
+    assert list(store.sequences.columns) == list(open_store(folder).sequences.columns)
+
+
+def test_a_newer_major_version_is_refused(folder):
+    path = folder / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    path.write_text(json.dumps({**info, "schema_version": "1.7.0"}))
+    assert len(open_store(folder)) == 3
+    path.write_text(json.dumps({**info, "schema_version": "2.0.0"}))
+    with pytest.raises(BadInput, match=r"expected schema version 1\.1\.0, got 2\.0\.0; upgrade .* hoidata migrate /"):
+        open_store(folder)
+    path.write_text(json.dumps({**info, "schema_version": "0.9.0"}))
+    with pytest.raises(BadInput, match=r"got 0\.9\.0; run: hoidata migrate /"):
+        open_store(folder)
+
+
+def test_other_hands_than_those_of_the_conversion_are_refused(folder):
+    embedded = load_embedded_hands()
+    wider = replace(embedded.right, template_m=embedded.right.template_m * 1.01)
+    with pytest.raises(BadInput, match="hand model"):
+        open_store(folder, HandPair(left=embedded.left, right=wider))
+    path = folder / "meta" / "info.json"
+    info = json.loads(path.read_text())
+    path.write_text(json.dumps({**info, "hand_model": {"name": "mano", "digest": "ff" * 32}}))
+    with pytest.raises(MissingResource, match="mano"):
+        open_store(folder).joints("test/s1/a", "left")
+
+
+def test_a_folder_that_is_no_store_is_named(tmp_path):
+    with pytest.raises(MissingResource, match=r"meta/info\.json is missing"):
+        open_store(tmp_path)
+
+
+def test_a_truncated_array_file_is_named(folder):
+    path = folder / "arrays" / "frames-00000.npz"
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(BadInput, match="frames-00000"):
+        open_store(folder).clip("test/s1/a")
+
+
+def test_a_clip_that_breaks_the_rules_is_refused(tmp_path, clips):
+    millimetres = replace(clips[0].object, translation_m=clips[0].object.translation_m * 1000)
+    with pytest.raises(BadInput, match="unit"):
+        write_store(tmp_path / "clips", [replace(clips[0], object=millimetres)], generated_info("test"))
+    assert not (tmp_path / "clips").exists()
+
+
+def test_the_second_clip_of_one_id_is_left_out_and_listed(tmp_path, clips, folder):
+    second = replace(clips[2], clip_id=clips[0].clip_id)
+    counts = write_store(tmp_path / "twice", [clips[0], second, *clips[1:]], generated_info("test"))
+    assert counts["clips"] == 3
+    store = open_store(tmp_path / "twice")
+    np.testing.assert_array_equal(store.clip("test/s1/a").object.rotvec, clips[0].object.rotvec)
+    (row,) = store.quarantine.to_dict("records")
+    assert row["source_key"] == "test/s1/a"
+    assert "a second one, frames 0 to 19 of s1/c" in row["got"]
+    frames = "arrays/frames-00000.npz"
+    assert (tmp_path / "twice" / frames).read_bytes() == (folder / frames).read_bytes()
+
+
+def with_mesh(clip, clip_id, scale):
+    model = replace(clip.object.model, vertices_m=np.array(clip.object.model.vertices_m) * scale)
+    return replace(clip, clip_id=clip_id, object=replace(clip.object, model=model))
+
+
+def test_different_meshes_of_one_name_are_kept_apart_whatever_their_order(tmp_path, clips):
+    small, large = with_mesh(clips[2], "test/s1/small", 1.0), with_mesh(clips[2], "test/s1/large", 1.5)
+    other = clips[1]
+    write_store(tmp_path / "one", [small, large, other], generated_info("test"))
+    write_store(tmp_path / "two", [other, large, small], generated_info("test"))
+    one, two = open_store(tmp_path / "one"), open_store(tmp_path / "two")
+    assert check_store(tmp_path / "one") == []
+    pd.testing.assert_frame_equal(one.objects, two.objects)
+    names = set(one.objects["object"])
+    assert "hinged_box" in names
+    assert {name.split("#")[0] for name in names - {"hinged_box"}} == {"box"}
+    for store in (one, two):
+        for clip in (small, large):
+            found = store.clip(clip.clip_id).object.model
+            assert found.name == f"box#{store.objects.set_index('object').at[found.name, 'digest'][:8]}"
+            np.testing.assert_array_equal(found.vertices_m, clip.object.model.vertices_m)
+    again = [one.clip(clip_id) for clip_id in one.ids]
+    write_store(tmp_path / "again", again, generated_info("test"))
+    assert open_store(tmp_path / "again").objects["object"].tolist() == one.objects["object"].tolist()
+
+
+@pytest.mark.parametrize(
+    "key", ["dataset_version", "frame", "hand_convention", "licence", "may_be_shared", "source_fps", "hand_model"]
+)
+def test_a_store_without_a_required_fact_is_refused_before_anything_is_written(tmp_path, clips, key):
+    info = generated_info("test")
+    with pytest.raises(BadInput, match=f"info.json: {key}"):
+        write_store(tmp_path / "clips", clips, {name: info[name] for name in info if name != key})
+    assert not list(tmp_path.iterdir())
+
+
+def test_facts_of_the_wrong_kind_are_refused(tmp_path):
+    frame = generated_info("test")["frame"]
+    for further in ({"frame": frame | {"handedness": "left"}}, {"may_be_shared": "yes"}, {"source_fps": True}):
+        with pytest.raises(BadInput, match=f"info.json: {next(iter(further))}"):
+            write_store(tmp_path / "clips", [], generated_info("test", **further))
+
+
+def test_many_contact_labels_fill_a_shard(tmp_path, clips, monkeypatch):
+    monkeypatch.setattr("hoidata.store.shards.CONTACTS_PER_SHARD", 40)
+    touched = [replace(clips[2], clip_id=f"test/s1/{number}") for number in range(3)]
+    assert len(touched[0].source_contact.frame) >= 40
+    write_store(tmp_path / "clips", touched, generated_info("test"))
+    store = open_store(tmp_path / "clips")
+    assert store.sequences["shard"].tolist() == [0, 1, 2]
+    for clip in touched:
+        assert_equal_values(store.clip(clip.clip_id).source_contact, clip.source_contact)
+
+
+def test_a_store_survives_pickling_without_carrying_its_arrays(folder):
+    import pickle
+
+    store = open_store(folder)
+    store.clip("test/s1/a")
+    data = pickle.dumps(store)
+    assert len(data) < 50_000
+    again = pickle.loads(data)
+    np.testing.assert_array_equal(again.clip("test/s1/a").source_frames, store.clip("test/s1/a").source_frames)

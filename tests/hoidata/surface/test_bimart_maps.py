@@ -1,0 +1,143 @@
+"""BimArt's maps against brute force in the world, world motion, mirroring, hinges, and the cost of storing them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips import SIDES, Clip, ObjectTrack
+from hoidata.contact.proximity import joints_in_object
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.objects.sampling import sample_points
+from hoidata.surface.bimart_maps import BEYOND, REACH_M, bimart_map, clip_map, packed_map, unpacked_map
+from hoidata.surface.contact import PlacedHand, placed_hand
+
+MIRROR = np.diag((-1.0, 1.0, 1.0))
+POINTS = 200
+
+
+@pytest.fixture(params=[False, True], ids=["rigid", "articulated"])
+def scene(request, make_clip):
+    """A clip in which both hands hold the box (the lid turns by more than half a circle), its vertices and points."""
+    clip = make_clip(8, hand_type="both", articulated=request.param, seed=4)
+    if request.param:
+        angles = np.linspace(-1.4, 2.2, clip.n_frames)
+        clip = replace(clip, object=replace(clip.object, hinge_rad=angles))
+    hands = load_embedded_hands()
+    vertices = {side: track_vertices(clip.hands[side], hands[side]).astype(np.float64) for side in SIDES}
+    return clip, vertices, sample_points(clip.object.model, POINTS)
+
+
+def placed(track: ObjectTrack, vertices: np.ndarray, valid: np.ndarray | None = None) -> PlacedHand:
+    """World vertices as the object sees them."""
+    frames = np.arange(len(vertices)) if valid is None else np.flatnonzero(valid)
+    hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
+    return PlacedHand(joints_in_object(vertices, track)[frames], frames, hinge, np.zeros((0, 3), int), len(vertices))
+
+
+def map_of(track: ObjectTrack, vertices: np.ndarray, points, valid: np.ndarray | None = None) -> np.ndarray:
+    return bimart_map(placed(track, vertices, valid), points, track.model.hinge)
+
+
+def world_points(track: ObjectTrack, points) -> np.ndarray:
+    """(frame, point, 3) float64, from the definitions of a hinge and a pose."""
+    placed = []
+    for frame in range(track.n_frames):
+        local = points.points_m.astype(np.float64).copy()
+        if track.model.hinge is not None:
+            moves, hinge = points.part == 1, track.model.hinge
+            turn = Rotation.from_rotvec(np.asarray(hinge.axis) * track.hinge_rad[frame])
+            local[moves] = turn.apply(local[moves] - hinge.origin_m) + hinge.origin_m
+        pose = Rotation.from_rotvec(np.asarray(track.rotvec[frame], np.float64))
+        placed.append(pose.apply(local) + track.translation_m[frame])
+    return np.array(placed)
+
+
+def brute_force(track: ObjectTrack, vertices: np.ndarray, points) -> np.ndarray:
+    """(frame, point) distance to the nearest vertex, float64, in the world; infinite beyond the reach."""
+    placed = world_points(track, points)
+    rows = zip(placed, vertices, strict=True)
+    nearest = np.array([np.linalg.norm(p[:, None] - v[None], axis=2).min(axis=1) for p, v in rows])
+    return np.where(nearest <= REACH_M, nearest, np.inf)
+
+
+def test_map_is_the_distance_to_the_nearest_hand_vertex(scene):
+    clip, vertices, points = scene
+    for side in SIDES:
+        truth = brute_force(clip.object, vertices[side], points)
+        assert np.isfinite(truth).sum() > POINTS
+        np.testing.assert_allclose(map_of(clip.object, vertices[side], points), truth, atol=1e-6)
+        hand = placed_hand(clip, side, load_embedded_hands())
+        np.testing.assert_allclose(bimart_map(hand, points, clip.object.model.hinge), truth, atol=1e-6)
+
+
+def test_map_is_unchanged_when_the_world_turns_and_shifts(scene):
+    clip, vertices, points = scene
+    turn, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array((1.0, -2.0, 0.5))
+    rotvec = (turn * Rotation.from_rotvec(clip.object.rotvec)).as_rotvec()
+    track = replace(clip.object, rotvec=rotvec, translation_m=turn.apply(clip.object.translation_m) + shift)
+    for side in SIDES:
+        moved = turn.apply(vertices[side].reshape(-1, 3)).reshape(vertices[side].shape) + shift
+        before, after = map_of(clip.object, vertices[side], points), map_of(track, moved, points)
+        np.testing.assert_array_equal(np.isfinite(before), np.isfinite(after))
+        np.testing.assert_allclose(before, after, atol=1e-6)
+
+
+def test_mirrored_scene_has_the_maps_of_the_other_hand(scene):
+    """The mirrored right hand is a left one, before a mirrored object that turns and folds the other way round."""
+    clip, vertices, points = scene
+    track, model = clip.object, clip.object.model
+    hinge = model.hinge and replace(
+        model.hinge, axis=-MIRROR @ model.hinge.axis, origin_m=MIRROR @ model.hinge.origin_m
+    )
+    turned = Rotation.from_rotvec(track.rotvec).as_matrix()
+    mirrored = replace(
+        track,
+        model=replace(model, hinge=hinge),
+        rotvec=Rotation.from_matrix(MIRROR @ turned @ MIRROR).as_rotvec(),
+        translation_m=track.translation_m @ MIRROR,
+    )
+    other_points = replace(points, points_m=points.points_m @ MIRROR.astype(np.float32))
+    for side in SIDES:
+        found = map_of(mirrored, vertices[side] @ MIRROR, other_points)
+        np.testing.assert_allclose(found, map_of(track, vertices[side], points), atol=1e-6)
+
+
+def test_frames_without_the_hand_are_beyond_and_do_not_count(scene):
+    clip, vertices, points = scene
+    valid = np.arange(clip.n_frames) % 3 != 0
+    whole = map_of(clip.object, vertices["right"], points)
+    part = map_of(clip.object, vertices["right"], points, valid)
+    np.testing.assert_array_equal(part[valid], whole[valid])
+    assert np.isinf(part[~valid]).all()
+    np.testing.assert_array_equal(clip_map(part), whole[valid].min(axis=0))
+    assert np.isinf(map_of(clip.object, vertices["right"], points, np.zeros(clip.n_frames, bool))).all()
+
+
+def test_clip_map_is_the_nearest_the_hand_ever_comes():
+    distances = np.array([[0.01, np.inf, 0.2], [0.03, np.inf, 0.1]], np.float32)
+    np.testing.assert_array_equal(clip_map(distances), np.array([0.01, np.inf, 0.1], np.float32))
+    assert np.isinf(clip_map(np.zeros((0, 3), np.float32))).all()
+
+
+def test_a_hand_too_far_away_gives_nothing_and_one_within_reach_is_seen(make_clip):
+    clip: Clip = make_clip(2)
+    points = sample_points(clip.object.model, POINTS)
+    centre = clip.object.translation_m[:, None].astype(np.float64)
+    beside = np.array((0.0, 0.0, 1.0))
+    radius = np.linalg.norm(points.points_m, axis=1)
+    for away, reached in ((0.19, True), (0.45, False)):
+        hand = centre + away * beside
+        found = map_of(clip.object, np.broadcast_to(hand, (2, 778, 3)), points)
+        assert np.isfinite(found).any() == reached
+    assert radius.max() < 0.1
+
+
+def test_packing_errs_by_at_most_half_a_step_and_repeats():
+    distances = np.append(np.linspace(0, REACH_M, 40_001), [REACH_M * 1.0001, 0.3, np.inf]).astype(np.float32)
+    packed = packed_map(distances)
+    assert packed.dtype == np.uint8
+    assert packed[-4:].tolist() == [250, BEYOND, BEYOND, BEYOND]
+    assert np.abs(unpacked_map(packed)[:-3] - distances[:-3]).max() <= 0.0004 + 1e-7
+    np.testing.assert_array_equal(packed_map(unpacked_map(packed)), packed)

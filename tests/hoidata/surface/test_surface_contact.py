@@ -1,0 +1,216 @@
+"""Hands of clips against the exact surface: known contacts, invariance under world motion and mirroring."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import igl
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips import SIDES, Clip
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.objects.model import Hinge, ObjectModel, articulate, place
+from hoidata.objects.surface_index import SurfaceIndex
+from hoidata.surface.contact import (
+    Penetration,
+    PlacedHand,
+    penetration,
+    placed_hand,
+    signed_distances_m,
+    touched_vertices,
+)
+from hoidata.surface.solid_overlap import SolidOverlap
+
+HANDS = load_embedded_hands()
+
+
+def shifted(clip: Clip, way_m: float) -> Clip:
+    """The object moved towards the right hand, so that it enters."""
+    wrist = clip.hands["right"].wrist_m
+    away = wrist - clip.object.translation_m
+    towards = way_m * away / np.linalg.norm(away, axis=1, keepdims=True)
+    track = replace(clip.object, translation_m=(clip.object.translation_m + towards).astype(np.float32))
+    return replace(clip, object=track)
+
+
+@pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
+def test_distances_equal_libigl_s_to_the_posed_mesh_in_the_world(
+    make_clip: Callable[..., Clip], articulated: bool
+) -> None:
+    clip = shifted(make_clip(n_frames=5, articulated=articulated), 0.02)
+    model, track = clip.object.model, clip.object
+    index, hand = SurfaceIndex(model), placed_hand(clip, "right", HANDS)
+    posed = place(
+        articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad), track.rotvec, track.translation_m
+    )
+    vertices = track_vertices(clip.hands["right"], HANDS.right).astype(np.float64)
+    found, touched = signed_distances_m(hand, index, 0.05), touched_vertices(hand, index)
+    for frame in range(5):
+        kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
+        parts = [np.ascontiguousarray(model.faces[model.face_part == part], dtype=np.int64) for part in index.solids]
+        signed = np.stack([igl.signed_distance(vertices[frame], posed[frame], own, kind)[0] for own in parts])
+        expected = np.where((signed < 0).any(axis=0), signed.min(axis=0), np.abs(signed).min(axis=0))
+        near = np.abs(expected) < 0.0499
+        np.testing.assert_allclose(found[frame][near], expected[near], atol=1e-7)
+        clear = np.abs(np.abs(signed).min(axis=0) - 0.005) > 1e-7
+        np.testing.assert_array_equal(touched[frame][clear], (np.abs(signed).min(axis=0) < 0.005)[clear])
+    assert touched.any(axis=1).all()
+    assert np.nanmin(found) < 0
+
+
+def test_a_vertex_inside_has_its_depth_however_deep_and_one_outside_only_within_the_reach(make_clip) -> None:
+    clip = shifted(make_clip(n_frames=2), 0.04)
+    index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
+    whole, near = signed_distances_m(hand, index, 1.0), signed_distances_m(hand, index, 0.001)
+    assert whole.min() < -0.005
+    assert (whole > 0.001).any()
+    np.testing.assert_array_equal(near, np.where(whole > 0.001, np.inf, whole))
+
+
+def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip]) -> None:
+    clip = shifted(make_clip(n_frames=6), 0.02)
+    valid = np.array([False, True, True, False, True, True])
+    right = replace(clip.hands["right"], valid=valid)
+    clip = replace(clip, hands={**clip.hands, "right": right})
+    index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
+    touched, found = touched_vertices(hand, index), penetration(hand, index, SolidOverlap(index, 0.002))
+    np.testing.assert_array_equal(touched.any(axis=1), valid)
+    np.testing.assert_array_equal(np.isfinite(found.deepest_m), valid)
+    assert found.volume_m3 is not None
+    np.testing.assert_array_equal(np.isfinite(found.volume_m3), valid)
+    assert found.share() == 1.0
+    assert found.share(more_than_m=0.5) == 0.0
+    gone = replace(clip, hands={**clip.hands, "right": replace(right, valid=np.zeros(6, bool))})
+    nothing = penetration(placed_hand(gone, "right", HANDS), index, SolidOverlap(index, 0.002))
+    assert np.isnan(nothing.share())
+    assert np.isnan(nothing.deepest_m).all()
+
+
+def test_the_angle_of_a_hinge_is_that_of_its_own_frame_where_others_lack_the_hand(
+    make_clip: Callable[..., Clip],
+) -> None:
+    clip = shifted(make_clip(n_frames=6, articulated=True), 0.02)
+    track = replace(clip.object, hinge_rad=np.linspace(-0.5, 2.0, 6).astype(np.float32))
+    clip, valid = replace(clip, object=track), np.array([False, True, False, True, True, False])
+    some = replace(clip, hands={**clip.hands, "right": replace(clip.hands["right"], valid=valid)})
+    index = SurfaceIndex(clip.object.model)
+    overlap = SolidOverlap(index, 0.002)
+    whole, part = (placed_hand(each, "right", HANDS) for each in (clip, some))
+    np.testing.assert_array_equal(
+        signed_distances_m(part, index, 1.0)[valid], signed_distances_m(whole, index, 1.0)[valid]
+    )
+    volumes = [penetration(hand, index, overlap).volume_m3 for hand in (part, whole)]
+    assert volumes[0] is not None
+    assert volumes[1] is not None
+    np.testing.assert_array_equal(volumes[0][valid], volumes[1][valid])
+
+
+def test_a_frame_counts_as_entered_only_deeper_than_asked_for() -> None:
+    found = Penetration(np.array([[0.0, 0.0], [0.01, 0.002], [np.nan, np.nan], [0.02, 0.0]]), None)
+    assert found.share() == pytest.approx(2 / 3)
+    assert found.share(more_than_m=0.01) == pytest.approx(1 / 3)
+
+
+def test_deeper_hands_share_more_volume_and_a_far_hand_none(make_clip: Callable[..., Clip]) -> None:
+    clip = make_clip(n_frames=3)
+    index = SurfaceIndex(clip.object.model)
+    overlap, volumes, depths = SolidOverlap(index), [], []
+    for way_m in (0.0, 0.01, 0.02, 0.04):
+        found = penetration(placed_hand(shifted(clip, way_m), "right", HANDS), index, overlap)
+        assert found.volume_m3 is not None
+        volumes.append(found.volume_m3.mean())
+        depths.append(found.deepest_m.mean())
+    assert (np.diff(volumes[1:]) > 0).all()
+    assert (np.diff(depths[1:]) > 0).all()
+    far = penetration(placed_hand(clip, "left", HANDS), index, overlap)
+    assert far.volume_m3 is not None
+    assert not far.volume_m3.any()
+    assert not far.depth_m.any()
+
+
+@pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
+def test_nothing_changes_when_the_world_moves(make_clip: Callable[..., Clip], articulated: bool) -> None:
+    clip = shifted(make_clip(n_frames=6, articulated=articulated), 0.02)
+    turn, way = Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix(), np.array([0.3, -0.2, 0.5])
+    moved = world_moved(clip, turn, way)
+    index = SurfaceIndex(clip.object.model)
+    overlap = SolidOverlap(index)
+    for side in SIDES:
+        one, two = placed_hand(clip, side, HANDS), placed_hand(moved, side, HANDS)
+        np.testing.assert_allclose(two.vertices_m, one.vertices_m, atol=2e-6)
+        first, second = signed_distances_m(one, index, 0.05), signed_distances_m(two, index, 0.05)
+        clear = np.abs(np.abs(first) - 0.005) > 3e-6
+        np.testing.assert_array_equal(touched_vertices(one, index)[clear], touched_vertices(two, index)[clear])
+        both = np.isfinite(first) & np.isfinite(second)
+        np.testing.assert_allclose(second[both], first[both], atol=3e-6)
+        volumes = [penetration(hand, index, overlap).volume_m3 for hand in (one, two)]
+        np.testing.assert_allclose(volumes[1], volumes[0], atol=2e-8)
+
+
+def world_moved(clip: Clip, turn: np.ndarray, way_m: np.ndarray) -> Clip:
+    def turned(rotvec: np.ndarray) -> np.ndarray:
+        return rotmat_to_rotvec(turn @ rotvec_to_rotmat(rotvec.astype(np.float64))).astype(np.float32)
+
+    hands = {
+        side: replace(
+            track,
+            wrist_m=(track.wrist_m @ turn.T + way_m).astype(np.float32),
+            global_orient=turned(track.global_orient),
+        )
+        for side, track in clip.hands.items()
+    }
+    translation = (clip.object.translation_m @ turn.T + way_m).astype(np.float32)
+    track = replace(clip.object, rotvec=turned(clip.object.rotvec), translation_m=translation)
+    return replace(clip, hands=hands, object=track)
+
+
+def test_the_mirrored_clip_has_the_other_hand_s_contacts(make_clip: Callable[..., Clip]) -> None:
+    clip = shifted(make_clip(n_frames=6, articulated=True), 0.02)
+    mirrored = mirror_image(clip)
+    index, other = SurfaceIndex(clip.object.model), SurfaceIndex(mirrored.object.model)
+    overlaps = SolidOverlap(index, 0.0005), SolidOverlap(other, 0.0005)
+    for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
+        one, two = placed_hand(clip, side, HANDS), placed_hand(mirrored, opposite, HANDS)
+        first, second = signed_distances_m(one, index, 0.05), signed_distances_m(two, other, 0.05)
+        both = np.isfinite(first) & np.isfinite(second)
+        np.testing.assert_allclose(second[both], first[both], atol=3e-6)
+        clear = np.abs(np.abs(first) - 0.005) > 3e-6
+        np.testing.assert_array_equal(touched_vertices(one, index)[clear], touched_vertices(two, other)[clear])
+        volumes = [penetration(*asked).volume_m3 for asked in ((one, index, overlaps[0]), (two, other, overlaps[1]))]
+        np.testing.assert_allclose(volumes[1], volumes[0], atol=2e-8)
+
+
+def mirror_image(clip: Clip) -> Clip:
+    """The clip in a mirror that turns x: axis-angles keep x and turn y and z, left and right change places."""
+    flip = np.array([-1.0, 1, 1])
+    turn = -flip
+    hands = {}
+    for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
+        track = clip.hands[opposite]
+        pose = (track.hand_pose.reshape(-1, 15, 3) * turn).reshape(track.hand_pose.shape)
+        hands[side] = replace(
+            track, wrist_m=track.wrist_m * flip, global_orient=track.global_orient * turn, hand_pose=pose
+        )
+    model = clip.object.model
+    assert model.hinge is not None
+    hinge = Hinge(model.hinge.axis * turn, model.hinge.origin_m * flip)
+    image = ObjectModel("mirrored", model.vertices_m * flip, model.faces[:, ::-1], model.part, hinge)
+    track = replace(
+        clip.object, model=image, rotvec=clip.object.rotvec * turn, translation_m=clip.object.translation_m * flip
+    )
+    return replace(clip, hands=hands, object=track)
+
+
+def test_an_open_object_has_touched_vertices_but_no_penetration(make_clip: Callable[..., Clip]) -> None:
+    clip = make_clip(n_frames=2)
+    model = clip.object.model
+    sheet = ObjectModel("sheet", model.vertices_m, model.faces[: len(model.faces) // 2], model.part)
+    index, hand = SurfaceIndex(sheet), placed_hand(clip, "right", HANDS)
+    assert isinstance(hand, PlacedHand)
+    assert touched_vertices(hand, index, 1.0).all()
+    with pytest.raises(BadInput, match="it is open"):
+        penetration(hand, index)
+    assert index.solid_note == "sheet has no inside: it is open"

@@ -1,0 +1,176 @@
+"""Provenance and its comparison with today, on a graph of two stages in a temporary folder."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from hoidata.errors import BadInput
+from hoidata.files import canonical_json
+from pipelines.lineage.digests import path_digest
+from pipelines.lineage.graph import look_up, read_graph
+from pipelines.lineage.provenance import build_provenance, read_provenance
+from pipelines.lineage.tree import lineage_tree, overall_status, tree_as_json
+
+GRAPH = """
+stages:
+  convert:
+    matrix: {dataset: "${datasets}"}
+    cmd: python convert.py ${item.dataset}
+    deps: ["manifests/${item.dataset}.json", hoidata/datasets]
+    params: [convert]
+    outs:
+      - data/${item.dataset}:
+          persist: true
+  train:
+    matrix:
+      dataset: ${datasets}
+      model: [contact, length]
+    cmd: >-
+      python train.py ${item.dataset}
+      ${item.model}
+    deps: ["data/${item.dataset}", models]
+    params: ["train.${train.size}.${item.model}"]
+    outs: ["checkpoints/${item.dataset}/${item.model}"]
+"""
+PARAMS = """
+datasets: [grab, arctic]
+convert: {fps: 30}
+train:
+  size: demo
+  demo: {contact: {lr: 0.1, steps: 5}, length: {lr: 0.2}}
+  paper: {contact: {lr: 0.3}, length: {lr: 0.4}}
+"""
+FACTS = {"model": "contact", "seed": 0, "clips": {"train": ["grab/s1/a", "grab/s1/b"]}, "synthetic": True}
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    for name, text in {
+        "dvc.yaml": GRAPH,
+        "params.yaml": PARAMS,
+        "manifests/grab.json": "{}",
+        "hoidata/datasets/grab/adapter.py": "pass",
+        "models/text2hoi/contact.py": "pass",
+        "data/grab/clips.npz": "clips",
+    }.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return tmp_path
+
+
+@pytest.fixture
+def checkpoint(root: Path) -> Path:
+    provenance = build_provenance(root, "train@grab-contact", FACTS)
+    path = root / "checkpoints/grab/contact/model.safetensors"
+    path.parent.mkdir(parents=True)
+    metadata = {"hoidata": canonical_json({"provenance": provenance})}
+    save_file({"weight": np.zeros(2, np.float32)}, path, metadata)
+    return path
+
+
+def status_of(root: Path, checkpoint: Path) -> dict[str, str]:
+    return {f"{node.kind} {node.name}": node.status for node in lineage_tree(root, checkpoint)[0].walk()}
+
+
+def test_graph_resolves_matrix_and_params(root):
+    graph = read_graph(root)
+    assert sorted(graph) == sorted(
+        ["convert@grab", "convert@arctic"]
+        + [f"train@{d}-{m}" for d in ("grab", "arctic") for m in ("contact", "length")]
+    )
+    stage = graph["train@grab-contact"]
+    assert stage.command == "python train.py grab contact"
+    assert (stage.code, stage.data, stage.params) == (("models",), ("data/grab",), ("train.demo.contact",))
+    assert graph["convert@grab"].outs == ("data/grab",)
+
+
+def test_missing_param_is_refused_with_the_known_ones():
+    with pytest.raises(BadInput, match="one of: lr"):
+        look_up({"train": {"lr": 1}}, "train.rate")
+
+
+def test_tree_names_every_stage_param_code_and_manifest_behind_a_checkpoint(root, checkpoint):
+    found = status_of(root, checkpoint)
+    assert set(found.values()) == {"same"}
+    assert {
+        "stage train@grab-contact",
+        "param train.demo.contact",
+        "code models",
+        "data data/grab",
+        "stage convert@grab",
+        "param convert",
+        "code hoidata/datasets",
+        "manifest manifests/grab.json",
+    } <= set(found)
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "node"),
+    [
+        ("manifests/grab.json", "{ }", "manifest manifests/grab.json"),
+        ("hoidata/datasets/grab/adapter.py", "1", "code hoidata/datasets"),
+        ("models/new.py", "1", "code models"),
+        ("data/grab/clips.npz", "others", "data data/grab"),
+        ("params.yaml", PARAMS.replace("fps: 30", "fps: 60"), "param convert"),
+        ("params.yaml", PARAMS.replace("lr: 0.1", "lr: 0.5"), "param train.demo.contact"),
+        ("params.yaml", PARAMS.replace("size: demo", "size: paper"), "stage train@grab-contact"),
+    ],
+)
+def test_a_change_of_any_input_is_found(root, checkpoint, path, text, node):
+    (root / path).write_text(text)
+    assert status_of(root, checkpoint)[node] == "changed"
+    assert overall_status(lineage_tree(root, checkpoint)[0]) == "changed"
+
+
+def test_a_changed_param_says_what_it_was_and_is(root, checkpoint):
+    (root / "params.yaml").write_text(PARAMS.replace("lr: 0.1", "lr: 0.5"))
+    nodes = lineage_tree(root, checkpoint)[0].walk()
+    assert next(node.detail for node in nodes if node.name == "train.demo.contact") == "lr: 0.1 -> 0.5"
+
+
+def test_what_is_gone_is_missing(root, checkpoint):
+    (root / "manifests/grab.json").unlink()
+    assert status_of(root, checkpoint)["manifest manifests/grab.json"] == "missing"
+    assert overall_status(lineage_tree(root, checkpoint)[0]) == "missing"
+
+
+def test_unrelated_changes_are_not_reported(root, checkpoint):
+    (root / "params.yaml").write_text(PARAMS.replace("lr: 0.2", "lr: 0.9"))
+    (root / "models" / "__pycache__").mkdir()
+    (root / "models" / "__pycache__" / "contact.pyc").write_text("compiled")
+    assert overall_status(lineage_tree(root, checkpoint)[0]) == "same"
+
+
+def test_provenance_depends_on_content_alone(root):
+    first = canonical_json(build_provenance(root, "train@grab-contact", FACTS))
+    for path in root.rglob("*.py"):
+        path.touch()
+    assert canonical_json(build_provenance(root, "train@grab-contact", FACTS)) == first
+
+
+def test_tree_is_plain_json(root, checkpoint):
+    tree = lineage_tree(root, checkpoint)[0]
+    assert json.loads(json.dumps(tree_as_json(tree)))["children"][0]["name"] == "train@grab-contact"
+
+
+def test_clips_it_was_trained_on_are_carried(root, checkpoint):
+    assert read_provenance(checkpoint)["clips"] == FACTS["clips"]
+
+
+@pytest.mark.parametrize("data", [b"", b"\x00" * 7, b"\xff" * 16, (2).to_bytes(8, "little") + b"{}"])
+def test_what_is_no_checkpoint_is_refused_with_its_name(tmp_path, data):
+    (tmp_path / "model.safetensors").write_bytes(data)
+    with pytest.raises(BadInput, match=r"model\.safetensors: expected"):
+        read_provenance(tmp_path / "model.safetensors")
+
+
+def test_folder_digest_depends_on_names_and_bytes(tmp_path):
+    (tmp_path / "a").write_text("1")
+    before = path_digest(tmp_path)
+    (tmp_path / "a").rename(tmp_path / "b")
+    assert path_digest(tmp_path) != before
+    assert path_digest(tmp_path / "nothing") is None
