@@ -66,11 +66,11 @@ def make_clip(number: int, plan: Plan) -> Clip:
     start = np.array([0.3, -0.2, 0.9])
     top = float(plan.model.vertices_m[:, 2].max()) + GRASP_HEIGHT_M
     hands = {}
-    for side, acts, shift in (("left", plan.left, -0.04), ("right", plan.right, 0.04)):
+    for side, active_hands, shift in (("left", plan.left, -0.04), ("right", plan.right, 0.04)):
         wrist = path + start + np.array([shift, 0, top]) + away[:, None] * np.array([0, 0, 1.0])
         orient = np.tile(np.array([0.1 * number, 0.2, 0.0]), (frames, 1))
         hands[side] = HandTrack(
-            (wrist if acts else wrist + 1).astype(np.float32),
+            (wrist if active_hands else wrist + 1).astype(np.float32),
             orient.astype(np.float32),
             np.full((frames, 45), 0.05, np.float32),
             np.full((1, 10), 0.3, np.float32),

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from models.common.surface import Surface
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
@@ -12,7 +13,6 @@ from hoidata.objects.model import ObjectModel
 from models import losses
 from models.common.features import Hands, object_rotmat, place_points
 from models.common.fields import DistanceFields
-from models.common.surface import Surface
 
 
 @pytest.fixture(scope="module")

@@ -24,12 +24,12 @@ def test_f1_is_the_harmonic_mean_of_precision_and_recall() -> None:
 
 
 def test_the_best_threshold_separates_the_maps() -> None:
-    chances = np.array([[0.1, 0.4, 0.62, 0.9], [0.2, 0.3, 0.7, 0.8]])
+    probabilities = np.array([[0.1, 0.4, 0.62, 0.9], [0.2, 0.3, 0.7, 0.8]])
     true = np.array([[0, 0, 1, 1], [0, 0, 1, 1]], bool)
-    best = metrics.best_threshold(chances, true)
+    best = metrics.best_threshold(probabilities, true)
     assert best == pytest.approx(0.45)
-    assert metrics.mean_f1(chances, true, best) == 1
-    assert metrics.mean_f1(chances, true, 0.65) == pytest.approx((2 / 3 + 1) / 2)
+    assert metrics.mean_f1(probabilities, true, best) == 1
+    assert metrics.mean_f1(probabilities, true, 0.65) == pytest.approx((2 / 3 + 1) / 2)
 
 
 def test_the_mean_map_by_place_reads_the_nearest_training_points() -> None:

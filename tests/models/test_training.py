@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from models.common.evaluation import evaluate_dataset
 from safetensors import safe_open
 
 from hoidata.annotation import load_encoder
@@ -18,7 +19,6 @@ from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import load_checkpoint, save_checkpoint
 from models.common.corpus import batches
-from models.common.evaluation import evaluate_dataset
 from models.common.training import TrainingConfig, learning_rate_factor, train_model
 from models.text2hoi.generation import GeneratedMotion, generate
 
@@ -26,7 +26,7 @@ POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
 TRANSFORMER = {
     "width": 32, "layers": 1, "heads": 2, "feed_forward": 64, "dropout": 0.1, "norm_first": True, "frames_per_token": 5,
 }  # fmt: skip
-BUDGET = {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "average": 0.5}
+BUDGET = {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "ema_decay": 0.5}
 PARAMS = {
     "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
     "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
