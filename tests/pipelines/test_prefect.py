@@ -44,7 +44,7 @@ def test_prefect_deployment_run_annotate_arctic_completes(project, project_tools
     with hoidata_up(project, project_tools) as up:
         asked = project_tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
         assert asked.returncode == 0, asked.stdout + asked.stderr
-        assert flow_state(project, project_tools, up.settings, 300) == "Completed", up.log.read_text()
+        assert flow_state(project, project_tools, up.settings, 900) == "Completed", up.log.read_text()
     assert (project / "data/embedded/arctic/annotation/text.parquet").is_file()
     assert not (project / "checkpoints").exists()
 
