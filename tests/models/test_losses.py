@@ -103,7 +103,7 @@ def test_a_field_reads_the_distance_of_a_sphere() -> None:
 
 
 def test_a_field_turns_the_moving_part_with_the_hinge(batch: ClipBatch, hands: Hands) -> None:
-    surface = Surface.of(hands, batch.samples, 40, torch.device("cpu"))
+    surface = Surface.of(hands, batch.objects, 40, torch.device("cpu"))
     points = place_points(batch, batch.object)
     both = points[:, None].expand(-1, 2, -1, -1, -1)
     _, distance, _ = surface.measure(batch, both, batch.object)
