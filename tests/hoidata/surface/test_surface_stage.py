@@ -211,12 +211,12 @@ def test_bytes_repeat_and_shards_do_not_change_what_is_read(written, monkeypatch
 def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_up(written, monkeypatch):
     folder, asked = written[0], []
 
-    def backwards(bench, jobs):
+    def backwards(measure, clip_ids, jobs):
         asked.append(jobs)
-        for clip_id in reversed(bench.store.ids):
-            yield clip_id, (bench.measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
+        for clip_id in reversed(clip_ids):
+            yield clip_id, (measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
 
-    monkeypatch.setattr("hoidata.surface.stage._measured", backwards)
+    monkeypatch.setattr("hoidata.surface.stage.in_workers", backwards)
     left_out = {"test/s2/left": "left out by quality control: so"}
     arguments = {"points": POINTS, "left_out": left_out, "progress": False}
     report = surface_store(folder / "clips", folder / "backwards", jobs=8, **arguments)
