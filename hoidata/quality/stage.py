@@ -18,7 +18,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hoidata.clips.clip import SIDES
-from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
@@ -34,7 +33,7 @@ from hoidata.quality.thresholds import (
     verdict_of,
 )
 from hoidata.store.store import Store, open_store
-from hoidata.workers import WorkerLost, in_workers
+from hoidata.workers import in_workers
 
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 50_000
@@ -118,18 +117,9 @@ def _measured(
     frames = sum(store.sequences["n_frames"].tolist())
     jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
     rows: dict[str, dict[str, Any]] = {}
-    try:
-        with Progress(console=Console(stderr=True), disable=not progress) as bar:
-            rows |= bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality")
-    except WorkerLost as error:
-        raise _worker_lost(error) from error
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        rows |= bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality")
     return [rows[clip_id] for clip_id in store.ids]
-
-
-def _worker_lost(error: WorkerLost) -> BadInput:
-    where = ", ".join(map(str, error.in_flight)) or "quality"
-    remedy = "run it again; if memory ran out, set HOIDATA_JOBS=1"
-    return BadInput(where, "worker processes that live until they are done", f"one lost ({error.cause})", remedy)
 
 
 def _measure(store: Store, facts: dict[str, ObjectFacts], thresholds: Thresholds, clip_id: str) -> dict[str, Any]:
