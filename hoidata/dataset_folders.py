@@ -71,11 +71,25 @@ def dataset_folder(name: str) -> Path | None:
 
 
 def dataset_facts(name: str) -> DatasetFacts | None:
-    """What ``facts.toml`` of a dataset says; None where it has no such file. Raises BadInput where it is wrong."""
+    """What is known of a dataset by name; None where it has no folder, or one without ``facts.toml``."""
     folder = dataset_folder(name)
-    path = None if folder is None else folder / "facts.toml"
-    if path is None or not path.is_file():
-        return None
+    return _read_facts(folder) if folder is not None and (folder / "facts.toml").is_file() else None
+
+
+def facts_beside(file: str) -> DatasetFacts:
+    """The facts of the dataset in whose folder ``file`` lies: an adapter's ``__file__``."""
+    return _read_facts(Path(file).parent)
+
+
+def dataset_title(name: str) -> str:
+    """The dataset's name as pages write it."""
+    facts = dataset_facts(name)
+    return name if facts is None else facts.title
+
+
+def _read_facts(folder: Path) -> DatasetFacts:
+    """``facts.toml`` of a dataset's folder. Raises BadInput that names the entry that is wrong or missing."""
+    path = folder / "facts.toml"
     values = _read_toml(path)
     known = {item.name: _KINDS[item.type] for item in fields(DatasetFacts) if item.name != "name"}
     if wrong := sorted(values.keys() - known.keys()):
@@ -84,23 +98,9 @@ def dataset_facts(name: str) -> DatasetFacts | None:
         if type(value) not in known[key]:
             raise BadInput(f"{path}: {key}", known[key][0].__name__, repr(value)[:40], REMEDY)
     try:
-        return DatasetFacts(name, **values)
+        return DatasetFacts(folder.name, **values)
     except TypeError as error:
         raise BadInput(path, "every fact but paper, split and conventions", str(error), REMEDY) from error
-
-
-def require_facts(name: str) -> DatasetFacts:
-    """The facts of a dataset whose adapter reads them. Raises BadInput where its folder has no ``facts.toml``."""
-    facts = dataset_facts(name)
-    if facts is None:
-        raise BadInput(f"{name}/facts.toml", "the facts of the dataset", "no file", REMEDY)
-    return facts
-
-
-def dataset_title(name: str) -> str:
-    """The dataset's name as pages write it."""
-    facts = dataset_facts(name)
-    return name if facts is None else facts.title
 
 
 def _listed_in_settings() -> list[str]:

@@ -4,13 +4,13 @@ import re
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
-from hoidata.dataset_folders import DatasetFacts, require_facts
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.arctic.files import (
     Description,
@@ -20,6 +20,7 @@ from hoidata.datasets.arctic.files import (
     parse_misc,
     parse_parts,
 )
+from hoidata.datasets.arctic.words import EXCLUDED, object_words
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
@@ -28,12 +29,6 @@ from hoidata.hands import HandPair
 from hoidata.objects.model import Hinge, ObjectModel
 
 MILLIMETRES = 1e-3
-EXCLUDED = {("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")}  # as Text2HOI does
-OBJECT_WORDS = {
-    "capsulemachine": "capsule machine",
-    "espressomachine": "espresso machine",
-    "waffleiron": "waffle iron",
-}
 TOPS = ("", "data/", "arctic_data/data/")
 HINGE_AXIS = (0.0, 0.0, -1.0)
 FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
@@ -90,7 +85,7 @@ class ArcticAdapter(Described):
     black). body: keep the parameters of the subject's SMPL-X body.
     """
 
-    facts: ClassVar[DatasetFacts] = require_facts("arctic")
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     shortest_frames: int = 20
     clips: Stretches = "described"
@@ -188,7 +183,7 @@ class ArcticAdapter(Described):
             source_frames=np.arange(motion.n_frames, dtype=np.int32),
             gravity=np.array([0.0, 0.0, -1.0]),
             verb=None if description is None else description.verb,
-            object_words=OBJECT_WORDS.get(motion.object.model.name, motion.object.model.name),
+            object_words=object_words(motion.object.model.name),
             labelled_hand=None if description is None else description.hand,
             sources=raw.sources,
             source_fps=self.source_fps,

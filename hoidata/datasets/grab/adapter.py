@@ -3,13 +3,13 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, BodyTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
-from hoidata.dataset_folders import DatasetFacts, require_facts
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.grab.contact import read_contact
@@ -57,7 +57,7 @@ class GrabAdapter(Described):
     body: keep the parameters of the person's SMPL-X body.
     """
 
-    facts: ClassVar[DatasetFacts] = require_facts("grab")
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     contact: bool = True
     body: bool = False

@@ -8,26 +8,25 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import ClassVar, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
 from hoidata.clips.clip import CameraTrack, Clip, ObjectTrack, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
-from hoidata.dataset_folders import DatasetFacts, require_facts
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
-    ACTIONS,
     LISTS,
-    OBJECTS,
     HandSource,
     SequenceFrames,
     listed_segments,
     read_frames,
 )
 from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
+from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
@@ -83,7 +82,7 @@ class H2OAdapter(Described):
     a label, not the one that is tracked most.
     """
 
-    facts: ClassVar[DatasetFacts] = require_facts("h2o")
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     shortest_frames: int = 21
     hands: HandSource = "mano"

@@ -6,16 +6,14 @@ To go right-handed, the world and every joint frame are seen in a mirror with no
 """
 
 import json
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
-from hoidata.dataset_folders import DatasetFacts, require_facts
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.bvh import BvhMotion, parse_bvh, unpack_text
@@ -32,6 +30,7 @@ from hoidata.datasets.manipnet.segments import (
     motion_verb,
     widened,
 )
+from hoidata.datasets.manipnet.words import object_words
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
@@ -57,14 +56,6 @@ MANO_JOINTS = (
     *THUMB_CHAIN[1:],
 )
 TIP_JOINTS = (*(f"{finger}_DIP_FE" for finger in FINGERS), "THUMB_IP_FE")
-SIZES = {"small": "small", "med": "medium", "large": "large"}
-NOUNS = {
-    "cyl": "cylinder",
-    "hemi": "hemisphere",
-    "tetra": "tetrahedron",
-    "tri prism": "triangular prism",
-    "wineglass": "wine glass",
-}
 FRAME = WorldFrame("+y", "stated", "Unity's world seen in a mirror with normal x: right-handed, y up")
 CONVENTION = HandConvention(
     translation="wrist",
@@ -141,7 +132,7 @@ class ManipNetAdapter(Described):
     depend on which other recordings are there.
     """
 
-    facts: ClassVar[DatasetFacts] = require_facts("manipnet")
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
@@ -265,14 +256,6 @@ def thirty_fps_frames(n_frames: int, frame_time_s: float) -> np.ndarray:
     count = int(np.floor((n_frames - 1) * frame_time_s * FPS + 1e-3)) + 1
     frames = np.rint(np.arange(count) / (FPS * frame_time_s)).astype(int)
     return frames[frames < n_frames]
-
-
-def object_words(name: str) -> str:
-    """A released object's file name in words: ``cyl_med`` -> "medium cylinder", ``teapot2`` -> "teapot"."""
-    words = [re.sub(r"\d+$", "", word) for word in name.split("_")]
-    sizes = [SIZES[word] for word in words if word in SIZES]
-    noun = " ".join(word for word in words if word not in SIZES and word not in ("body", "old", "simplified"))
-    return " ".join([*sizes, NOUNS.get(noun, noun)])
 
 
 def _hand_path(name: str, side: Side) -> str:

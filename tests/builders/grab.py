@@ -1,5 +1,6 @@
 """One GRAB recording and its meshes, written by hand: a sequence of 61 frames whose numbers are all known."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,20 @@ def write_root(root: Path) -> Path:
     for side, letter in (("left", "l"), ("right", "r")):
         mesh = trimesh.Trimesh(personal_mesh(side), load_embedded_hands()[side].faces, process=False)
         mesh.export(people / f"s3_{letter}hand.ply")
+    return root
+
+
+def write_two(root: Path) -> Path:
+    """The sequence, and another one of a cube with a mesh of its own."""
+    write_root(root)
+    first = root / "grab/s3/cubelarge_offhand_1.npz"
+    kept = first.read_bytes()
+    data = sequence() | {"obj_name": "cubesmall"}
+    data["object"]["object_mesh"] = data["object"]["object_mesh"].replace("large", "small")
+    write_sequence(root, data).rename(root / "grab/s3/cubesmall_offhand_1.npz")
+    first.write_bytes(kept)
+    meshes = root / "tools/object_meshes/contact_meshes"
+    shutil.copy(meshes / "cubelarge.ply", meshes / "cubesmall.ply")
     return root
 
 

@@ -62,6 +62,14 @@ def write_root(root: Path) -> Path:
     return root
 
 
+def write_two(root: Path) -> Path:
+    """The sequence, and another one with a mixer."""
+    write_root(root)
+    write_sequence(root, "mixer_use_01")
+    write_template(root, "mixer")
+    return root
+
+
 def head() -> dict:
     """The camera on the head, from world to camera; it turns and moves."""
     rotation = Rotation.from_rotvec(np.stack([1.8 + 0 * TIME, 0.01 * TIME, 0.2 + 0 * TIME], axis=1)).as_matrix()

@@ -1,8 +1,6 @@
 """GRAB: what comes with the motion: table, body, contact labels; and the adapter's settings."""
 
-import importlib.util
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -10,18 +8,7 @@ import pytest
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.datasets.grab.contact import read_contact
 from hoidata.errors import BadInput
-
-
-def load_recording() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("grab_recording", Path(__file__).with_name("grab_recording.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-recording = load_recording()
+from tests.builders import grab as recording
 
 
 @pytest.fixture
@@ -139,20 +126,3 @@ def test_labels_longer_than_one_piece_are_those_read_at_once(root):
     part = labels.cut(100, 200)
     assert (part.frame.min(), part.frame.max()) == (0, 99)
     assert len(part.frame) == ((expected_frame >= 100) & (expected_frame < 200)).sum()
-
-
-@pytest.mark.parametrize(
-    ("setting", "expected"),
-    [
-        ({"margin_frames": -1}, "0 or more"),
-        ({"margin_frames": 1.5}, "0 or more"),
-        ({"margin_frames": True}, "0 or more"),
-        ({"contact": "yes"}, "true or false"),
-        ({"body": 1}, "true or false"),
-    ],
-)
-def test_a_setting_that_means_nothing_is_refused(setting, expected):
-    with pytest.raises(BadInput) as caught:
-        GrabAdapter(**setting)
-    assert expected in caught.value.expected
-    assert next(iter(setting)) in caught.value.where

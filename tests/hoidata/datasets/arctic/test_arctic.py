@@ -1,31 +1,14 @@
 """ARCTIC: parameter files, templates and descriptions written by hand, and what their numbers must mean."""
 
-import importlib.util
 import json
 from pathlib import Path
-from types import ModuleType
 
-import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hoidata.datasets import Quarantined
 from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.datasets.arctic.files import parse_description
-from hoidata.hands import track_joints
-from hoidata.objects import articulate, place
-
-
-def load_recording() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("arctic_recording", Path(__file__).with_name("arctic_recording.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-recording = load_recording()
+from tests.builders import arctic as recording
 
 
 @pytest.fixture
@@ -61,61 +44,6 @@ def test_words_and_hand_come_from_the_description(clips):
         ("close", "right", "box"),
         ("open", "right", "box"),
     }
-
-
-def test_fingers_are_relative_to_the_mean_pose_and_stay_unwrapped(lift, hands, formula):
-    for side in ("left", "right"):
-        rest = formula.rest_points(hands[side], recording.SHAPE[side].astype(np.float32))
-        absolute = recording.STORED + hands[side].mean_pose
-        joints = track_joints(lift.hands[side], hands[side])[0, :16]
-        expected = formula.chain(rest, recording.HAND_ORIENT[side], absolute, recording.HAND_TRANSL[side])
-        np.testing.assert_allclose(joints, expected, atol=2e-6)
-        as_stored = formula.chain(rest, recording.HAND_ORIENT[side], recording.STORED, recording.HAND_TRANSL[side])
-        assert np.linalg.norm(joints - as_stored, axis=1).max() > 0.005
-        np.testing.assert_allclose(lift.hands[side].hand_pose[0], absolute, atol=1e-6)
-        assert lift.hands[side].hand_pose.max() > 6
-
-
-def test_the_wrist_stands_at_the_shaped_rest_wrist_plus_trans(lift, hands, formula):
-    for side in ("left", "right"):
-        rest = formula.rest_points(hands[side], recording.SHAPE[side])
-        np.testing.assert_allclose(lift.hands[side].wrist_m[3], rest[0] + recording.HAND_TRANSL[side], atol=1e-6)
-        assert np.linalg.norm(rest[0]) > 0.05
-
-
-def test_things_fall_along_minus_z_of_the_vicon_world(lift):
-    assert lift.gravity.tolist() == [0, 0, -1]
-    assert lift.source_fps == 30
-
-
-def test_millimetres_become_metres_in_mesh_and_translation(lift):
-    np.testing.assert_allclose(
-        lift.object.model.vertices_m, np.array(recording.BOTTOM_MM + recording.TOP_MM) / 1000, atol=1e-9
-    )
-    np.testing.assert_allclose(lift.object.translation_m, recording.TRANSLATION_MM[14:44] / 1000, atol=1e-6)
-
-
-def test_the_top_turns_about_minus_z_and_the_bottom_does_not(lift):
-    model = lift.object.model
-    assert model.part.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
-    points = place(
-        articulate(model.vertices_m, model.part, model.hinge, lift.object.hinge_rad),
-        lift.object.rotvec,
-        lift.object.translation_m,
-    )
-    for at, frame in enumerate(range(14, 44)):
-        turn = Rotation.from_euler("z", -recording.ANGLE[frame]).as_matrix()
-        pose = Rotation.from_rotvec(recording.ORIENT[frame]).as_matrix()
-        canonical = np.vstack((recording.BOTTOM_MM, np.array(recording.TOP_MM) @ turn.T))
-        expected = (canonical @ pose.T + recording.TRANSLATION_MM[frame]) / 1000
-        np.testing.assert_allclose(points[at], expected, atol=1e-6)
-        other_way = (np.array(recording.TOP_MM) @ turn @ pose.T + recording.TRANSLATION_MM[frame]) / 1000
-        assert np.abs(points[at, 4:] - other_way).max() > 0.01
-
-
-def test_the_hinge_angle_is_kept_beyond_pi(lift):
-    np.testing.assert_allclose(lift.object.hinge_rad, recording.ANGLE[14:44], atol=1e-6)
-    assert lift.object.hinge_rad[-1] > np.pi
 
 
 def test_parts_may_be_json_booleans(root, load_all, lift):

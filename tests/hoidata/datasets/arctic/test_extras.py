@@ -1,10 +1,8 @@
 """ARCTIC: what comes with the motion (head camera, body), whole sequences, the withheld subject, pure parsers."""
 
-import importlib.util
 import json
 import shutil
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -15,18 +13,7 @@ from hoidata.datasets import RawTree
 from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.datasets.arctic.files import Description, parse_descriptions, parse_misc, parse_parts
 from hoidata.errors import BadInput
-
-
-def load_recording() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("arctic_recording", Path(__file__).with_name("arctic_recording.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-recording = load_recording()
+from tests.builders import arctic as recording
 
 
 @pytest.fixture
@@ -164,22 +151,6 @@ def test_files_are_paired_by_name_and_never_by_position(root, load_all):
         with pytest.raises(BadInput) as caught:
             adapter.load(RawTree(root), key, None)
         assert f"{key.name}.{missing}.npy" in caught.value.where
-
-
-@pytest.mark.parametrize(
-    ("setting", "expected"),
-    [
-        ({"clips": "all"}, "described or whole"),
-        ({"margin_frames": -2}, "0 or more"),
-        ({"shortest_frames": 2.5}, "0 or more"),
-        ({"trimmed_frames": "ten"}, "0 or more"),
-        ({"body": None}, "true or false"),
-    ],
-)
-def test_a_setting_that_means_nothing_is_refused(setting, expected):
-    with pytest.raises(BadInput) as caught:
-        ArcticAdapter(**setting)
-    assert expected in caught.value.expected
 
 
 def test_descriptions_are_parsed_from_bytes_with_the_bad_lines_by_number():

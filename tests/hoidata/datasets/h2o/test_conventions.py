@@ -14,7 +14,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import Clip
-from hoidata.datasets import RawTree, get_adapter
+from hoidata.datasets import RawTree
 from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
@@ -366,8 +366,3 @@ def test_parameters_and_joints_are_never_mixed(root, clip, tmp_path):
     np.testing.assert_array_equal(again.hands["left"].wrist_m, clip.hands["left"].wrist_m)
     with pytest.raises(BadInput, match=r"cam4/hand_pose: expected a folder"):
         load(tmp_path / "h2o", hands="keypoints")
-
-
-def test_another_source_of_hands_is_refused_with_the_known_ones():
-    with pytest.raises(BadInput, match=r"hands: expected mano or keypoints, got 'joints'"):
-        get_adapter("h2o", hands="joints")
