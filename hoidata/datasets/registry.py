@@ -7,9 +7,11 @@ holds one class whose name ends in ``Adapter``. A package adds one with an entry
     kitchen = "kitchen_hoi:KitchenAdapter"
 """
 
+import sys
 from dataclasses import dataclass, fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
 from hoidata.dataset_folders import built_in_names, dataset_folder, outside_folders
@@ -106,6 +108,9 @@ def _kind(name: str) -> Any:
 
 def _kind_of_folder(name: str) -> type:
     """The one adapter class of a dataset's folder."""
+    room, above = sys.modules["hoidata.datasets"].__path__, str(Path(str(dataset_folder(name))).parent)
+    if above not in room:  # named since this process imported the room
+        room.append(above)
     try:
         module = import_module(f"hoidata.datasets.{name}.adapter")
     except BadInput:

@@ -13,41 +13,49 @@ from scipy.spatial.transform import Rotation
 
 import hoidata.datasets
 from hoidata.clips.clip import HandTrack
+from hoidata.datasets.registry import ENTRY_POINT_GROUP
 from hoidata.hands import HandPair, track_joints
 
 WALK_THROUGH = Path(hoidata.datasets.__file__).with_name("README.md")
 PACKAGE = "kitchen_hoi"
+FILES = {"toml": "facts.toml", "json": "splits/drawn.json", "python": "adapter.py"}
 FRAMES_AT_60_HZ = 48
 HALF_BOX_M = np.array([0.05, 0.02, 0.05])
 
 
-def example_code() -> str:
-    """The one Python block of the walk-through."""
-    (code,) = re.findall(r"^```python\n(.*?)^```$", WALK_THROUGH.read_text(), re.DOTALL | re.MULTILINE)
-    return code
+def write_dataset(folder: Path) -> Path:
+    """The walk-through's folder ``kitchen``: the first block of TOML, JSON and Python it prints."""
+    text = WALK_THROUGH.read_text()
+    blocks = {kind: re.findall(rf"^```{kind}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)[0] for kind in FILES}
+    for kind, name in FILES.items():
+        path = folder / "kitchen" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(blocks[kind])
+    return folder / "kitchen"
 
 
-def write_package(folder: Path) -> None:
-    """The example as an installed package of somebody else: its code, and metadata with the entry point."""
+def write_package(folder: Path) -> Path:
+    """The same as an installed package of somebody else, with the entry point in its metadata; the adapter's file."""
     (folder / PACKAGE).mkdir(parents=True)
-    (folder / PACKAGE / "__init__.py").write_text(example_code())
+    (folder / PACKAGE / "__init__.py").touch()
     metadata = folder / f"{PACKAGE}-2.5.dist-info"
     metadata.mkdir()
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: kitchen-hoi\nVersion: 2.5\n")
-    (metadata / "entry_points.txt").write_text(f"[hoidata.datasets]\nkitchen = {PACKAGE}:KitchenAdapter\n")
+    point = f"[{ENTRY_POINT_GROUP}]\nkitchen = {PACKAGE}.kitchen.adapter:KitchenAdapter\n"
+    (metadata / "entry_points.txt").write_text(point)
+    return write_dataset(folder / PACKAGE) / "adapter.py"
 
 
 def import_example(folder: Path) -> ModuleType:
     """The example as a module of this process."""
-    if PACKAGE not in sys.modules:
-        write_package(folder)
-        spec = importlib.util.spec_from_file_location(PACKAGE, folder / PACKAGE / "__init__.py")
+    name = "kitchen_adapter"
+    if name not in sys.modules:
+        spec = importlib.util.spec_from_file_location(name, write_dataset(folder) / "adapter.py")
         assert spec is not None
         assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        sys.modules[PACKAGE] = module
-        spec.loader.exec_module(module)
-    return sys.modules[PACKAGE]
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return sys.modules[name]
 
 
 def write_kitchen(root: Path, hands: HandPair) -> Path:
