@@ -136,7 +136,7 @@ def test_scanning_speaks_of_the_dataset_before_it_speaks_of_mano(here, tmp_path)
     complete = hoidata("raw", "scan", "taco", "--root", str(root)).exception
     assert isinstance(complete, MissingResource)
     assert str(complete).startswith("taco holds MANO parameters and no MANO files are registered")
-    assert not manifest(here, "taco")["present"]
+    assert not (here / "manifests/own/taco.json").exists()
 
 
 def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
