@@ -13,7 +13,6 @@ import torch
 
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.sentences import FORMS, HAND_PHRASES, four_sentences
-from hoidata.batches.dataset import CONTACT_THRESHOLD_M as CROPPED_THRESHOLD_M
 from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
 from hoidata.clips import HandTrack
 from hoidata.contact import CONTACT_THRESHOLD_M
@@ -175,7 +174,7 @@ class TestText2Hoi:
 
     def test_contact_and_distances_end_at_2_centimetres(self):
         """Sections 3.2 and 3.3 name the threshold tau; its value is that of the authors' code."""
-        assert CONTACT_THRESHOLD_M == CROPPED_THRESHOLD_M == 0.02
+        assert CONTACT_THRESHOLD_M == 0.02
         params = read_params(PROJECT)
         assert [params[stage]["threshold_m"] for stage in ("annotate", "contact")] == [0.02, 0.02]
         assert [params[stage]["points"] for stage in ("annotate", "contact")] == [1024, 1024]
