@@ -11,7 +11,7 @@ from typing import Literal
 from hoidata.errors import HoidataError
 from pipelines.lineage.graph import read_params
 from pipelines.lineage.manifests import Manifest, read_manifest
-from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
+from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
@@ -103,8 +103,9 @@ def _hand(profile: str) -> Finding:
 
 def _encoder() -> Finding:
     from hoidata.annotation import load_encoder
+    from hoidata.annotation.settings import AnnotationSettings
 
-    name = read_params(Path())["annotate"]["encoder"]
+    name = load_settings(AnnotationSettings, "annotate").encoder
     try:
         return Finding("text encoder", "ok", _named(load_encoder(name).identity))
     except HoidataError as error:
