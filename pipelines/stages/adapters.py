@@ -1,13 +1,14 @@
 """The adapter of a dataset with the settings of params.yaml: what scanning, checking and converting share."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from hoidata.datasets.base import Adapter
 from hoidata.datasets.registry import get_adapter
 from hoidata.errors import BadInput
-from pipelines.stages.base import load_settings
+from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
+from pipelines.stages.base import Place, load_settings
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,22 @@ class ConvertSettings:
         # Without a margin nothing is said of it, so that an adapter without that setting works too.
         common = {"margin_frames": self.margin_frames} if self.margin_frames else {}
         return get_adapter(name, **{**common, **(self.adapters.get(name) or {})})
+
+
+def manifest_of(place: Place) -> Manifest:
+    """What is known of a dataset's raw files; that it is absent where nothing has been scanned."""
+    path = place.manifest
+    return read_manifest(path) if path.is_file() else absent_manifest(configured_adapter(place.dataset))
+
+
+def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:
+    """Write the manifests the graph depends on where nobody has: those datasets, and the hand, are absent."""
+    for place in (Place(profile, name) for name in datasets):
+        if not place.manifest.is_file():
+            write_manifest(place.manifest, manifest_of(place))
+    hand = Place(profile).hand_manifest
+    if not hand.is_file():
+        write_manifest(hand, ABSENT_HAND)
 
 
 def configured_adapter(name: str) -> Adapter:

@@ -178,13 +178,18 @@ def load_hands(profile: str) -> "HandPair":
     """The hand of the profile: the embedded one, or in ``own`` the user's MANO files where they are registered."""
     from hoidata.hands import load_embedded_hands, load_mano_hands
 
-    values = json.loads(Place(profile).hand_manifest.read_text())
-    if profile == "embedded" or not values["present"]:
+    if profile == "embedded" or not hand_is_present(profile):
         return load_embedded_hands()
     root = own_root(HAND)
     if root is None or not root.is_dir():
         raise MissingResource(f"the MANO files are not at {root}; set {root_variable(HAND)} to their folder")
     return load_mano_hands(root)
+
+
+def hand_is_present(profile: str) -> bool:
+    """Whether the profile has a hand of its own: the embedded one, or MANO files that were scanned."""
+    path = Place(profile).hand_manifest
+    return path.is_file() and bool(json.loads(path.read_text())["present"])
 
 
 def empty_reason(folder: Path) -> str | None:
