@@ -86,6 +86,7 @@ def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, projec
 def test_scanning_a_dataset_leaves_the_work_tree_clean_and_dvc_builds_the_users_profile(
     project, tmp_path, project_tools
 ):
+    make_plain_params(project)
     commit(project, project_tools)
     write_corpus("grab", tmp_path / "grab", 0, "small", 1)
     write_manifest(project / "manifests/own/hand.json", replace(ABSENT_HAND, present=True))
