@@ -17,7 +17,7 @@ from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore, load_annotated
-from models import metrics
+from models.common import metrics
 from models.common.checkpoints import FILE_NAME, Checkpoint, empty_reason, load_checkpoint, motion_generator
 from models.common.config import build_config
 from models.common.features import Hands, object_hinge_rad, object_position_m, object_rotmat
@@ -191,8 +191,8 @@ class Evaluation:
     def refiner(self) -> dict[str, float]:
         """Penetration and distance of contact joints of generated motions, before and after, by the exact mesh.
 
-        Penetration: depth of the deepest vertex, mean over acting hands and frames. Contact joints: those within 2 cm
-        of the surface in the true clip, frame by frame; their distance to the surface in the generated motion.
+        Penetration: depth of the deepest vertex, mean over acting hands and frames. Contact joints: those closer than
+        the contact stage's threshold in the true clip, frame by frame; their distance in the generated motion.
         """
         network = self.loaded["refiner"].network
         assert isinstance(network, RefinerModel)
@@ -231,7 +231,7 @@ class Evaluation:
                 name: HandsAndObject.of(sample, meshes[name][0][index], meshes[name][1][index], motions[name][1][index])
                 for name in motions
             }
-            touching = seen["true"].joint_distances(stride) < metrics.TOUCH_M
+            touching = seen["true"].joint_distances(stride) < sample.contact_threshold_m
             rows.append(
                 {
                     name: (motion.penetration_mm(stride), _mean_mm(motion.joint_distances(stride), touching))

@@ -9,7 +9,6 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.distance import closest_points, signed_distance
 from hoidata.objects.model import ObjectModel
 
-TOUCH_M = 0.02
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 
 

@@ -217,6 +217,7 @@ def _request(model: ObjectModel, points: SampledPoints, feature: Tensor, acts: n
         text=feature.numpy(),
         points=ObjectPoints(points.points_m, points.normals, points.part),
         contact=np.zeros((2, n_points), bool),
+        contact_threshold_m=0.0,
         distances=DistanceEntries(nothing, nothing, nothing, nothing, np.zeros(0, np.float32)),
         world_from_model=np.eye(4),
     )

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.geometry.rotations import rot6d_to_rotmat
-from models import losses
+from models.common import losses
 from models.common.corpus import Corpus, any_form
 from models.common.features import Hands, Normaliser, object_rotmat, place_points
 from models.common.sampling import TRAIN_STEPS, add_noise, alphas_bar
@@ -93,7 +93,7 @@ class LengthRecipe:
 
 @dataclass(frozen=True)
 class DiffusionLossConfig:
-    """Weights beside the simple loss (1): eq. 6 in units of (2 cm)^2, eq. 7. frames: how many of a clip they see."""
+    """Weights beside the simple loss (1): eq. 6 in contact thresholds, eq. 7. frames: how many of a clip they see."""
 
     distance_weight: float = 1.0
     orientation_weight: float = 1.0
@@ -198,4 +198,5 @@ class DiffusionRecipe:
             generator,
         )
         joints = self.hands.joints(hands, batch.betas, batch.template_m)
-        return losses.distance_map_loss(joints, place_points(batch, objects), rows, distance), orientation
+        points, scale_m = place_points(batch, objects), batch.contact_threshold_m
+        return losses.distance_map_loss(joints, points, rows, distance, scale_m), orientation

@@ -10,6 +10,7 @@ from markupsafe import Markup
 from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
+from hoidata.store.annotated import AnnotatedStore
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
@@ -141,13 +142,18 @@ def _motions(
     sentence = annotated.sentences(ids[0])[0]
     caption = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}: {sentence}"
     paint = true_contact(annotated, ids[0])
-    recorded = motion_player(annotated.clip(ids[0]), hands, sentence, caption, paint, "within 2 cm of a joint")
+    recorded = motion_player(annotated.clip(ids[0]), hands, sentence, caption, paint, touch_words(annotated))
     if not is_trained(checkpoints):
         return [recorded], [("clip", ids[0])]
     motion = generated_example(annotated, checkpoints, hands, ids[0], seed)
     paint, caption = generated_contact(motion), f"Generated: {sentence}"
     generated = motion_player(motion.clip, hands, sentence, caption, paint, "contact it was made for")
     return [recorded, generated], [("clip", ids[0]), *generation_facts(motion)]
+
+
+def touch_words(annotated: AnnotatedStore) -> str:
+    """What a recorded contact map shows, with the threshold it was made with."""
+    return f"within {annotated.contact_threshold_m * 100:g} cm of a joint"
 
 
 def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[str, list[Player]]]:
@@ -160,7 +166,7 @@ def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[s
         players = [
             contact_player(example.clip, paint, f"{caption}: {example.sentence}", caption, look, label)
             for caption, paint, label in (
-                ("ground truth", example.truth, "within 2 cm of a joint"),
+                ("ground truth", example.truth, touch_words(annotated)),
                 ("predicted", example.predicted, "chance of contact, 0 to 1"),
             )
         ]
