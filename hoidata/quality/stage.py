@@ -7,7 +7,6 @@ info.json        thresholds, counts
 """
 
 from collections import Counter
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ from hoidata.quality.thresholds import (
     reasons_of,
     verdict_of,
 )
+from hoidata.settings import plain_config
 from hoidata.store.store import Store, open_store
 from hoidata.workers import in_workers
 
@@ -88,15 +88,9 @@ def quality_store(
     with atomic_folder(out_folder) as part:
         write_table(part / "clips.parquet", [_nulled(row, CLIPS) for row in clips], CLIPS)
         write_table(part / "meshes.parquet", [_nulled(row, MESHES) for row in meshes], MESHES)
-        info = {"thresholds": as_json(thresholds), "counts": counts}
+        info = {"thresholds": plain_config(thresholds), "counts": counts}
         (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
-
-
-def as_json(thresholds: Thresholds) -> dict[str, Any]:
-    """The thresholds in the form of their section of params.yaml."""
-    limits = {name: limit._asdict() for name, limit in thresholds.limits.items()}
-    return asdict(thresholds) | {"limits": limits}
 
 
 def _inherited(name: str, found: list[Finding]) -> list[Finding]:

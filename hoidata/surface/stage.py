@@ -30,6 +30,14 @@ from hoidata.workers import in_workers
 FRAMES_PER_JOB = 20_000
 
 
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """enabled: only the pages read what it measures. touch_m: a hand vertex closer to the surface touches it."""
+
+    enabled: bool = True
+    touch_m: float = TOUCH_M
+
+
 class SurfaceReport(NamedTuple):
     """counts: of clips, frames, objects; seconds: processor time of each operation, over all processes."""
 

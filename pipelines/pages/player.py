@@ -52,9 +52,9 @@ def motion_player(
     title: str,
     caption: str = "",
     contact: ContactPaint | None = None,
-    contact_label: str = "within 2 cm of a joint",
+    contact_label: str = "",
 ) -> Player:
-    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it."""
+    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it. contact_label: its meaning."""
     return Player(
         glb=glb_bytes(clip, hands, contact),
         title=title,

@@ -8,6 +8,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from hoidata.clips.clip import Clip
+from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
@@ -21,7 +22,6 @@ from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
-TITLES = {"h2o": "H2O", "grab": "GRAB", "arctic": "ARCTIC", "manipnet": "ManipNet"}
 CONTACT_EXAMPLES = 3
 
 
@@ -96,7 +96,7 @@ def write_report(
 
 def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: HandPair) -> Section:
     facts = read_dataset(folders.data / name, name, hands)
-    title = TITLES.get(name, name)
+    title = dataset_title(name)
     if facts.empty:
         return Section(facts, title)
     networks = sorted(path for path in (folders.checkpoints / name).glob("*") if path.is_dir())
@@ -151,12 +151,12 @@ def _player(
     annotated: AnnotatedStore, clip_id: str, clip: Clip, hands: HandPair, kind: str, paint: ContactPaint
 ) -> Player:
     sentence = annotated.sentences(clip_id)[0]
-    return motion_player(clip, hands, sentence, f"{kind}: {sentence}", paint, _touched_words(annotated))
+    return motion_player(clip, hands, sentence, f"{kind}: {sentence}", paint, touch_words(annotated))
 
 
-def _touched_words(annotated: AnnotatedStore) -> str:
-    """What a painted point means, with the distance the contact stage used."""
-    return f"within {float(annotated.contact_info['threshold_m']) * 100:g} cm of a joint"
+def touch_words(annotated: AnnotatedStore) -> str:
+    """What a contact map shows, with the threshold it was made with."""
+    return f"within {annotated.contact_threshold_m * 100:g} cm of a joint"
 
 
 def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[tuple[str, list[Player]]]:
@@ -173,7 +173,7 @@ def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[
         paints = {"ground truth": truth, "generated": motion_contact(annotated, clip_id, motion, hands)}
         players = [
             contact_player(
-                clip, paint, f"{caption}: {sentence}", caption, touched_side(clip, truth), _touched_words(annotated)
+                clip, paint, f"{caption}: {sentence}", caption, touched_side(clip, truth), touch_words(annotated)
             )
             for caption, paint in paints.items()
         ]
