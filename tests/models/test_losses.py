@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from models.text2hoi.surface import Surface
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
@@ -13,6 +12,7 @@ from hoidata.objects.model import ObjectModel
 from models.common import losses
 from models.common.features import Hands, object_rotmat, place_points
 from models.common.fields import DistanceFields
+from models.text2hoi.surface import Surface
 
 
 @pytest.fixture(scope="module")
