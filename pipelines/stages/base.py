@@ -37,9 +37,10 @@ class Place:
     profile: str
     dataset: str = ""
     model: str = ""
+    family: str = ""
 
     def __str__(self) -> str:
-        return "-".join(filter(None, (self.profile, self.dataset, self.model)))
+        return "-".join(filter(None, (self.profile, self.dataset, self.model, self.family)))
 
     @property
     def data(self) -> Path:
@@ -90,8 +91,12 @@ class Place:
         return self.checkpoints / self.model
 
     @property
+    def samples(self) -> Path:
+        return Path("samples", self.profile, self.dataset, self.family)
+
+    @property
     def metrics(self) -> Path:
-        return Path("metrics", self.profile, f"{self.dataset}.json")
+        return Path("metrics", self.profile, self.dataset, f"{self.family}.json")
 
     @property
     def report(self) -> Path:
