@@ -31,7 +31,7 @@ def _cells(metric: Metric) -> tuple[str, ...]:
         f"`{metric.name}`",
         metric.title,
         metric.unit or "-",
-        metric.direction,
+        f"floor of `{metric.floor_of}`" if metric.floor_of else metric.direction,
         metric.reduction,
         metric.frames,
         str(metric.every),

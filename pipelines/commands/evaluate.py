@@ -1,6 +1,7 @@
 """``hoidata evaluate``: how near the motions of any store come to the recorded ones."""
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,7 +38,7 @@ def evaluate(
     from pipelines.pages.metrics_table import printed_table
 
     found = evaluate_store(store, reference, _hands(reference), split=split, progress=True)
-    Console().print(printed_table(found), soft_wrap=True)
+    Console(width=None if sys.stdout.isatty() else 120).print(printed_table(found))
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")
     if out is not None:

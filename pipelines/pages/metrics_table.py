@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from rich import box
 from rich.table import Table
 
 from hoidata.metrics.registry import METRICS, Metric, is_better
@@ -106,7 +107,7 @@ def loses_to_lookup(metric: Metric, family: str, column: Mapping[str, float]) ->
 def printed_table(found: Mapping[str, Any]) -> Table:
     """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
     title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips"
-    table = Table(title=title + (", synthetic" if found["synthetic"] else ""))
+    table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
     for name in ("metric", "figure", "unit", "better", "clips", "values"):
         table.add_column(name, justify="right" if name in ("figure", "clips", "values") else "left")
     for metric in METRICS:
@@ -118,6 +119,8 @@ def printed_table(found: Mapping[str, Any]) -> Table:
 
 
 def _better(metric: Metric) -> str:
+    if metric.floor_of:
+        return "a floor"
     return metric.direction if metric.direction == "nearer the truth" else f"{metric.direction} is better"
 
 

@@ -7,19 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip
 from hoidata.contact.maps import contact_maps, distance_entries
 from hoidata.contact.proximity import ProximityIndex
-from hoidata.contact.stage import contact_store
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
 from hoidata.objects.sampling import sample_points
-from hoidata.splits import split_store
-from hoidata.store.info import generated_info
-from hoidata.store.store import write_store
-
-RULE = {"by": "subject", "train": ["s1"], "validation": ["s2"], "test": ["s3"]}
+from tests.builders.annotated import write_annotated_dataset
 
 
 @pytest.fixture
@@ -60,18 +54,4 @@ def move_hands(clip: Clip, shift_m: np.ndarray | tuple[float, ...], sides=SIDES)
 @pytest.fixture
 def write_annotated(make_clip, tmp_path: Path) -> Callable[..., tuple[Path, dict[str, Clip]]]:
     """Call it with threshold_m and points: an annotated dataset, and its two test clips (right hand, and both)."""
-
-    def write(threshold_m: float = 0.02, points: int = 256) -> tuple[Path, dict[str, Clip]]:
-        root = tmp_path / "annotated"
-        plans = (("s1", "right"), ("s2", "left"), ("s3", "right"), ("s3", "both"))
-        clips = [
-            make_clip(12, hand, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject)
-            for seed, (subject, hand) in enumerate(plans)
-        ]
-        write_store(root / "clips", clips, generated_info("toy"))
-        annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=0.02)
-        contact_store(root / "clips", root / "contact", points=points, threshold_m=threshold_m)
-        split_store(root / "clips", root / "annotation", root / "splits", RULE)
-        return root, {clip.clip_id: clip for clip in clips[2:]}
-
-    return write
+    return lambda **settings: write_annotated_dataset(tmp_path / "annotated", make_clip, **settings)
