@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample
+from hoidata.objects.signed_distance_grid import DistanceFields
 from models.common.features import Hands, object_hinge_rad, to_object_frame
-from models.common.fields import DistanceFields
 from models.text2hoi.refiner import CoarseMotion
 
 
