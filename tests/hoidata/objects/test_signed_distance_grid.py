@@ -23,7 +23,7 @@ def test_both_look_ups_give_the_exact_signed_distance_to_a_fraction_of_a_cell():
     far = np.abs(exact.distance_m) < 0.03  # the offset jumps in the middle of the ball
     for found in (numpy_m, torch_m[0, 0].numpy()):
         np.testing.assert_allclose(found[far], exact.distance_m[far], atol=4e-4)
-    np.testing.assert_allclose(points[far] + offset_m[0, 0].numpy()[far], exact.closest_m[far], atol=1.5e-3)
+    np.testing.assert_allclose(points[far] + offset_m[0, 0].numpy()[far], exact.closest_m[far], atol=3e-3)
 
 
 def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_numpy_one_stays_below():

@@ -148,9 +148,8 @@ def test_world_points_reach_the_object_frame():
 def test_quality_means_by_penetration_what_the_exact_surface_means(make_clip):
     """Two engines, because the bytes of quality rest on one and speed on the other; one figure."""
     model = make_clip(2, articulated=True).object.model
-    points = np.random.default_rng(0).uniform(-0.06, 0.06, (5, 300, 3))
-    hinge = np.linspace(0, 1.2, 5)
-    for row in range(300):
-        one = points[:, row : row + 1]
-        exact = surface_index(model).depth_m(one, hinge)[:, 0]
-        np.testing.assert_allclose(depths_m(model, hinge, one, [0, 1]), exact, atol=1e-12)
+    points = np.random.default_rng(0).uniform(-0.06, 0.06, (1500, 1, 3))
+    hinge = np.linspace(0, 1.2, 1500)
+    exact = surface_index(model).depth_m(points, hinge).max(axis=1)
+    assert (exact > 0.01).sum() > 100
+    np.testing.assert_allclose(depths_m(model, hinge, points, [0, 1]), exact, atol=1e-12)
