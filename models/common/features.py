@@ -122,7 +122,7 @@ class Normaliser:
         """From training samples; frames of a side that does not act are left out."""
         means, scales = np.zeros((2, HAND_FEATURES)), np.ones((2, HAND_FEATURES))
         for side in range(2):
-            frames = [s.hands[side][s.valid[side]] for s in samples if s.acts[side]]
+            frames = [s.hands[side][s.valid[side]] for s in samples if s.active_hands[side]]
             means[side], scales[side] = _moments(frames, HAND_FEATURES)
         object_mean, object_scale = _moments([sample.object for sample in samples], OBJECT_FEATURES)
         arrays = (means, scales, object_mean, object_scale)

@@ -5,7 +5,19 @@ import importlib
 import os
 import sys
 
-STAGES = ("raw", "convert", "quality", "annotate", "contact", "surface", "split", "train", "evaluate", "report")
+STAGES = (
+    "raw",
+    "convert",
+    "quality",
+    "annotate",
+    "contact",
+    "surface",
+    "split",
+    "train",
+    "sample",
+    "evaluate",
+    "report",
+)
 
 
 def main() -> int:
