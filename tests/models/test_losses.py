@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from models.text2hoi.surface import Surface
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
@@ -13,6 +12,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.signed_distance_grid import DistanceFields
 from models import losses
 from models.common.features import Hands, object_rotmat, place_points
+from models.text2hoi.surface import Surface
 
 
 @pytest.fixture(scope="module")
