@@ -9,9 +9,9 @@ from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.signed_distance_grid import DistanceFields
 from models.common import losses
 from models.common.features import Hands, object_rotmat, place_points
-from models.common.fields import DistanceFields
 from models.text2hoi.surface import Surface
 
 
