@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hoidata.hands.model import N_JOINTS, PARENTS, TIP_VERTICES, HandModel
+from hoidata.hands.model import N_ROTATIONS, PARENTS, TIP_VERTICES, HandModel
 from hoidata.hands.tracks import HandTrackLike
 
 _CHUNK_FRAMES = 256  # the rotations of so many frames stay in the processor's cache
@@ -49,7 +49,7 @@ class _Tips(NamedTuple):
 @lru_cache(maxsize=8)
 def _tips_of(model: HandModel) -> _Tips:
     pose = model.pose_directions[_TIPS].reshape(15, -1).T
-    identity = np.tile(np.eye(3).ravel(), N_JOINTS - 1)
+    identity = np.tile(np.eye(3).ravel(), N_ROTATIONS - 1)
     return _Tips(
         shape=np.ascontiguousarray(model.shape_directions[_TIPS].reshape(15, -1).T),
         pose=np.ascontiguousarray(pose),

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.hands.model import N_JOINTS, N_SHAPE, PARENTS, TIP_VERTICES, HandModel
+from hoidata.hands.model import N_ROTATIONS, N_SHAPE, PARENTS, TIP_VERTICES, HandModel
 
 _LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
 
@@ -61,7 +61,7 @@ class HandKinematics(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """World rotations (batch, 16, 3, 3) and positions (batch, 16, 3) of the joints, and the rest joints."""
         base = self.rest_joints_m if template_m is None else self.joint_regressor @ template_m
-        rest = base + (betas @ self.joint_directions).reshape(-1, N_JOINTS, 3)
+        rest = base + (betas @ self.joint_directions).reshape(-1, N_ROTATIONS, 3)
         bones = (rest[:, 1:] - rest[:, list(PARENTS[1:])]).expand(len(wrist_m), -1, -1)
         rotations, places = [rotmats[:, :1].expand(-1, 5, -1, -1)], [wrist_m[:, None].expand(-1, 5, -1)]
         for level in _LEVELS:
@@ -100,7 +100,7 @@ class _Skin(nn.Module):
         """World positions (batch, vertex, 3)."""
         n_batch = len(rotmats)
         moves = torch.cat((rotations, (places[..., None] - rotations @ rest[..., None])), -1)
-        blended = moves.reshape(n_batch, N_JOINTS, 12).transpose(1, 2) @ self.weights
+        blended = moves.reshape(n_batch, N_ROTATIONS, 12).transpose(1, 2) @ self.weights
         x, y, z, shift = blended.reshape(n_batch, 3, 4, -1).unbind(2)
         rested = self._rested(rotmats, betas, template_m)
         placed = x * rested[:, :1] + y * rested[:, 1:2] + z * rested[:, 2:] + shift

@@ -13,7 +13,7 @@ import numpy as np
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import ARRAYS, Record, atomic_file, restricted_load
-from hoidata.hands.model import N_JOINTS, N_SHAPE, PARENTS, HandModel, HandPair, Side, checked_model
+from hoidata.hands.model import N_ROTATIONS, N_SHAPE, PARENTS, HandModel, HandPair, Side, checked_model
 
 MANO_SITE = "https://mano.is.tue.mpg.de"
 FILE_NAMES: dict[Side, str] = {"left": "MANO_LEFT.pkl", "right": "MANO_RIGHT.pkl"}
@@ -154,7 +154,7 @@ def write_mano_pickle(model: HandModel, path: str | Path) -> None:
         "J_regressor": model.joint_regressor,
         "J": model.joint_regressor @ model.template_m,
         "weights": model.skin_weights,
-        "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_JOINTS)], dtype=np.int64),
+        "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_ROTATIONS)], dtype=np.int64),
         "f": model.faces.astype(np.uint32),
         "hands_mean": model.mean_pose,
         "hands_components": model.components,

@@ -15,8 +15,10 @@ from hoidata.files import sha256_bytes
 
 Side = Literal["left", "right"]
 
-N_VERTICES, N_FACES, N_JOINTS, N_SHAPE, N_POSE = 778, 1538, 16, 10, 45
-N_POSE_FEATURES = (N_JOINTS - 1) * 9
+N_VERTICES, N_FACES, N_SHAPE, N_POSE = 778, 1538, 10, 45
+N_ROTATIONS = 16  # joints that turn, the wrist among them
+N_JOINTS = 21  # those, then the fingertips
+N_POSE_FEATURES = (N_ROTATIONS - 1) * 9
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
 # Fingertip vertices of MANO's mesh as used by Text2HOI and manopth: index, middle, pinky, ring, thumb.
 TIP_VERTICES = (317, 445, 673, 556, 745)
@@ -30,9 +32,9 @@ _SHAPES = {
     "template_m": (N_VERTICES, 3),
     "shape_directions": (N_VERTICES, 3, N_SHAPE),
     "pose_directions": (N_VERTICES, 3, N_POSE_FEATURES),
-    "joint_regressor": (N_JOINTS, N_VERTICES),
-    "skin_weights": (N_VERTICES, N_JOINTS),
-    "parents": (N_JOINTS,),
+    "joint_regressor": (N_ROTATIONS, N_VERTICES),
+    "skin_weights": (N_VERTICES, N_ROTATIONS),
+    "parents": (N_ROTATIONS,),
     "faces": (N_FACES, 3),
     "mean_pose": (N_POSE,),
     "components": (N_POSE, N_POSE),
@@ -82,7 +84,7 @@ class HandModel:
         """
         betas = np.asarray(betas, dtype=np.float64)
         template = self.template_m if template_m is None else np.asarray(template_m, dtype=np.float64)
-        shift = (betas @ self.joint_directions).reshape(*betas.shape[:-1], N_JOINTS, 3)
+        shift = (betas @ self.joint_directions).reshape(*betas.shape[:-1], N_ROTATIONS, 3)
         return self.joint_regressor @ template + shift
 
     def wrist_offset_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
@@ -93,7 +95,7 @@ class HandModel:
     def joint_directions(self) -> np.ndarray:
         """(10, 48) metres per unit of beta: shape directions of the 16 rest joints, joint by joint."""
         directions = np.tensordot(self.joint_regressor, self.shape_directions, axes=1)
-        return directions.transpose(2, 0, 1).reshape(N_SHAPE, N_JOINTS * 3)
+        return directions.transpose(2, 0, 1).reshape(N_SHAPE, N_ROTATIONS * 3)
 
 
 @dataclass(frozen=True, eq=False)
