@@ -11,7 +11,6 @@ from collections import OrderedDict
 import numpy as np
 
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.distance import merged_surface
 from hoidata.objects.distance_grid import (
     DistanceGrid,
@@ -127,18 +126,8 @@ class SurfaceIndex:
 
     def _in_part(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
         """(frame x place, 3) places in the part's rest frame."""
-        return np.ascontiguousarray(in_part(self.model, places_m, hinge_rad, part).reshape(-1, 3))
-
-
-def in_part(model: ObjectModel, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
-    """Object-frame places (frame, place, 3) in the rest frame of a part, float64: the hinge undone for part 1."""
-    places, hinge = np.asarray(places_m, dtype=np.float64), model.hinge
-    if part == 0 or hinge is None:
-        return places
-    if hinge_rad is None:
-        raise BadInput(f"motion of {model.name!r}", "a hinge angle for every frame", "none", "give the angles")
-    turn = rotvec_to_rotmat(np.asarray(hinge.axis, dtype=np.float64) * np.asarray(hinge_rad, dtype=np.float64)[:, None])
-    return (places - hinge.origin_m) @ turn + hinge.origin_m
+        part_from_object = self.model.object_from_part(part, hinge_rad).inverse()
+        return np.ascontiguousarray((part_from_object @ np.asarray(places_m, np.float64)).reshape(-1, 3))
 
 
 class _Surface:

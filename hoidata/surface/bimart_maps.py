@@ -13,8 +13,7 @@ average (table 6).
 import numpy as np
 from numba import njit
 
-from hoidata.contact.proximity import joints_in_part
-from hoidata.objects.model import Hinge
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
 from hoidata.surface.contact import PlacedHand
 
@@ -23,15 +22,15 @@ STEP_M = 0.0008
 BEYOND = 255
 
 
-def bimart_map(hand: PlacedHand, points: SampledPoints, hinge: Hinge | None) -> np.ndarray:
+def bimart_map(hand: PlacedHand, points: SampledPoints, model: ObjectModel) -> np.ndarray:
     """(frame, point) float32 distance from each sampled point to the nearest vertex of one hand, metres.
 
-    points, hinge: of the object the hand is placed before; points of the moving part go with the hinge. Infinite in
+    points, model: of the object the hand is placed before; points of the moving part go with the hinge. Infinite in
     frames where the hand is not valid, and everywhere beyond 20 cm.
     """
     nearest = np.full((len(hand.vertices_m), len(points)), np.inf, np.float32)
     for part in np.unique(points.part) if len(hand.vertices_m) else ():
-        places = joints_in_part(hand.vertices_m, int(part), hinge, hand.hinge_rad)
+        places = model.object_from_part(int(part), hand.hinge_rad).inverse() @ hand.vertices_m
         members = np.flatnonzero(points.part == part)
         cloud = np.ascontiguousarray(points.points_m[members].T, np.float32)
         nearest[:, members] = _nearest_m(np.ascontiguousarray(places.transpose(0, 2, 1), np.float32), cloud)

@@ -14,7 +14,7 @@ import numpy as np
 from hoidata.errors import BadInput
 from hoidata.objects.line_crossings import Stretches, common_length_m, stretches_inside
 from hoidata.objects.solid import Solid, patched_holes, volume_m3
-from hoidata.objects.surface_index import SurfaceIndex, in_part
+from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.objects.triangle_tree import triangle_tree
 
 CELL_M = 0.001
@@ -44,7 +44,8 @@ class SolidOverlap:
         """
         volume = np.zeros(len(vertices_m))
         for part, lines in self._lines.items():
-            local = in_part(self.index.model, vertices_m, hinge_rad, part)
+            part_from_object = self.index.model.object_from_part(part, hinge_rad).inverse()
+            local = part_from_object @ np.asarray(vertices_m, np.float64)
             near = _frames_near(local, lines)
             places, closed = patched_holes(local[near], np.asarray(faces, dtype=np.int64))
             for frame, own in zip(near, places, strict=True):

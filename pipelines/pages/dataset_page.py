@@ -181,7 +181,7 @@ def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair, count
 def still_of(annotated: AnnotatedStore, clip_id: str, hands: HandPair, title: str) -> Player:
     """The clip in the frame in which most points are touched, with its contact map; without a legend."""
     clip, frame = annotated.clip(clip_id), _busiest_frame(annotated, clip_id)
-    still = motion_player(clip.cut(frame, frame + 1), hands, title, contact=true_contact(annotated, clip_id))
+    still = motion_player(clip.take(slice(frame, frame + 1)), hands, title, contact=true_contact(annotated, clip_id))
     return replace(still, legend=(), contact_label="")
 
 

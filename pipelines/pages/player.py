@@ -80,7 +80,7 @@ def contact_player(
     look_from: (3,) where the camera starts, see ``touched_side``. label: what the colours mean.
     """
     absent = {side: replace(track, valid=np.zeros_like(track.valid)) for side, track in clip.hands.items()}
-    still = replace(clip, hands=absent, other_objects=()).cut(0, 1)
+    still = replace(clip, hands=absent, other_objects=()).take(slice(0, 1))
     view = still_view(still, look_from)
     return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
 

@@ -200,7 +200,7 @@ class ArcticAdapter:
             camera=motion.camera,
             body=motion.body,
         )
-        return whole.cut(start, stop)
+        return whole.take(slice(start, stop))
 
 
 def _found(raw: RawTree, path: str) -> str:

@@ -13,7 +13,6 @@ from hoidata.datasets import Quarantined
 from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.datasets.arctic.files import parse_description
 from hoidata.hands import track_joints
-from hoidata.objects import articulate, place
 
 
 def load_recording() -> ModuleType:
@@ -98,11 +97,7 @@ def test_millimetres_become_metres_in_mesh_and_translation(lift):
 def test_the_top_turns_about_minus_z_and_the_bottom_does_not(lift):
     model = lift.object.model
     assert model.part.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
-    points = place(
-        articulate(model.vertices_m, model.part, model.hinge, lift.object.hinge_rad),
-        lift.object.rotvec,
-        lift.object.translation_m,
-    )
+    points = lift.object.points_in_world(model.vertices_m, model.part)
     for at, frame in enumerate(range(14, 44)):
         turn = Rotation.from_euler("z", -recording.ANGLE[frame]).as_matrix()
         pose = Rotation.from_rotvec(recording.ORIENT[frame]).as_matrix()

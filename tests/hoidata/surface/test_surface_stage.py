@@ -102,7 +102,7 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
         clip = stored.clip(clip_id)
         points = sample_points(clip.object.model, POINTS)
         for side in SIDES:
-            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model.hinge)
+            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model)
             found = store.bimart_map(clip_id, side)
             assert found.shape == exact.shape
             near = np.isfinite(exact)
@@ -277,8 +277,8 @@ def test_one_mesh_without_a_surface_costs_its_own_clips_only(clips, tmp_path, mo
             raise BadInput("mesh of 'hinged_box'", "at least one triangle", "none")
         return SurfaceIndex(model)
 
-    for module in ("surface_stage", "surface_measure"):
-        monkeypatch.setattr(f"hoidata.contact.{module}.SurfaceIndex", index_of)
+    for module in ("stage", "measure"):
+        monkeypatch.setattr(f"hoidata.surface.{module}.SurfaceIndex", index_of)
     write_store(tmp_path / "clips", clips, generated_info("grab"))
     report = surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
     store = open_surface(tmp_path / "surface")
