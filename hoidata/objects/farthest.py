@@ -24,7 +24,7 @@ def farthest_rows(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def _buckets(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows bucket by bucket, rising in each, and where each starts: stretches of a Morton curve through the points."""
+    """Rows bucket by bucket, rising in each, and where each starts: intervals of a Morton curve through the points."""
     above = points.astype(np.float64) - points.min(axis=0)
     cell = (above / (above.max() or 1) * 1023).astype(np.uint32)
     x, y, z = _spread_bits(cell).T

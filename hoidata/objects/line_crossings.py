@@ -15,11 +15,11 @@ from hoidata.objects.triangle_tree import DEEPEST, TriangleTree
 OUTSIDE, INSIDE, UNSURE = 0, 1, 2
 
 
-class Stretches(NamedTuple):
+class Intervals(NamedTuple):
     """Lines through a solid, one in the middle of each cell of a lattice in y and z.
 
     low_m: (2,) y and z of the lattice's corner; cell_m: edge of a cell; shape: (2,) cells. first: (line + 1,) where
-    each line's stretches inside the solid start; start_m, stop_m: (stretch,) x of their ends, rising along a line.
+    each line's intervals inside the solid start; start_m, stop_m: (interval,) x of their ends, rising along a line.
     """
 
     low_m: np.ndarray
@@ -30,12 +30,12 @@ class Stretches(NamedTuple):
     stop_m: np.ndarray
 
 
-def stretches_inside(tree: TriangleTree, cell_m: float) -> Stretches:
+def intervals_inside(tree: TriangleTree, cell_m: float) -> Intervals:
     """The lattice lies evenly about the middle of the surface's box."""
     low, high = tree.box[0, 1:3], tree.box[0, 4:]
     shape = np.ceil((high - low) / cell_m - 1e-9).astype(np.int64)  # a size that is so many cells but for rounding
     corner = (low + high) / 2 - shape * cell_m / 2
-    return Stretches(corner, cell_m, shape, *_stretches(tree, corner, cell_m, shape))
+    return Intervals(corner, cell_m, shape, *_intervals(tree, corner, cell_m, shape))
 
 
 @njit(cache=True)
@@ -134,7 +134,7 @@ def _side_of_edge(vertices_m, start, stop, y, z):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _stretches(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
+def _intervals(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
     """Where each line runs inside the solid."""
     _, box, link, _, corner, vertices_m = tree
     stack, places, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
@@ -167,9 +167,9 @@ def _sort(places, turns, count):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def common_length_m(vertices_m, faces, stretches):  # pragma: no cover (compiled)
-    """Summed over all lines, the length inside both a closed surface (vertex, 3), (face, 3) and the stretches."""
-    low_m, cell_m, shape, first, start_m, stop_m = stretches
+def common_length_m(vertices_m, faces, intervals):  # pragma: no cover (compiled)
+    """Summed over all lines, the length inside both a closed surface (vertex, 3), (face, 3) and the intervals."""
+    low_m, cell_m, shape, first, start_m, stop_m = intervals
     newest = np.full(shape[0] * shape[1], -1, np.int64)  # of each line, its newest crossing
     older, places, turns = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for face in range(len(faces)):
@@ -215,8 +215,8 @@ def _summed(newest, older, places, turns, first, start_m, stop_m):  # pragma: no
         winding = 0.0
         for number in range(count):
             if winding > 0:
-                for stretch in range(first[line], first[line + 1]):
-                    begin = max(own_places[number - 1], start_m[stretch])
-                    length += max(min(own_places[number], stop_m[stretch]) - begin, 0.0)
+                for interval in range(first[line], first[line + 1]):
+                    begin = max(own_places[number - 1], start_m[interval])
+                    length += max(min(own_places[number], stop_m[interval]) - begin, 0.0)
             winding -= own_turns[number]
     return length
