@@ -264,7 +264,7 @@ def _write(out: Path, faces: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
     )
     integers = {"regressor_joint": "<u1", "regressor_vertex": "<u2", "weight_joint": "<u1"}
     stored = {key: value.astype(integers.get(key, "<f4")) for key, value in arrays.items()}
-    with atomic_file(out) as part, open(part, "wb") as stream:
+    with atomic_file(out) as partial, open(partial, "wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, faces=faces.astype("<u2"), provenance=np.array(text), **stored)
 
 

@@ -162,5 +162,5 @@ def write_mano_pickle(model: HandModel, path: str | Path) -> None:
         "bs_style": "lbs",
         "bs_type": "lrotmin",
     }
-    with atomic_file(path) as part:
-        part.write_bytes(pickle.dumps(content, protocol=2))
+    with atomic_file(path) as partial:
+        partial.write_bytes(pickle.dumps(content, protocol=2))

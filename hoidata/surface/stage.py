@@ -71,8 +71,8 @@ def surface_store(
     bench = _Bench(store, touch_m, points, left_out or {})
     seconds: defaultdict[str, float] = defaultdict(float)
     jobs = min(jobs, 1 + sum(store.sequences["n_frames"].tolist()) // FRAMES_PER_JOB)
-    with atomic_folder(out_folder) as part, Progress(console=Console(stderr=True), disable=not progress) as bar:
-        writer = SurfaceWriter(part, points, touch_m)
+    with atomic_folder(out_folder) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
+        writer = SurfaceWriter(partial, points, touch_m)
         for clip, spent in _in_order(bar.track(_measured(bench, jobs), len(store), description="surface"), store.ids):
             writer.add(clip)
             for name, value in spent.items():

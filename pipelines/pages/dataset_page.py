@@ -91,8 +91,8 @@ def write_dataset_page(
         has_players=True,
     )
     path = Path(out) / f"{name}.html"
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return path
 
 

@@ -118,8 +118,8 @@ def write_motion_page(
         "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
         files=files or [], arrays=arrays or [], figures=trusted_figures(figures or []), has_players=True,
     )  # fmt: skip
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return Path(path)
 
 

@@ -88,8 +88,8 @@ def write_report(
         if section.page:
             write_dataset_page(out, folders.data / section.facts.name, section.facts.name, hands, section.title)
     path = Path(out) / "index.html"
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return path
 
 
