@@ -78,16 +78,18 @@ def flat_hand(body: Body, vertices_m: np.ndarray) -> Hand:
     local = np.zeros_like(vertices_m)
     local[in_hand] = (vertices_m[in_hand] - joints[0]) @ axes.T
     joints = (joints - joints[0]) @ axes.T
-    rotations, places = _straightened(joints)
-    tips = np.stack([_bone_move(rotations, places, joints, 3 * finger + 3, joints[16 + finger]) for finger in range(5)])
+    rotations, positions = _straightened(joints)
+    tips = np.stack(
+        [_bone_move(rotations, positions, joints, 3 * finger + 3, joints[16 + finger]) for finger in range(5)]
+    )
     flat = np.zeros_like(local)
     for joint in range(N_ROTATIONS):
         touched = body.weights[:, joint] > 0
-        moved = _bone_move(rotations, places, joints, joint, local[touched])
+        moved = _bone_move(rotations, positions, joints, joint, local[touched])
         flat[touched] += body.weights[touched, joint, None] * moved
     total = body.weights.sum(axis=1)
     flat[in_hand] += (1 - total[in_hand])[:, None] * local[in_hand]
-    return Hand(flat, np.concatenate((places, tips)))
+    return Hand(flat, np.concatenate((positions, tips)))
 
 
 def _canonical_axes(joints: np.ndarray) -> np.ndarray:
@@ -99,13 +101,13 @@ def _canonical_axes(joints: np.ndarray) -> np.ndarray:
     return np.stack((x, np.cross(z, x), z))
 
 
-def _bone_move(rotations, places, joints, joint: int, points: np.ndarray) -> np.ndarray:
-    return (points - joints[joint]) @ rotations[joint].T + places[joint]
+def _bone_move(rotations, positions, joints, joint: int, points: np.ndarray) -> np.ndarray:
+    return (points - joints[joint]) @ rotations[joint].T + positions[joint]
 
 
 def _straightened(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World rotation (16, 3, 3) of each bone and place (16, 3) of each joint in the flat hand."""
-    rotations, places = np.tile(np.eye(3), (N_ROTATIONS, 1, 1)), joints[:N_ROTATIONS].copy()
+    """World rotation (16, 3, 3) of each bone and position (16, 3) of each joint in the flat hand."""
+    rotations, positions = np.tile(np.eye(3), (N_ROTATIONS, 1, 1)), joints[:N_ROTATIONS].copy()
     for finger in range(5):
         chain = [3 * finger + 1, 3 * finger + 2, 3 * finger + 3, 16 + finger]
         bones = np.diff(joints[chain], axis=0)
@@ -120,8 +122,8 @@ def _straightened(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             rotations[joint] = _shortest_rotation(directions[segment], target)
             if segment:
                 parent = chain[segment - 1]
-                places[joint] = places[parent] + rotations[parent] @ (joints[joint] - joints[parent])
-    return rotations, places
+                positions[joint] = positions[parent] + rotations[parent] @ (joints[joint] - joints[parent])
+    return rotations, positions
 
 
 def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:

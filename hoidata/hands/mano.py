@@ -64,9 +64,9 @@ def _load_side(folder: Path, side: Side) -> HandModel:
 
 
 def _find(folder: Path, name: str) -> Path:
-    for place in (folder, folder / "models", folder / "mano_v1_2" / "models"):
-        if (place / name).is_file():
-            return place / name
+    for parent in (folder, folder / "models", folder / "mano_v1_2" / "models"):
+        if (parent / name).is_file():
+            return parent / name
     raise MissingResource(
         f"{folder}: expected {name} of the MANO hand model, found none; register at {MANO_SITE}, download "
         f"mano_v1_2.zip, unpack it and give its 'models' folder (MANO may not be redistributed, so hoidata has no copy)"

@@ -80,7 +80,7 @@ class HandModel:
     def rest_joints_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
         """Joints of the unposed hand in the model's own frame: betas (frame, 10) to (frame, 16, 3), metres.
 
-        template_m: (778, 3) personal rest mesh in place of the model's template.
+        template_m: (778, 3) personal rest mesh instead of the model's template.
         """
         betas = np.asarray(betas, dtype=np.float64)
         template = self.template_m if template_m is None else np.asarray(template_m, dtype=np.float64)
@@ -122,11 +122,11 @@ def checked_model(where: str, remedy: str, **values) -> HandModel:
     arrays = {}
     for key, shape in _SHAPES.items():
         value = np.asarray(values.pop(key))
-        place = f"{where}: {key}"
+        field = f"{where}: {key}"
         if value.shape != shape:
-            raise BadInput(place, f"shape {shape}", f"shape {value.shape}", remedy)
+            raise BadInput(field, f"shape {shape}", f"shape {value.shape}", remedy)
         if value.dtype.kind not in "fiu" or not np.isfinite(value).all():
-            raise BadInput(place, "finite real numbers", f"dtype {value.dtype} with other values", remedy)
+            raise BadInput(field, "finite real numbers", f"dtype {value.dtype} with other values", remedy)
         arrays[key] = np.ascontiguousarray(value, np.int64 if key in ("parents", "faces") else np.float64)
     _check_meaning(where, remedy, arrays)
     return HandModel(**values, **arrays)

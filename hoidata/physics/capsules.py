@@ -56,7 +56,7 @@ class CapsuleContacts(NamedTuple):
 
     frame, capsule: (contact,) int. part: (contact,) touched part. depth_m: (contact,) radius less signed distance of
     the deepest axis point. point_m: (contact, 3) nearest surface point to it. normal: (contact, 3) unit, out of the
-    object, the gradient of the signed distance there. along: (contact,) place of the deepest point on the axis, 0 to 1.
+    object, the gradient of the signed distance there. along: (contact,) where on the axis the deepest point is, 0 to 1.
     """
 
     frame: np.ndarray
@@ -134,7 +134,7 @@ def _candidates(
 
 
 def _deepest(model: ObjectModel, faces: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(segment,) place on each axis, 0 to 1, where the signed distance is least."""
+    """(segment,) position on each axis, 0 to 1, where the signed distance is least."""
     grid = np.linspace(0, 1, COARSE_SAMPLES)
     along = np.broadcast_to(grid, (len(start), COARSE_SAMPLES))
     step = grid[1]

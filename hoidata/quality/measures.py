@@ -90,8 +90,8 @@ def object_motion(track: ObjectTrack, facts: ObjectFacts) -> ObjectMotion:
     poses, motions = track.world_from_object, [track.world_from_object]
     if track.model.is_articulated:
         motions.append(poses @ track.model.object_from_part(1, track.hinge_rad))
-    rotmats, places = (np.stack([getattr(pose, name) for pose in motions]) for name in ("rotation", "translation"))
-    return ObjectMotion(track.points_in_world(facts.points_m, facts.part), facts.part, rotmats, places)
+    rotmats, positions = (np.stack([getattr(pose, name) for pose in motions]) for name in ("rotation", "translation"))
+    return ObjectMotion(track.points_in_world(facts.points_m, facts.part), facts.part, rotmats, positions)
 
 
 def _box_corners(vertices_m: np.ndarray) -> np.ndarray:
@@ -101,10 +101,10 @@ def _box_corners(vertices_m: np.ndarray) -> np.ndarray:
 
 def _shaking(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
     wrists, fingers = [], []
-    for side, places in joints.items():
+    for side, positions in joints.items():
         valid = clip.hands[side].valid
-        wrists.append(motion.accelerations_m_s2(places[:, :1], valid))
-        fingers.append(motion.accelerations_m_s2(places[:, 1:] - places[:, :1], valid))
+        wrists.append(motion.accelerations_m_s2(positions[:, :1], valid))
+        fingers.append(motion.accelerations_m_s2(positions[:, 1:] - positions[:, :1], valid))
     thing = motion.accelerations_m_s2(corners, np.ones(len(corners), bool))
     shaking = np.array([series > thresholds.shaking_m_s2 for series in (*wrists, *fingers, thing)]).any(axis=0)
     return {
@@ -123,7 +123,7 @@ def _median(values: np.ndarray) -> float:
 
 def _jumps(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
     rule = thresholds.sudden_m, thresholds.large_m, thresholds.sudden_ratio
-    steps = [motion.steps_m(places, clip.hands[side].valid) for side, places in joints.items()]
+    steps = [motion.steps_m(positions, clip.hands[side].valid) for side, positions in joints.items()]
     hand = max((motion.largest_jump(step, *rule) for step in steps), default=motion.Jump(NAN, -1))
     thing = motion.largest_jump(motion.steps_m(corners, np.ones(len(corners), bool)), *rule)
     return {
@@ -139,7 +139,9 @@ def _frozen(clip: Clip, joints: Joints, corners: np.ndarray) -> dict[str, float]
     same: Joints = {
         side: motion.equal_steps(_hand_numbers(clip.hands[side]), clip.hands[side].valid) for side in joints
     }
-    moves: Joints = {side: motion.steps_m(places, clip.hands[side].valid) > STILL_M for side, places in joints.items()}
+    moves: Joints = {
+        side: motion.steps_m(positions, clip.hands[side].valid) > STILL_M for side, positions in joints.items()
+    }
     thing_moves = motion.steps_m(corners, always) > STILL_M
     alone = [same[side] & (thing_moves | _any(moves, but=side, like=thing_moves)) for side in joints]
     things = [motion.equal_steps(_object_numbers(track), always) for track in (clip.object, *clip.other_objects)]
@@ -191,7 +193,7 @@ def _hand_depths(clip: Clip, side: Side, frames: np.ndarray, facts: ObjectFacts,
 
 def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Thresholds) -> dict[str, float]:
     found = time_offset(
-        [(places.astype(np.float64), clip.hands[side].valid) for side, places in joints.items()],
+        [(positions.astype(np.float64), clip.hands[side].valid) for side, positions in joints.items()],
         object_motion(clip.object, facts),
     )
     sure = found.confidence >= thresholds.offset_confidence

@@ -47,8 +47,8 @@ class SolidOverlap:
             part_from_object = self.index.model.object_from_part(part, hinge_rad).inverse()
             local = part_from_object @ np.asarray(vertices_m, np.float64)
             near = _frames_near(local, lines)
-            places, closed = patched_holes(local[near], np.asarray(faces, dtype=np.int64))
-            for frame, own in zip(near, places, strict=True):
+            positions, closed = patched_holes(local[near], np.asarray(faces, dtype=np.int64))
+            for frame, own in zip(near, positions, strict=True):
                 volume[frame] += common_length_m(np.ascontiguousarray(own), closed, lines) * self.cell_m**2
         return volume
 
