@@ -69,13 +69,13 @@ class HandModel:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over side, shapes and little-endian bytes of all arrays: equal digest, equal kinematics."""
-        parts = [self.side.encode()]
+        pieces = [self.side.encode()]
         for field in fields(self):
             if field.name in _SHAPES:
                 array = getattr(self, field.name)
                 kind = "<i8" if array.dtype.kind in "iu" else "<f8"
-                parts += [field.name.encode(), repr(array.shape).encode(), np.ascontiguousarray(array, kind).tobytes()]
-        return sha256_bytes(b"\0".join(parts))
+                pieces += [field.name.encode(), repr(array.shape).encode(), np.ascontiguousarray(array, kind).tobytes()]
+        return sha256_bytes(b"\0".join(pieces))
 
     def rest_joints_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
         """Joints of the unposed hand in the model's own frame: betas (frame, 10) to (frame, 16, 3), metres.

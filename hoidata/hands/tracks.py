@@ -61,7 +61,7 @@ def _in_chunks(track: HandTrackLike, model: HandModel, n_points: int, run) -> np
     out = np.empty((len(wrist), n_points, 3), dtype=np.float32)
     with torch.no_grad():
         for start in range(0, len(wrist), _CHUNK_FRAMES):
-            part = slice(start, start + _CHUNK_FRAMES)
-            own_betas = betas if len(betas) == 1 else betas[part]
-            out[part] = run(layer, (wrist[part], rotmats[part], own_betas, template)).numpy()
+            rows = slice(start, start + _CHUNK_FRAMES)
+            own_betas = betas if len(betas) == 1 else betas[rows]
+            out[rows] = run(layer, (wrist[rows], rotmats[rows], own_betas, template)).numpy()
     return out

@@ -40,8 +40,8 @@ class SurfaceReport(NamedTuple):
     def cost(self) -> str:
         """Processor time per 1,000 frames, in words."""
         thousands = max(self.counts["frames"], 1) / 1000
-        parts = ", ".join(f"{name} {seconds / thousands:.3f}" for name, seconds in self.seconds.items())
-        return f"{sum(self.seconds.values()) / thousands:.3f} s per 1,000 frames of two hands ({parts})"
+        operations = ", ".join(f"{name} {seconds / thousands:.3f}" for name, seconds in self.seconds.items())
+        return f"{sum(self.seconds.values()) / thousands:.3f} s per 1,000 frames of two hands ({operations})"
 
 
 def surface_store(

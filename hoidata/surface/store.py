@@ -125,7 +125,7 @@ class SurfaceWriter:
         return {**_summary(found), "map_row": row, "map_first": first, "map_stop": stop}
 
     def _write_shard(self) -> None:
-        arrays = {name: np.concatenate(parts) for name, parts in self._pending.items()}
+        arrays = {name: np.concatenate(pieces) for name, pieces in self._pending.items()}
         write_npz(self._folder / _shard_name(self._shard), arrays)
         self._shard += 1
         self._start_shard()

@@ -18,7 +18,7 @@ class TruthSequence:
     "s1/mug_drink_1", ARCTIC "s01/box_use_01"). raw_start: its first frame there. source_fps: 30, or 120 for GRAB.
     verb, object_words: in words. object_name: the source's name. hand_type: the hands that touch.
     hands: both sides; ``valid`` is False where the source says the hand is absent. object: pose and hinge.
-    clip: first frame and one past the last of the labelled part. contact: the same for the firm grasp.
+    clip: first frame and one past the last of the labelled interval. contact: the same for the firm grasp.
     held: (frame,) the object is more than 1.5 cm above its rest. stand_m: height of the stand it rests on.
     """
 
@@ -69,7 +69,7 @@ class TruthSequence:
         return self.take(frames[(frames + self.raw_start) % self.stride == 0])
 
     def clip_truth(self) -> "TruthSequence":
-        """The labelled part alone, at 30 fps: what an adapter must find."""
+        """The labelled interval alone, at 30 fps: what an adapter must find."""
         return self.take(self.clip_frames)
 
     def take(self, frames: np.ndarray) -> "TruthSequence":

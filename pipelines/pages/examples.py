@@ -81,14 +81,14 @@ def _contact_example(annotated: AnnotatedStore, checkpoint: Checkpoint, clip_id:
     network = checkpoint.network
     assert isinstance(network, ContactModel)
     points = annotated.points(annotated.object_key(clip_id))
-    acts = [annotated.hand_type(clip_id) in (side, "both") for side in SIDES]
-    chances = network.sample(
+    active_hands = [annotated.hand_type(clip_id) in (side, "both") for side in SIDES]
+    probabilities = network.sample(
         torch.from_numpy(points.points_m)[None],
         torch.from_numpy(annotated.text_features(clip_id)[:1]),
-        torch.tensor([acts]),
+        torch.tensor([active_hands]),
         CONTACT_DRAWS,
         torch.Generator().manual_seed(seed),
     )
-    predicted = ContactPaint(points.points_m, points.part, chances[0].mean(0).double().numpy())
+    predicted = ContactPaint(points.points_m, points.part, probabilities[0].mean(0).double().numpy())
     sentence = annotated.sentences(clip_id)[0]
     return ContactExample(annotated.clip(clip_id), sentence, true_contact(annotated, clip_id), predicted)

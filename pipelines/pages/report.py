@@ -161,7 +161,7 @@ def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[s
             contact_player(example.clip, paint, f"{caption}: {example.sentence}", caption, look, label)
             for caption, paint, label in (
                 ("ground truth", example.truth, "within 2 cm of a joint"),
-                ("predicted", example.predicted, "chance of contact, 0 to 1"),
+                ("predicted", example.predicted, "probability of contact, 0 to 1"),
             )
         ]
         pairs.append((example.sentence, players))
