@@ -4,6 +4,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, SourceContact
 from hoidata.errors import BadInput
+from hoidata.hands.model import N_VERTICES
 
 REMEDY = "the adapter broke a rule of Clip: report it"
 FARTHEST_M = 100.0  # a position farther from the origin than any capture room is wide means a wrong unit
@@ -100,7 +101,7 @@ def _check_hand(where: str, track: HandTrack, n_frames: int) -> None:
     if track.valid.dtype != bool or track.valid.shape != (n_frames,):
         raise BadInput(f"{where}.valid", f"{n_frames} booleans", f"{track.valid.dtype} {track.valid.shape}", REMEDY)
     if track.template_m is not None:
-        _check_array(f"{where}.template_m", track.template_m, (778, 3))
+        _check_array(f"{where}.template_m", track.template_m, (N_VERTICES, 3))
         _check_size(f"{where}.template_m", track.template_m, HAND_SIZE_M)
     _check_positions(f"{where}.wrist_m", track.wrist_m[track.valid])
 

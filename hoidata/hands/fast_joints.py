@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hoidata.hands.model import N_ROTATIONS, PARENTS, TIP_VERTICES, HandModel
+from hoidata.hands.model import N_JOINTS, N_ROTATIONS, PARENTS, TIP_VERTICES, HandModel
 from hoidata.hands.tracks import HandTrackLike
 
 _CHUNK_FRAMES = 256  # the rotations of so many frames stay in the processor's cache
@@ -26,7 +26,7 @@ def fast_track_joints(track: HandTrackLike, model: HandModel) -> np.ndarray:
     rest_joints = model.rest_joints_m(betas, track.template_m)
     template = model.template_m if track.template_m is None else np.asarray(track.template_m, dtype=np.float64)
     rest_tips = template[_TIPS] + tips.pose_origin_m + (betas @ tips.shape).reshape(-1, 5, 3)
-    out = np.empty((len(track.wrist_m), 21, 3), dtype=np.float32)
+    out = np.empty((len(track.wrist_m), N_JOINTS, 3), dtype=np.float32)
     for start in range(0, len(out), _CHUNK_FRAMES):
         frames = slice(start, start + _CHUNK_FRAMES)
         own = frames if len(betas) > 1 else slice(None)
