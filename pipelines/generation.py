@@ -11,7 +11,8 @@ from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
 from hoidata.store.store import open_store
-from models.text2hoi.generation import MODELS, generate
+from models.text2hoi.family import NAMES
+from models.text2hoi.generation import generate
 from pipelines.lineage.graph import look_up, read_params
 from pipelines.pages.generation_page import write_generation
 from pipelines.stages.base import Place, empty_reason, load_hands
@@ -38,7 +39,7 @@ def generate_files(
 
 def why_not_trained(place: Place) -> str | None:
     """What is missing of the four models of a dataset, or None when all are there."""
-    for name in MODELS:
+    for name in NAMES:
         folder = place.checkpoints / name
         if reason := empty_reason(folder):
             return f"{name} is empty, {reason}"

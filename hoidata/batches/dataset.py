@@ -8,7 +8,7 @@ The layout of the features stands in ``hoidata.clips.features``. Sides are order
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -16,10 +16,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from hoidata.batches.requests import ObjectPoints, RequestBatch, conditions
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
-from hoidata.clips.features import HAND_FEATURES as HAND_FEATURES
-from hoidata.clips.features import N_ROTATIONS as N_ROTATIONS
-from hoidata.clips.features import OBJECT_FEATURES as OBJECT_FEATURES
 from hoidata.clips.features import OBJECT_POSITION, WRIST, hand_features, object_features, upright
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
@@ -31,20 +29,11 @@ Crop = Literal["random", "start"]
 
 
 @dataclass(frozen=True)
-class ObjectPoints:
-    """The sampled points of one object, in its own frame: points_m, normals (1024, 3), part (1024,) 0 or 1."""
-
-    points_m: np.ndarray
-    normals: np.ndarray
-    part: np.ndarray
-
-
-@dataclass(frozen=True)
 class ClipSample:
     """One clip in the model frame; NumPy arrays, axes (side, frame, ...), metres and radians.
 
     hands (2, F, 99), object (F, 10), joints_m (2, F, 21, 3): features and true joints, with the clip's own hand shape.
-    valid (2, F): frames in which a side was tracked. acts (2,): the sides that take part in the interaction.
+    valid (2, F): frames in which a side was tracked. active_hands (2,): the sides that take part in the interaction.
     contact (2, 1024): points that came within 2 cm of a joint of that acting side in these frames.
     text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
     start: first frame within the clip. world_from_model (4, 4).
@@ -64,7 +53,7 @@ class ClipSample:
     object: np.ndarray
     joints_m: np.ndarray
     valid: np.ndarray
-    acts: np.ndarray
+    active_hands: np.ndarray
     betas: np.ndarray
     template_m: np.ndarray | None
     text: np.ndarray
@@ -78,8 +67,8 @@ class ClipSample:
         return len(self.object)
 
     @property
-    def touched(self) -> np.ndarray:
-        """(1024,) bool contact map of Text2HOI: the points touched by any acting hand."""
+    def contact_map(self) -> np.ndarray:
+        """(1024,) bool contact map of Text2HOI: the points touched by any active hand."""
         return np.logical_or(self.contact[0], self.contact[1])
 
     def crop(self, start: int, length: int) -> "ClipSample":
@@ -177,11 +166,11 @@ def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
     """The whole clip as a sample in the model frame."""
     clip = annotated.clip(clip_id)
     hand_type = annotated.hand_type(clip_id)
-    acts = np.array([hand_type in (side, "both") for side in SIDES])
+    active_hands = np.array([hand_type in (side, "both") for side in SIDES])
     rotation = upright(clip.gravity)
     origin = clip.object.translation_m[0].astype(np.float64)
     points = _points(annotated, annotated.object_key(clip_id))
-    distances = _acting_entries(annotated.distances(clip_id), acts)
+    distances = _acting_entries(annotated.distances(clip_id), active_hands)
     tracks = [clip.hands[side] for side in SIDES]
     joints = np.stack([(annotated.joints(clip_id, side) - origin) @ rotation.T for side in SIDES])
     return ClipSample(
@@ -199,7 +188,7 @@ def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
         object=object_features(clip.object, rotation, origin),
         joints_m=joints.astype(np.float32),
         valid=np.stack([track.valid for track in tracks]).astype(bool),
-        acts=acts,
+        active_hands=active_hands,
         betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
         template_m=_templates(tracks),
         text=np.asarray(annotated.text_embedding(clip_id), dtype=np.float32),
@@ -236,88 +225,62 @@ def _points(annotated: Annotated, object_key: str) -> ObjectPoints:
     )
 
 
-def _acting_entries(stored: Any, acts: np.ndarray) -> DistanceEntries:
+def _acting_entries(stored: Any, active_hands: np.ndarray) -> DistanceEntries:
     index = {name: np.asarray(getattr(stored, name), np.int64) for name in ("side", "frame", "joint", "point")}
     entries = DistanceEntries(**index, distance_m=np.asarray(stored.distance_m, np.float32))
-    return entries.select(acts[entries.side])
+    return entries.select(active_hands[entries.side])
 
 
-@dataclass(frozen=True)
-class ClipBatch:
-    """Clips padded to the longest of them; tensors with axes (clip, side, frame, ...), padding is zero.
+@dataclass(frozen=True, kw_only=True)
+class ClipBatch(RequestBatch):
+    """Recorded clips padded to the longest of them, with all a model may be asked of them (:class:`RequestBatch`).
 
-    frames (B, F): True where a clip has a frame. present (B, 2, F): the side acts and is tracked in the frame.
-    acts (B, 2). entries: (entry, 5) int64 rows (clip, side, frame, joint, point) and their distances (entry,).
-    hinge_axis, hinge_origin_m (B, 3), zero for rigid objects; articulated (B,). template_m (B, 2, 778, 3) or None.
+    Axes (clip, side, frame, ...), padding is zero. hands (B, 2, F, 99), object (B, F, 10), joints_m (B, 2, F, 21, 3).
+    text (B, 4, 512): the four sentences. present (B, 2, F): the side takes part and is tracked in the frame.
+    contact (B, 2, N). entries: (entry, 5) int64 rows (clip, side, frame, joint, point) and their distances (entry,).
     """
 
     samples: tuple[ClipSample, ...]
     hands: Tensor
     object: Tensor
     joints_m: Tensor
-    frames: Tensor
     present: Tensor
-    acts: Tensor
-    lengths: Tensor
-    betas: Tensor
-    template_m: Tensor | None
-    text: Tensor
-    points_m: Tensor
-    normals: Tensor
-    part: Tensor
     contact: Tensor
     entries: Tensor
     entry_distance_m: Tensor
-    hinge_axis: Tensor
-    hinge_origin_m: Tensor
-    articulated: Tensor
-
-    def __len__(self) -> int:
-        return len(self.samples)
 
     @property
-    def touched(self) -> Tensor:
-        """(B, 1024) contact map as 0 or 1, float32: both acting hands together."""
+    def contact_map(self) -> Tensor:
+        """(B, N) contact map as 0 or 1, float32: both active hands together."""
         return self.contact.any(1).float()
-
-    def to(self, device: torch.device | str) -> "ClipBatch":
-        """The batch with every tensor on ``device``."""
-        parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)})
 
 
 def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
     """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
-    n_frames = max(sample.length for sample in samples)
-    frames = np.zeros((len(samples), n_frames), dtype=bool)
-    for row, sample in enumerate(samples):
-        frames[row, : sample.length] = True
-    valid = np.stack([_padded(sample.valid, 1, n_frames) for sample in samples])
-    acts = np.stack([sample.acts for sample in samples])
-    hinges = [sample.object_model.hinge for sample in samples]
+    lengths = np.array([sample.length for sample in samples])
+    asked = conditions(
+        [sample.object_model for sample in samples],
+        [sample.points for sample in samples],
+        np.stack([sample.active_hands for sample in samples]),
+        lengths,
+        np.stack([sample.betas for sample in samples]),
+        [sample.template_m for sample in samples],
+    )
+    n_frames = int(lengths.max())
     rows, distance = _entry_rows(samples if with_entries else ())
     arrays = {
+        "text": np.stack([sample.text for sample in samples]),
         "hands": np.stack([_padded(sample.hands, 1, n_frames) for sample in samples]),
         "object": np.stack([_padded(sample.object, 0, n_frames) for sample in samples]),
         "joints_m": np.stack([_padded(sample.joints_m, 1, n_frames) for sample in samples]),
-        "frames": frames,
-        "present": valid & acts[:, :, None] & frames[:, None],
-        "acts": acts,
-        "lengths": np.array([sample.length for sample in samples]),
-        "betas": np.stack([sample.betas for sample in samples]),
-        "text": np.stack([sample.text for sample in samples]),
-        "points_m": np.stack([sample.points.points_m for sample in samples]),
-        "normals": np.stack([sample.points.normals for sample in samples]),
-        "part": np.stack([sample.points.part for sample in samples]).astype(np.int64),
         "contact": np.stack([sample.contact for sample in samples]),
         "entries": rows,
         "entry_distance_m": distance,
-        "hinge_axis": np.stack([np.zeros(3) if h is None else h.axis for h in hinges]).astype(np.float32),
-        "hinge_origin_m": np.stack([np.zeros(3) if h is None else h.origin_m for h in hinges]).astype(np.float32),
-        "articulated": np.array([hinge is not None for hinge in hinges]),
     }
-    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return ClipBatch(samples=tuple(samples), template_m=_batch_templates(samples), **tensors)
+    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    valid = torch.from_numpy(np.stack([_padded(sample.valid, 1, n_frames) for sample in samples]))
+    present = valid & asked["active_hands"][:, :, None] & asked["frames"][:, None]
+    return ClipBatch(samples=tuple(samples), present=present, **asked, **tensors)
 
 
 def _padded(array: np.ndarray, axis: int, n_frames: int) -> np.ndarray:
@@ -334,14 +297,3 @@ def _entry_rows(samples: Sequence[ClipSample]) -> tuple[np.ndarray, np.ndarray]:
         rows.append(np.stack((clip, entries.side, entries.frame, entries.joint, entries.point), axis=1))
         distances.append(entries.distance_m)
     return np.concatenate(rows), np.concatenate(distances)
-
-
-def _batch_templates(samples: Sequence[ClipSample]) -> Tensor | None:
-    templates = [sample.template_m for sample in samples]
-    if all(template is None for template in templates):
-        return None
-    if any(template is None for template in templates):
-        raise BadInput(
-            "collate", "personal hand templates in all clips or in none", "a mixture", "batch one dataset at a time"
-        )
-    return torch.from_numpy(np.stack([template for template in templates if template is not None]))

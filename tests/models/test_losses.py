@@ -12,7 +12,7 @@ from hoidata.objects.model import ObjectModel
 from models import losses
 from models.common.features import Hands, object_rotmat, place_points
 from models.common.fields import DistanceFields
-from models.common.surface import Surface
+from models.text2hoi.surface import Surface
 
 
 @pytest.fixture(scope="module")

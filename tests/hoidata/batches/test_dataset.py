@@ -7,8 +7,9 @@ import pytest
 import torch
 import trimesh
 
-from hoidata.batches.dataset import HoiDataset, collate, upright
+from hoidata.batches.dataset import HoiDataset, collate
 from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
+from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
@@ -50,7 +51,7 @@ def make_clip(number: int, frames: int) -> Clip:
 
 @dataclass
 class Clips:
-    """Clips in memory with what annotation would add: the right hand acts, and touches point f in frame f."""
+    """Clips in memory with what annotation would add: the right hand active_hands, and touches point f in frame f."""
 
     clips: dict[str, Clip]
     sampled: dict[str, SampledPoints] = field(default_factory=dict)
@@ -127,7 +128,7 @@ def test_upright_is_a_rotation_that_turns_gravity_down(gravity: tuple | None) ->
 
 def test_contact_and_distances_are_restricted_to_the_crop_and_to_acting_hands(clips: Clips) -> None:
     sample = HoiDataset(clips, "train").whole("toy/0").crop(5, 10)
-    assert np.flatnonzero(sample.touched).tolist() == list(range(5, 15))
+    assert np.flatnonzero(sample.contact_map).tolist() == list(range(5, 15))
     assert not sample.contact[0].any()
     assert set(sample.distances.side) == {1}
     assert sample.distances.frame.tolist() == list(range(10))
@@ -157,7 +158,7 @@ def test_collate_pads_with_zeros_and_masks_what_is_missing(clips: Clips) -> None
     assert not batch.hands.transpose(1, 2)[~batch.frames].any()
     assert not batch.present[:, 0].any()
     assert batch.present[1, 1].tolist() == [frame < 12 and frame != 2 for frame in range(45)]
-    assert torch.equal(batch.touched[1].nonzero()[:, 0], torch.arange(12))
+    assert torch.equal(batch.contact_map[1].nonzero()[:, 0], torch.arange(12))
     clip, side, frame, joint, point = batch.entries.T
     assert torch.equal(torch.bincount(clip), batch.lengths)
     assert torch.equal(point, frame)

@@ -7,12 +7,12 @@ from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
-from models import losses
+from models.common import losses
 from models.common.corpus import Corpus
-from models.common.sampling import TRAIN_STEPS, SamplerConfig
-from models.common.surface import Surface
+from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.refiner import CoarseMotion, RefinerModel, hands_in_object_frame
+from models.text2hoi.surface import Surface
 
 GENERATED_AT_ONCE = 32
 PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")
@@ -41,17 +41,17 @@ class RefinerLossConfig:
 class _Coarse:
     """One generated motion of a clip as the refiner sees it, frame first, and the hands to stay near.
 
-    seen: the tensors of :class:`CoarseMotion` that have frames, by name, (F, ...). target: (F, 2, 99), relative to the
+    view: the tensors of :class:`CoarseMotion` that have frames, by name, (F, ...). target: (F, 2, 99), relative to the
     object. true_distance_m: (F, 2, 21) of the joints to the surface in the clip itself.
     """
 
-    seen: dict[str, Tensor]
+    view: dict[str, Tensor]
     target: Tensor
     true_distance_m: Tensor
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Comparison:
     """A batch of coarse motions with what they are compared with; side before frame."""
 
     batch: ClipBatch
@@ -60,7 +60,7 @@ class _Seen:
     true_distance_m: Tensor
 
 
-class RefinerRecipe:
+class RefinerObjective:
     """Half of the coarse motions are clips noised and denoised once, as in Text2HOI's released training: they are to go
     back to the clip's own hands relative to the object. The others are sampled from noise, as in use, where no true
     hands exist: they are to stay near themselves. All are to touch as the clip does, and not to penetrate."""
@@ -80,14 +80,14 @@ class RefinerRecipe:
         self.network, self.weights, self.device = network, weights, device
         self.generator, self.surface = generator, surface
         self.vertices = torch.arange(0, 778, max(1, 778 // weights.vertices), device=device)
-        draws = torch.Generator(device).manual_seed(seed)
+        draws = torch.Generator().manual_seed(seed)
         train, held_out = list(corpus.train), corpus.held_out
         kinds = ["once" if number % 2 == 0 else "sampled" for number in range(weights.samples)]
         self.pool = {sample.clip_id: [] for sample in train}
         for kind in kinds:
             for sample, coarse in zip(train, self._make(train, kind, draws), strict=True):
                 self.pool[sample.clip_id].append(coarse)
-        held = self._make(held_out, "sampled", torch.Generator(device).manual_seed(0))
+        held = self._make(held_out, "sampled", torch.Generator().manual_seed(0))
         self.held_out = self._batch(collate(held_out, with_entries=False).to(device), held)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
@@ -101,7 +101,7 @@ class RefinerRecipe:
         found = self._losses(network, self.held_out, torch.Generator().manual_seed(0))
         return float(found["total"])
 
-    def _losses(self, network: RefinerModel, seen: _Seen, generator: torch.Generator) -> dict[str, Tensor]:
+    def _losses(self, network: RefinerModel, seen: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
         batch, coarse, weights = seen.batch, seen.coarse, self.weights
         refined = network(coarse)
         change = (hands_in_object_frame(refined, coarse.object) - seen.target) / network.reach
@@ -123,9 +123,9 @@ class RefinerRecipe:
         skin, inner = distance.split([len(self.vertices), joints.shape[-2]], -1)
         return skin, inner
 
-    def _batch(self, batch: ClipBatch, motions: list[_Coarse]) -> _Seen:
+    def _batch(self, batch: ClipBatch, motions: list[_Coarse]) -> _Comparison:
         padded = {
-            name: pad_sequence([motion.seen[name] for motion in motions], batch_first=True) for name in motions[0].seen
+            name: pad_sequence([motion.view[name] for motion in motions], batch_first=True) for name in motions[0].view
         }
         objects = padded.pop("object")
         hands = {name: tensor.transpose(1, 2) for name, tensor in padded.items()}
@@ -133,8 +133,8 @@ class RefinerRecipe:
             pad_sequence([getattr(motion, name) for motion in motions], batch_first=True).transpose(1, 2)
             for name in ("target", "true_distance_m")
         )
-        common = {"present": batch.present, "points_m": batch.points_m, "touched": batch.touched}
-        return _Seen(batch, CoarseMotion(object=objects, **hands, **common), target, true)
+        common = {"present": batch.present, "points_m": batch.points_m, "contact_map": batch.contact_map}
+        return _Comparison(batch, CoarseMotion(object=objects, **hands, **common), target, true)
 
     @torch.no_grad()
     def _make(self, samples: list[ClipSample], kind: str, draws: torch.Generator) -> list[_Coarse]:
@@ -145,22 +145,24 @@ class RefinerRecipe:
             rows = order[start : start + GENERATED_AT_ONCE]
             batch = collate([samples[index] for index in rows], with_entries=False).to(self.device)
             hands, objects = self._generate(batch, kind, draws)
-            coarse = self.surface.coarse(batch, hands, objects, batch.touched)
+            coarse = self.surface.coarse(batch, hands, objects, batch.contact_map, batch.present)
             own = (batch.hands, batch.object) if kind == "once" else (hands, objects)
             target = hands_in_object_frame(*own).transpose(1, 2)
             true = self.surface.measure(batch, batch.joints_m, batch.object)[1].transpose(1, 2)
-            seen = {name: getattr(coarse, name).transpose(1, 2) for name in PER_HAND} | {"object": objects}
+            view = {name: getattr(coarse, name).transpose(1, 2) for name in PER_HAND} | {"object": objects}
             for row, index in enumerate(rows):
                 stop = samples[index].length
-                parts = {name: tensor[row, :stop].clone() for name, tensor in seen.items()}
+                parts = {name: tensor[row, :stop].clone() for name, tensor in view.items()}
                 made[index] = _Coarse(parts, target[row, :stop].clone(), true[row, :stop].clone())
         return [made[index] for index in range(len(samples))]
 
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
-        form = torch.randint(batch.text.shape[1], (len(batch),), generator=draws, device=draws.device)
+        form = torch.randint(batch.text.shape[1], (len(batch),), generator=draws).to(self.device)
         text = batch.text[torch.arange(len(batch), device=form.device), form]
-        condition = Condition.of(batch, self.generator.network.object_feature(batch.points_m), text)
+        condition = Condition.of(batch, self.generator.network.object_feature(batch.points_m), text, batch.contact_map)
         if kind == "sampled":
-            return self.generator.sample(condition, SamplerConfig(steps=self.weights.sampler_steps), draws)
-        steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=draws, device=draws.device)
+            sampler = SamplerConfig(steps=self.weights.sampler_steps)
+            noise = draw_motion(batch.hands.shape, batch.object.shape, draws)
+            return self.generator.sample(condition, sampler, noise, draws)
+        steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=draws).to(self.device)
         return self.generator.denoise_once(batch.hands, batch.object, steps, condition, draws)

@@ -1,17 +1,17 @@
 """What one training step and one validation of each of the four models are."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.geometry.rotations import rot6d_to_rotmat
-from models import losses
+from models.common import losses
 from models.common.corpus import Corpus, any_form
 from models.common.features import Hands, Normaliser, object_rotmat, place_points
-from models.common.sampling import TRAIN_STEPS, add_noise, alphas_bar
+from models.common.sampling import TRAIN_STEPS, add_noise, alphas_cumprod
 from models.text2hoi.contact import ContactLossConfig, ContactModel, contact_loss, turned_and_scaled
 from models.text2hoi.diffusion import Condition, DiffusionModel
 from models.text2hoi.length import LengthModel, jittered_frames, length_loss
@@ -20,25 +20,7 @@ Losses = dict[str, Tensor]
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
 
 
-class Recipe(Protocol):
-    """How to train one network. ``needs_entries``: whether batches must carry the distance entries."""
-
-    @property
-    def network(self) -> nn.Module: ...
-
-    @property
-    def needs_entries(self) -> bool: ...
-
-    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        """Named losses of one training batch; "total" is the one to minimise."""
-        ...
-
-    def validation(self, network: nn.Module) -> float:
-        """The loss on held-out clips, always with the same draws; network is in evaluation mode."""
-        ...
-
-
-class ContactRecipe:
+class ContactObjective:
     """Text2HOI Sec. 3.1: cross-entropy, Dice and KL divergence."""
 
     needs_entries = False
@@ -50,23 +32,23 @@ class ContactRecipe:
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
         some = torch.randperm(points.shape[1], generator=generator)[: self.weights.points].to(self.device)
-        touched = batch.touched[:, some]
+        contact_map = batch.contact_map[:, some]
         noise = torch.randn(len(batch), self.network.config.latent, generator=generator).to(self.device)
         logits, mean, log_variance = self.network(
-            points[:, some], any_form(batch, generator), batch.acts, touched, noise
+            points[:, some], any_form(batch, generator), batch.active_hands, contact_map, noise
         )
-        return contact_loss(logits, touched, mean, log_variance, self.weights)
+        return contact_loss(logits, contact_map, mean, log_variance, self.weights)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> float:
         assert isinstance(network, ContactModel)
-        generator = torch.Generator(self.device).manual_seed(0)
         held = self.held_out
-        chance = network.sample(held.points_m, held.text[:, 0], held.acts, 8, generator).mean(1)
-        return float(nn.functional.binary_cross_entropy(chance.clamp(1e-4, 1 - 1e-4), held.touched))
+        latents = network.draw_latents(8, len(held), torch.Generator().manual_seed(0)).to(self.device)
+        probability = network.sample(held.points_m, held.text[:, 0], held.active_hands, latents).mean(1)
+        return float(nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map))
 
 
-class LengthRecipe:
+class LengthObjective:
     """Text2HOI Sec. 4.1, with a likelihood in place of the plain squared error."""
 
     needs_entries = False
@@ -77,7 +59,7 @@ class LengthRecipe:
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         frames = jittered_frames(batch.lengths, generator)
-        mean, log_spread = self.network(any_form(batch, generator), batch.acts)
+        mean, log_spread = self.network(any_form(batch, generator), batch.active_hands)
         return length_loss(mean, log_spread, frames)
 
     @torch.no_grad()
@@ -85,7 +67,7 @@ class LengthRecipe:
         assert isinstance(network, LengthModel)
         held = self.held_out
         errors = [
-            (network.expected_frames(held.text[:, form], held.acts) - held.lengths).abs()
+            (network.expected_frames(held.text[:, form], held.active_hands) - held.lengths).abs()
             for form in range(held.text.shape[1])
         ]
         return float(torch.stack(errors).mean())
@@ -101,7 +83,7 @@ class DiffusionLossConfig:
     entries: int = 8192
 
 
-class DiffusionRecipe:
+class DiffusionObjective:
     """Text2HOI eq. 4-7."""
 
     needs_entries = True
@@ -117,7 +99,7 @@ class DiffusionRecipe:
     ) -> None:
         self.network, self.weights, self.device = network, weights, device
         self.hands, self.normaliser = hands.to(device), normaliser.to(device)
-        self.signal = alphas_bar(device)
+        self.signal = alphas_cumprod(device)
         self.needs_entries = weights.distance_weight > 0
         self.features: dict[str, Tensor] = {}
         self.held_out = collate(corpus.held_out, with_entries=False).to(device)
@@ -154,7 +136,7 @@ class DiffusionRecipe:
         clean = self.normaliser.encode(batch.hands, batch.object)
         noise = [torch.randn(part.shape, generator=generator).to(self.device) for part in clean]
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
-        condition = Condition.of(batch, self._object_features(network, batch), text)
+        condition = Condition.of(batch, self._object_features(network, batch), text, batch.contact_map)
         return network(*noised, steps, condition, None if keep is None else keep.to(self.device))
 
     def _object_features(self, network: DiffusionModel, batch: ClipBatch) -> Tensor:
@@ -181,9 +163,9 @@ class DiffusionRecipe:
         true_object = losses.take_frames(batch.object, chosen, 1)
         present = losses.take_frames(batch.present, chosen, 2)
         orientation = losses.relative_orientation_loss(
-            rot6d_to_rotmat(hands[..., 3:9]),
+            rot6d_to_rotmat(hands[..., GLOBAL_ORIENT_6D]),
             object_rotmat(objects),
-            rot6d_to_rotmat(true_hands[..., 3:9]),
+            rot6d_to_rotmat(true_hands[..., GLOBAL_ORIENT_6D]),
             object_rotmat(true_object),
             present,
         )
