@@ -13,8 +13,9 @@ import torch
 
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.sentences import FORMS, HAND_PHRASES, four_sentences
-from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
+from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.clips import HandTrack
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.contact.settings import ContactSettings
 from hoidata.datasets.grab.words import INTENTS, OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS

@@ -115,12 +115,12 @@ def annotate_store(
         "variations": {**asdict(variations), **varied.facts()},
         "counts": counts,
     }
-    with atomic_folder(out_folder) as part:
-        write_table(part / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
-        write_hand_distances(part / "hand_distance.npz", [item.evidence for item in found])
-        write_table(part / "text.parquet", _text_rows(named, varied, sentences), TEXT_TABLE)
-        _write_embeddings(part / "embeddings.npz", encoder, sentences)
-        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+    with atomic_folder(out_folder) as partial:
+        write_table(partial / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
+        write_hand_distances(partial / "hand_distance.npz", [item.evidence for item in found])
+        write_table(partial / "text.parquet", _text_rows(named, varied, sentences), TEXT_TABLE)
+        _write_embeddings(partial / "embeddings.npz", encoder, sentences)
+        (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
 
 

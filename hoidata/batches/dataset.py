@@ -4,9 +4,7 @@ A sample lives in the *model frame*: the clip's world turned so that things fall
 is known) and moved so that the object's origin lies at zero in the first frame. The stored clips are never changed;
 ``world_from_model`` takes every sample back.
 
-Features follow Text2HOI (Cha et al. 2024, Sec. 3.2.1). One hand, 99 numbers per frame: wrist position (3, metres), then
-16 local rotations in 6D, the global one first, absolute. One object, 10 numbers: position (3), rotation in 6D, hinge
-angle (radians, 0 for rigid objects). Sides are ordered left, right.
+The layout of the features stands in ``hoidata.clips.features``. Sides are ordered left, right.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,14 +17,12 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hoidata.batches.requests import ObjectPoints, RequestBatch, conditions
-from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
+from hoidata.clips.features import OBJECT_POSITION, WRIST, hand_features, object_features, upright
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotmat_to_rot6d, rotvec_to_rotmat
-from hoidata.hands import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.store.distances import DistanceEntries
 
-HAND_FEATURES, OBJECT_FEATURES, N_ROTATIONS = 99, 10, 16
 MAX_FRAMES = 150
 Crop = Literal["random", "start"]
 
@@ -92,10 +88,10 @@ class ClipSample:
 
     def recentred(self) -> "ClipSample":
         """The same frames with the object's origin at zero in the first of them."""
-        shift = self.object[0, :3].copy()
+        shift = self.object[0, OBJECT_POSITION].copy()
         hands, objects = self.hands.copy(), self.object.copy()
-        hands[..., :3] -= shift
-        objects[:, :3] -= shift
+        hands[..., WRIST] -= shift
+        objects[:, OBJECT_POSITION] -= shift
         move = np.eye(4)
         move[:3, 3] = shift
         return replace(
@@ -204,34 +200,6 @@ def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
         distances=distances,
         world_from_model=_world_from_model(rotation, origin),
     )
-
-
-def hand_features(track: HandTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
-    """(frame, 99) float32 features in the model frame: rotation ``model_from_world`` (3, 3) about ``origin_m`` (3,)."""
-    rotmats = track_rotmats(track).astype(np.float64)
-    rotmats[:, 0] = model_from_world @ rotmats[:, 0]
-    wrist = (track.wrist_m - origin_m) @ model_from_world.T
-    return np.concatenate((wrist, rotmat_to_rot6d(rotmats).reshape(len(wrist), -1)), axis=1, dtype=np.float32)
-
-
-def object_features(track: ObjectTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
-    """(frame, 10) float32 features in the model frame; the hinge angle of a rigid object is 0."""
-    rotation = model_from_world @ rotvec_to_rotmat(track.rotvec.astype(np.float64))
-    position = (track.translation_m - origin_m) @ model_from_world.T
-    hinge = np.zeros(len(position)) if track.hinge_rad is None else track.hinge_rad
-    return np.concatenate((position, rotmat_to_rot6d(rotation), hinge[:, None]), axis=1, dtype=np.float32)
-
-
-def upright(gravity: np.ndarray | None) -> np.ndarray:
-    """(3, 3) smallest rotation that turns the gravity direction (3,) to -z; the identity where it is unknown."""
-    if gravity is None:
-        return np.eye(3)
-    down = np.asarray(gravity, dtype=np.float64) / np.linalg.norm(gravity)
-    axis = np.cross(down, (0.0, 0.0, -1.0))
-    sine, cosine = float(np.linalg.norm(axis)), float(-down[2])
-    if sine < 1e-9:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return rotvec_to_rotmat(axis / sine * np.arctan2(sine, cosine))
 
 
 def contact_of(distances: DistanceEntries, n_points: int, threshold_m: float) -> np.ndarray:

@@ -57,15 +57,15 @@ def contact_store(
     settings = replace(settings or ContactSettings(), **changes)
     store, points = open_store(clips_folder, hands), settings.points
     sampled = sample_objects(store, points)
-    with atomic_folder(out_folder) as part:
-        _write_points(part, sampled, points)
-        writer = _Writer(part, points)
+    with atomic_folder(out_folder) as partial:
+        _write_points(partial, sampled, points)
+        writer = _Writer(partial, points)
         indices = {name: ProximityIndex(cloud) for name, cloud in sampled.items()}
         for clip_id, entries in clip_entries(store, indices, settings.threshold_m):
             writer.add(clip_id, entries)
         counts = writer.finish() | {"objects": len(sampled)}
         info = {"threshold_m": settings.threshold_m, "points": points, "counts": counts}
-        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+        (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
 
 

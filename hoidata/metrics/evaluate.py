@@ -119,7 +119,7 @@ class _Reference:
         near = self.entries.window(start, stop)
         touched[near.point[np.isin(near.side, [SIDES.index(side) for side in self.sides])]] = True
         contact = TrueContact(self.index, touched, self.threshold_m)
-        own = Motion(whole.clip.cut(start, stop), joints, whole.hands)
+        own = Motion(whole.clip.take(slice(start, stop)), joints, whole.hands)
         return Pair(predicted, own, self.sides, contact, self.table_m)
 
 

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, Side
-from hoidata.contact.proximity import ProximityIndex, joints_in_object
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene
@@ -26,7 +26,7 @@ class Motion:
 
     def joints_in_object(self, side: Side, frames: np.ndarray) -> np.ndarray:
         """(chosen frame, 21, 3) float64 joints of one hand in the object frame, metres."""
-        return joints_in_object(self.joints_m[side], self.clip.object)[frames]
+        return (self.clip.object.world_from_object.inverse() @ self.joints_m[side])[frames]
 
     def hinge_rad(self, frames: np.ndarray) -> np.ndarray | None:
         """(chosen frame,) hinge angle, None for a rigid object."""

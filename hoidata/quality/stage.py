@@ -6,8 +6,8 @@ meshes.parquet   one row per object: likewise, ``thresholds.MESH_MEASURES``
 info.json        thresholds, counts
 """
 
+import functools
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -85,11 +85,11 @@ def quality_store(
     for row in meshes:
         _judge(row, mesh_findings[row["object"]])
     counts = _counts(clips, meshes)
-    with atomic_folder(out_folder) as part:
-        write_table(part / "clips.parquet", [_nulled(row, CLIPS) for row in clips], CLIPS)
-        write_table(part / "meshes.parquet", [_nulled(row, MESHES) for row in meshes], MESHES)
+    with atomic_folder(out_folder) as partial:
+        write_table(partial / "clips.parquet", [_nulled(row, CLIPS) for row in clips], CLIPS)
+        write_table(partial / "meshes.parquet", [_nulled(row, MESHES) for row in meshes], MESHES)
         info = {"thresholds": plain_config(thresholds), "counts": counts}
-        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+        (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
 
 
@@ -107,7 +107,7 @@ def _measured(
 ) -> list[dict[str, Any]]:
     """The rows of all clips in the store's order."""
     store.hand_pair()
-    measure = partial(_measure, store, facts, thresholds)
+    measure = functools.partial(_measure, store, facts, thresholds)
     frames = sum(store.sequences["n_frames"].tolist())
     jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
     rows: dict[str, dict[str, Any]] = {}

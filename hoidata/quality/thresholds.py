@@ -147,5 +147,5 @@ def reasons_of(found: Sequence[Finding]) -> str:
 
 def _reason(measure: Measure, values: Mapping[str, float], limit: float) -> str:
     unit = f" {measure.unit}" if measure.unit else ""
-    place = f" at frame {values[measure.frame]:g}" if measure.frame else ""
-    return f"{measure.words}: {values[measure.name]:.3g}{unit}{place}, above {limit:g}{unit}"
+    frame = f" at frame {values[measure.frame]:g}" if measure.frame else ""
+    return f"{measure.words}: {values[measure.name]:.3g}{unit}{frame}, above {limit:g}{unit}"

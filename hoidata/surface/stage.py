@@ -48,8 +48,8 @@ class SurfaceReport(NamedTuple):
     def cost(self) -> str:
         """Processor time per 1,000 frames, in words."""
         thousands = max(self.counts["frames"], 1) / 1000
-        parts = ", ".join(f"{name} {seconds / thousands:.3f}" for name, seconds in self.seconds.items())
-        return f"{sum(self.seconds.values()) / thousands:.3f} s per 1,000 frames of two hands ({parts})"
+        operations = ", ".join(f"{name} {seconds / thousands:.3f}" for name, seconds in self.seconds.items())
+        return f"{sum(self.seconds.values()) / thousands:.3f} s per 1,000 frames of two hands ({operations})"
 
 
 def surface_store(
@@ -79,8 +79,8 @@ def surface_store(
     bench = _Bench(store, touch_m, points, left_out or {})
     seconds: defaultdict[str, float] = defaultdict(float)
     jobs = min(jobs, 1 + sum(store.sequences["n_frames"].tolist()) // FRAMES_PER_JOB)
-    with atomic_folder(out_folder) as part, Progress(console=Console(stderr=True), disable=not progress) as bar:
-        writer = SurfaceWriter(part, points, touch_m)
+    with atomic_folder(out_folder) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
+        writer = SurfaceWriter(partial, points, touch_m)
         for clip, spent in _in_order(
             bar.track(in_workers(bench.measure, store.ids, jobs), len(store), description="surface"), store.ids
         ):

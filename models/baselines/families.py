@@ -6,9 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hoidata.batches.dataset import HAND_FEATURES, OBJECT_FEATURES, ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
 from models.common.family import Family, Sources, motion_clip
 from models.common.features import proper_hands, proper_object
@@ -26,7 +27,7 @@ class GroundTruth:
         return [self._recorded(request) for request in requests]
 
     def _recorded(self, request: Request) -> Clip:
-        clip = self.annotated.clip(request.clip_id).cut(0, request.n_frames)
+        clip = self.annotated.clip(request.clip_id).take(slice(0, request.n_frames))
         return replace(clip, clip_id=request.motion_id, other_objects=(), camera=None, body=None, source_contact=None)
 
 

@@ -12,8 +12,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
+from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from models.common.features import Normaliser, proper_hands, proper_object, scaled_text
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion

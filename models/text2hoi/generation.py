@@ -16,6 +16,7 @@ from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import SIDES, Clip, HandType
+from hoidata.clips.features import OBJECT_POSITION, WRIST
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
@@ -120,9 +121,9 @@ def _length(model: Text2Hoi, request: Request) -> int:
 
 def _started_at_origin(motion: Text2HoiMotion) -> Text2HoiMotion:
     """The whole motion moved so that the object's origin is exactly at zero in the first frame."""
-    shift = motion.object[0, :3].clone()
+    shift = motion.object[0, OBJECT_POSITION].clone()
     coarse, refined, thing = motion.coarse.clone(), motion.refined.clone(), motion.object.clone()
     for hands in (coarse, refined):
-        hands[..., :3] -= shift
-    thing[..., :3] -= shift
+        hands[..., WRIST] -= shift
+    thing[..., OBJECT_POSITION] -= shift
     return replace(motion, coarse=coarse, refined=refined, object=thing)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from models.common import losses
 from models.common.corpus import Corpus, any_form
@@ -162,9 +163,9 @@ class DiffusionObjective:
         true_object = losses.take_frames(batch.object, chosen, 1)
         present = losses.take_frames(batch.present, chosen, 2)
         orientation = losses.relative_orientation_loss(
-            rot6d_to_rotmat(hands[..., 3:9]),
+            rot6d_to_rotmat(hands[..., GLOBAL_ORIENT_6D]),
             object_rotmat(objects),
-            rot6d_to_rotmat(true_hands[..., 3:9]),
+            rot6d_to_rotmat(true_hands[..., GLOBAL_ORIENT_6D]),
             object_rotmat(true_object),
             present,
         )

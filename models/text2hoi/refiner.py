@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import HAND_FEATURES
+from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, HAND_POSE_6D, HAND_ROTATIONS_6D, WRIST
 from models.common.features import object_position_m, object_rotmat, proper_hands
 from models.common.transformer import (
     Encoder,
@@ -84,9 +84,9 @@ def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
 
 def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
     """Wrist and global 6D turned by ``rotation`` about ``origin``."""
-    wrist = (rotation @ (hands[..., :3] - origin)[..., None])[..., 0]
-    columns = rotation @ hands[..., 3:9].unflatten(-1, (3, 2))
-    return torch.cat((wrist, columns.flatten(-2), hands[..., 9:]), -1)
+    wrist = (rotation @ (hands[..., WRIST] - origin)[..., None])[..., 0]
+    columns = rotation @ hands[..., GLOBAL_ORIENT_6D].unflatten(-1, (3, 2))
+    return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
 
 
 class RefinerModel(nn.Module):
@@ -106,7 +106,7 @@ class RefinerModel(nn.Module):
             nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
             nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
         reach = torch.full((HAND_FEATURES,), config.rotation_reach)
-        reach[:3] = config.wrist_reach_m
+        reach[WRIST] = config.wrist_reach_m
         self.register_buffer("reach", reach, persistent=False)
 
     def forward(self, coarse: CoarseMotion) -> Tensor:
@@ -128,7 +128,7 @@ class RefinerModel(nn.Module):
         return hands_in_world(local + residual * self.reach, coarse.object)
 
     def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:
-        scaled = torch.cat((local[..., :3] * 10, local[..., 3:]), -1)
+        scaled = torch.cat((local[..., WRIST] * 10, local[..., HAND_ROTATIONS_6D]), -1)
         offset = coarse.offset_m / (coarse.offset_m.norm(dim=-1, keepdim=True) + REACH_M)
         parts = [
             scaled,

@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoidata.batches.dataset import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.batches.requests import Request, collate_requests
 from hoidata.clips.clip import Clip
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.hands import HandPair
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip

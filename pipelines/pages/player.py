@@ -73,7 +73,7 @@ def contact_player(
     look_from: (3,) where the camera starts, see ``touched_side``. label: what the colours mean.
     """
     absent = {side: replace(track, valid=np.zeros_like(track.valid)) for side, track in clip.hands.items()}
-    still = replace(clip, hands=absent, other_objects=()).cut(0, 1)
+    still = replace(clip, hands=absent, other_objects=()).take(slice(0, 1))
     view = still_view(still, look_from)
     return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
 
@@ -111,8 +111,8 @@ def write_motion_page(
         "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
         files=files or [], arrays=arrays or [], figures=trusted_figures(figures or []), has_players=True,
     )  # fmt: skip
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return Path(path)
 
 

@@ -190,7 +190,7 @@ class ArcticAdapter(Described):
             camera=motion.camera,
             body=motion.body,
         )
-        return whole.cut(start, stop)
+        return whole.take(slice(start, stop))
 
 
 def _found(raw: RawTree, path: str) -> str:

@@ -23,7 +23,7 @@ from hoidata.datasets.manipnet.segments import (
     TOUCH_M,
     BodyMotion,
     Cut,
-    Stretch,
+    Interval,
     find_cuts,
     height_above_table,
     interactions,
@@ -170,7 +170,7 @@ class ManipNetAdapter(Described):
         return results
 
     def _clip(
-        self, key: SequenceKey, recording: Recording, stretch: Stretch, betas: np.ndarray, hands: HandPair
+        self, key: SequenceKey, recording: Recording, stretch: Interval, betas: np.ndarray, hands: HandPair
     ) -> Clip:
         """The frames of a stretch as a clip; its id, verb and sources are the caller's to say."""
         frames = slice(*stretch)

@@ -93,7 +93,7 @@ class TacoAdapter(Described):
             source_fps=self.source_fps,
         )
         start, stop = _touched(whole, hands)
-        clip = whole.cut(max(0, start - self.margin_frames), min(whole.n_frames, stop + self.margin_frames))
+        clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
         return [replace(clip, sources=raw.sources)]
 
 

@@ -7,8 +7,9 @@ import pytest
 import torch
 import trimesh
 
-from hoidata.batches.dataset import HoiDataset, collate, upright
+from hoidata.batches.dataset import HoiDataset, collate
 from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
+from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
@@ -97,7 +98,7 @@ def clips() -> Clips:
 def test_a_sample_goes_back_to_the_world_it_came_from(clips: Clips) -> None:
     for crop in ("start", "random"):
         sample = HoiDataset(clips, "train", 20, crop, seed=1)[0]
-        clip = clips.clip(sample.clip_id).cut(sample.start, sample.start + sample.length)
+        clip = clips.clip(sample.clip_id).take(slice(sample.start, sample.start + sample.length))
         rotation, origin = sample.world_from_model[:3, :3], sample.world_from_model[:3, 3]
         for number, side in enumerate(("left", "right")):
             world = sample.hands[number, :, :3] @ rotation.T + origin

@@ -7,7 +7,7 @@ import trimesh
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.quality.meshes import part_facts, surface_facts
-from hoidata.quality.penetration import depths_m, object_frame
+from hoidata.quality.penetration import depths_m
 from hoidata.quality.shape import distances_to_others, largest_beta
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
@@ -137,12 +137,6 @@ def test_moving_part_is_met_where_its_hinge_has_taken_it():
     points = np.tile([[-0.11, 0.0, 0.15]], (2, 1, 1))
     assert depths_m(model, quarter, points, [0, 1]) == pytest.approx([0, 0.01])
     assert depths_m(model, quarter, points, [0]) == pytest.approx([0, 0])
-
-
-def test_world_points_reach_the_object_frame():
-    rotvec, place = np.array([[0, 0, np.pi / 2]]), np.array([[1.0, 2.0, 3.0]])
-    # A quarter turn about z takes the object's x axis to the world's y axis.
-    assert object_frame(np.array([[[1.0, 3.0, 3.0]]]), rotvec, place) == pytest.approx(np.array([[[1.0, 0, 0]]]))
 
 
 def test_quality_means_by_penetration_what_the_exact_surface_means(make_clip):

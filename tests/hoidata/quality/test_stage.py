@@ -201,8 +201,8 @@ def test_store_without_clips_gives_empty_tables(tmp_path):
 def late_hands(clip: Clip, late: int) -> Clip:
     """The hands' frames are those of ``late`` frames before."""
     frames = clip.n_frames
-    hands = clip.cut(max(0, -late), frames - max(0, late)).hands
-    return replace(clip.cut(max(0, late), frames - max(0, -late)), hands=hands)
+    hands = clip.take(slice(max(0, -late), frames - max(0, late))).hands
+    return replace(clip.take(slice(max(0, late), frames - max(0, -late))), hands=hands)
 
 
 @pytest.fixture(scope="module", params=["h2o", "grab", "arctic"])

@@ -102,7 +102,7 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
         clip = stored.clip(clip_id)
         points = sample_points(clip.object.model, POINTS)
         for side in SIDES:
-            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model.hinge)
+            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model)
             found = store.bimart_map(clip_id, side)
             assert found.shape == exact.shape
             near = np.isfinite(exact)

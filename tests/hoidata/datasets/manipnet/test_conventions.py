@@ -15,7 +15,6 @@ from hoidata.clips.clip import Clip
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import ManipNetAdapter, read_recording
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.objects import place
 
 EXACT_M, WRONG_M = 2e-6, 0.005
 N_FRAMES = 480
@@ -289,7 +288,7 @@ def test_the_left_hands_tips_are_the_mirrored_capsule_ends(raw: RawTree, right: 
 def test_meshes_are_right_handed_already(clip: Clip) -> None:
     """In the left-handed world an OBJ's vertices have their x negated; seen in the mirror they are as written."""
     at = clip.source_frames.tolist().index(120)
-    placed = place(clip.object.model.vertices_m[None], clip.object.rotvec, clip.object.translation_m)[at]
+    placed = (clip.object.world_from_object @ clip.object.model.vertices_m)[at]
     expected = world_m(WEDGE * MIRROR @ turned(OBJECT_TURN).T + object_dm(120))
     mirrored_once_more = world_m(WEDGE @ turned(OBJECT_TURN).T + object_dm(120))
     assert off_m(placed, expected) < EXACT_M
@@ -298,7 +297,7 @@ def test_meshes_are_right_handed_already(clip: Clip) -> None:
 
 def test_object_matrices_act_on_columns(clip: Clip) -> None:
     at = clip.source_frames.tolist().index(120)
-    placed = place(clip.object.model.vertices_m[None], clip.object.rotvec, clip.object.translation_m)[at]
+    placed = (clip.object.world_from_object @ clip.object.model.vertices_m)[at]
     transposed = world_m(WEDGE * MIRROR @ turned(OBJECT_TURN) + object_dm(120))
     assert off_m(placed, world_m(WEDGE * MIRROR @ turned(OBJECT_TURN).T + object_dm(120))) < EXACT_M
     assert off_m(placed, transposed) > WRONG_M

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.datasets.manipnet.segments import BodyMotion, find_cuts, interactions, motion_verb, widened
-from hoidata.geometry.stretches import Stretch
+from hoidata.geometry.intervals import Interval
 
 
 def body(name: str, position_m: np.ndarray, degrees: np.ndarray | None = None) -> BodyMotion:
@@ -120,4 +120,4 @@ def test_the_verb_says_what_the_object_does(lift_m: tuple, way_m: float, degrees
 def test_a_margin_adds_as_many_usable_frames_on_both_sides(margin, expected):
     usable = np.ones(30, dtype=bool)
     usable[[1, 28]] = False
-    assert tuple(widened(Stretch(10, 20), margin, usable)) == expected
+    assert tuple(widened(Interval(10, 20), margin, usable)) == expected

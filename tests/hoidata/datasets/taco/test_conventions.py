@@ -15,7 +15,6 @@ from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.taco.adapter import TacoAdapter
 from hoidata.hands import load_embedded_hands
-from hoidata.objects import place
 
 EXACT_M, WRONG_M = 2e-6, 0.005
 KEY = SequenceKey("taco", "20231105", "(stir, spoon, pan)/20231105_007")
@@ -140,7 +139,7 @@ def hands_like(hands, left_directions):
 
 
 def corners(track) -> np.ndarray:
-    return place(track.model.vertices_m[None], track.rotvec, track.translation_m)[AT]
+    return (track.world_from_object @ track.model.vertices_m)[AT]
 
 
 def expected_corners(corners_cm, turn, shift_m, scale: float = 0.01) -> np.ndarray:

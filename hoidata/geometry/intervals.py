@@ -1,22 +1,22 @@
-"""Stretches of a recording in which something holds, and steps that stand out from the motion around them."""
+"""Intervals of a recording in which something holds, and steps that stand out from the motion around them."""
 
 from typing import NamedTuple
 
 import numpy as np
 
 
-class Stretch(NamedTuple):
+class Interval(NamedTuple):
     """Frames ``start`` to ``stop``, half-open."""
 
     start: int
     stop: int
 
 
-def runs(flags: np.ndarray) -> list[Stretch]:
-    """Maximal stretches of True in (frame,) booleans."""
+def runs(flags: np.ndarray) -> list[Interval]:
+    """Maximal intervals of True in (frame,) booleans."""
     change = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
     pairs = zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True)
-    return [Stretch(int(start), int(stop)) for start, stop in pairs]
+    return [Interval(int(start), int(stop)) for start, stop in pairs]
 
 
 def sudden_steps(step: np.ndarray, notable: float, large: float, ratio: float, neighbours: int = 5) -> np.ndarray:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from hoidata.geometry.stretches import runs, sudden_steps
+from hoidata.geometry.intervals import runs, sudden_steps
 
 
 @pytest.mark.parametrize(
