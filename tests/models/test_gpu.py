@@ -2,17 +2,17 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
 
-from hoidata.annotation import load_encoder
 from hoidata.hands import load_embedded_hands
-from models.common.training import train_model
-from models.text2hoi.generation import generate
-from tests.models.test_training import PARAMS
+from hoidata.metrics.evaluate import evaluate_store
+from models.common.predicting import sample_family
+from models.registry import load_family
+from tests.models.toy import FAST, PARAMS, train
 
-NEEDS = {"contact": (), "length": (), "diffusion": ("contact",), "refiner": ("diffusion",)}
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU: torch.cuda.is_available() is False"),
@@ -20,23 +20,25 @@ pytestmark = [
 
 
 @pytest.fixture(scope="module")
-def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def on_gpu(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One short training of each network on the GPU."""
     out = tmp_path_factory.mktemp("gpu")
-    for name, needs in NEEDS.items():
-        upstream = {other: out / other for other in needs}
-        train_model(name, annotated_root, out / name, PARAMS[name], upstream=upstream, device="cuda")
+    for name in PARAMS:
+        train(name, annotated_root, out, device="cuda")
     return out
 
 
-def test_every_network_trains_on_the_gpu_and_its_weights_are_finite(trained: Path):
-    for name in NEEDS:
-        weights = load_file(trained / name / "model.safetensors")
+def test_every_network_trains_on_the_gpu_and_its_weights_are_finite(on_gpu: Path) -> None:
+    for name in PARAMS:
+        weights = load_file(on_gpu / name / "model.safetensors")
         assert weights
         assert all(torch.isfinite(weight).all() for weight in weights.values())
 
 
-def test_a_motion_is_sampled_from_what_was_trained_on_the_gpu(trained: Path, annotated):
-    model = annotated.object_model(annotated.object_key(annotated.ids()[0]))
-    motion = generate("Lift a box with the right hand.", model, trained, load_embedded_hands(), load_encoder("hash"), 0)
-    assert motion.clip.n_frames > 0
+def test_motions_are_sampled_and_measured_on_the_gpu(annotated_root: Path, on_gpu: Path, tmp_path: Path) -> None:
+    family, hands = load_family("text2hoi"), load_embedded_hands()
+    sample_family(
+        family, annotated_root, on_gpu, tmp_path / "motions", {"samples": 2}, hands, settings=FAST, device="cuda"
+    )
+    figures = evaluate_store(tmp_path / "motions" / "clips", annotated_root, hands)["figures"]
+    assert all(np.isfinite(value) for value in figures.values())

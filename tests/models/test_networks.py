@@ -10,7 +10,7 @@ from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common.features import Hands, Normaliser
-from models.common.sampling import SamplerConfig, add_noise, alphas_cumprod, noise_schedule, sample_motion
+from models.common.sampling import SamplerConfig, add_noise, alphas_cumprod, draw_motion, noise_schedule, sample_motion
 from models.common.transformer import TransformerConfig, smoothed
 from models.text2hoi.contact import ContactConfig, ContactLossConfig, ContactModel, PointNetConfig, contact_loss
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
@@ -139,7 +139,9 @@ def test_a_perfect_denoiser_gives_the_clean_motion_back() -> None:
     truth = torch.randn(3, 2, 7, 99, generator=generator), torch.randn(3, 7, 10, generator=generator)
     for kind, steps in (("ddim", 1), ("ddim", 20), ("ddpm", 50)):
         config = SamplerConfig(kind, steps)  # pyright: ignore[reportArgumentType]
-        hands, objects = sample_motion(lambda *_: truth, truth[0].shape, truth[1].shape, config, generator)
+        hands, objects = sample_motion(
+            lambda *_: truth, draw_motion(truth[0].shape, truth[1].shape, generator), config, generator
+        )
         torch.testing.assert_close(hands, truth[0], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
         torch.testing.assert_close(objects, truth[1], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
 

@@ -22,11 +22,11 @@ PARAMS = {
 }
 
 
-def train(name: str, root: Path, out: Path) -> Path:
+def train(name: str, root: Path, out: Path, device: str = "cpu") -> Path:
     network = load_network(name)
     needed = {load_network(other): out / other for other in network.needs}
     provenance = lambda facts: {"model": facts["model"]}  # noqa: E731
-    return train_network(network, root, out / name, PARAMS[name], needed=needed, provenance=provenance)
+    return train_network(network, root, out / name, PARAMS[name], needed=needed, provenance=provenance, device=device)
 
 
 # Sections of families with which sampling takes a moment.

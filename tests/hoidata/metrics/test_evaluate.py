@@ -75,7 +75,7 @@ def test_left_and_right_hand_are_not_taken_for_each_other(write_annotated, moved
 def test_predictions_that_cannot_be_compared_are_listed_with_the_reason(write_annotated, make_clip, tmp_path):
     root, clips = write_annotated()
     clip, both = clips[RIGHT], clips[BOTH]
-    short = named(clip.cut(0, 9), f"{RIGHT}~1", source_frames=np.arange(70, 79, dtype=np.int32))
+    short = named(clip.take(slice(0, 9)), f"{RIGHT}~1", source_frames=np.arange(70, 79, dtype=np.int32))
     handless = replace(both.hands["left"], valid=np.zeros(12, bool))
     other = make_clip(12, "both", articulated=True)
     predicted = [
@@ -111,7 +111,7 @@ def test_a_store_of_which_nothing_can_be_compared_is_refused(write_annotated, ma
 @pytest.mark.parametrize("start", [0, 4])
 def test_a_prediction_of_some_frames_is_compared_with_those(write_annotated, tmp_path, start):
     root, clips = write_annotated()
-    part = clips[RIGHT].cut(start, start + 7)
+    part = clips[RIGHT].take(slice(start, start + 7))
     found = evaluate_store(written(tmp_path / "part", [part]), root)
     assert found["figures"]["joint_error_mm"] == 0
     assert found["figures"]["contact_f1"] == 1
