@@ -8,7 +8,6 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, HandTrack, ObjectTrack
-from hoidata.contact.proximity import joints_in_object
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics import forces, motion, touch
 from hoidata.metrics.registry import METRICS
@@ -95,7 +94,7 @@ def test_jitter_is_a_known_jerk_in_the_world(make_clip, pair_of):
 def test_penetration_is_the_depth_of_the_deepest_vertex_in_a_box(make_clip, moved, pair_of):
     clip, hands = make_clip(12), load_embedded_hands()
     deep = moved(clip, along_the_face(clip, 0.012))
-    points = joints_in_object(track_vertices(deep.hands["right"], hands.right), deep.object)
+    points = deep.object.world_from_object.inverse() @ track_vertices(deep.hands["right"], hands.right)
     expected = np.maximum(-to_box_m(points).min(axis=1), 0) * 1000
     assert expected.min() > 5
     assert touch.penetration_mm(pair_of(deep, clip), 1) == pytest.approx(expected, abs=1e-3)
