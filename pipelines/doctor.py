@@ -10,7 +10,8 @@ from typing import Literal
 
 from hoidata.errors import HoidataError
 from pipelines.lineage.graph import read_params
-from pipelines.lineage.manifests import Manifest, read_manifest
+from pipelines.lineage.manifests import Manifest
+from pipelines.stages.adapters import manifest_of
 from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
@@ -71,7 +72,7 @@ def _gpu() -> Finding:
 def _raw(profile: str, dataset: str) -> Finding:
     part, place = f"raw {dataset} ({profile})", Place(profile, dataset)
     try:
-        manifest = read_manifest(place.manifest)
+        manifest = manifest_of(place)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
     root = place.generated_raw if profile == "embedded" else own_root(dataset)

@@ -38,12 +38,16 @@ def set_profile(profile: str) -> bool:
 
 
 def remember_root(name: str, root: Path) -> None:
-    """Note a raw folder in hoidata.toml, which version control ignores."""
+    """Note a raw folder in hoidata.toml, which version control ignores; its other sections stay."""
     import json
+    import re
     import tomllib
 
     path = Path("hoidata.toml")
-    settings = tomllib.loads(path.read_text()) if path.is_file() else {}
+    text = path.read_text() if path.is_file() else ""
+    settings = tomllib.loads(text)
     roots = {**settings.get("roots", {}), name: str(root)}
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in sorted(roots.items())]
-    path.write_text("# Where your raw files lie. Written by `hoidata raw scan`.\n[roots]\n" + "".join(lines))
+    head = "# Where your raw files lie. Written by `hoidata raw scan`.\n[roots]\n"
+    others = re.sub(rf"({re.escape(head)}|^\[roots\]\n)[^\[]*", "", text, flags=re.MULTILINE)
+    path.write_text(f"{others.rstrip()}\n\n".lstrip() + head + "".join(lines))

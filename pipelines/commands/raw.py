@@ -49,22 +49,10 @@ def _scan_dataset(place, root: Path):
     if place.dataset not in known:
         remedy = f"add {place.dataset} to `datasets` in params.yaml"
         raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
-    _ensure_manifests(adapter)
     # First what was asked about, then what it needs besides.
     _require_parts(adapter, root, also=_hand_problem(place))
     require_hand(place)
     return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
-
-
-def _ensure_manifests(adapter) -> None:
-    """A dataset new to the project is absent from both profiles until it is scanned."""
-    from pipelines.lineage.manifests import absent_manifest, write_manifest
-    from pipelines.stages.base import Place
-
-    for profile in ("embedded", "own"):
-        path = Place(profile, adapter.name).manifest
-        if not path.is_file():
-            write_manifest(path, absent_manifest(adapter))
 
 
 def _hand_problem(place) -> str:
@@ -137,12 +125,12 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     asked_for: by name, so that its absence is a complaint.
     """
     from hoidata.errors import MissingResource
-    from pipelines.lineage.manifests import absent_manifest, read_manifest, verify_files
-    from pipelines.stages.adapters import configured_adapter
+    from pipelines.lineage.manifests import read_manifest, verify_files
+    from pipelines.stages.adapters import configured_adapter, manifest_of
     from pipelines.stages.base import Place, raw_root
 
     place, adapter = Place(current_profile(), dataset), configured_adapter(dataset)
-    manifest = read_manifest(place.manifest) if place.manifest.is_file() else absent_manifest(adapter)
+    manifest = manifest_of(place)
     if not manifest.present:
         typer.echo(f"{dataset}: not present in the profile {place.profile}: no raw files were scanned")
         _say_where_to_get(adapter)

@@ -30,9 +30,9 @@ def share(
 def _terms() -> list[str]:
     """One line per dataset of the current profile whose licence does not let derived data be passed on."""
     from pipelines.lineage.graph import read_params
-    from pipelines.lineage.manifests import read_manifest
+    from pipelines.stages.adapters import manifest_of
     from pipelines.stages.base import Place
 
     places = [Place(current_profile(), name) for name in read_params(Path())["datasets"]]
-    bound = [manifest for place in places if (manifest := read_manifest(place.manifest)).present]
+    bound = [manifest for place in places if (manifest := manifest_of(place)).present]
     return [f"{item.dataset}: {item.licence}" for item in bound if not item.may_be_shared]

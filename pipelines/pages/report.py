@@ -8,6 +8,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from hoidata.clips.clip import Clip
+from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
@@ -21,7 +22,6 @@ from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
-TITLES = {"h2o": "H2O", "grab": "GRAB", "arctic": "ARCTIC", "manipnet": "ManipNet"}
 CONTACT_EXAMPLES = 3
 
 
@@ -96,7 +96,7 @@ def write_report(
 
 def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: HandPair) -> Section:
     facts = read_dataset(folders.data / name, name, hands)
-    title = TITLES.get(name, name)
+    title = dataset_title(name)
     if facts.empty:
         return Section(facts, title)
     networks = sorted(path for path in (folders.checkpoints / name).glob("*") if path.is_dir())

@@ -6,7 +6,8 @@ from pydantic import Field
 
 from hoidata.datasets.base import Adapter
 from hoidata.datasets.registry import get_adapter
-from pipelines.stages.base import StageParams, load_params
+from pipelines.lineage.manifests import Manifest, absent_manifest, read_manifest
+from pipelines.stages.base import Place, StageParams, load_params
 
 
 class ConvertParams(StageParams):
@@ -20,6 +21,15 @@ class ConvertParams(StageParams):
         # Without a margin nothing is said of it, so that an adapter without that setting works too.
         common = {"margin_frames": self.margin_frames} if self.margin_frames else {}
         return get_adapter(name, **{**common, **(self.adapters.get(name) or {})})
+
+
+def manifest_of(place: Place) -> Manifest:
+    """The manifest of a dataset in a profile. Where there is none, the profile does not have the dataset."""
+    return (
+        read_manifest(place.manifest)
+        if place.manifest.is_file()
+        else absent_manifest(configured_adapter(place.dataset))
+    )
 
 
 def configured_adapter(name: str) -> Adapter:

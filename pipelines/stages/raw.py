@@ -8,7 +8,7 @@ from hoidata.files.atomic import atomic_file
 from pipelines.lineage.digests import paths_digests, value_digest
 from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
-from pipelines.stages.adapters import configured_adapter
+from pipelines.stages.adapters import configured_adapter, manifest_of
 from pipelines.stages.base import Place, jobs, raw_root, root_variable
 
 SHOWN_DIFFERENCES = 5
@@ -16,7 +16,7 @@ SHOWN_DIFFERENCES = 5
 
 def run(place: Place) -> None:
     """Write ``raw.json``: the committed manifest itself, or for a generated corpus the files its recipe gives."""
-    manifest = read_manifest(place.manifest)
+    manifest = manifest_of(place)
     if manifest.present and manifest.synthetic:
         manifest = manifest.with_files(generated_files(place, manifest))
     elif manifest.present:
