@@ -1,7 +1,8 @@
 """Losses of generator and refiner: Text2HOI eq. 5-7 and 9-11, as means over what is present.
 
-All geometry is in metres in the model frame. Distances to surfaces come from ``models.common.fields``, whose gradient
-reaches the query points only. Masks are 0/1 tensors; an empty mask gives zero.
+All geometry is in metres in the model frame. Distances to surfaces come from
+``hoidata.objects.signed_distance_grid``, whose gradient reaches the query points only. Masks are 0/1 tensors; an empty
+mask gives zero.
 """
 
 import torch

@@ -7,8 +7,8 @@ from torch import Tensor
 
 from hoidata.batches.requests import RequestBatch
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.signed_distance_grid import DistanceFields
 from models.common.features import Hands, object_hinge_rad, to_object_frame
-from models.common.fields import DistanceFields
 from models.text2hoi.refiner import CoarseMotion
 
 

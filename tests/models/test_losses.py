@@ -10,9 +10,9 @@ from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.signed_distance_grid import DistanceFields
 from models import losses
 from models.common.features import Hands, object_rotmat, place_points
-from models.common.fields import DistanceFields
 
 
 @pytest.fixture(scope="module")

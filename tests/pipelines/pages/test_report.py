@@ -14,12 +14,10 @@ from hoidata.store.store import write_store
 from models.common.training import UPSTREAM, train_model
 from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
-from pipelines.pages.metrics_table import metrics_tables, number
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
 
 HELD_OUT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
-DIFFUSION = {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90}
 
 
 @pytest.fixture
@@ -129,37 +127,3 @@ def test_wide_positive_ranges_are_drawn_logarithmically():
     assert Panel("", [Curve("", x, np.array([1.0, 10, 30]))]).is_logarithmic
     assert not Panel("", [Curve("", x, np.array([-1.0, 10, 30]))]).is_logarithmic
     assert not Panel("", [Curve("", x, np.array([10.0, 20, 30]))]).is_logarithmic
-
-
-def test_every_figure_of_a_metrics_file_reaches_the_table_beside_its_baseline():
-    figures = {"mae_frames": 10.25, "mae_mean_length_frames": 14, "clips": 40}
-    (table,) = metrics_tables({"length": figures, "synthetic": True})
-    (row,) = table.rows
-    assert (row.value, row.baselines, row.verdict) == ("10.2", [("mean length", "14")], "good")
-    assert table.notes == ["clips 40"]
-    assert metrics_tables({"other": {"deep": {"figure": 0.5}}})[0].notes == ["deep figure 0.500"]
-    assert metrics_tables({"contact": {"empty": "no clips"}})[0].empty == "no clips"
-
-
-@pytest.mark.parametrize(
-    ("model", "figures", "verdict"),
-    [
-        ("contact", {"f1": 0.44, "f1_mean_map": 0.40}, "bad"),
-        ("contact", {"f1": 0.46, "f1_mean_map": 0.40}, "good"),
-        ("length", {"mae_frames": 9.0, "mae_mean_length_frames": 10.0}, "bad"),
-        (
-            "diffusion",
-            {"joint_error_mm": 50, "joint_error_mean_pose_mm": 90, "joint_error_shuffled_prompt_mm": 40},
-            "bad",
-        ),
-        ("diffusion", DIFFUSION | {"joint_error_shuffled_prompt_mm": 40}, "bad"),
-        ("diffusion", DIFFUSION | {"joint_error_shuffled_prompt_mm": 60}, "good"),
-        ("diffusion", DIFFUSION, ""),
-    ],
-)
-def test_verdict_asks_for_the_margin_of_the_project(model, figures, verdict):
-    assert metrics_tables({model: figures})[0].rows[0].verdict == verdict
-
-
-def test_numbers_keep_three_digits():
-    assert [number(value) for value in (1234567, 0.01234, 11.0, None, "x")] == ["1,234,567", "0.0123", "11.0", "", "x"]
