@@ -1,11 +1,24 @@
-"""``python -m pipelines.stages STAGE --profile P [--dataset D] [--model M]``: what dvc.yaml runs."""
+"""``python -m pipelines.stages STAGE --profile P [--dataset D] [--model M] [--family F]``: what dvc.yaml runs."""
 
 import argparse
 import importlib
 import os
 import sys
 
-STAGES = ("code", "raw", "convert", "quality", "annotate", "contact", "surface", "split", "train", "evaluate", "report")
+STAGES = (
+    "code",
+    "raw",
+    "convert",
+    "quality",
+    "annotate",
+    "contact",
+    "surface",
+    "split",
+    "train",
+    "sample",
+    "evaluate",
+    "report",
+)
 
 
 def main() -> int:
@@ -15,6 +28,7 @@ def main() -> int:
     parser.add_argument("--profile", choices=("embedded", "own"), default="embedded")
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
+    parser.add_argument("--family", default="")
     options = parser.parse_args()
     # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read as torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -31,7 +45,7 @@ def _run(module, options: argparse.Namespace) -> int:
     from hoidata.errors import HoidataError
     from pipelines.stages.base import Place
 
-    place = Place(options.profile, options.dataset, options.model)
+    place = Place(options.profile, options.dataset, options.model, options.family)
     try:
         module.run(place)
     except HoidataError as error:

@@ -37,9 +37,10 @@ class Place:
     profile: str
     dataset: str = ""
     model: str = ""
+    family: str = ""
 
     def __str__(self) -> str:
-        return "-".join(filter(None, (self.profile, self.dataset, self.model)))
+        return "-".join(filter(None, (self.profile, self.dataset, self.model, self.family)))
 
     @property
     def data(self) -> Path:
@@ -88,6 +89,10 @@ class Place:
     @property
     def checkpoint(self) -> Path:
         return self.checkpoints / self.model
+
+    @property
+    def samples(self) -> Path:
+        return Path("samples", self.profile, self.dataset, self.family)
 
     @property
     def metrics(self) -> Path:

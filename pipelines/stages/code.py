@@ -3,7 +3,6 @@
 Always run, so that DVC sees each change: a module that was edited, imported anew, or came with another package.
 """
 
-import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -39,20 +38,15 @@ def run(place: Place) -> None:
 def write_code(root: Path) -> None:
     """Write ``code/`` of the project at ``root`` anew."""
     with atomic_folder(root / CODE) as part:
-        for name, digests in code_today(root).items():
-            write_json(part / f"{name}.json", digests)
+        for path, digests in code_today(root).items():
+            write_json(part / Path(path).relative_to(CODE), digests)
 
 
 def code_today(root: Path) -> dict[str, dict[str, str]]:
-    """The digests of every file of ``code/``, by its name (``convert/grab``), as the code is now."""
+    """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``)."""
     tree = SourceTree(root)
-    starts = closures(root, tree)
-    return {name: tree.closure([start.module], start.chosen) for name, start in starts.items()}
-
-
-def read_code(path: Path) -> dict[str, str]:
-    """The digests in a file of ``code/`` as the stage wrote it."""
-    return json.loads(path.read_text())
+    starts = closures(root, tree).items()
+    return {f"{CODE / name}.json": tree.closure([start.module], start.chosen) for name, start in starts}
 
 
 def closures(root: Path, tree: SourceTree) -> dict[str, Start]:
@@ -63,7 +57,10 @@ def closures(root: Path, tree: SourceTree) -> dict[str, Start]:
         chosen = _chosen_by_dataset(tree, dataset)
         found |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
         every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
-    found |= {f"train/{network}": _start("train", every) for network in params["train"]["demo"]}
+    for network in params["train"]["demo"]:
+        found[f"train/{network}"] = _start("train", every | _chosen_by_network(network))
+    for family in params["families"]:
+        found[f"sample/{family}"] = _start("sample", every | _chosen_by_family(family))
     return found | {stage: _start(stage, every) for stage in ("evaluate", "report")}
 
 
@@ -77,3 +74,13 @@ def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
     modules = tree.modules_below(package) or tree.added("hoidata.adapters", name)
     read = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
     return {f"{DATASETS}.registry": [Choice(tuple(modules))], **read}
+
+
+def _chosen_by_network(name: str) -> dict[str, list[Choice]]:
+    """What the registry of families loads to train a network."""
+    return {}
+
+
+def _chosen_by_family(name: str) -> dict[str, list[Choice]]:
+    """What the registry of families loads to sample from a family."""
+    return {}
