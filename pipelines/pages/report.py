@@ -7,6 +7,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
@@ -20,7 +21,6 @@ from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.view import touched_side
 
 MODELS = ("contact", "length", "diffusion", "refiner")
-TITLES = {"h2o": "H2O", "grab": "GRAB", "arctic": "ARCTIC", "manipnet": "ManipNet"}
 CONTACT_EXAMPLES = 3
 
 
@@ -95,7 +95,7 @@ def write_report(
 
 def _section(name: str, folders: ReportFolders, hands: HandPair, seed: int) -> Section:
     facts = read_dataset(folders.data / name, name, hands)
-    title = TITLES.get(name, name)
+    title = dataset_title(name)
     if facts.empty:
         return Section(facts, title)
     checkpoints = folders.checkpoints / name

@@ -4,12 +4,13 @@ import re
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import numpy as np
 
 from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.dataset_folders import DatasetFacts, require_facts
 from hoidata.datasets import checks
 from hoidata.datasets.arctic.files import (
     Description,
@@ -19,7 +20,7 @@ from hoidata.datasets.arctic.files import (
     parse_misc,
     parse_parts,
 )
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
@@ -78,7 +79,7 @@ class _Motion:
 
 
 @dataclass(frozen=True)
-class ArcticAdapter:
+class ArcticAdapter(Described):
     """Raw root: the folder with ``raw_seqs/``, ``meta/`` and ``description/`` (or ``data/`` above them).
 
     clips: "described" gives one clip per line of Text2HOI's description files; "whole" one clip per sequence without
@@ -89,19 +90,13 @@ class ArcticAdapter:
     black). body: keep the parameters of the subject's SMPL-X body.
     """
 
+    facts: ClassVar[DatasetFacts] = require_facts("arctic")
     margin_frames: int = 0
     shortest_frames: int = 20
     clips: Stretches = "described"
     trimmed_frames: int = 0
     all_pairs: bool = False
     body: bool = False
-    name: str = "arctic"
-    version: str = "1.0"
-    licence: str = "ARCTIC licence (MPI): non-commercial research, no redistribution"
-    where_to_register: str = "https://arctic.is.tue.mpg.de (raw_seqs.zip, meta.zip) and Text2HOI's description files"
-    needs_mano: bool = True
-    source_fps: float = 30.0
-    may_be_shared: bool = False
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
 

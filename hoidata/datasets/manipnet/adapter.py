@@ -9,13 +9,15 @@ import json
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
+from hoidata.dataset_folders import DatasetFacts, require_facts
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.bvh import BvhMotion, parse_bvh, unpack_text
 from hoidata.datasets.manipnet.segments import (
     LIFTED_M,
@@ -130,7 +132,7 @@ def surface_distances(
 
 
 @dataclass(frozen=True)
-class ManipNetAdapter:
+class ManipNetAdapter(Described):
     """Raw root: ``sequences/<name>/*.bvh.gz``, ``objects/<group>/<object>.obj.gz``, ``hand/hand_reference.json``.
 
     margin_frames: frames (of 30 fps) kept before and after each interaction, as far as the tracking is usable; ids and
@@ -139,14 +141,8 @@ class ManipNetAdapter:
     depend on which other recordings are there.
     """
 
+    facts: ClassVar[DatasetFacts] = require_facts("manipnet")
     margin_frames: int = 0
-    name: str = "manipnet"
-    version: str = "1.0"
-    licence: str = "CC BY-NC 4.0"
-    where_to_register: str = "no registration: the data release of the ManipNet paper (SIGGRAPH 2021)"
-    needs_mano: bool = False
-    source_fps: float = 120.0
-    may_be_shared: bool = True
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS

@@ -8,14 +8,15 @@ import re
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.dataset_folders import DatasetFacts, require_facts
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_torch_pickle
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
@@ -48,21 +49,15 @@ Poses = Mapping[Hashable, Any]  # by frame key: {"hand_pose": (48,), "hand_trans
 
 
 @dataclass(frozen=True)
-class TacoAdapter:
+class TacoAdapter(Described):
     """Raw root: ``Hand_Poses/``, ``Object_Poses/`` (``<triplet>/<recording>/``) and ``Object_Models/<id>_cm.obj``.
 
     margin_frames: frames kept before the first and after the last one with a hand within 2 cm of the tool.
     The source names no persons: a recording's subject is its day, the part of its name before the first underscore.
     """
 
+    facts: ClassVar[DatasetFacts] = require_facts("taco")
     margin_frames: int = 0
-    name: str = "taco"
-    version: str = "1.0"
-    licence: str = "CC BY 4.0"
-    where_to_register: str = "no registration: links on https://taco2024.github.io (hand poses, object poses, models)"
-    needs_mano: bool = True
-    source_fps: float = 30.0
-    may_be_shared: bool = True
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
