@@ -1,12 +1,16 @@
 """Stage code: for every stage the digests of exactly the code it runs, in ``code/``, which the stage depends on.
 
 Always run, so that DVC sees each change: a module that was edited, imported anew, or came with another package.
+What params.yaml sets for one dataset stands there too, so that it concerns that dataset's stages only.
 """
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
+from hoidata.files.digest import canonical_json
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.lineage.graph import read_params
 from pipelines.stages.base import Place, write_json
@@ -20,6 +24,10 @@ READERS = {
     "hoidata.splits.definitions": ("splits/*.json",),
     "hoidata.splits.published": ("published.json",),
 }
+
+
+# Sections of params.yaml that hold a key per dataset. It may be absent, which DVC does not allow of a parameter.
+SECTIONS_OF_DATASETS = {"convert": ("convert", "adapters"), "split": ("split",)}
 
 
 @dataclass(frozen=True)
@@ -44,14 +52,17 @@ def write_code(root: Path) -> None:
 
 def code_today(root: Path) -> dict[str, dict[str, str]]:
     """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``)."""
-    tree = SourceTree(root)
-    starts = closures(root, tree).items()
-    return {f"{CODE / name}.json": tree.closure([start.module], start.chosen) for name, start in starts}
-
-
-def closures(root: Path, tree: SourceTree) -> dict[str, Start]:
-    """Where the code of each file of ``code/`` begins: the one table of what the stages run."""
     params = read_params(root)
+    tree = SourceTree(root, {f"{DATASETS}.{name}": folder for name, folder in outside_folders().items()})
+    starts = closures(params, tree).items()
+    return {
+        f"{CODE / name}.json": tree.closure([start.module], start.chosen) | _own_settings(params, name)
+        for name, start in starts
+    }
+
+
+def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
+    """Where the code of each file of ``code/`` begins: the one table of what the stages run."""
     found, every = {}, {}
     for dataset in params["datasets"]:
         chosen = _chosen_by_dataset(tree, dataset)
@@ -66,6 +77,17 @@ def closures(root: Path, tree: SourceTree) -> dict[str, Start]:
 
 def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
     return Start(f"pipelines.stages.{stage}", chosen)
+
+
+def _own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
+    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON."""
+    stage, _, dataset = name.partition("/")
+    if stage not in SECTIONS_OF_DATASETS:
+        return {}
+    keys, value = (*SECTIONS_OF_DATASETS[stage], dataset), params
+    for key in keys:
+        value = (value or {}).get(key)
+    return {f"params.yaml {'.'.join(keys)}": canonical_json(value)}
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
