@@ -96,7 +96,7 @@ class Place:
 
     @property
     def metrics(self) -> Path:
-        return Path("metrics", self.profile, f"{self.dataset}.json")
+        return Path("metrics", self.profile, self.dataset, f"{self.family}.json")
 
     @property
     def report(self) -> Path:
