@@ -80,14 +80,14 @@ def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
 
 
 def _own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
-    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON."""
+    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same."""
     stage, _, dataset = name.partition("/")
     if stage not in SECTIONS_OF_DATASETS:
         return {}
     keys, value = (*SECTIONS_OF_DATASETS[stage], dataset), params
     for key in keys:
         value = (value or {}).get(key)
-    return {f"params.yaml {'.'.join(keys)}": canonical_json(value)}
+    return {f"params.yaml {'.'.join(keys)}": canonical_json(value or None)}
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
