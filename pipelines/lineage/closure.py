@@ -145,7 +145,7 @@ class SourceTree:
                 yield from ((_below(choice.package, folder, path), path) for path in paths)
 
     def _data_of(self, name: str) -> list[tuple[str, Path]]:
-        """The data files of a module's package: in its folder, and in folders below that are no packages."""
+        """The data files of a module's package: in its folder, and in folders below that hold no modules."""
         source = self._source(name)
         package = name if source and source.name == "__init__.py" else name.rpartition(".")[0]
         if package not in self._data:
@@ -162,7 +162,7 @@ def _below(package: str, folder: Path, path: Path) -> str:
 def _data_files(folder: Path) -> Iterator[Path]:
     for item in folder.iterdir():
         if item.is_dir():
-            if item.name != "__pycache__" and not (item / "__init__.py").is_file():
+            if item.name != "__pycache__" and not any(item.glob("*.py")):
                 yield from _data_files(item)
         elif not any(item.match(pattern) for pattern in NOT_DATA):
             yield item
