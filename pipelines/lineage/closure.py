@@ -21,11 +21,15 @@ NOT_DATA = ("*.py", "*.pyc", "*.md", "dvc.yaml", "dvc.lock", ".*")
 
 @dataclass(frozen=True)
 class Choice:
-    """What one module picks by name: modules it imports and, as glob patterns in a package's folder, files it reads."""
+    """What one module picks by name: modules it imports and, as glob patterns in a package's folder, files it reads.
+
+    is_table: the module names much that is not picked here, so its own text does not count, only what it picks.
+    """
 
     modules: tuple[str, ...] = ()
     package: str = ""
     files: tuple[str, ...] = ()
+    is_table: bool = False
 
 
 class SourceTree:
@@ -49,7 +53,8 @@ class SourceTree:
         """
         reached = self._reached(start, chosen)
         sources = {name: source for name in reached if (source := self._source(name))}
-        found = {self._key(name, source): source for name, source in sources.items()}
+        tables = {by for by, choices in chosen.items() if any(choice.is_table for choice in choices)}
+        found = {self._key(name, source): source for name, source in sources.items() if name not in tables}
         picked = {by: dict(self._picked(choices)) for by, choices in chosen.items()}
         claimed = {key for files in picked.values() for key in files}
         data = (item for name in sources for item in self._data_of(name))

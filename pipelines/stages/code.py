@@ -11,6 +11,7 @@ from typing import Any
 from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
+from models.registry import family_module, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.lineage.graph import read_params
 from pipelines.stages.base import Place, write_json
@@ -69,10 +70,16 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         found |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
         every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
     for network in params["train"]["demo"]:
-        found[f"train/{network}"] = _start("train", every | _chosen_by_network(network))
+        found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
     for family in params["families"]:
-        found[f"sample/{family}"] = _start("sample", every | _chosen_by_family(family))
+        found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
+    every |= _families([family_module(family) for family in params["families"]])
     return found | {stage: _start(stage, every) for stage in ("evaluate", "report")}
+
+
+def _families(modules: list[str]) -> dict[str, list[Choice]]:
+    """Of the table of all families only what is picked here counts: one more row concerns no other family."""
+    return {"models.registry": [Choice(tuple(modules), is_table=True)]}
 
 
 def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
@@ -96,13 +103,3 @@ def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
     modules = tree.modules_below(package) or tree.added("hoidata.adapters", name)
     read = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
     return {f"{DATASETS}.registry": [Choice(tuple(modules))], **read}
-
-
-def _chosen_by_network(name: str) -> dict[str, list[Choice]]:
-    """What the registry of families loads to train a network."""
-    return {}
-
-
-def _chosen_by_family(name: str) -> dict[str, list[Choice]]:
-    """What the registry of families loads to sample from a family."""
-    return {}

@@ -1,5 +1,6 @@
 """Which files the code behind a module is, on packages in a temporary folder."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -79,6 +80,13 @@ def test_what_a_registry_picks_counts_only_for_those_who_reach_the_registry(root
     found = set(SourceTree(root).closure(["hoidata.registry"], chosen))
     assert {"hoidata/datasets/grab/adapter.py", "hoidata/datasets/grab/words.csv"} <= found
     assert "hoidata/datasets/h2o/adapter.py" not in found
+
+
+def test_of_a_table_of_names_only_what_is_picked_counts(root):
+    chosen = {"hoidata.registry": [replace(ADAPTER, is_table=True)]}
+    found = SourceTree(root).closure(["hoidata.registry"], chosen)
+    assert "hoidata/datasets/grab/adapter.py" in found
+    assert "hoidata/registry.py" not in found
 
 
 def test_files_that_a_module_reads_by_name_count_for_it_and_not_for_the_package_they_lie_in(root):
