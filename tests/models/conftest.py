@@ -17,6 +17,7 @@ from hoidata.splits import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from tests.models.toy import PARAMS, train
 
 torch.set_num_threads(1)
 GRASP_HEIGHT_M = 0.01
@@ -110,3 +111,12 @@ def annotated(annotated_root: Path) -> AnnotatedStore:
 def batch(annotated: AnnotatedStore) -> ClipBatch:
     """The three training clips: left, right and both hands, of different length."""
     return collate(list(HoiDataset(annotated, "train")))
+
+
+@pytest.fixture(scope="session")
+def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a checkpoint of each of Text2HOI's networks, of the toy dataset."""
+    out = tmp_path_factory.mktemp("checkpoints")
+    for name in PARAMS:
+        train(name, annotated_root, out)
+    return out

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from models.common.surface import Surface
+from models.text2hoi.surface import Surface
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from models.common.surface import Surface
+from models.text2hoi.surface import Surface
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
@@ -31,12 +31,12 @@ def diffusion_model(**changes) -> DiffusionModel:
 
 
 def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
-    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0])
+    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0], batch.contact_map)
 
 
 def coarse_of(batch: ClipBatch) -> CoarseMotion:
-    surface = Surface.of(Hands(load_embedded_hands()), batch.samples, 24, torch.device("cpu"))
-    return surface.coarse(batch, batch.hands, batch.object, batch.contact_map)
+    surface = Surface.of(Hands(load_embedded_hands()), batch.objects, 24, torch.device("cpu"))
+    return surface.coarse(batch, batch.hands, batch.object, batch.contact_map, batch.present)
 
 
 @pytest.mark.parametrize("frames_per_token", [1, 2, 5])
@@ -211,7 +211,10 @@ def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
     fitted(model.parameters(), loss, 60, 1e-2)
     model.eval()
     probability = model.sample(
-        two.points_m, two.text[:, 0], two.active_hands, 8, torch.Generator().manual_seed(1)
+        two.points_m,
+        two.text[:, 0],
+        two.active_hands,
+        model.draw_latents(8, len(two), torch.Generator().manual_seed(1)),
     ).mean(1)
     assert ((probability > 0.5) == (two.contact_map > 0.5)).float().mean() > 0.95
 
