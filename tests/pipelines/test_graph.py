@@ -79,7 +79,8 @@ def test_importing_a_closure_loads_no_file_outside_of_it(code, name):
     result = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
     loaded = {Path(path) for path in json.loads(result.stdout)}
     ours = {path.relative_to(PROJECT).as_posix() for path in loaded if path.is_relative_to(PROJECT)}
-    assert {path for path in ours if path.split("/")[0] in ("hoidata", "models", "pipelines")} == set(files)
+    ours = {path for path in ours if path.split("/")[0] in ("hoidata", "models", "pipelines")}
+    assert ours - {"models/registry.py"} == set(files)  # a table: what it picks counts, it does not
 
 
 def test_rooms_that_change_no_result_are_in_no_stage(code):
