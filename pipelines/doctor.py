@@ -12,7 +12,7 @@ from hoidata.errors import HoidataError
 from pipelines.lineage.graph import read_params
 from pipelines.lineage.manifests import Manifest
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
+from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
@@ -104,8 +104,9 @@ def _hand(profile: str) -> Finding:
 
 def _encoder() -> Finding:
     from hoidata.annotation import load_encoder
+    from hoidata.annotation.settings import AnnotationSettings
 
-    name = read_params(Path())["annotate"]["encoder"]
+    name = load_settings(AnnotationSettings, "annotate").encoder
     try:
         return Finding("text encoder", "ok", _named(load_encoder(name).identity))
     except HoidataError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from pipelines.lineage.graph import read_graph, read_params
 from pipelines.lineage.manifests import read_manifest
-from pipelines.stages.adapters import manifest_of
+from pipelines.stages.adapters import ensure_manifests
 from pipelines.stages.base import Place, raw_root
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
@@ -32,7 +32,8 @@ def preflight() -> None:
     """Write again a generated corpus that a conversion is about to read; refuse when the user's files are missing."""
     params = read_params(Path())
     places = [Place(params["profile"], name) for name in params["datasets"]]
-    present = [place for place in places if manifest_of(place).present]
+    ensure_manifests(params["profile"], params["datasets"])
+    present = [place for place in places if read_manifest(place.manifest).present]
     for place in present:
         if place.profile == "own":
             require_hand(place)

@@ -13,10 +13,9 @@ import torch
 
 from hoidata.annotation.grammar import default_grammar
 from hoidata.annotation.sentences import FORMS, HAND_PHRASES, four_sentences
-from hoidata.batches.dataset import CONTACT_THRESHOLD_M as CROPPED_THRESHOLD_M
 from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
 from hoidata.clips import HandTrack
-from hoidata.contact import CONTACT_THRESHOLD_M
+from hoidata.contact.settings import ContactSettings
 from hoidata.datasets.grab.words import INTENTS, OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.hands import load_embedded_hands, track_joints
@@ -175,10 +174,8 @@ class TestText2Hoi:
 
     def test_contact_and_distances_end_at_2_centimetres(self):
         """Sections 3.2 and 3.3 name the threshold tau; its value is that of the authors' code."""
-        assert CONTACT_THRESHOLD_M == CROPPED_THRESHOLD_M == 0.02
-        params = read_params(PROJECT)
-        assert [params[stage]["threshold_m"] for stage in ("annotate", "contact")] == [0.02, 0.02]
-        assert [params[stage]["points"] for stage in ("annotate", "contact")] == [1024, 1024]
+        assert ContactSettings() == ContactSettings(points=1024, threshold_m=0.02)
+        assert read_params(PROJECT)["contact"] == {}
 
     def test_noise_has_1000_steps(self):
         """Section 4.1: T = 1,000, cosine schedule (Nichol and Dhariwal 2021)."""

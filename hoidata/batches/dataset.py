@@ -28,7 +28,6 @@ from hoidata.store.distances import DistanceEntries
 
 HAND_FEATURES, OBJECT_FEATURES, N_ROTATIONS = 99, 10, 16
 MAX_FRAMES = 150
-CONTACT_THRESHOLD_M = 0.02
 Crop = Literal["random", "start"]
 
 
@@ -38,7 +37,7 @@ class ClipSample:
 
     hands (2, F, 99), object (F, 10), joints_m (2, F, 21, 3): features and true joints, with the clip's own hand shape.
     valid (2, F): frames in which a side was tracked. active_hands (2,): the sides that take part in the interaction.
-    contact (2, 1024): points that came within 2 cm of a joint of that acting side in these frames.
+    contact (2, 1024): points that came within ``contact_threshold_m``, the contact stage's, of a joint of that side.
     text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
     start: first frame within the clip. world_from_model (4, 4).
     """
@@ -63,6 +62,7 @@ class ClipSample:
     text: np.ndarray
     points: ObjectPoints
     contact: np.ndarray
+    contact_threshold_m: float
     distances: DistanceEntries
     world_from_model: np.ndarray
 
@@ -86,7 +86,7 @@ class ClipSample:
             object=self.object[start:stop],
             joints_m=self.joints_m[:, start:stop],
             valid=self.valid[:, start:stop],
-            contact=contact_of(distances, len(self.points.points_m)),
+            contact=contact_of(distances, len(self.points.points_m), self.contact_threshold_m),
             distances=distances,
         ).recentred()
 
@@ -110,6 +110,8 @@ class ClipSample:
 class Annotated(Protocol):
     """What a dataset needs of ``hoidata.store.annotated.AnnotatedStore``."""
 
+    @property
+    def contact_threshold_m(self) -> float: ...
     def split_ids(self, split: str) -> list[str]: ...
     def clip(self, clip_id: str) -> Clip: ...
     def joints(self, clip_id: str, side: Side) -> np.ndarray: ...
@@ -197,7 +199,8 @@ def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
         template_m=_templates(tracks),
         text=np.asarray(annotated.text_embedding(clip_id), dtype=np.float32),
         points=points,
-        contact=contact_of(distances, len(points.points_m)),
+        contact=contact_of(distances, len(points.points_m), annotated.contact_threshold_m),
+        contact_threshold_m=annotated.contact_threshold_m,
         distances=distances,
         world_from_model=_world_from_model(rotation, origin),
     )
@@ -231,10 +234,10 @@ def upright(gravity: np.ndarray | None) -> np.ndarray:
     return rotvec_to_rotmat(axis / sine * np.arctan2(sine, cosine))
 
 
-def contact_of(distances: DistanceEntries, n_points: int) -> np.ndarray:
-    """(2, point) bool: points within 2 cm of a joint of each side in any frame of the entries."""
+def contact_of(distances: DistanceEntries, n_points: int, threshold_m: float) -> np.ndarray:
+    """(2, point) bool: points closer than ``threshold_m`` to a joint of each side in any frame of the entries."""
     contact = np.zeros((2, n_points), dtype=bool)
-    near = distances.distance_m < CONTACT_THRESHOLD_M
+    near = distances.distance_m < threshold_m
     contact[distances.side[near], distances.point[near]] = True
     return contact
 
@@ -269,7 +272,8 @@ class ClipBatch(RequestBatch):
 
     Axes (clip, side, frame, ...), padding is zero. hands (B, 2, F, 99), object (B, F, 10), joints_m (B, 2, F, 21, 3).
     text (B, 4, 512): the four sentences. present (B, 2, F): the side takes part and is tracked in the frame.
-    contact (B, 2, N). entries: (entry, 5) int64 rows (clip, side, frame, joint, point) and their distances (entry,).
+    contact (B, 2, N), at contact_threshold_m, which is that of all clips. entries: (entry, 5) int64 rows (clip, side,
+    frame, joint, point) and their distances (entry,).
     """
 
     samples: tuple[ClipSample, ...]
@@ -278,6 +282,7 @@ class ClipBatch(RequestBatch):
     joints_m: Tensor
     present: Tensor
     contact: Tensor
+    contact_threshold_m: float
     entries: Tensor
     entry_distance_m: Tensor
 
@@ -312,7 +317,8 @@ def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBat
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
     valid = torch.from_numpy(np.stack([_padded(sample.valid, 1, n_frames) for sample in samples]))
     present = valid & asked["active_hands"][:, :, None] & asked["frames"][:, None]
-    return ClipBatch(samples=tuple(samples), present=present, **asked, **tensors)
+    threshold_m = _batch_threshold_m(samples)
+    return ClipBatch(samples=tuple(samples), present=present, contact_threshold_m=threshold_m, **asked, **tensors)
 
 
 def _padded(array: np.ndarray, axis: int, n_frames: int) -> np.ndarray:
@@ -329,3 +335,10 @@ def _entry_rows(samples: Sequence[ClipSample]) -> tuple[np.ndarray, np.ndarray]:
         rows.append(np.stack((clip, entries.side, entries.frame, entries.joint, entries.point), axis=1))
         distances.append(entries.distance_m)
     return np.concatenate(rows), np.concatenate(distances)
+
+
+def _batch_threshold_m(samples: Sequence[ClipSample]) -> float:
+    found = {sample.contact_threshold_m for sample in samples}
+    if len(found) > 1:
+        raise BadInput("collate", "one contact threshold", f"{sorted(found)} m", "batch one dataset at a time")
+    return found.pop()

@@ -32,7 +32,7 @@ from hoidata.hands import HandPair
 from hoidata.store.store import SCHEMA_VERSION
 
 # The code a conversion runs: these rooms of hoidata, and the adapter's own file wherever it lies.
-ROOMS = ("adapters", "schema", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
+ROOMS = ("conversion", "datasets", "store", "clips", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
 LIBRARIES = ("numpy", "scipy", "torch", "trimesh")
 _CACHED_ARRAYS = 32
 

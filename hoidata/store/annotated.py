@@ -104,6 +104,11 @@ class AnnotatedStore:
         """The store's ``meta/info.json``: dataset, synthetic, hand model, licence."""
         return self.store.info
 
+    @property
+    def contact_threshold_m(self) -> float:
+        """The contact stage's: contact maps and distances hold what is closer, metres."""
+        return float(self.contact_info["threshold_m"])
+
     def clip(self, clip_id: str) -> Clip:
         return self.store.clip(clip_id)
 

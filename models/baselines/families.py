@@ -47,12 +47,14 @@ class MeanMotion:
         hands, objects = np.zeros((2, bins, HAND_FEATURES)), np.zeros((bins, OBJECT_FEATURES))
         n_hands, n_objects = np.zeros((2, bins, 1)), np.zeros((bins, 1))
         for sample in train:
-            rows = matched_rows(sample.length, bins)
-            np.add.at(objects, rows, sample.object)
+            # Clip and bins divide the same time: every frame counts in a bin by how long it lies in it.
+            moments = np.arange(sample.length * bins)
+            frames, rows = moments // bins, moments // sample.length
+            np.add.at(objects, rows, sample.object[frames])
             np.add.at(n_objects, rows, 1.0)
             for side in range(2):
-                there = sample.valid[side] & sample.active_hands[side]
-                np.add.at(hands[side], rows[there], sample.hands[side][there])
+                there = (sample.valid[side] & sample.active_hands[side])[frames]
+                np.add.at(hands[side], rows[there], sample.hands[side][frames[there]])
                 np.add.at(n_hands[side], rows[there], 1.0)
         synthetic = any(sample.synthetic for sample in train)
         return cls(_means(hands, n_hands), _means(objects, n_objects), synthetic)

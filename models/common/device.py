@@ -1,17 +1,19 @@
-"""Which device a run computes on."""
+"""On which device networks run: the setting ``device`` of params.yaml as torch's name for it."""
 
 import torch
 
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, MissingResource
 
-SETTINGS = ("auto", "cpu", "cuda")
+DEVICES = ("auto", "cpu", "cuda")
 
 
 def chosen_device(setting: str) -> str:
-    """Torch's name of the device: ``auto`` takes a GPU where there is one. Raises BadInput for a GPU that is absent."""
-    if setting not in SETTINGS:
-        raise BadInput("params.yaml: device", f"one of {', '.join(SETTINGS)}", setting, "correct it")
-    present = torch.cuda.is_available()
-    if setting == "cuda" and not present:
-        raise BadInput("params.yaml: device", "a GPU that torch can use", "none", "set device to auto or cpu")
-    return "cuda" if present and setting != "cpu" else "cpu"
+    """``cuda`` or ``cpu``: auto takes a GPU where torch finds one.
+
+    Raises BadInput for another word, and MissingResource where cuda is asked for and there is none.
+    """
+    if setting not in DEVICES:
+        raise BadInput("params.yaml: device", " or ".join(DEVICES), repr(setting), "correct it")
+    if setting == "cuda" and not torch.cuda.is_available():
+        raise MissingResource("params.yaml: device is cuda, and torch finds no GPU; set it to auto or cpu")
+    return "cuda" if setting != "cpu" and torch.cuda.is_available() else "cpu"

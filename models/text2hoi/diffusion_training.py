@@ -22,7 +22,7 @@ VALIDATION_STEPS = (100, 300, 500, 700, 900)
 
 @dataclass(frozen=True)
 class DiffusionLossConfig:
-    """Weights beside the simple loss (1): eq. 6 in units of (2 cm)^2, eq. 7. frames: how many of a clip they see."""
+    """Weights beside the simple loss (1): eq. 6 in contact thresholds, eq. 7. frames: how many of a clip they see."""
 
     distance_weight: float = 1.0
     orientation_weight: float = 1.0
@@ -127,7 +127,8 @@ class DiffusionObjective:
             generator,
         )
         joints = self.hands.joints(hands, batch.betas, batch.template_m)
-        return losses.distance_map_loss(joints, place_points(batch, objects), rows, distance), orientation
+        points, scale_m = place_points(batch, objects), batch.contact_threshold_m
+        return losses.distance_map_loss(joints, points, rows, distance, scale_m), orientation
 
 
 def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:

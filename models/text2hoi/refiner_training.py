@@ -112,7 +112,7 @@ class RefinerObjective:
         present, true = (losses.take_frames(part, chosen, 2) for part in (coarse.present, seen.true_distance_m))
         skin, inner = self._distances(batch, losses.take_frames(refined, chosen, 2), coarse.object, chosen)
         penetration = losses.penetration_loss(skin, present)
-        contact = losses.contact_loss(inner, true, present)
+        contact = losses.contact_loss(inner, true, present, batch.contact_threshold_m)
         total = weights.simple_weight * simple + weights.penetration_weight * penetration
         total = total + weights.contact_weight * contact
         return {"total": total, "simple": simple, "penetration": penetration, "contact": contact}

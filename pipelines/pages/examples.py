@@ -41,6 +41,6 @@ def motion_contact(annotated: AnnotatedStore, clip_id: str, motion: Clip, hands:
     points = annotated.points(annotated.object_key(clip_id))
     index = ProximityIndex(points)
     joints: dict[Side, np.ndarray] = {side: track_joints(motion.hands[side], hands[side]) for side in SIDES}
-    threshold_m = float(annotated.contact_info["threshold_m"])
+    threshold_m = annotated.contact_threshold_m
     maps = contact_maps(distance_entries(motion, joints, index, threshold_m), len(points.points_m))
     return ContactPaint(points.points_m, points.part, np.maximum(*maps.values()).astype(np.float64))

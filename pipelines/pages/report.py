@@ -1,6 +1,5 @@
 """The report of one profile: a self-contained page over all its datasets, and beside it a page per dataset."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,7 +15,7 @@ from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
 from pipelines.pages.examples import first_motion, motion_contact, shown_ids, true_contact
-from pipelines.pages.metrics_table import Table, metrics_tables
+from pipelines.pages.metrics_table import MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.surface import ContactPaint
@@ -54,8 +53,7 @@ class Section:
     motions: list[Player] = field(default_factory=list)
     motion_facts: list[tuple[str, str]] = field(default_factory=list)
     contact: list[tuple[str, list[Player]]] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
-    metrics_note: str = ""
+    table: MetricsTable | None = None
     curves: list[dict[str, str]] = field(default_factory=list)
     missing: list[tuple[str, str]] = field(default_factory=list)
 
@@ -100,7 +98,6 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
     if facts.empty:
         return Section(facts, title)
     networks = sorted(path for path in (folders.checkpoints / name).glob("*") if path.is_dir())
-    tables, note = _metrics(folders.metrics / f"{name}.json")
     samples = folders.samples / name / families[0]
     motions, motion_facts = _motions(facts, hands, samples)
     return Section(
@@ -112,20 +109,10 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
         motions=motions,
         motion_facts=motion_facts,
         contact=_contact_pairs(facts, hands, samples),
-        tables=tables,
-        metrics_note=note,
+        table=metrics_tables(folders.metrics / name, families),
         curves=[chart for folder in networks if (chart := _loss_chart(name, folder.name, folder / "log.csv"))],
         missing=[(folder.name, reason) for folder in networks if (reason := reason_for_nothing(folder))],
     )
-
-
-def _metrics(path: Path) -> tuple[list[Table], str]:
-    if not path.is_file():
-        return [], "The models of this dataset have not been evaluated."
-    values = json.loads(path.read_text(encoding="utf-8"))
-    if "empty" in values:
-        return [], f"Not evaluated: {values['empty']}."
-    return metrics_tables(values), ""
 
 
 def _what_is_shown(facts: DatasetFacts) -> str:
@@ -151,12 +138,12 @@ def _player(
     annotated: AnnotatedStore, clip_id: str, clip: Clip, hands: HandPair, kind: str, paint: ContactPaint
 ) -> Player:
     sentence = annotated.sentences(clip_id)[0]
-    return motion_player(clip, hands, sentence, f"{kind}: {sentence}", paint, _touched_words(annotated))
+    return motion_player(clip, hands, sentence, f"{kind}: {sentence}", paint, touch_words(annotated))
 
 
-def _touched_words(annotated: AnnotatedStore) -> str:
-    """What a painted point means, with the distance the contact stage used."""
-    return f"within {float(annotated.contact_info['threshold_m']) * 100:g} cm of a joint"
+def touch_words(annotated: AnnotatedStore) -> str:
+    """What a contact map shows, with the threshold it was made with."""
+    return f"within {annotated.contact_threshold_m * 100:g} cm of a joint"
 
 
 def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[tuple[str, list[Player]]]:
@@ -173,7 +160,7 @@ def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[
         paints = {"ground truth": truth, "generated": motion_contact(annotated, clip_id, motion, hands)}
         players = [
             contact_player(
-                clip, paint, f"{caption}: {sentence}", caption, touched_side(clip, truth), _touched_words(annotated)
+                clip, paint, f"{caption}: {sentence}", caption, touched_side(clip, truth), touch_words(annotated)
             )
             for caption, paint in paints.items()
         ]

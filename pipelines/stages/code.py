@@ -40,7 +40,14 @@ class Start:
 
 
 def run(place: Place) -> None:
-    """Write one file per stage, and per dataset, network or family where that chooses among modules."""
+    """Write one file per stage, and per dataset, network or family where that chooses among modules.
+
+    Manifests the graph depends on and nobody has written are written too: those datasets are absent.
+    """
+    from pipelines.stages.adapters import ensure_manifests
+
+    params = read_params(Path())
+    ensure_manifests(params["profile"], params["datasets"])
     write_code(Path())
 
 

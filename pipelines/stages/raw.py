@@ -7,9 +7,9 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_file
 from pipelines.lineage.closure import SourceTree
 from pipelines.lineage.digests import value_digest
-from pipelines.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
+from pipelines.lineage.manifests import Manifest, scan_files, verify_files, write_manifest
 from pipelines.stages.adapters import configured_adapter, manifest_of
-from pipelines.stages.base import Place, jobs, raw_root, root_variable
+from pipelines.stages.base import Place, hand_is_present, jobs, raw_root, root_variable
 
 SHOWN_DIFFERENCES = 5
 WRITER = "hoidata.synthetic.corpus"
@@ -55,7 +55,7 @@ def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
 
 def require_hand(place: Place) -> None:
     """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
-    if not configured_adapter(place.dataset).needs_mano or read_manifest(place.hand_manifest).present:
+    if not configured_adapter(place.dataset).needs_mano or hand_is_present(place.profile):
         return
     raise MissingResource(
         f"{place.dataset} holds MANO parameters and no MANO files are registered. Register at "

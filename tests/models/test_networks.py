@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from models.text2hoi.surface import Surface
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
@@ -17,6 +16,7 @@ from models.text2hoi.contact import ContactConfig, ContactLossConfig, ContactMod
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
+from models.text2hoi.surface import Surface
 
 SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2

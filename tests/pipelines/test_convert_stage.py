@@ -6,20 +6,20 @@ import pytest
 
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput
-from pipelines.stages.adapters import ConvertParams
-from pipelines.stages.base import load_params
+from pipelines.stages.adapters import ConvertSettings
+from pipelines.stages.base import load_settings
 
 PROJECT = Path(__file__).parents[2]
 
 
-def params_of(folder: Path, text: str) -> ConvertParams:
+def params_of(folder: Path, text: str) -> ConvertSettings:
     path = folder / "params.yaml"
     path.write_text(text)
-    return load_params(ConvertParams, "convert", path)
+    return load_settings(ConvertSettings, "convert", path)
 
 
 def test_the_committed_settings_are_every_adapters_defaults():
-    params = load_params(ConvertParams, "convert", PROJECT / "params.yaml")
+    params = load_settings(ConvertSettings, "convert", PROJECT / "params.yaml")
     assert params.adapter("grab") == GrabAdapter()
 
 
@@ -32,7 +32,7 @@ def test_a_dataset_may_have_a_margin_of_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("convert: {margin: 5}", "margin_frames, adapters, got margin"),
+        ("convert: {margin: 5}", "keys among: margin_frames, adapters, got margin"),
         ("convert: {margin_frames: -1}", "margin_frames"),
         ("convert: {adapters: {grab: {margin: 1}}}", "settings of the adapter grab.*margin_frames.*got margin"),
     ],

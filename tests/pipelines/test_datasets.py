@@ -46,7 +46,7 @@ def hoidata(*words: str) -> str:
 
 def run_stages(place: Place) -> dict[str, int]:
     """All stages up to the split; how many clips each part has."""
-    for stage in (raw, convert, quality, annotate, contact, split):
+    for stage in (raw, convert, quality, contact, annotate, split):
         stage.run(place)
     chosen = json.loads((place.splits / "info.json").read_text())["chosen"]
     assert chosen["name"] == "drawn"

@@ -54,6 +54,7 @@ class Clips:
 
     clips: dict[str, Clip]
     sampled: dict[str, SampledPoints] = field(default_factory=dict)
+    contact_threshold_m: float = 0.02
 
     def split_ids(self, split: str) -> list[str]:
         return list(self.clips) if split == "train" else []
@@ -132,6 +133,16 @@ def test_contact_and_distances_are_restricted_to_the_crop_and_to_acting_hands(cl
     assert set(sample.distances.side) == {1}
     assert sample.distances.frame.tolist() == list(range(10))
     assert sample.start == 5
+
+
+def test_the_contact_stages_threshold_decides_what_is_touched_whole_and_cropped(clips: Clips) -> None:
+    """Every entry lies 1 cm away: nothing is closer than half of that."""
+    strict = HoiDataset(replace(clips, contact_threshold_m=0.005), "train")
+    assert not strict.whole("toy/0").touched.any()
+    assert not strict.whole("toy/0").crop(5, 10).touched.any()
+    assert collate([strict.whole("toy/0"), strict.whole("toy/1")]).contact_threshold_m == 0.005
+    with pytest.raises(BadInput, match="one contact threshold"):
+        collate([strict.whole("toy/0"), HoiDataset(clips, "train").whole("toy/1")])
 
 
 def test_random_crops_repeat_with_the_seed_and_reach_the_last_window(clips: Clips) -> None:

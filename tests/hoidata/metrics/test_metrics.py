@@ -218,6 +218,37 @@ def test_the_floor_is_what_falls_by_itself(make_clip, pair_of):
     assert forces.floor_as_released(pair_of(slow, slow, table_m=-1.0), 1)[:-2].all()
 
 
+def test_every_name_in_the_registry_gives_the_figure_it_names(make_clip, pair_of):
+    """Figures that tell all metrics of forces, meshes and derivatives from each other."""
+
+    def figures(pair):
+        found = {metric.name: metric.measure(pair, metric.every) for metric in METRICS}
+        # Without the last two frames, in which forward differences have nothing.
+        inner = {name: values[:-2] if len(values) > 2 else values for name, values in found.items()}
+        return {name: float(values.mean()) for name, values in inner.items() if len(values)}
+
+    held, slow = on_a_hand(make_clip), on_a_hand(make_clip, 0.98, 0.5)
+    carried = figures(pair_of(held, held, table_m=-1.0))
+    alone = {name: value for name, value in figures(pair_of(slow, held, table_m=-1.0)).items() if "realism" in name}
+    assert (carried["realism_si"], carried["realism_released"]) == (1, 1)
+    assert (carried["realism_si_floor"], carried["realism_released_floor"]) == (0, 0)
+    assert alone == {
+        "realism_si": 0,
+        "realism_si_floor": 0,
+        "realism_released": 1,
+        "realism_released_floor": 1,
+    }
+    assert 6 < carried["penetration_mm"] < 15
+    assert carried["deep_share"] in (0, 1)
+    assert carried["capsule_depth_mm"] < 6
+    time = np.arange(12) / FPS
+    joints = np.zeros((12, 21, 3))
+    joints[:, 1:, 0] += 7.0 / 6 * time[:, None] ** 3
+    moving = figures(with_joints(pair_of(held, held), joints))
+    assert moving["jitter_m_s3"] == pytest.approx(7.0 * 20 / 21)
+    assert moving["smoothness_m_s2"] == pytest.approx(7.0 * 20 / 21 * time[1:-1].mean())
+
+
 def test_forces_are_asked_about_above_the_table_of_the_truth_only(make_clip, pair_of):
     held = on_a_hand(make_clip)
     assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M), 1)) == 0

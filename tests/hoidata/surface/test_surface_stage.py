@@ -211,12 +211,12 @@ def test_bytes_repeat_and_shards_do_not_change_what_is_read(written, monkeypatch
 def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_up(written, monkeypatch):
     folder, asked = written[0], []
 
-    def backwards(bench, jobs):
+    def backwards(measure, clip_ids, jobs):
         asked.append(jobs)
-        for clip_id in reversed(bench.store.ids):
-            yield clip_id, (bench.measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
+        for clip_id in reversed(clip_ids):
+            yield clip_id, (measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
 
-    monkeypatch.setattr("hoidata.surface.stage._measured", backwards)
+    monkeypatch.setattr("hoidata.surface.stage.in_workers", backwards)
     left_out = {"test/s2/left": "left out by quality control: so"}
     arguments = {"points": POINTS, "left_out": left_out, "progress": False}
     report = surface_store(folder / "clips", folder / "backwards", jobs=8, **arguments)
@@ -277,8 +277,8 @@ def test_one_mesh_without_a_surface_costs_its_own_clips_only(clips, tmp_path, mo
             raise BadInput("mesh of 'hinged_box'", "at least one triangle", "none")
         return SurfaceIndex(model)
 
-    for module in ("surface_stage", "surface_measure"):
-        monkeypatch.setattr(f"hoidata.contact.{module}.SurfaceIndex", index_of)
+    for module in ("stage", "measure"):
+        monkeypatch.setattr(f"hoidata.surface.{module}.SurfaceIndex", index_of)
     write_store(tmp_path / "clips", clips, generated_info("grab"))
     report = surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
     store = open_surface(tmp_path / "surface")

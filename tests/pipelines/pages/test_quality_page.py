@@ -1,7 +1,7 @@
 """The report's section on quality control: every measure, its limits, and what was left out and why."""
 
 import re
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from hoidata.store.store import write_store
 from pipelines.pages.quality import measures_svg, read_quality
 from pipelines.pages.report import ReportFolders, write_report
 
-LIMITS = {name: limit._asdict() for name, limit in DEFAULT_LIMITS.items()}
+LIMITS = {name: asdict(limit) for name, limit in DEFAULT_LIMITS.items()}
 
 
 @pytest.fixture
