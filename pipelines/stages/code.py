@@ -44,10 +44,12 @@ def run(place: Place) -> None:
 
     Manifests the graph depends on and nobody has written are written too: those datasets are absent.
     """
-    from pipelines.stages.adapters import ensure_manifests
-
     params = read_params(Path())
-    ensure_manifests(params["profile"], params["datasets"])
+    places = [Place(params["profile"], name) for name in params["datasets"]]
+    if not all(path.is_file() for place in places for path in (place.manifest, place.hand_manifest)):
+        from pipelines.stages.adapters import ensure_manifests  # imports adapters, which takes longer than all the rest
+
+        ensure_manifests(params["profile"], params["datasets"])
     write_code(Path())
 
 
