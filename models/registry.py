@@ -5,9 +5,13 @@
 
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any
 
 from hoidata.errors import BadInput
-from models.common.family import Family, Network
+
+# Asking where a family is must not load torch: the stage that digests the code does so each time.
+if TYPE_CHECKING:
+    from models.common.family import Family, Network
 
 ENTRY_POINT_GROUP = "hoidata.families"
 FAMILIES = {
@@ -18,6 +22,13 @@ FAMILIES = {
     "mean-motion": "models.baselines.families:MEAN_MOTION",
     "mean-pose": "models.baselines.families:MEAN_POSE",
     "ground-truth": "models.baselines.families:GROUND_TRUTH",
+}
+# Each in a module of its own, so that a change of one trains no other again.
+NETWORKS = {
+    "contact": "models.text2hoi.contact_training:CONTACT",
+    "length": "models.text2hoi.length_training:LENGTH",
+    "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
+    "refiner": "models.text2hoi.refiner_training:REFINER",
 }
 
 
@@ -31,18 +42,35 @@ def family_module(name: str) -> str:
     return _address(name).partition(":")[0]
 
 
-def load_family(name: str) -> Family:
+def network_modules(name: str) -> list[str]:
+    """The module that defines a network; for one of another package, those of all families that may hold it."""
+    return [address.partition(":")[0] for address in _addresses_of_network(name)]
+
+
+def load_family(name: str) -> "Family":
     """A family by name. Raises BadInput that lists the known ones."""
-    module, _, attribute = _address(name).partition(":")
+    return _load(_address(name))
+
+
+def load_network(name: str) -> "Network":
+    """A network by its name, of whatever family. Raises BadInput that lists the known ones."""
+    if name in NETWORKS:
+        return _load(NETWORKS[name])
+    added = [network for address in _addresses_of_network(name) for network in _load(address).networks]
+    found = {network.name: network for network in added}
+    if name not in found:
+        known = ", ".join([*NETWORKS, *sorted(found)])
+        raise BadInput("network", f"one of {known}", name, "correct the name")
+    return found[name]
+
+
+def _load(address: str) -> Any:
+    module, _, attribute = address.partition(":")
     return getattr(import_module(module), attribute)
 
 
-def load_network(name: str) -> Network:
-    """A network by its name, of whatever family. Raises BadInput that lists the known ones."""
-    networks = {network.name: network for family in family_names() for network in load_family(family).networks}
-    if name not in networks:
-        raise BadInput("network", f"one of {', '.join(sorted(networks))}", name, "correct the name")
-    return networks[name]
+def _addresses_of_network(name: str) -> list[str]:
+    return [NETWORKS[name]] if name in NETWORKS else sorted(point.value for point in _added())
 
 
 def _address(name: str) -> str:

@@ -28,6 +28,7 @@ from models.common.features import (
 
 DOWN = np.array([0.0, 0.0, -1.0])
 Figures = dict[str, dict[str, float]]
+Losses = dict[str, Tensor]
 
 
 class Objective(Protocol):
@@ -39,7 +40,7 @@ class Objective(Protocol):
     @property
     def needs_entries(self) -> bool: ...
 
-    def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         """Named losses of one training batch; "total" is the one to minimise."""
         ...
 

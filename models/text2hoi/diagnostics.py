@@ -12,8 +12,9 @@ from models.common.checkpoints import load_checkpoint
 from models.common.family import Figures, Sources
 from models.common.point_net import normalised_points
 from models.text2hoi.contact import ContactModel
+from models.text2hoi.contact_training import CONTACT, contact_threshold
 from models.text2hoi.length import LengthModel
-from models.text2hoi.networks import CONTACT, LENGTH, contact_threshold
+from models.text2hoi.length_training import LENGTH
 from models.text2hoi.thresholds import best_threshold, contact_probabilities, mean_f1, true_maps
 
 CONTACT_SAMPLES = 32

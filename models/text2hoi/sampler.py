@@ -20,9 +20,11 @@ from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.sampling import SamplerConfig, draw_each
 from models.text2hoi.contact import ContactModel
+from models.text2hoi.contact_training import contact_threshold
 from models.text2hoi.diffusion import Condition
+from models.text2hoi.diffusion_training import motion_generator
 from models.text2hoi.length import LengthModel
-from models.text2hoi.networks import NETWORKS, contact_threshold, motion_generator
+from models.text2hoi.networks import NETWORKS
 from models.text2hoi.refiner import RefinerModel, refine
 from models.text2hoi.surface import Surface
 

@@ -6,7 +6,6 @@ import pytest
 
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput
-from pipelines.lineage.graph import read_graph, read_params
 from pipelines.stages.adapters import ConvertSettings
 from pipelines.stages.base import load_settings
 
@@ -41,11 +40,3 @@ def test_a_dataset_may_have_a_margin_of_its_own(tmp_path):
 def test_a_wrong_setting_is_named_with_the_known_ones(tmp_path, text, problem):
     with pytest.raises(BadInput, match=problem):
         params_of(tmp_path, text).adapter("grab")
-
-
-def test_a_setting_of_one_dataset_decides_no_other_datasets_conversion():
-    graph, values = read_graph(PROJECT), read_params(PROJECT)
-    assert set(values["convert"]["adapters"]) >= set(values["datasets"])
-    for name in values["datasets"]:
-        stage = graph[f"convert@{values['profile']}-{name}"]
-        assert stage.params == ("convert.margin_frames", f"convert.adapters.{name}")

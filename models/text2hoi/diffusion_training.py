@@ -1,6 +1,6 @@
-"""What one training step and one validation of each of the four models are."""
+"""Training of the diffusion network: what one step and one validation are."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -9,68 +9,16 @@ from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from models.common import losses
+from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
+from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points
 from models.common.sampling import TRAIN_STEPS, add_noise, alphas_cumprod
-from models.text2hoi.contact import ContactLossConfig, ContactModel, contact_loss, turned_and_scaled
-from models.text2hoi.diffusion import Condition, DiffusionModel
-from models.text2hoi.length import LengthModel, jittered_frames, length_loss
+from models.text2hoi.contact import ContactModel
+from models.text2hoi.contact_training import CONTACT
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 
-Losses = dict[str, Tensor]
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
-
-
-class ContactObjective:
-    """Text2HOI Sec. 3.1: cross-entropy, Dice and KL divergence."""
-
-    needs_entries = False
-
-    def __init__(self, network: ContactModel, weights: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.weights, self.device = network, weights, device
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
-
-    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
-        some = torch.randperm(points.shape[1], generator=generator)[: self.weights.points].to(self.device)
-        contact_map = batch.contact_map[:, some]
-        noise = torch.randn(len(batch), self.network.config.latent, generator=generator).to(self.device)
-        logits, mean, log_variance = self.network(
-            points[:, some], any_form(batch, generator), batch.active_hands, contact_map, noise
-        )
-        return contact_loss(logits, contact_map, mean, log_variance, self.weights)
-
-    @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
-        assert isinstance(network, ContactModel)
-        held = self.held_out
-        latents = network.draw_latents(8, len(held), torch.Generator().manual_seed(0)).to(self.device)
-        probability = network.sample(held.points_m, held.text[:, 0], held.active_hands, latents).mean(1)
-        return float(nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map))
-
-
-class LengthObjective:
-    """Text2HOI Sec. 4.1, with a likelihood in place of the plain squared error."""
-
-    needs_entries = False
-
-    def __init__(self, network: LengthModel, corpus: Corpus, device: torch.device) -> None:
-        self.network = network
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
-
-    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        frames = jittered_frames(batch.lengths, generator)
-        mean, log_spread = self.network(any_form(batch, generator), batch.active_hands)
-        return length_loss(mean, log_spread, frames)
-
-    @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
-        assert isinstance(network, LengthModel)
-        held = self.held_out
-        errors = [
-            (network.expected_frames(held.text[:, form], held.active_hands) - held.lengths).abs()
-            for form in range(held.text.shape[1])
-        ]
-        return float(torch.stack(errors).mean())
 
 
 @dataclass(frozen=True)
@@ -182,3 +130,24 @@ class DiffusionObjective:
         joints = self.hands.joints(hands, batch.betas, batch.template_m)
         points, scale_m = place_points(batch, objects), batch.contact_threshold_m
         return losses.distance_map_loss(joints, points, rows, distance, scale_m), orientation
+
+
+def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:
+    """The motion generator of a diffusion checkpoint."""
+    assert isinstance(checkpoint.network, DiffusionModel)
+    assert checkpoint.normaliser is not None
+    return MotionGenerator(checkpoint.network, checkpoint.normaliser)
+
+
+def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
+    contact = setup.trained["contact"].network
+    assert isinstance(contact, ContactModel)
+    network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net)).to(setup.device)
+    network.object_net.load_state_dict(contact.object_net.state_dict())
+    normaliser = Normaliser.of(list(setup.corpus.train)).to(setup.device)
+    return DiffusionObjective(network, setup.loss, setup.corpus, setup.hands, normaliser, setup.device), normaliser
+
+
+DIFFUSION = Network(
+    "diffusion", DiffusionConfig, DiffusionModel, _diffusion_objective, DiffusionLossConfig, needs=(CONTACT.name,)
+)

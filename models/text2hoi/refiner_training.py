@@ -9,9 +9,11 @@ from torch.nn.utils.rnn import pad_sequence
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from models.common import losses
 from models.common.corpus import Corpus
+from models.common.family import Network, Objective, Setup
 from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
-from models.text2hoi.refiner import CoarseMotion, RefinerModel, hands_in_object_frame
+from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame
 from models.text2hoi.surface import Surface
 
 GENERATED_AT_ONCE = 32
@@ -166,3 +168,16 @@ class RefinerObjective:
             return self.generator.sample(condition, sampler, noise, draws)
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=draws).to(self.device)
         return self.generator.denoise_once(batch.hands, batch.object, steps, condition, draws)
+
+
+def _refiner_objective(setup: Setup) -> tuple[Objective, None]:
+    generator = motion_generator(setup.trained["diffusion"])
+    network = RefinerModel(setup.network).to(setup.device)
+    models = [sample.object_model for sample in (*setup.corpus.train, *setup.corpus.held_out)]
+    surface = Surface.of(setup.hands, models, setup.loss.field_resolution, setup.device)
+    return RefinerObjective(network, setup.loss, setup.corpus, generator, surface, setup.device, setup.seed), None
+
+
+REFINER = Network(
+    "refiner", RefinerConfig, RefinerModel, _refiner_objective, RefinerLossConfig, needs=(DIFFUSION.name,), crop="start"
+)
