@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import igl.copyleft.cgal as cgal
 import numpy as np
+from numpy.typing import ArrayLike
 
 _WELD_DIGITS = 6
-Profile = list[tuple[float, float]]
 
 
 class Solid(NamedTuple):
@@ -70,7 +70,7 @@ def _compact(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     return Solid(vertices[used], renumbered.reshape(-1, 3).astype(np.int64))
 
 
-def revolved(profile: Profile, sections: int = 40, spacing_m: float = 0.012) -> Solid:
+def revolved(profile: ArrayLike, sections: int = 40, spacing_m: float = 0.012) -> Solid:
     """The solid swept by a profile of (radius, height) points about the z axis, from the axis below to the axis above.
 
     The first and last points lie on the axis. Segments longer than ``spacing_m`` are cut.
