@@ -8,10 +8,11 @@ from rich.table import Table
 
 from hoidata.hands import load_embedded_hands
 from hoidata.physics.contact_forces import RESIDUAL_LIMIT
-from hoidata.synthetic.generate import generate_sequences, worker_pool
+from hoidata.synthetic.generate import generate_sequences
 from hoidata.synthetic.plan import DATASET_IDS, Size
 from hoidata.synthetic.soundness import measure, residuals_without_contact
 from hoidata.synthetic.truth import TruthSequence
+from hoidata.workers import in_workers
 
 SHIFT_M = 0.010
 _DIRECTIONS_SEED = 7
@@ -60,9 +61,8 @@ def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
     """One row per dataset: shares of held frames that pass, extremes in mm, controls, and what the verb explains."""
-    with worker_pool(jobs) as run:
-        figures: list[SequenceFigures] = list(run(sequence_figures, sequences))
-    datasets = dict.fromkeys(one.dataset for one in figures)
+    figures: list[SequenceFigures] = [found for _, found in in_workers(sequence_figures, sequences, jobs)]
+    datasets = dict.fromkeys(truth.dataset for truth in sequences)
     return pd.DataFrame([_row(dataset, [one for one in figures if one.dataset == dataset]) for dataset in datasets])
 
 

@@ -8,12 +8,13 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from hoidata.errors import HoidataError
 from hoidata.files import atomic_folder
 from hoidata.hands import load_embedded_hands
-from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of, worker_pool
+from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.plan import DATASET_IDS, Size
 from hoidata.synthetic.truth import TruthSequence
 from hoidata.synthetic.write_arctic import write_arctic_meta, write_arctic_sequence
 from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
 from hoidata.synthetic.write_h2o import write_h2o_objects_and_lists, write_h2o_sequence
+from hoidata.workers import in_workers
 
 # Per dataset, who writes what all sequences share, and who writes one raw sequence.
 _WRITERS = {
@@ -35,12 +36,12 @@ def write_corpus(
         raise HoidataError(f"no embedded corpus named {dataset!r}; there are {', '.join(DATASET_IDS)}")
     tasks = tasks_of(dataset, seed, size)
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns) as progress, worker_pool(min(jobs, len(tasks))) as run, atomic_folder(root) as partial_root:
-        making = progress.track(run(make_action, tasks), len(tasks), description=f"{dataset}: making")
-        sequences = place_in_raw_sequences(dataset, [pair for pairs in making for pair in pairs])
+    with Progress(*columns) as progress, atomic_folder(root) as partial_root:
+        making = progress.track(in_workers(make_action, tasks, jobs), len(tasks), description=f"{dataset}: making")
+        sequences = place_in_raw_sequences(dataset, [pair for _, pairs in making for pair in pairs])
         write_shared_files(dataset, partial_root, sequences)
         groups = by_raw_sequence(sequences)
-        writing = run(partial(write_raw_sequence, dataset, partial_root), groups)
+        writing = in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
         list(progress.track(writing, len(groups), description=f"{dataset}: writing"))
     return sequences
 

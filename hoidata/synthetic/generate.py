@@ -1,10 +1,6 @@
 """Making the sequences of one corpus: grasps per action, then actions until each is sound. Any number of jobs."""
 
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
-from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +15,7 @@ from hoidata.synthetic.pools import GRASPS_PER_PAIR, search_pool
 from hoidata.synthetic.sequences import Person, draw_length, make_person, make_sequence
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
+from hoidata.workers import in_workers
 
 _ATTEMPTS = 18
 _PERSON_STREAM, _POOL_STREAM = 1_000_001, 1_000_002
@@ -37,9 +34,8 @@ def generate_sequences(dataset: str, seed: int, size: Size = "full", jobs: int =
 
     Raises HoidataError where an action cannot be made sound.
     """
-    with worker_pool(jobs) as run:
-        made = [pair for pairs in run(make_action, tasks_of(dataset, seed, size)) for pair in pairs]
-    return place_in_raw_sequences(dataset, made)
+    made = in_workers(make_action, tasks_of(dataset, seed, size), jobs)
+    return place_in_raw_sequences(dataset, [pair for _, pairs in made for pair in pairs])
 
 
 def tasks_of(dataset: str, seed: int, size: Size) -> list[_Task]:
@@ -124,19 +120,3 @@ def place_in_raw_sequences(dataset: str, made: list[tuple[int, TruthSequence]]) 
                 placed[index] = replace(sequences[index], source_key=key, raw_start=frame)
                 frame += sequences[index].n_frames + GAP_FRAMES
     return placed
-
-
-@contextmanager
-def worker_pool(jobs: int) -> Iterator:
-    """A function that maps a task function over tasks, results in order: here, or in ``jobs`` fresh processes."""
-    if jobs <= 1:
-        yield lambda function, tasks: map(function, tasks)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_one_thread) as executor:
-        yield executor.map
-
-
-def _one_thread() -> None:
-    import torch
-
-    torch.set_num_threads(1)

@@ -4,6 +4,7 @@ Formats: raw-formats.md section 1. MANO translations are of the "add" kind: wris
 turn about J0 stays, so in the camera frame ``t' = A (J0 + t) + b - J0``.
 """
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -136,9 +137,7 @@ def _object_rows(truth: TruthSequence, turn: np.ndarray, eye: np.ndarray) -> tup
     pose[:, :3, :3] = turn @ Rotation.from_rotvec(track.rotvec).as_matrix()
     pose[:, :3, 3] = np.einsum("fij,fj->fi", turn, track.translation_m - eye)
     low, high = track.model.vertices_m.min(0), track.model.vertices_m.max(0)
-    corners = np.array(
-        [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
+    corners = np.array(list(product(*zip(low, high, strict=True))))
     edges = np.array([(corners[a] + corners[b]) / 2 for a, b in _EDGES])
     points = np.concatenate([[(low + high) / 2], corners, edges])
     seen = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]
