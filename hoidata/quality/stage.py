@@ -30,7 +30,7 @@ from hoidata.quality.thresholds import (
     findings,
     reasons_of,
     verdict_of,
-)  # fmt: skip
+)
 from hoidata.settings import plain_config
 from hoidata.store.store import Store, open_store
 from hoidata.workers import in_workers

@@ -22,7 +22,7 @@ from hoidata.store.fields import (
     Field,
     StoreFile,
     Version,
-)  # fmt: skip
+)
 from hoidata.store.mapped import map_npz
 from hoidata.store.meshes import mesh_digest
 from hoidata.store.writing import template_key

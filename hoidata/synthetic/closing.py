@@ -16,7 +16,7 @@ from hoidata.synthetic.hand_capsules import (
     THUMB,
     CapsuleHands,
     capsule_points,
-)  # fmt: skip
+)
 
 PRESS_M = 0.0008
 _LARGEST_STEPS = 70

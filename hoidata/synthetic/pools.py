@@ -21,7 +21,7 @@ from hoidata.synthetic.grasps import (
     posed_hands,
     to_grip,
     verify,
-)  # fmt: skip
+)
 from hoidata.synthetic.hand_capsules import CapsuleHands, capsule_hands
 
 GRASPS_PER_PAIR = 2
