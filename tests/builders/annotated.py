@@ -6,7 +6,7 @@ from pathlib import Path
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import Clip
 from hoidata.contact.stage import contact_store
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 

@@ -13,7 +13,7 @@ from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
 from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
 from hoidata.contact.stage import contact_store
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store

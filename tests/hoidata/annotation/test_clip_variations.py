@@ -23,7 +23,7 @@ from hoidata.clips import Clip, HandTrack, ObjectTrack
 from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store

@@ -20,7 +20,7 @@ from hoidata.files.arrays import read_npz, write_npz
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.objects.surface_index import surface_index
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.hand_evidence import HandDistances, HandEvidence
 from hoidata.store.info import generated_info

@@ -16,7 +16,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import sample_points
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store, write_store

@@ -41,7 +41,8 @@ def pairs(corpus):
     truths, store = corpus
     clips = [store.clip(clip_id) for clip_id in store.ids]
     assert {(clip.sequence, int(clip.source_frames[0])) for clip in clips} == set(truths)
-    return [(clip, truths[clip.sequence, int(clip.source_frames[0])].clip_truth()) for clip in clips]
+    found = [truths[clip.sequence, int(clip.source_frames[0])] for clip in clips]
+    return [(clip, truth.take(truth.clip_frames)) for clip, truth in zip(clips, found, strict=True)]
 
 
 @pytest.mark.slow

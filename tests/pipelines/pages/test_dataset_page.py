@@ -12,7 +12,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput, MissingResource
 from hoidata.quality.stage import quality_store
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store

@@ -8,7 +8,7 @@ import pytest
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips.quarantine import Quarantined
 from hoidata.contact.stage import contact_store
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from models.common.training import UPSTREAM, train_model
