@@ -56,7 +56,7 @@ class CapsuleContacts(NamedTuple):
 
     frame, capsule: (contact,) int. part: (contact,) touched part. depth_m: (contact,) radius less signed distance of
     the deepest axis point. point_m: (contact, 3) nearest surface point to it. normal: (contact, 3) unit, out of the
-    object, the gradient of the signed distance there. along: (contact,) where on the axis the deepest point is, 0 to 1.
+    object, the gradient of the signed distance there.
     """
 
     frame: np.ndarray
@@ -65,7 +65,6 @@ class CapsuleContacts(NamedTuple):
     depth_m: np.ndarray
     point_m: np.ndarray
     normal: np.ndarray
-    along: np.ndarray
 
 
 def joined(hands: list[Capsules]) -> Capsules:
@@ -121,7 +120,7 @@ def _part_contacts(
     point = (world_from_part[frame] @ point[hit][:, None])[:, 0]
     normal = world_from_part[frame].turn(normal[hit][:, None])[:, 0]
     depth = (radius - distance)[hit]
-    return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal, along[hit])
+    return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal)
 
 
 def _candidates(

@@ -23,8 +23,7 @@ import torch
 import trimesh
 
 from hoidata.clips import HandTrack, ObjectTrack
-from hoidata.contact import ProximityIndex
-from hoidata.contact.proximity import CONTACT_THRESHOLD_M
+from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_joints, track_rotmats, write_mano_pickle
 from hoidata.hands.fast_joints import fast_track_joints

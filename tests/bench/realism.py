@@ -40,8 +40,6 @@ def variants(tolerance_m: float) -> dict[str, Variant]:
     return {
         "SI": StandardUnits(),
         f"SI, within {1e3 * tolerance_m:g} mm": StandardUnits(tolerance_m=tolerance_m),
-        "the same, torque / 5 cm": StandardUnits(tolerance_m=tolerance_m, torque_length_m=0.05),
-        "the same, sliding > 10 cm/s": StandardUnits(tolerance_m=tolerance_m, sliding_m_s=0.1),
         "as released": AsReleased(),
         "as released, about origin": AsReleased(reference="origin"),
     }
