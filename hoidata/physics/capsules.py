@@ -83,17 +83,13 @@ def capsule_contacts(
     """
     found = [
         _part_contacts(model, part, poses.world_from_part(model, part), capsules, tolerance_m, at_centre)
-        for part in _parts(model)
+        for part in model.parts
     ]
     every = CapsuleContacts(*(np.concatenate(column) for column in zip(*found, strict=True)))
     order = np.lexsort((-every.depth_m, every.capsule, every.frame))
     frame, capsule = every.frame[order], every.capsule[order]
     first = np.r_[True, (np.diff(frame) != 0) | (np.diff(capsule) != 0)] if len(order) else np.zeros(0, dtype=bool)
     return CapsuleContacts(*(column[order][first] for column in every))
-
-
-def _parts(model: ObjectModel) -> list[int]:
-    return [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
 
 
 def _part_contacts(
@@ -104,7 +100,7 @@ def _part_contacts(
     tolerance_m: float,
     at_centre: bool,
 ) -> CapsuleContacts:
-    faces = model.faces[model.face_part == part] if model.is_articulated else model.faces
+    faces = model.faces_of(part)
     start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
     frame, capsule = _candidates(model.vertices_m[np.unique(faces)], start, end, capsules.radius_m + tolerance_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]

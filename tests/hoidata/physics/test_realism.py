@@ -13,7 +13,7 @@ from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.physics.as_released import AsReleased, friction_edges
 from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts
 from hoidata.physics.contact_forces import cone_edges
-from hoidata.physics.realism import HandMotion, clip_motions, measure, score, smoothness_m_s2
+from hoidata.physics.realism import score, smoothness_m_s2
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits, table_contacts
 
@@ -300,34 +300,3 @@ def test_smoothness_passes_over_frames_without_the_hand():
     joints[::3] = np.nan
     with pytest.raises(ValueError, match="three frames in a row"):
         smoothness_m_s2(joints, turned, 30.0)
-
-
-def test_one_call_gives_shares_floors_penetration_and_smoothness():
-    time = _times()
-    centre = np.tile([0.0, 0.0, 0.5], (20, 1))
-    scene = _scene(centre, hands=_pinch(centre))
-    finger = np.stack([0 * centre, 0.1 + 0.5 * 3.0 * time**2 * [1, 0, 0]], axis=1)
-    turned = np.tile(np.eye(3), (20, 1, 1))
-    motions = {"left": HandMotion(finger, turned), "right": HandMotion(np.full_like(finger, np.nan), turned)}
-    found = measure(scene, motions)
-    assert found.shares == {"SI": 1.0, "as released": 1.0}
-    assert found.floors == {"SI": 0.0, "as released": 1.0}
-    assert found.scored == 20
-    assert found.penetration_m == pytest.approx(0.001, abs=1e-6)
-    assert found.smoothness_m_s2 == {"left": pytest.approx(3.0 / 2)}
-
-
-def test_one_call_measures_the_hands_of_a_clip(make_clip):
-    clip = make_clip(n_frames=12, hand_type="right")
-    clip.hands["right"].valid[3] = False
-    clip.hands["left"].valid[:] = False
-    scene, motions = clip_scene(clip, load_embedded_hands(), table_m=-1.0), clip_motions(clip, load_embedded_hands())
-    found = measure(scene, motions, {"near": StandardUnits(tolerance_m=0.005)})
-    assert list(found.shares) == list(found.floors) == ["near"]
-    assert found.scored == 12
-    assert list(found.smoothness_m_s2) == ["right"]
-    right, track = motions["right"], clip.hands["right"]
-    assert np.isnan(right.joints_m[3]).all()
-    np.testing.assert_allclose(right.joints_m[4:, 0], track.wrist_m[4:], atol=1e-6)
-    turned = Rotation.from_rotvec(track.global_orient).as_matrix()
-    np.testing.assert_allclose(right.wrist_rotmats, turned, atol=1e-6)
