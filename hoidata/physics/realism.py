@@ -5,12 +5,12 @@ Scored are lifted frames in which no capsule is 1.5 cm or more inside the object
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
 from hoidata.physics.as_released import AsReleased
-from hoidata.physics.capsules import CapsuleContacts, capsule_contacts
+from hoidata.physics.capsules import capsule_contacts
 from hoidata.physics.scene import Scene
 from hoidata.physics.standard_units import StandardUnits
 
@@ -18,16 +18,8 @@ LARGEST_PENETRATION_M = 0.015
 SMOOTHNESS_FPS = 60.0
 
 
-class Variant(Protocol):
-    """A way to score frames: ``StandardUnits`` or ``AsReleased``."""
-
-    at_centre: ClassVar[bool]
-
-    @property
-    def limit(self) -> float: ...
-    @property
-    def tolerance_m(self) -> float: ...
-    def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray: ...
+# A way to score frames.
+Variant = StandardUnits | AsReleased
 
 
 class Realism(NamedTuple):

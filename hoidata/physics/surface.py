@@ -90,15 +90,13 @@ def hand_patches(model: HandModel) -> np.ndarray:
     return np.where(joint == 0, 15 + region, joint - 1)
 
 
-def patch_contacts(
-    distances: SurfaceDistances, patches: np.ndarray, frame: int, tolerance_m: float = CONTACT_TOLERANCE_M
-) -> Contacts:
-    """At most one contact per patch: its deepest vertex, where that is nearer than the tolerance.
+def patch_contacts(distances: SurfaceDistances, patches: np.ndarray, frame: int) -> Contacts:
+    """At most one contact per patch: its deepest vertex, where that is nearer than 2 mm.
 
     The contact point is the closest surface point. patches: (point,) as from :func:`hand_patches`, any numbering.
     """
     order = np.argsort(distances.distance_m[frame], kind="stable")
-    order = order[distances.distance_m[frame][order] < tolerance_m]
+    order = order[distances.distance_m[frame][order] < CONTACT_TOLERANCE_M]
     first = np.unique(patches[order], return_index=True)[1]
     chosen = order[first]
     return Contacts(distances.closest_m[frame][chosen], distances.normal[frame][chosen])

@@ -193,7 +193,7 @@ def test_variations_follow_the_four_forms_and_leave_them_as_they_are(plain: Path
     assert len(before.ids()) == 14
     for key in before.ids():
         assert after.sentences(key) == before.sentences(key)
-        assert after.text_features(key).tobytes() == before.text_features(key).tobytes()
+        assert after.text_embedding(key).tobytes() == before.text_embedding(key).tobytes()
         assert (before.variations(key), before.variation_features(key).shape) == ((), (0, 512))
         assert len(after.variations(key)) == 5
         np.testing.assert_array_equal(after.variation_features(key), encoder.encode(after.variations(key)))
