@@ -135,10 +135,12 @@ def default_grammar() -> Grammar:
     rows = list(csv.DictReader(table.splitlines()))
     forms = ("base", "gerund", "past_participle", "third_singular")
     verbs = {row["base"]: VerbForms(*(row[name] for name in forms)) for row in rows if row["kind"] == "verb"}
-    objects = [
-        (row["base"], row["noun_phrase"], cast(Number, row["number"])) for row in rows if row["kind"] == "object"
-    ]
-    return Grammar(verbs, {base: NounPhrase(base, words, number) for base, words, number in objects})
+    nouns = {
+        row["base"]: NounPhrase(row["base"], row["noun_phrase"], cast(Number, row["number"]))
+        for row in rows
+        if row["kind"] == "object"
+    }
+    return Grammar(verbs, nouns)
 
 
 @lru_cache(maxsize=1)

@@ -106,9 +106,13 @@ def _is_inside_out(surface: MergedSurface, closed: bool) -> bool:
     """Negative volume: more than rounding of it (two opposite shells enclose nothing), or where the surface is open
     and its volume vague, more than 1 % of the bounding box.
     """
-    corners = (surface.vertices_m - surface.vertices_m.mean(axis=0))[surface.faces]
-    volume = np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    return bool(volume < -(1e-6 if closed else 0.01) * np.ptp(surface.vertices_m, axis=0).prod())
+    return bool(volume_m3(*surface) < -(1e-6 if closed else 0.01) * np.ptp(surface.vertices_m, axis=0).prod())
+
+
+def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
+    """Volume a closed surface encloses by the divergence theorem; negative when it is turned inside out."""
+    corners = (vertices_m - vertices_m.mean(axis=0))[faces]
+    return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 
 
 def _chunks(points_m: np.ndarray) -> list[np.ndarray]:

@@ -36,7 +36,6 @@ class AsReleased:
     limit: float = 0.01
     tolerance_m: float = 0.0
     reference: Literal["centre of mass", "origin"] = "centre of mass"
-    name: ClassVar[str] = "as released"
     at_centre: ClassVar[bool] = True
 
     def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray:

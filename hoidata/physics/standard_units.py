@@ -30,7 +30,6 @@ class StandardUnits:
     limit: float = RESIDUAL_LIMIT
     tolerance_m: float = 0.0
     table_m: float | None = None
-    name: ClassVar[str] = "SI"
     at_centre: ClassVar[bool] = False
 
     def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray:

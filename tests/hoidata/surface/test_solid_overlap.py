@@ -8,8 +8,9 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
+from hoidata.objects.distance import volume_m3
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.objects.solid import patched_holes, volume_m3
+from hoidata.objects.solid import patched_holes
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.surface.solid_overlap import SolidOverlap
 
