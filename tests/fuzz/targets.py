@@ -204,7 +204,7 @@ def _numpy_files() -> list[Target]:
             "npz-pieces",
             lambda: [*seeds.npz_object_files(), *seeds.near_pieces()],
             on_disk("a.npz", _pieces),
-            [item for item in functions_of(array_pieces) if item.__name__ != "_readable"],
+            functions_of(array_pieces),
             zip_words,
             zip_mutation(objects),
         ),

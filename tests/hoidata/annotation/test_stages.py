@@ -124,7 +124,7 @@ def test_every_clip_with_words_has_its_part(annotated: AnnotatedStore) -> None:
 def test_features_are_those_of_the_sentences(annotated: AnnotatedStore) -> None:
     encoder = load_encoder("hash")
     for key in annotated.ids():
-        np.testing.assert_array_equal(annotated.text_features(key), encoder.encode(annotated.sentences(key)))
+        np.testing.assert_array_equal(annotated.text_embedding(key), encoder.encode(annotated.sentences(key)))
     assert annotated.encoder_identity == encoder.identity
 
 

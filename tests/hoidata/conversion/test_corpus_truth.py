@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.contact import ProximityIndex, acting_hands
+from hoidata.contact.hands import acting_hands
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import get_adapter
 from hoidata.files import load_npy, load_npz_objects

@@ -5,8 +5,9 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
+from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.objects.sampling import SampledPoints, farthest_points, sample_points
+from hoidata.objects.sampling import SampledPoints, sample_points
 
 
 def rigid(mesh: trimesh.Trimesh) -> ObjectModel:
