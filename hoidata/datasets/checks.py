@@ -5,7 +5,10 @@ from typing import Any
 
 import numpy as np
 
+from hoidata.clips.clip import BodyTrack
 from hoidata.errors import BadInput
+
+BODY_COLUMNS = {"transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
 
 
 def table(where: str, value: Any, columns: int, rows: int | None = None, row: str = "frames") -> np.ndarray:
@@ -34,6 +37,19 @@ def finite(where: str, array: np.ndarray) -> None:
     good = np.isfinite(array).reshape(len(array), -1).all(axis=1)
     if not good.all():
         raise BadInput(where, "finite numbers", f"NaN or infinity in row {int(np.argmin(good))}")
+
+
+def body_track(where: str, params: Any, n_frames: int, further: Mapping[str, int] | None = None) -> BodyTrack:
+    """The parameters of the person's SMPL-X body, float32.
+
+    further: columns of the entries not every source has.
+    """
+    values = {
+        name: table(f"{where}: {name}", entry(where, params, name), columns, n_frames).astype(np.float32)
+        for name, columns in {**BODY_COLUMNS, **(further or {})}.items()
+    }
+    face = np.concatenate([values.pop(name) for name in ("jaw_pose", "leye_pose", "reye_pose")], axis=1)
+    return BodyTrack(values.pop("transl"), face_pose=face, **values)
 
 
 def rigid_transforms(folder: str, names: Sequence[str], matrices: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hoidata.geometry.intervals import runs
 from hoidata.objects.resting import Footing
 
 NO_HAND_M = 0.03  # farther from the object's box than any joint's flesh is thick
@@ -109,7 +110,7 @@ def _rests(thing: TrackedObject, joints_m: np.ndarray, camera_rotation: np.ndarr
     corners = np.array(list(product(*thing.footing.box_m.T)))
     scene = _Scene(thing, _placed(corners, thing.poses), joints_m, below_head)
     rests = []
-    for start, stop in _runs(thing.frames & _hands_away(thing, joints_m)):
+    for start, stop in runs(thing.frames & _hands_away(thing, joints_m)):
         middle = np.median(scene.corners[start:stop], axis=0)
         off = np.linalg.norm(scene.corners[start:stop] - middle, axis=-1).max(axis=1)
         still = start + np.flatnonzero(off < STILL_M)
@@ -159,14 +160,8 @@ def _hands_away(thing: TrackedObject, joints_m: np.ndarray) -> np.ndarray:
 
 def _watched(frames: np.ndarray, start: int, stop: int) -> np.ndarray:
     """Frame numbers around a stretch, as far as the same object is tracked without a break."""
-    first, last = next((a, b) for a, b in _runs(frames) if a <= start < b)
+    first, last = next((a, b) for a, b in runs(frames) if a <= start < b)
     return np.arange(max(first, start - WATCHED_FRAMES), min(last, stop + WATCHED_FRAMES))
-
-
-def _runs(mask: np.ndarray) -> list[tuple[int, int]]:
-    """Half-open ranges in which ``mask`` holds."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], mask, [False])).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _different(rests: Sequence[_Rest]) -> int:

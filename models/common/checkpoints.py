@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from hoidata.errors import BadInput
 from hoidata.files import atomic_file, canonical_json
-from models.common.config import build_config, plain_config
+from hoidata.settings import build_config, plain_config
 from models.common.family import Network
 from models.common.features import Normaliser
 

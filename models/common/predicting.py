@@ -15,10 +15,10 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.files import atomic_file, atomic_folder
 from hoidata.hands import HandPair
+from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
-from models.common.config import build_config
 from models.common.family import Family, Sampler, Sources
 
 CLIPS_AT_ONCE = 32

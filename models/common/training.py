@@ -19,9 +19,9 @@ from torch import nn
 from hoidata.errors import BadInput
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
+from hoidata.settings import build_config, plain_config
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import empty_reason, load_checkpoint, save_checkpoint, write_empty
-from models.common.config import build_config, plain_config
 from models.common.corpus import Corpus, batches
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands

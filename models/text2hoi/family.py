@@ -8,7 +8,7 @@ import numpy as np
 from hoidata.batches.dataset import HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
-from models.common.config import build_config
+from hoidata.settings import build_config
 from models.common.family import Family, Sources
 from models.text2hoi.diagnostics import diagnose
 from models.text2hoi.networks import NETWORKS

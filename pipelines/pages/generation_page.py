@@ -6,7 +6,7 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.files.arrays import write_npz
-from hoidata.hands import HandPair, track_joints, track_vertices
+from hoidata.hands import HandPair, track_joints
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import motion_player, write_motion_page
@@ -21,7 +21,6 @@ ARRAYS = {
     "valid": "(S, F) whether the hand takes part",
     "joints_m": "(S, F, 21, 3) MANO's 16 joints, then the tips of index, middle, pinky, ring, thumb",
     "coarse_joints_m": "(S, F, 21, 3) the same before refinement",
-    "vertices_m": "(S, F, 778, 3) hand meshes",
     "wrist_m": "(S, F, 3) world position of the wrist joint",
     "global_orient": "(S, F, 3) axis-angle about the wrist joint",
     "hand_pose": "(S, F, 45) axis-angle of the 15 finger joints; zero is the flat hand",
@@ -38,18 +37,16 @@ ARRAYS = {
 }
 
 
-def write_generation(
-    out_dir: str | Path, motion: GeneratedMotion, hands: HandPair, vertices: bool = False
-) -> list[Path]:
+def write_generation(out_dir: str | Path, motion: GeneratedMotion, hands: HandPair) -> list[Path]:
     """Write motion.npz, motion.glb and index.html; the same motion gives the same bytes. Gives the three paths.
 
-    hands: the model the motion's parameters belong to. vertices: also store the hand meshes (19 KB per frame).
+    hands: the model the motion's parameters belong to.
     """
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
     text = str(motion.evidence["text"])
     paint = generated_contact(motion)
-    arrays = motion_arrays(motion, hands, vertices)
+    arrays = motion_arrays(motion, hands)
     write_npz(folder / "motion.npz", arrays)
     write_glb(folder / "motion.glb", motion.clip, hands, paint)
     write_motion_page(
@@ -88,8 +85,8 @@ def generation_facts(motion: GeneratedMotion) -> list[tuple[str, str]]:
     ]
 
 
-def motion_arrays(motion: GeneratedMotion, hands: HandPair, vertices: bool = False) -> dict[str, np.ndarray]:
-    """The arrays of motion.npz, as ``ARRAYS`` explains them; ``vertices_m`` only if asked.
+def motion_arrays(motion: GeneratedMotion, hands: HandPair) -> dict[str, np.ndarray]:
+    """The arrays of motion.npz, as ``ARRAYS`` explains them.
 
     Metres, radians, 30 fps, the clip's world frame. Rows of a hand where ``valid`` is False are zero.
     """
@@ -108,9 +105,6 @@ def motion_arrays(motion: GeneratedMotion, hands: HandPair, vertices: bool = Fal
         "joints_m": joints,
         "coarse_joints_m": coarse,
     }
-    if vertices:
-        meshes = [track_vertices(clip.hands[side], hands[side]) for side in SIDES]
-        arrays["vertices_m"] = _where_valid(meshes, valid)
     for name in ("wrist_m", "global_orient", "hand_pose"):
         arrays[name] = _where_valid([getattr(clip.hands[side], name) for side in SIDES], valid)
     return arrays | {"betas": _betas(clip)} | _object_arrays(motion)

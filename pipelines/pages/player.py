@@ -4,6 +4,7 @@ three.js and its GLTFLoader (MIT) lie in ``vendor``, where their version and lic
 """
 
 import base64
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -99,26 +100,17 @@ def write_motion_page(
     facts: list[tuple[str, str]],
     synthetic: bool,
     subtitle: str = "",
-    files: list[tuple[str, str]] | None = None,
-    figures: list[dict[str, str]] | None = None,
-    arrays: list[tuple[str, str]] | None = None,
+    files: Sequence[tuple[str, str]] = (),
+    arrays: Sequence[tuple[str, str]] = (),
 ) -> Path:
-    """Write one self-contained page that plays ``player``.
-
-    facts, files, arrays: (name, text) rows. figures: dicts of ``title`` and ``svg`` (trusted markup).
-    """
+    """Write one self-contained page that plays ``player``. facts, files, arrays: (name, text) rows."""
     page = render_page(
         "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
-        files=files or [], arrays=arrays or [], figures=trusted_figures(figures or []), has_players=True,
+        files=files, arrays=arrays, has_players=True,
     )  # fmt: skip
     with atomic_file(path) as partial:
         partial.write_text(page, encoding="utf-8")
     return Path(path)
-
-
-def trusted_figures(figures: list[dict[str, str]]) -> list[dict[str, str]]:
-    """Mark the drawings made by this room as finished markup, so that the template does not escape them."""
-    return [{**figure, "svg": Markup(figure["svg"])} for figure in figures]
 
 
 @lru_cache(maxsize=1)

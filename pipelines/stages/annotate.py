@@ -16,11 +16,6 @@ def run(place: Place) -> None:
     if reason := empty_reason(place.clips):
         write_empty(place.annotation, reason)
         return
-    annotate(place, settings)
-
-
-def annotate(place: Place, settings: AnnotationSettings) -> None:
-    """Clips to words."""
     from hoidata.annotation.stage import annotate_store
     from hoidata.quality.verdicts import left_out_reasons
 

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_folder
@@ -21,15 +20,6 @@ if TYPE_CHECKING:
 
 EMPTY = "empty.json"
 HAND = "hand"
-
-
-class StageParams(BaseModel):
-    """A stage's section of params.yaml. Frozen; unknown keys fail and the known ones are listed."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-
-Params = TypeVar("Params", bound=StageParams)
 Settings = TypeVar("Settings")
 
 
@@ -118,18 +108,6 @@ def load_settings(kind: type[Settings], section: str, path: Path = Path("params.
 def read_section(section: str, path: Path = Path("params.yaml")) -> dict[str, Any]:
     """One section of params.yaml as it stands there; an empty one where nothing is chosen."""
     return _sections(path).get(section) or {}
-
-
-def load_params(kind: type[Params], section: str, path: Path = Path("params.yaml")) -> Params:
-    """One section of params.yaml, checked. Raises BadInput that names the wrong key and lists the known ones."""
-    values = read_section(section, path)
-    known = ", ".join(kind.model_fields) or "none"
-    try:
-        return kind.model_validate(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise BadInput(f"{path}: {section}", f"keys among: {known}", f"{key}: {first['msg']}", "correct it") from error
 
 
 def _sections(path: Path) -> dict[str, Any]:

@@ -10,11 +10,6 @@ def run(place: Place) -> None:
     if reason := empty_reason(place.clips):
         write_empty(place.contact, reason)
         return
-    measure(place, settings)
-
-
-def measure(place: Place, settings: ContactSettings) -> None:
-    """Clips to contact and distance maps."""
     from hoidata.contact.stage import contact_store
 
     print_counts(place, contact_store(place.clips, place.contact, settings, hands=load_hands(place.profile)))

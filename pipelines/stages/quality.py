@@ -10,11 +10,6 @@ def run(place: Place) -> None:
     if reason := empty_reason(place.clips):
         write_empty(place.quality, reason)
         return
-    judge(place, thresholds)
-
-
-def judge(place: Place, thresholds: Thresholds) -> None:
-    """Clips to measures and verdicts."""
     from hoidata.quality.stage import quality_store
 
     hands = load_hands(place.profile)

@@ -12,11 +12,6 @@ def run(place: Place) -> None:
     if reason:
         write_empty(place.surface, reason)
         return
-    measure(place, settings)
-
-
-def measure(place: Place, settings: SurfaceSettings) -> None:
-    """Clips to exact contact, depth and maps; the maps lie on the points of the stage contact."""
     from hoidata.quality.verdicts import left_out_reasons
     from hoidata.surface.stage import surface_store
 

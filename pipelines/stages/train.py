@@ -1,24 +1,26 @@
 """Stage train: one network on one dataset, with the record of what it was made from."""
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.files.atomic import atomic_folder
 from models.common.device import chosen_device
-from models.common.family import Network
 from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph, read_params
 from pipelines.lineage.provenance import build_provenance
-from pipelines.stages.base import Place, StageParams, empty_reason, load_hands, load_params, write_empty
+from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
 
 
-class TrainParams(StageParams):
+@dataclass(frozen=True)
+class TrainParams:
     """size: which of the two budgets to take. Each holds a section per network, whose keys the network checks."""
 
     size: Literal["demo", "paper"]
     seed: int
-    demo: dict[str, dict[str, Any]]
-    paper: dict[str, dict[str, Any]]
+    demo: Mapping[str, Any]
+    paper: Mapping[str, Any]
 
     def of(self, network: str) -> dict[str, Any]:
         """The network's section in the chosen size, with the seed; a network without one keeps its defaults."""
@@ -33,14 +35,9 @@ def run(place: Place) -> None:
         if reason := empty_reason(folder):
             write_empty(place.checkpoint, reason)
             return
-    train(place, network, needed)
-
-
-def train(place: Place, network: Network, needed: dict[Network, Path]) -> None:
-    """Train, and store with the weights what they were made from."""
     from models.common.training import train_network
 
-    params = load_params(TrainParams, "train").of(network.name)
+    params = load_settings(TrainParams, "train").of(network.name)
     stage = producers(read_graph(Path()))[place.checkpoint.as_posix()].name
     with atomic_folder(place.checkpoint) as partial:
         train_network(

@@ -34,6 +34,7 @@ from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
 from pipelines.lineage import manifests
 from pipelines.stages import base
+from pipelines.stages.adapters import ConvertSettings
 from tests.fuzz import seeds
 from tests.fuzz.coverage import functions_of
 from tests.fuzz.engine import Target
@@ -418,18 +419,14 @@ def _settings() -> list[Target]:
             "params-yaml",
             lambda: [text],
             on_disk("params.yaml", _params),
-            (base.load_params, base._sections),
+            (base.load_settings, base._sections),
             (b"convert: ", b"- ", b"!!python/object/apply:os.system ", b"&a ", b"*a", b"<<: *a\n", b"{", b"]", b"? "),
         ),
     ]
 
 
-class _Margin(base.StageParams):
-    margin_frames: int = 0
-
-
 def _params(path: Path) -> Any:
-    return base.load_params(_Margin, "convert", path)
+    return base.load_settings(ConvertSettings, "convert", path)
 
 
 def _own_root(path: Path) -> Any:

@@ -17,7 +17,8 @@ from hoidata.objects.mesh import load_mesh
 from hoidata.store.mapped import map_npz
 from hoidata.store.store import open_store
 from pipelines.lineage.manifests import read_manifest
-from pipelines.stages.base import StageParams, load_params, own_root
+from pipelines.stages.adapters import ConvertSettings
+from pipelines.stages.base import load_settings, own_root
 
 
 def archive(content: bytes, kind: int = zipfile.ZIP_STORED) -> bytes:
@@ -125,4 +126,4 @@ def test_settings_that_are_no_toml_are_bad_input(tmp_path: Path, monkeypatch: py
 def test_params_that_are_no_sections_are_bad_input(tmp_path: Path, text: str) -> None:
     (tmp_path / "params.yaml").write_bytes(text.encode("utf-8", "surrogateescape"))
     with pytest.raises(BadInput, match=r"params\.yaml"):
-        load_params(StageParams, "convert", tmp_path / "params.yaml")
+        load_settings(ConvertSettings, "convert", tmp_path / "params.yaml")

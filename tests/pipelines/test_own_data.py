@@ -16,7 +16,7 @@ from hoidata.synthetic.corpus import write_corpus
 from pipelines.cli import app
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import Place, load_params
+from pipelines.stages.base import Place, load_settings
 from pipelines.stages.train import TrainParams
 
 PROJECT = Path(__file__).parents[2]
@@ -210,7 +210,7 @@ def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
     values["train"]["sizes"] = 3
     path.write_text(yaml.safe_dump(values))
     with pytest.raises(BadInput, match="size, seed, demo, paper"):
-        load_params(TrainParams, "train", path)
+        load_settings(TrainParams, "train", path)
 
 
 def test_places_of_two_profiles_never_meet():

@@ -14,7 +14,6 @@ from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.arctic.files import (
     Description,
-    body_track,
     head_camera,
     parse_descriptions,
     parse_misc,
@@ -255,7 +254,7 @@ def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair, with_body: boo
     )
     camera = _camera(raw, paths["egocam.dist.npy"], key.subject, len(pose))
     body_path = paths["smplx.npy"]
-    body = body_track(body_path, load_npy_object(raw.file(body_path)), len(pose)) if with_body else None
+    body = checks.body_track(body_path, load_npy_object(raw.file(body_path)), len(pose)) if with_body else None
     return _Motion(tracks, track, camera, body)
 
 

@@ -1,4 +1,4 @@
-"""What ARCTIC's small files say: descriptions, part ids, image offsets, the head camera and the body (Fan et al. 2023).
+"""What ARCTIC's small files say: descriptions, part ids, image offsets and the head camera (Fan et al. 2023).
 
 The ``parse_`` functions take the bytes of a file and open nothing.
 """
@@ -10,14 +10,13 @@ from typing import Any, get_args
 import numpy as np
 import orjson
 
-from hoidata.clips.clip import BodyTrack, CameraTrack, HandType
+from hoidata.clips.clip import CameraTrack, HandType
 from hoidata.datasets import checks
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 
 LARGEST_TEXT_BYTES = 16 << 20
 EGO_IMAGE_SIZE = (2800, 2000)  # width, height of the head camera's images
-BODY_COLUMNS = {"transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
 _RANGE = re.compile(r"([0-9]{1,9})-([0-9]{1,9})")
 _ROTATION_ERROR = 1e-3
 
@@ -110,16 +109,6 @@ def head_camera(where: str, content: Any, n_frames: int, image_offset: int) -> C
         images=np.arange(n_frames, dtype=np.int32) + np.int32(image_offset),
         intrinsics=np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *EGO_IMAGE_SIZE]),
     )
-
-
-def body_track(where: str, content: Any, n_frames: int) -> BodyTrack:
-    """The subject's SMPL-X body; ARCTIC files no expressions."""
-    values = {
-        name: checks.table(f"{where}: {name}", checks.entry(where, content, name), columns, n_frames).astype(np.float32)
-        for name, columns in BODY_COLUMNS.items()
-    }
-    face = np.concatenate([values[name] for name in ("jaw_pose", "leye_pose", "reye_pose")], axis=1)
-    return BodyTrack(values["transl"], values["global_orient"], values["body_pose"], face)
 
 
 def _matrices(where: str, value: Any, n_frames: int) -> np.ndarray:

@@ -44,7 +44,6 @@ PARTS = (
     ),
 )
 MEMBERS = ("obj_name", "motion_intent", "framerate", "n_frames", "lhand", "rhand", "object")
-BODY_COLUMNS = {"transl": 3, "global_orient": 3, "body_pose": 63, "jaw_pose": 3, "leye_pose": 3, "reye_pose": 3}
 MOST_COMPONENTS = 45
 
 
@@ -190,19 +189,8 @@ def _table(raw: RawTree, file: _SequenceFile, frames: np.ndarray) -> tuple[Objec
 
 
 def _body(file: _SequenceFile, frames: np.ndarray) -> BodyTrack:
-    where, params = f"{file.path}: body", file.params("body")
-    values = {
-        name: checks.table(f"{where}.{name}", checks.entry(where, params, name), columns, file.n_frames)[frames]
-        for name, columns in {**BODY_COLUMNS, "expression": 10}.items()
-    }
-    values = {name: value.astype(np.float32) for name, value in values.items()}
-    return BodyTrack(
-        transl_m=values["transl"],
-        global_orient=values["global_orient"],
-        body_pose=values["body_pose"],
-        face_pose=np.concatenate([values[name] for name in ("jaw_pose", "leye_pose", "reye_pose")], axis=1),
-        expression=values["expression"],
-    )
+    body = checks.body_track(f"{file.path}: body", file.params("body"), file.n_frames, {"expression": 10})
+    return body.take(frames)
 
 
 def _hand(raw: RawTree, file: _SequenceFile, side: Side, frames: np.ndarray, hands: HandPair) -> HandTrack:

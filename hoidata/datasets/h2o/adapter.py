@@ -28,6 +28,7 @@ from hoidata.datasets.h2o.files import (
 from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
 from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
+from hoidata.geometry.intervals import runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
@@ -213,14 +214,14 @@ def _tracked_pieces(
     classes = frames.classes[start:stop]
     counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))
     wanted = int(counts.argmax()) if label is None else OBJECTS.index(ACTIONS[label][1])
-    runs = [(first, last) for first, last in label_runs((classes == wanted).astype(int)) if last - first >= shortest]
-    if not counts.any() or not runs:
+    long = [(first, last) for first, last in runs(classes == wanted) if last - first >= shortest]
+    if not counts.any() or not long:
         thing = "one object" if label is None else f"class {wanted} ({OBJECTS[wanted]}), the object of action {label},"
         got = f"classes {np.unique(classes).tolist()} ({named_frames})"
         expected = f"{thing} for {shortest} frames or more"
         raise BadInput(f"{frames.folder}/obj_pose_rt", expected, got, "check the annotation")
     verb = None if label is None else ACTIONS[label][0]
-    return [_Run(start + first, start + last, verb, OBJECTS[wanted]) for first, last in runs]
+    return [_Run(start + first, start + last, verb, OBJECTS[wanted]) for first, last in long]
 
 
 def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) -> str:

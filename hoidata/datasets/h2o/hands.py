@@ -8,6 +8,7 @@ import numpy as np
 from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHand, hand_track, to_track
 from hoidata.datasets.h2o.files import SequenceFrames
+from hoidata.geometry.intervals import runs
 from hoidata.hands import HandPair, track_joints
 from hoidata.hands.fitting import fit_hands, fit_shape
 from hoidata.hands.joint_orders import openpose_to_mano_order
@@ -99,8 +100,7 @@ class KeypointHands:
         """The track and the error (valid frame, 21) of one hand: each stretch of valid frames is fitted by itself."""
         valid = _known(points)
         numbers, errors = np.zeros((len(points), 3 + 3 + 45)), [np.zeros((0, 21))]
-        edges = np.flatnonzero(np.diff(np.concatenate(([False], valid, [False])).astype(np.int8))).reshape(-1, 2)
-        for first, last in edges:
+        for first, last in runs(valid):
             fit = fit_hands({side: points[first:last]}, self.models, self.betas)[side]
             numbers[first:last] = np.concatenate((fit.wrist_m, fit.global_orient, fit.hand_pose), axis=1)
             errors.append(fit.error_m)

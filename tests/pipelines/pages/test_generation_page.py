@@ -32,12 +32,6 @@ def test_arrays_open_without_pickle_and_hold_the_motion(motion, hands, tmp_path)
     assert np.array_equal(arrays["joints_m"][1], track_joints(motion.clip.hands["right"], hands.right))
     assert arrays["contact"].shape == (1024,)
     assert np.allclose(arrays["object_translation_m"], motion.clip.object.translation_m, atol=1e-6)
-    assert "vertices_m" not in arrays
-
-
-def test_hand_meshes_are_stored_when_asked_for(motion, hands, tmp_path):
-    with np.load(write_generation(tmp_path, motion, hands, vertices=True)[0], allow_pickle=False) as archive:
-        assert archive["vertices_m"].shape == (2, motion.clip.n_frames, 778, 3)
 
 
 def test_page_names_seed_hands_length_and_that_it_is_synthetic(motion, hands, tmp_path):
@@ -50,7 +44,7 @@ def test_page_names_seed_hands_length_and_that_it_is_synthetic(motion, hands, tm
 
 
 def test_every_array_is_explained_on_the_page(motion, hands, tmp_path):
-    paths = write_generation(tmp_path, motion, hands, vertices=True)
+    paths = write_generation(tmp_path, motion, hands)
     page = paths[2].read_text()
     with np.load(paths[0], allow_pickle=False) as archive:
         assert set(archive.files) <= set(ARRAYS)
