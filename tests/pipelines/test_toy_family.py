@@ -5,6 +5,7 @@ import shutil
 from pathlib import Path
 
 import pytest
+import yaml
 
 from pipelines.lineage.provenance import read_checkpoint_metadata
 
@@ -20,23 +21,17 @@ def add_line(path: Path, before: str, line: str) -> None:
 
 
 def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(project: Path, project_tools) -> None:
-    project_tools.set_present(project, {"grab"})
-    # Only so that the test is quick: Text2HOI's own stages would run as well.
-    (project / "models" / "text2hoi" / "dvc.yaml").unlink()
     params = project / "params.yaml"
-    params.write_text(
-        "".join(
-            "families:\n" if line.startswith("families:") else line
-            for line in params.read_text().splitlines(keepends=True)
-            if line.strip() not in ("- text2hoi", "- text2hoi-coarse", "- other-prompt")
-        )
-    )
+    # One dataset and none of Text2HOI's stages, only so that the test is quick.
+    values = yaml.safe_load(params.read_text()) | {"datasets": ["grab"], "families": ["ground-truth"]}
+    project_tools.write_params(project, values)
+    (project / "models" / "text2hoi" / "dvc.yaml").unlink()
     shutil.copytree(FOLDER, project / "models" / "toy", ignore=shutil.ignore_patterns("__pycache__"))
     (project / "models" / "toy" / "__init__.py").touch()
     typed = (
         (project / "models" / "registry.py", '    "nearest-clip"', '    "toy": "models.toy.family:TOY",'),
         (project / "models" / "registry.py", '    "contact"', '    "toy": "models.toy.family:NETWORK",'),
-        (params, "- nearest-clip", "- toy"),
+        (params, "- ground-truth", "- toy"),
     )
     for path, before, line in typed:
         add_line(path, before, line)
