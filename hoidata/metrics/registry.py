@@ -97,26 +97,26 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,
-        f"{MANIPNET} and Appendix A, in SI units", samples=2, thresholds=FORCES,
+        f"{MANIPNET} and Appendix A, in SI units", samples=1, thresholds=FORCES,
     ),
     Metric(
         "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", forces.floor_si,
-        "mean over frames", LIFTED, "this project: what the metric gives for nothing", samples=2, thresholds=FORCES,
+        "mean over frames", LIFTED, "this project: what the metric gives for nothing", samples=1, thresholds=FORCES,
         floor_of="realism_si",
     ),
     Metric(
         "realism_released", "physical realism, as released", "", "higher", forces.realism_as_released,
-        "mean over frames", SCORED, f"{MANIPNET} and Appendix A, units of the released sources", samples=2,
+        "mean over frames", SCORED, f"{MANIPNET} and Appendix A, units of the released sources", samples=1,
         thresholds=FORCES,
     ),
     Metric(
         "realism_released_floor", "physical realism, as released, without hands", "", "nearer the truth",
         forces.floor_as_released, "mean over frames", LIFTED, "this project: what the metric gives for nothing",
-        samples=2, thresholds=FORCES, floor_of="realism_released",
+        samples=1, thresholds=FORCES, floor_of="realism_released",
     ),
     Metric(
         "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", forces.capsule_depth_mm,
-        "mean over motions", LIFTED, f"{MANIPNET}, penetration depth", samples=2,
+        "mean over motions", LIFTED, f"{MANIPNET}, penetration depth", samples=1,
     ),
     Metric(
         "smoothness_m_s2", "acceleration of joints in the wrist's frame", "m/s2", "nearer the truth",

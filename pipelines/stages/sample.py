@@ -2,23 +2,30 @@
 
 from pathlib import Path
 
-from models.common.device import chosen_device
-from models.common.predicting import sample_family
-from models.common.training import make_repeatable
-from models.registry import load_family
 from pipelines.lineage.graph import read_params
-from pipelines.stages.base import Place, load_hands
+from pipelines.stages.base import Place, empty_reason, load_hands, write_empty
 
 
 def run(place: Place) -> None:
     """Write the motions; a dataset without clips, or a family that is not trained, gives an empty output."""
-    params = read_params(Path())
+    if reason := empty_reason(place.clips):
+        write_empty(place.samples, reason)
+        return
+    sample(place, read_params(Path()))
+
+
+def sample(place: Place, params: dict) -> None:
+    """Motions of the family ``place.family``; params: all of params.yaml."""
+    from models.common.device import chosen_device
+    from models.common.predicting import sample_family
+    from models.common.training import make_repeatable
+    from models.registry import load_family
+
     section = dict(params.get("sample") or {})
     settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
-    family = load_family(place.family)
     make_repeatable(0, threads=2)
     counts = sample_family(
-        family,
+        load_family(place.family),
         place.data,
         place.checkpoints,
         place.samples,

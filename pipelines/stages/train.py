@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.files.atomic import atomic_folder
-from models.common.device import chosen_device
 from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph, read_params
 from pipelines.lineage.provenance import build_provenance
@@ -29,14 +28,17 @@ class TrainParams:
 
 def run(place: Place) -> None:
     """Train ``place.model``; a dataset without clips, or without what the network builds on, gives an empty output."""
-    network = load_network(place.model)
-    needed = {load_network(name): place.checkpoints / name for name in network.needs}
-    for folder in (place.clips, *needed.values()):
-        if reason := empty_reason(folder):
-            write_empty(place.checkpoint, reason)
-            return
+    if reason := empty_reason(place.clips):
+        write_empty(place.checkpoint, reason)
+        return
+    from models.common.device import chosen_device
     from models.common.training import train_network
 
+    network = load_network(place.model)
+    needed = {load_network(name): place.checkpoints / name for name in network.needs}
+    if reason := next(filter(None, map(empty_reason, needed.values())), None):
+        write_empty(place.checkpoint, reason)
+        return
     params = load_settings(TrainParams, "train").of(network.name)
     stage = producers(read_graph(Path()))[place.checkpoint.as_posix()].name
     with atomic_folder(place.checkpoint) as partial:
