@@ -22,7 +22,7 @@ from queue import SimpleQueue
 ROOT = Path(__file__).parents[2]
 PRODUCT = ("hoidata", "models", "pipelines")
 COPIES = ROOT / ".mutants"
-NO_RESULT = 99
+PASSED, NO_RESULT = (0, 5), 99  # 5: none of these tests has the mark
 LIMIT_S = 300.0  # a fault that makes the tests run on for ever is noticed too
 HEAVY = ("numpy", "torch", "scipy.spatial.transform", "numba", "pandas", "pyarrow.parquet", "trimesh", "igl",
          "diffusers", "pytest", "rich.progress", "hypothesis.extra.numpy",
@@ -81,7 +81,7 @@ def copied_tree(number: int) -> Path:
     return copy
 
 
-def _run_pytest(copy: Path, tests: Sequence[str]) -> None:
+def _run_pytest(copy: Path, tests: Sequence[str], marked: str) -> None:
     """In a process of its own: run the tests of the copy, and exit with pytest's code."""
     os.chdir(copy)
     sys.path[:] = [str(copy), *(entry for entry in sys.path if Path(entry or ".").resolve() != ROOT)]
@@ -93,16 +93,16 @@ def _run_pytest(copy: Path, tests: Sequence[str]) -> None:
     code = NO_RESULT
     try:
         os.environ["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
-        quick = ("-x", "-q", "-p", "no:cacheprovider", "--assert=plain")
+        quick = ("-x", "-q", "-p", "no:cacheprovider", "--assert=plain", "-m", marked)
         code = int(importlib.import_module("pytest").main([*quick, *tests]))
     finally:
         sys.stdout.flush()
         os._exit(code)
 
 
-def exit_code(copy: Path, tests: Sequence[str], limit_s: float | None = LIMIT_S) -> int | None:
-    """Pytest's exit code, or none if it had to be ended."""
-    process = multiprocessing.get_context("fork").Process(target=_run_pytest, args=(copy, tests))
+def exit_code(copy: Path, tests: Sequence[str], marked: str, limit_s: float | None = LIMIT_S) -> int | None:
+    """Pytest's exit code for the tests with such marks, or none if it had to be ended."""
+    process = multiprocessing.get_context("fork").Process(target=_run_pytest, args=(copy, tests, marked))
     process.start()
     process.join(limit_s)
     if process.exitcode is None:
@@ -119,17 +119,19 @@ def tried(mutant: Mutant, copy: Path) -> str:
     text, times = path.read_text(encoding="utf-8"), path.stat()
     path.write_text(text.replace(mutant.old, mutant.new), encoding="utf-8")
     try:
-        code = exit_code(copy, mutant.test_paths(copy))
+        code = exit_code(copy, mutant.test_paths(copy), "not slow")
+        if code in PASSED:
+            code = exit_code(copy, mutant.test_paths(copy), "slow")
     finally:
         path.write_text(text, encoding="utf-8")
         os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
-    return {0: SURVIVED, 1: KILLED, None: KILLED}.get(code, BROKEN)
+    return SURVIVED if code in PASSED else KILLED if code in (1, None) else BROKEN
 
 
 def check_unchanged(mutants: Sequence[Mutant], copy: Path) -> None:
-    """Refuse to go on unless the tests pass as long as nothing is changed."""
+    """Refuse to go on unless the tests that are not slow pass as long as nothing is changed."""
     tests = sorted({path for mutant in mutants for path in mutant.test_paths(copy)})
-    if exit_code(copy, tests, None) != 0:
+    if exit_code(copy, tests, "not slow", None) != 0:
         raise SystemExit(f"the tests fail before anything is changed: {copy / '.mutants.log'}")
 
 
