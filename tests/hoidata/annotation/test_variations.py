@@ -11,12 +11,8 @@ from hoidata.annotation.prompts import Lexicon
 from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import four_sentences
 from hoidata.annotation.variations import SentenceMaker, manner_of, word_table
+from tests.builders.words import ARCTIC_OBJECTS, ARCTIC_VERBS
 
-ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
-ARCTIC_OBJECTS = (
-    "box", "capsule machine", "espresso machine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
-    "scissors", "waffle iron",
-)  # fmt: skip
 HOMOGRAPH_VERBS = ("stamp", "staple", "brush", "watch", "hand over", "screw", "use", "pass")
 HOMOGRAPH_OBJECTS = ("stamp", "stapler", "toothbrush", "watch", "hand", "train", "knife")
 
