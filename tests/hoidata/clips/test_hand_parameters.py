@@ -136,11 +136,6 @@ class TestFingers:
         expected += model.mean_pose if kind == "mean-relative" else 0
         np.testing.assert_allclose(track.hand_pose, expected, atol=1e-6)
 
-    def test_with_45_components_they_are_still_components(self, model):
-        source = source_hand()
-        as_components = to_track(source, replace(PLAIN, components=45), model).hand_pose
-        assert np.abs(as_components - source.fingers).max() > 0.1
-
     @pytest.mark.parametrize("fingers", ["absolute", "mean-relative"])
     def test_angles_beyond_pi_survive(self, model, fingers):
         source = source_hand()
@@ -304,14 +299,3 @@ class TestLeftShape:
             back = from_track(track, PLAIN, left)
             np.testing.assert_allclose(back.translation_m, source.translation_m, atol=1e-6)
         assert np.linalg.norm(joints["corrected"] - joints["as released"], axis=1).max() > 0.005
-
-
-def test_a_record_of_the_convention_names_every_choice():
-    assert replace(PLAIN, components=24, note="a note").as_json() == {
-        "translation": "transl",
-        "fingers": "absolute",
-        "shape": "betas per sequence",
-        "left_shape": "as released",
-        "components": 24,
-        "note": "a note",
-    }
