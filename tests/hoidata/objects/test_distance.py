@@ -69,6 +69,7 @@ def test_faces_are_numbered_as_the_caller_numbers_them(queries: np.ndarray) -> N
     faces = np.concatenate([[[0, 0, 1]], box.faces])
     found = closest_points(box.vertices, faces, queries)
     assert found.face.min() >= 1
+    np.testing.assert_allclose(found.distance_m, np.linalg.norm(found.closest_m - queries, axis=1), atol=1e-12)
     corners = box.vertices[faces[found.face]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     offset = ((found.closest_m - corners[:, 0]) * normal).sum(axis=1)

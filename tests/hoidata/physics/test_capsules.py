@@ -1,16 +1,18 @@
 """Capsules against boxes and spheres whose distances are known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import HandTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_vertices
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts, joined
+from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts
 from hoidata.physics.mano_capsules import N_CAPSULES, THUMB_CAPSULES, fit_capsules, hand_capsules
+from tests.builders.clips import random_hand
 
 SIZE = np.array([0.1, 0.08, 0.06])
 
@@ -152,15 +154,10 @@ def test_a_hinged_object_without_angles_is_refused():
         capsule_contacts(model, _still(), _capsule([0, 0, 0], [0, 0, 0.01], 0.01))
 
 
-def _track(n_frames: int = 3) -> HandTrack:
-    rng = np.random.default_rng(2)
-    one = [rng.normal(size=(n_frames, 3)), rng.normal(size=(n_frames, 3)), 0.3 * rng.normal(size=(n_frames, 45))]
-    return HandTrack(*one, rng.normal(size=(1, 10)), np.ones(n_frames, dtype=bool))
-
-
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_capsules_of_a_posed_hand_lie_in_its_skin_and_reach_its_fingertips(side):
-    model, track = load_embedded_hands()[side], _track()
+    model, track = load_embedded_hands()[side], random_hand(3, seed=2)
+    track = replace(track, hand_pose=0.6 * track.hand_pose)
     capsules = hand_capsules(track, model)
     assert capsules.start_m.shape == (3, N_CAPSULES, 3)
     vertices = track_vertices(track, model).astype(np.float64)
@@ -185,10 +182,3 @@ def _signed_gaps(points: np.ndarray, capsules: Capsules) -> np.ndarray:
     away = points[:, :, None] - capsules.start_m[:, None]
     along = np.clip((away * axis).sum(-1) / (axis**2).sum(-1), 0, 1)
     return (np.linalg.norm(away - along[..., None] * axis, axis=-1) - capsules.radius_m).min(axis=-1)
-
-
-def test_hands_are_joined_in_the_order_given():
-    first, second = _capsule([0, 0, 0], [0, 0, 1], 0.1), _capsule([1, 0, 0], [1, 0, 1], 0.2)
-    both = joined([first, second])
-    assert both.radius_m.tolist() == [0.1, 0.2]
-    assert both.start_m[0, 1, 0] == 1

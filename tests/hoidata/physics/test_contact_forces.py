@@ -12,6 +12,7 @@ from hoidata.physics.contact_forces import (
     cone_edges,
     force_residual,
     required_wrench,
+    wrench_columns,
 )
 from hoidata.physics.surface import body_motion
 from hoidata.synthetic.shapes import sharp_box
@@ -79,6 +80,12 @@ def test_cone_edges_push_inwards_and_slide_by_the_friction_coefficient():
     along = np.einsum("cek,ck->ce", edges, normals)
     np.testing.assert_allclose(along, -1.0)
     np.testing.assert_allclose(np.linalg.norm(edges + normals[:, None], axis=2), 0.35)
+
+
+def test_a_push_from_above_beside_the_centre_turns_the_body_that_way():
+    """A finger at x = 1 presses down: its four edges add up to four pushes, and their torque turns about +y."""
+    columns = wrench_columns(np.array([[1.0, 0, 0]]), np.array([[0.0, 0, 1]]), np.zeros(3))
+    np.testing.assert_allclose(columns.sum(axis=1), [0, 0, -4, 0, 4, 0], atol=1e-12)
 
 
 def test_the_inertia_of_a_box_is_the_textbook_one():
