@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.objects.model import Hinge, ObjectModel
-from models import metrics
+from models.common import metrics
 
 
 def box(size: tuple[float, float, float], shift: float = 0.0) -> trimesh.Trimesh:
