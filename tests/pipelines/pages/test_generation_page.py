@@ -35,11 +35,6 @@ def test_arrays_open_without_pickle_and_hold_the_motion(motion, hands, tmp_path)
     assert "vertices_m" not in arrays
 
 
-def test_hand_meshes_are_stored_when_asked_for(motion, hands, tmp_path):
-    with np.load(write_generation(tmp_path, motion, hands, vertices=True)[0], allow_pickle=False) as archive:
-        assert archive["vertices_m"].shape == (2, motion.clip.n_frames, 778, 3)
-
-
 def test_page_names_seed_hands_length_and_that_it_is_synthetic(motion, hands, tmp_path):
     page = write_generation(tmp_path, motion, hands)[2].read_text()
     assert "right (decided by rule: the right hand)" in page
