@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hoidata.annotation.hand_distances import hand_types_at, write_hand_distances
+from hoidata.annotation.hand_distances import hand_types_at
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip, Side
 from hoidata.contact import ProximityIndex, acting_hands
@@ -83,12 +83,6 @@ def test_another_threshold_gives_what_a_run_of_the_stage_with_it_gives(
     assert types == {None, "left", "right", "both"}
 
 
-def test_the_distances_do_not_depend_on_the_threshold(root: Path, tmp_path: Path) -> None:
-    annotate_store(root / "clips", tmp_path / "other", encoder="hash", threshold_m=0.06)
-    name = "hand_distance.npz"
-    assert (tmp_path / "other" / name).read_bytes() == (root / "annotation" / name).read_bytes()
-
-
 def test_a_threshold_just_above_and_at_the_smallest_distance(annotated: AnnotatedStore) -> None:
     """A hand acts strictly below the threshold, judged by the exact minimum and not by its float32 rounding."""
     smallest = annotated.hand_evidence("toy/s1/1").closest_m("left")
@@ -138,12 +132,6 @@ def test_no_length_is_no_threshold(root: Path) -> None:
     for wrong in (0.0, -0.02, float("nan")):
         with pytest.raises(BadInput, match="metres above 0"):
             hand_types_at(root / "annotation", wrong)
-
-
-def test_no_clips_give_no_distances(tmp_path: Path) -> None:
-    write_hand_distances(tmp_path / "hand_distance.npz", [])
-    with pytest.raises(IndexError):
-        HandDistances(tmp_path / "hand_distance.npz", 0).of(0)
 
 
 def test_at_the_surface_a_hand_is_as_near_as_the_box_is_and_never_farther_than_its_points() -> None:

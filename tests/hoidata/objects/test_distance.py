@@ -84,11 +84,6 @@ def test_a_box_with_a_small_hole_still_knows_its_inside() -> None:
     assert (found.distance_m < 0).tolist() == [True, True, False]
 
 
-def test_no_points_give_no_distances() -> None:
-    box = trimesh.creation.box((1, 1, 1))
-    assert len(signed_distance(box.vertices, box.faces, np.zeros((0, 3))).distance_m) == 0
-
-
 @pytest.mark.parametrize(
     ("vertices", "faces"), [(np.zeros((3, 3)), [[0, 1, 2]]), (np.full((3, 3), np.nan), [[0, 1, 2]])]
 )

@@ -11,12 +11,10 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
-from hoidata.objects.distance_grid import distance_grid
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.solid import Solid
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
-from hoidata.objects.triangle_tree import triangle_tree
 from tests.builders.objects import box_model, model_of, two_parts
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
@@ -125,15 +123,6 @@ def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
             for threshold_m in (0.01, 0.02, 1e-9):
                 within = index.within(places[None], None, threshold_m)[0]
                 np.testing.assert_array_equal(within, found < threshold_m)
-
-
-def test_a_grid_has_64_cells_along_the_longest_axis_of_the_surface_and_a_centimetre_around_it() -> None:
-    box = trimesh.creation.box((0.3, 0.14, 0.06))
-    grid = distance_grid(triangle_tree(np.array(box.vertices), np.array(box.faces)), solid=True)
-    assert grid.value.shape == (17, 33, 65)
-    np.testing.assert_allclose(grid.low_m, [-0.16, -0.08, -0.04])
-    assert grid.cell_m == pytest.approx(0.005)
-    assert (grid.value[8, 16, 32], grid.value[0, 16, 32]) == pytest.approx((-0.03, 0.01), abs=1e-7)
 
 
 def test_a_grid_changes_no_bit_of_any_answer() -> None:
