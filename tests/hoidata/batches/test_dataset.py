@@ -152,13 +152,14 @@ def test_a_batch_moves_to_a_device_with_all_its_tensors(clips: Clips) -> None:
 
 
 def test_personal_templates_come_along_or_are_refused_in_a_mixture(clips: Clips) -> None:
-    template = load_embedded_hands().left.template_m
+    pair = load_embedded_hands()
     whole = clips.clip("toy/s1/0")
-    hands = {side: replace(track, template_m=template) for side, track in whole.hands.items()}
+    hands = {side: replace(track, template_m=pair[side].template_m) for side, track in whole.hands.items()}
     own = HoiDataset(Clips({"toy/s1/0": replace(whole, hands=hands)}), "train")[0]
     assert own.template_m is not None
     batch = collate([own])
     assert batch.template_m is not None
-    assert batch.template_m.shape == (1, 2, 778, 3)
+    expected = np.stack([pair.left.template_m, pair.right.template_m])[None]
+    np.testing.assert_allclose(batch.template_m.numpy(), expected, atol=1e-6)
     with pytest.raises(BadInput, match="mixture"):
         collate([own, HoiDataset(clips, "train")[1]])
