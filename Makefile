@@ -54,4 +54,4 @@ bench: install-dev
 
 # Removes what the graph made and the generated raw data; your own raw files are never touched.
 clean:
-	rm -rf data checkpoints metrics report .hoidata dvc.lock
+	rm -rf code data checkpoints samples metrics report .hoidata dvc.lock models/*/dvc.lock

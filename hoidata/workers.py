@@ -1,6 +1,7 @@
 """One function over many items in worker processes: bounded, and honest about a worker that is killed.
 
-Unlike ``concurrent.futures``, it knows which item each worker had when it died, and its workers end with their parent.
+Unlike ``concurrent.futures`` and loky, whose pools break as a whole, it knows which item each worker had when it died
+and of what; only that item is done again. Its workers end with their parent.
 """
 
 import contextlib
@@ -16,15 +17,27 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from hoidata.errors import HoidataError
+from hoidata.errors import BadInput, HoidataError
 
 
-class WorkerLost(HoidataError):
-    """A worker process was killed. in_flight: the items the workers had at that moment, that of the dead one first."""
+class WorkerLost(BadInput):
+    """An item whose worker process died, also when it was tried once more alone. cause: of what, in words."""
 
-    def __init__(self, cause: str, in_flight: Sequence[Any]) -> None:
-        self.cause, self.in_flight = cause, tuple(in_flight)
-        super().__init__(f"a worker process was lost ({cause}) at {', '.join(map(str, in_flight)) or 'its start'}")
+    def __init__(self, item: Any, cause: str) -> None:
+        self.item, self.cause = item, cause
+        got = f"a process that died ({cause}), and so did another one that had nothing else to do"
+        remedy = "run it again with more free memory, or look whether its files are damaged"
+        super().__init__(str(item), "a worker process that lives until it is done", got, remedy)
+
+    def __reduce__(self) -> tuple:
+        return type(self), (self.item, self.cause)
+
+
+@dataclass
+class _Died:
+    """In the place of a result. cause: what ended the process, in words."""
+
+    cause: str
 
 
 @dataclass
@@ -37,26 +50,56 @@ class _Worker:
 Function = Callable[[Any], Any]
 
 
-def in_workers(function: Function, items: Sequence[Any], jobs: int, lock: int = -1) -> Iterator[tuple[Any, Any]]:
+def in_workers(
+    function: Function, items: Sequence[Any], jobs: int, lock: int = -1, on_lost: Function | None = None
+) -> Iterator[tuple[Any, Any]]:
     """Each item with the function's result for it, in no fixed order; one item per worker at a time.
 
-    jobs: fresh processes, each with one thread; 1 does the work here. lock: a file descriptor each worker keeps open
-    as long as it lives. Raises WorkerLost for a worker that died, and what the function raised; the others are ended.
+    jobs: fresh processes, each with one thread; 1 does the work here, where a death ends all. lock: a file descriptor
+    each worker keeps open as long as it lives. on_lost: gives the result of an item whose worker died twice, from a
+    WorkerLost; without it that is raised, after all others are done. Raises what the function raised.
     """
-    if jobs <= 1 or len(items) < 2:
+    if jobs <= 1:
         with one_thread():
-            for item in items:
-                yield item, function(item)
+            yield from ((item, function(item)) for item in items)
         return
+    lost = []
+    for item, result in _shared_out(function, items, jobs, lock):
+        if isinstance(result, _Died):
+            lost.append(item)
+        else:
+            yield item, result
+    for item in lost:  # alone: it may need all the memory there is
+        for _, result in _shared_out(function, [item], 1, lock):
+            if isinstance(result, _Died):
+                result = _given_up(WorkerLost(item, result.cause), on_lost)
+            yield item, result
+
+
+def _given_up(error: WorkerLost, on_lost: Function | None) -> Any:
+    if on_lost is None:
+        raise error
+    return on_lost(error)
+
+
+def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) -> Iterator[tuple[Any, Any]]:
+    """Each item with its result, or with ``_Died``; the dead worker's place is taken by a fresh one."""
     waiting = iter(items)
     workers = [_start(function, lock) for _ in range(min(jobs, len(items)))]
     try:
         busy = [worker for worker in workers if _give(worker, waiting)]
         while busy:
             for worker in _ready(busy):
-                yield _result_of(worker, busy)
-                if not _give(worker, waiting):
-                    busy.remove(worker)
+                item, result = worker.item, _result_of(worker)
+                busy.remove(worker)
+                if isinstance(result, _Died):
+                    worker.connection.close()
+                    workers.remove(worker)
+                    worker = _start(function, lock)
+                    workers.append(worker)
+                yield item, result
+                if _give(worker, waiting):
+                    busy.append(worker)
     finally:
         # Nothing is lost by killing: what a worker writes appears whole or not at all.
         for worker in workers:
@@ -103,22 +146,26 @@ def _ready(busy: list[_Worker]) -> list[_Worker]:
     return [worker for worker in busy if worker.connection in found or worker.process.sentinel in found]
 
 
-def _result_of(worker: _Worker, busy: list[_Worker]) -> tuple[Any, Any]:
+def _result_of(worker: _Worker) -> Any:
+    """The worker's answer. Raises what the function raised, and BadInput for a process that went by itself."""
     try:
         result, problem = worker.connection.recv()
     except (EOFError, ConnectionError):
         worker.process.join()
-        others = [other.item for other in busy if other is not worker]
-        raise WorkerLost(_cause(worker.process.exitcode or 0), [worker.item, *others]) from None
+        code = worker.process.exitcode or 0
+        if code >= 0:  # no fault of the item: such a process never began (a script without a __main__ guard)
+            got = f"exit code {code}"
+            raise BadInput(worker.item, "a worker process that starts", got, "look at what it wrote above") from None
+        return _Died(_cause(code))
     if problem is not None:
         raise problem
-    return worker.item, result
+    return result
 
 
 def _cause(code: int) -> str:
     if code == -signal.SIGKILL:
         return "killed by SIGKILL, as the system does when memory runs out"
-    return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+    return f"signal {signal.Signals(-code).name}"
 
 
 class _Descriptor:

@@ -5,7 +5,7 @@ import sys
 import typer
 
 from hoidata.errors import HoidataError
-from pipelines.commands import adapters, generate, graph, inspect, raw, share, show, store, synth
+from pipelines.commands import adapters, evaluate, generate, graph, inspect, raw, settings, share, show, store, synth
 
 app = typer.Typer(
     name="hoidata",
@@ -24,7 +24,10 @@ app.command("info")(inspect.info)
 app.command("validate")(store.validate)
 app.command("migrate")(store.migrate)
 app.command("lineage")(inspect.lineage)
+app.command("profile")(raw.profile)
+app.command("settings")(settings.settings)
 app.command("share")(share.share)
+app.command("evaluate")(evaluate.evaluate)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)
 

@@ -10,8 +10,9 @@ from typing import Literal
 
 from hoidata.errors import HoidataError
 from pipelines.lineage.graph import read_params
-from pipelines.lineage.manifests import Manifest, read_manifest
-from pipelines.stages.base import HAND, Place, load_hands, own_root, root_variable
+from pipelines.lineage.manifests import Manifest
+from pipelines.stages.adapters import manifest_of
+from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
@@ -71,7 +72,7 @@ def _gpu() -> Finding:
 def _raw(profile: str, dataset: str) -> Finding:
     part, place = f"raw {dataset} ({profile})", Place(profile, dataset)
     try:
-        manifest = read_manifest(place.manifest)
+        manifest = manifest_of(place)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
     root = place.generated_raw if profile == "embedded" else own_root(dataset)
@@ -103,8 +104,9 @@ def _hand(profile: str) -> Finding:
 
 def _encoder() -> Finding:
     from hoidata.annotation import load_encoder
+    from hoidata.annotation.settings import AnnotationSettings
 
-    name = read_params(Path())["annotate"]["encoder"]
+    name = load_settings(AnnotationSettings, "annotate").encoder
     try:
         return Finding("text encoder", "ok", _named(load_encoder(name).identity))
     except HoidataError as error:

@@ -6,15 +6,16 @@ import numpy as np
 
 from hoidata.annotation import load_encoder
 from hoidata.annotation.hand_choice import Method
+from hoidata.annotation.settings import AnnotationSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
 from hoidata.store.store import open_store
-from models.text2hoi.generation import MODELS, generate
-from pipelines.lineage.graph import look_up, read_params
+from models.text2hoi.family import NAMES
+from models.text2hoi.generation import generate
 from pipelines.pages.generation_page import write_generation
-from pipelines.stages.base import Place, empty_reason, load_hands
+from pipelines.stages.base import Place, empty_reason, load_hands, load_settings
 
 SMALLEST_M, LARGEST_M = 0.005, 2.0
 
@@ -31,14 +32,14 @@ def generate_files(
         raise MissingResource(f"the models of {place} cannot generate: {reason}")
     hands = load_hands(place.profile)
     model = read_object(object) if isinstance(object, Path) else stored_object(object, place, hands)
-    encoder = load_encoder(look_up(read_params(Path()), "annotate.encoder"))
+    encoder = load_encoder(load_settings(AnnotationSettings, "annotate").encoder)
     motion = generate(text, model, place.checkpoints, hands, encoder, seed, hand_by=hand_by)
     return write_generation(out, motion, hands)
 
 
 def why_not_trained(place: Place) -> str | None:
     """What is missing of the four models of a dataset, or None when all are there."""
-    for name in MODELS:
+    for name in NAMES:
         folder = place.checkpoints / name
         if reason := empty_reason(folder):
             return f"{name} is empty, {reason}"

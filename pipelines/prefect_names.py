@@ -1,15 +1,34 @@
-"""Lets Prefect find a deployment by its own name: ``prefect deployment run annotate-arctic``.
+"""Lets ``prefect deployment run annotate-arctic`` work as typed in this folder: a start-up hook of Prefect.
 
-Prefect wants FLOW/DEPLOYMENT and has no setting for less, so this start-up hook (entry point group
-``prefect.plugins``, switched on in prefect.toml) wraps its look-up by name. The form with a slash always works.
+(Entry point group ``prefect.plugins``, switched on in prefect.toml.) Prefect wants FLOW/DEPLOYMENT and has no setting
+for less, so its look-up by name is wrapped; the form with a slash always works. And this project's server lets nobody
+in without its key, which the hook takes from ``.prefect/``.
 """
 
-from prefect.plugins import register_hook
+import os
+
+from prefect.plugins import SetupResult, register_hook
+
+from pipelines.prefect_key import is_loopback, read_key
 
 
 @register_hook
-def setup_environment(*, ctx) -> None:
-    """Called once when Prefect is imported. Leaves Prefect as it is when its client is not where it used to be."""
+def setup_environment(*, ctx) -> SetupResult | None:
+    """Called once when Prefect is imported; Prefect reads its settings again when variables are returned."""
+    accept_bare_names(ctx)
+    return key_for(ctx.api_url)
+
+
+def key_for(url: str | None) -> SetupResult | None:
+    """The key as Prefect's setting, unless the user set one; a server that is not on this machine never gets it."""
+    if "PREFECT_API_AUTH_STRING" in os.environ or not is_loopback(url):
+        return None
+    key = read_key()
+    return SetupResult(env={"PREFECT_API_AUTH_STRING": key}) if key else None
+
+
+def accept_bare_names(ctx) -> None:
+    """Leaves Prefect as it is when its client is not where it used to be."""
     try:
         from prefect.client.orchestration._deployments.client import DeploymentAsyncClient
     except ImportError:

@@ -1,4 +1,11 @@
-"""A Prefect server, work pool, deployments and worker for this folder, all on the loopback interface."""
+"""A Prefect server, work pool, deployments and worker for this folder, all on the loopback interface.
+
+Every page open in a browser and every user of the machine reaches that interface, so the server answers nobody without
+the project's key (``prefect_key``; only the health check, the empty shell of its pages and Prefect's API reference are
+open), no other origin, and no change without a CSRF token. Its work pool has no variable, so a run cannot bring a
+command, an environment or a folder of its own. And since the worker obeys whoever answers at the address, only our own
+server may, as long as the worker lives.
+"""
 
 import os
 import signal
@@ -9,28 +16,41 @@ import tomllib
 import urllib.error
 import urllib.request
 from pathlib import Path
-from urllib.parse import urlparse
+from urllib.parse import urlsplit
 
-from hoidata.errors import MissingResource
+import psutil
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.atomic import exclusive
+from pipelines.prefect_key import KEY_FILE, is_loopback, write_key
 
 START_TIMEOUT_S = 180
 STOP_TIMEOUT_S = 15
 POOL = "local"
+POOL_TEMPLATE = Path(__file__).with_name("prefect_pool.json")
 
 
 def serve() -> int:
     """Start the server, deploy, and work until interrupted; server and worker end together. Returns the exit code."""
-    url, environment = api_url(), server_environment()
-    if _answers(f"{url}/health"):
-        raise MissingResource(f"another server answers at {url}; stop it, or set PREFECT_API_URL to a free port")
+    url = api_url()
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    with exclusive(KEY_FILE, wait_s=0):
+        if _answers(f"{url}/health"):
+            raise MissingResource(f"another server answers at {url}; stop it, or set PREFECT_API_URL to a free port")
+        return _serve(url, server_environment(url, write_key()))
+
+
+def _serve(url: str, environment: dict[str, str]) -> int:
     running = [_start_server(url, environment)]
     try:
         wait_until_healthy(url, running[0])
         deploy(environment)
         running.append(subprocess.Popen(_prefect("worker", "start", "--pool", POOL), env=environment))
+        print(f"{_origin(url)} asks for a password: the text in {KEY_FILE}, new at every start")
         print("ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder", flush=True)
-        return running[1].wait()
+        while all(process.poll() is None for process in running):
+            time.sleep(0.5)
+        return next(process.returncode or 1 for process in running if process.returncode is not None)
     except KeyboardInterrupt:
         return 0
     finally:
@@ -49,21 +69,41 @@ def _stop(process: subprocess.Popen) -> None:
 
 
 def api_url() -> str:
-    """PREFECT_API_URL, else the address in prefect.toml."""
+    """PREFECT_API_URL, else the address in prefect.toml. Raises BadInput unless it is a port of this machine alone."""
     configured = str(tomllib.loads(Path("prefect.toml").read_text())["api"]["url"])
-    return os.environ.get("PREFECT_API_URL") or configured
+    url = (os.environ.get("PREFECT_API_URL") or configured).rstrip("/")
+    if not is_loopback(url) or url != f"{_origin(url)}/api":
+        expected = "a loopback address with a port, such as http://127.0.0.1:4200/api"
+        raise BadInput("PREFECT_API_URL", expected, url, "unset it, or choose another port of 127.0.0.1")
+    return url
 
 
-def server_environment() -> dict[str, str]:
-    """Prefect's state in ``.prefect/`` of this folder unless PREFECT_HOME says otherwise; nothing is reported home."""
+def _origin(url: str) -> str:
+    """What a browser calls the server at ``url``: scheme, host and port."""
+    return f"http://{urlsplit(url).netloc}"
+
+
+def server_environment(url: str, key: str) -> dict[str, str]:
+    """What server, worker and deployments run with: only who has the key is let in, nothing is reported home.
+
+    Prefect's state is in ``.prefect/`` of this folder unless PREFECT_HOME says otherwise.
+    """
+    guards = {
+        "PREFECT_API_AUTH_STRING": key,
+        "PREFECT_SERVER_API_AUTH_STRING": key,
+        "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": _origin(url),
+        "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
+        "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",
+    }
     home = os.environ.get("PREFECT_HOME", str(Path(".prefect").resolve()))
     quiet = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
-    return {**os.environ, **quiet, "PREFECT_HOME": home, "PREFECT_API_URL": api_url()}
+    return {**os.environ, **quiet, **guards, "PREFECT_HOME": home, "PREFECT_API_URL": url}
 
 
 def deploy(environment: dict[str, str]) -> None:
     """Make the work pool (again) and the deployments of prefect.yaml."""
-    pool = _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite")
+    template = ("--base-job-template", str(POOL_TEMPLATE))
+    pool = _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite", *template)
     for command in (pool, _prefect("--no-prompt", "deploy", "--all")):
         code = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode
         if code:
@@ -71,15 +111,21 @@ def deploy(environment: dict[str, str]) -> None:
 
 
 def wait_until_healthy(url: str, server: subprocess.Popen) -> None:
-    """Wait for the server's health endpoint. Raises MissingResource when it ends or stays silent."""
+    """Wait until ``server``, and no stranger, answers at ``url``. Raises MissingResource when it ends or never does."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline:
         if server.poll() is not None:
             raise MissingResource(f"the Prefect server ended with exit code {server.returncode}; is {url} taken?")
-        if _answers(f"{url}/health"):
+        if _listens(server, url) and _answers(f"{url}/health"):
             return
         time.sleep(0.5)
     raise MissingResource(f"the Prefect server did not answer at {url} within {START_TIMEOUT_S} s")
+
+
+def _listens(server: subprocess.Popen, url: str) -> bool:
+    """Whether it is this process that has the port: another user may have taken it while it started."""
+    sockets = psutil.Process(server.pid).net_connections("tcp")
+    return any(found.status == psutil.CONN_LISTEN and found.laddr.port == urlsplit(url).port for found in sockets)
 
 
 def _answers(url: str) -> bool:
@@ -91,9 +137,10 @@ def _answers(url: str) -> bool:
 
 
 def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
-    address = urlparse(url)
-    where = ("--host", address.hostname or "127.0.0.1", "--port", str(address.port or 4200))
-    return subprocess.Popen(_prefect("server", "start", *where, "--analytics-off"), env=environment)
+    """The server; what it writes, its database above all, is for the owner alone."""
+    address = urlsplit(url)
+    where = ("--host", str(address.hostname), "--port", str(address.port))
+    return subprocess.Popen(_prefect("server", "start", *where, "--analytics-off"), env=environment, umask=0o077)
 
 
 def _prefect(*arguments: str) -> list[str]:

@@ -1,6 +1,5 @@
 """``dvc repro`` after a look at whether what it is going to read is there: DVC itself looks too late."""
 
-import json
 import os
 import subprocess
 import sys
@@ -8,7 +7,9 @@ from pathlib import Path
 
 from pipelines.lineage.graph import read_graph, read_params
 from pipelines.lineage.manifests import read_manifest
+from pipelines.stages.adapters import ensure_manifests
 from pipelines.stages.base import Place, raw_root
+from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
 
@@ -31,6 +32,7 @@ def preflight() -> None:
     """Write again a generated corpus that a conversion is about to read; refuse when the user's files are missing."""
     params = read_params(Path())
     places = [Place(params["profile"], name) for name in params["datasets"]]
+    ensure_manifests(params["profile"], params["datasets"])
     present = [place for place in places if read_manifest(place.manifest).present]
     for place in present:
         if place.profile == "own":
@@ -55,10 +57,12 @@ def _is_readable(place: Place) -> bool:
 
 def _stale_stages(stages: list[str]) -> set[str]:
     """Which of the stages DVC would run again."""
+    from dvc.repo import Repo
+
     known = read_graph(Path())
     wanted = [stage for stage in stages if stage in known]
     if not wanted:
         return set()
-    command = [sys.executable, "-m", "dvc", "status", "--json", *wanted]
-    result = subprocess.run(command, env=stage_environment(), capture_output=True, text=True, check=True)
-    return set(json.loads(result.stdout))
+    write_code(Path())
+    with Repo() as repo:
+        return set(repo.status(targets=wanted))

@@ -3,13 +3,13 @@
 import difflib
 from pathlib import Path
 
+from hoidata.dataset_folders import dataset_title
 from hoidata.errors import BadInput, MissingResource
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store
 from pipelines.lineage.graph import read_params
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.dataset_page import write_dataset_page
-from pipelines.pages.report import TITLES
 from pipelines.stages.base import Place, empty_reason, load_hands
 
 CLOSEST = 5
@@ -23,7 +23,7 @@ def write_shown(what: str, profile: str, out: Path) -> Path:
     datasets = [str(name) for name in read_params(Path())["datasets"]]
     if what in datasets:
         place = Place(profile, what)
-        return write_dataset_page(out, place.data, what, load_hands(profile), TITLES.get(what, what))
+        return write_dataset_page(out, place.data, what, load_hands(profile), dataset_title(what))
     place = find_clip(what, profile, datasets)
     hands = load_hands(profile)
     return write_clip_page(out / page_name(what), load_annotated(place.data, hands), what, hands)

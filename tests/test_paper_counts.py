@@ -9,13 +9,15 @@ from collections import Counter
 import numpy as np
 import torch
 
-from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES
+from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.clips import HandTrack
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
+from hoidata.contact.settings import ContactSettings
 from hoidata.datasets.grab.words import OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.splits import definitions_for, published
-from models.common.sampling import alphas_bar
+from models.common.sampling import alphas_cumprod
 from models.common.transformer import Encoder, TransformerConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 
@@ -126,9 +128,13 @@ class TestText2Hoi:
         """Sections 3.2 and 4.1: translation 3 + 16 x 6; translation 3 + 6 + articulation 1; L_max = 150."""
         assert (HAND_FEATURES, OBJECT_FEATURES, MAX_FRAMES) == (3 + 16 * 6, 3 + 6 + 1, 150)
 
+    def test_contact_and_distances_end_at_2_centimetres(self):
+        """Sections 3.2 and 3.3 name the threshold tau; its value is that of the authors' code."""
+        assert ContactSettings() == ContactSettings(points=1024, threshold_m=0.02)
+
     def test_noise_has_1000_steps(self):
         """Section 4.1: T = 1,000, cosine schedule (Nichol and Dhariwal 2021)."""
-        share = alphas_bar()
+        share = alphas_cumprod()
         assert share.shape == (1000,)
         steps = (torch.arange(1000) + 1) / 1000
         cosine = torch.cos((steps + 0.008) / 1.008 * torch.pi / 2) ** 2 / np.cos(0.008 / 1.008 * np.pi / 2) ** 2
@@ -147,18 +153,18 @@ class TestText2Hoi:
         """Section 3.2: one condition, then three agents of 150 frames."""
         small = TransformerConfig(width=16, layers=1, heads=2, feed_forward=16)
         model = DiffusionModel(DiffusionConfig(transformer=small)).eval()
-        seen: list[tuple[int, ...]] = []
-        model.encoder.register_forward_pre_hook(lambda _, inputs: seen.append(tuple(inputs[0].shape)))
+        shapes: list[tuple[int, ...]] = []
+        model.encoder.register_forward_pre_hook(lambda _, inputs: shapes.append(tuple(inputs[0].shape)))
         condition = Condition(
             text=torch.ones(1, 512),
             object=torch.zeros(1, 1024),
             points_m=torch.rand(1, 1024, 3),
             normals=torch.rand(1, 1024, 3),
-            touched=torch.zeros(1, 1024),
-            acts=torch.ones(1, 2, dtype=torch.bool),
+            contact_map=torch.zeros(1, 1024),
+            active_hands=torch.ones(1, 2, dtype=torch.bool),
             frames=torch.ones(1, 150, dtype=torch.bool),
         )
         with torch.no_grad():
             hands, objects = model(torch.zeros(1, 2, 150, 99), torch.zeros(1, 150, 10), torch.zeros(1), condition)
-        assert seen == [(1, 451, 16)]
+        assert shapes == [(1, 451, 16)]
         assert (hands.shape, objects.shape) == ((1, 2, 150, 99), (1, 150, 10))

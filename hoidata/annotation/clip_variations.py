@@ -18,6 +18,7 @@ from hoidata.annotation.grammar import Grammar
 from hoidata.annotation.sentences import UNLABELLED_VERB
 from hoidata.annotation.variations import Loss, Manner, SentenceMaker, manner_of
 from hoidata.clips import FPS, HandType
+from hoidata.errors import BadInput
 
 # Speed over a tenth of a second: over one frame a millimetre of jitter alone would be 4 cm/s.
 STEP_FRAMES = 3
@@ -35,6 +36,10 @@ class VariationSettings:
 
     per_clip: int = 0
     adverbs: bool = True
+
+    def __post_init__(self) -> None:
+        if self.per_clip < 0:
+            raise BadInput("annotate.variations.per_clip", "0 or more sentences", f"{self.per_clip}", "correct it")
 
 
 @dataclass(frozen=True)

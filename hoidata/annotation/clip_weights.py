@@ -105,8 +105,8 @@ def is_reachable(address: str, within_s: float = PROBE_S) -> bool:
 
 
 def _connect(address: str, within_s: float, found: threading.Event) -> None:
-    parts = urlsplit(address)
-    proxy = getproxies().get(parts.scheme)
+    address_fields = urlsplit(address)
+    proxy = getproxies().get(address_fields.scheme)
     target = urlsplit(proxy if proxy and "://" in proxy else f"http://{proxy}" if proxy else address)
     port = target.port or (443 if target.scheme == "https" else 80)
     try:

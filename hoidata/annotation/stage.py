@@ -7,37 +7,31 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from hoidata.annotation.clip_variations import (
-    ClipVariations,
-    VariationSettings,
-    Wording,
-    clip_variations,
-    hand_speed_m_s,
-)
+from hoidata.annotation.clip_variations import ClipVariations, Wording, clip_variations, hand_speed_m_s
 from hoidata.annotation.derived import derive_verb
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.hand_distances import write_hand_distances
 from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
+from hoidata.annotation.settings import AnnotationSettings, Forms
 from hoidata.clips import SIDES, Clip, HandType, Side
-from hoidata.contact import CONTACT_THRESHOLD_M, HandEvidence, ProximityIndex, acting_hands
+from hoidata.contact import HandEvidence, ProximityIndex, acting_hands
+from hoidata.contact.settings import ContactSettings
 from hoidata.contact.stage import sample_objects
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
-from hoidata.objects.sampling import POINT_COUNT
 from hoidata.store.annotated import VARIATION
 from hoidata.store.store import Store, open_store
 
-Forms = Literal["paper", "reference"]
 VerbSource = Literal["source", "derived"]
 HAND_TYPE_SOURCE = "proximity"
 _TEXT = pa.string()
@@ -83,42 +77,32 @@ class _Annotated:
 def annotate_store(
     clips_folder: str | Path,
     out_folder: str | Path,
+    settings: AnnotationSettings | None = None,
     *,
-    encoder: str | TextEncoder = "use",
-    threshold_m: float = CONTACT_THRESHOLD_M,
-    points: int = POINT_COUNT,
+    contact: ContactSettings | None = None,
+    encoder: str | TextEncoder | None = None,
     hands: HandPair | None = None,
     left_out: Mapping[str, str] | None = None,
-    forms: Forms = "paper",
-    variations: VariationSettings | None = None,
     features: str | Path | None = None,
-    derive_verbs: bool = True,
+    **changes: Any,
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
 
-    encoder: a name for ``load_encoder``, or the encoder itself. features: a folder that keeps text features between
-    runs (``DiskCachedEncoder``); it changes no output.
-    threshold_m: a hand acts when one of its joints comes closer to one of ``points`` sampled points.
-    hands: as in ``open_store``. Clips without an acting hand, or without a word for their object, are listed with that
-    reason and get no sentence. left_out: the same for further clips: reasons by clip id, as quality control found them.
-    forms: the paper's four sentences as we write them, or as the reference does. variations: how many guarded
-    sentences follow those of each clip, by default none. Raises BadInput for other forms, and for a threshold that
-    is no length.
-    derive_verbs: a clip whose source names no verb gets the one its motion shows (``derive_verb``), marked as derived
-    with what it rests on; else its sentences say "move".
+    A hand acts when one of its joints comes closer than the threshold to one of the object's sampled points. Clips
+    without an acting hand, or without a word for their object, are listed with that reason and get no sentence.
+    settings, changes: fields of ``changes`` replace those of ``settings``. contact: of the stage contact, whose points
+    are looked at. encoder: a name for ``load_encoder`` or the encoder itself, in place of the settings'.
+    hands: as in ``open_store``. left_out: reasons of further clips that get no sentence, by clip id.
+    features: a folder that keeps text features between runs (``DiskCachedEncoder``); it changes no output.
     Returns counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled,
     agreeing, derived_verbs.
     """
-    if forms not in get_args(Forms):
-        raise BadInput("forms of the sentences", " or ".join(get_args(Forms)), repr(forms), "choose one of them")
-    if not threshold_m > 0:
-        raise BadInput("threshold_m", "metres above 0", repr(threshold_m), "give a length such as 0.02")
-    store = open_store(clips_folder, hands)
-    encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
-    encoder = encoder if features is None else DiskCachedEncoder(encoder, features)
-    variations = variations or VariationSettings()
-    measured = variations.per_clip > 0 and variations.adverbs
-    found = _annotate_clips(store, threshold_m, points, left_out or {}, _Writer(forms, measured, derive_verbs))
+    settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
+    threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m
+    encoder = _encoder(settings.encoder if encoder is None else encoder, features)
+    store, variations = open_store(clips_folder, hands), settings.variations
+    writer = _Writer(settings.forms, variations.per_clip > 0 and variations.adverbs, settings.derive_verbs)
+    found = _annotate_clips(store, threshold_m, contact.points, left_out or {}, writer)
     named = [item for item in found if item.wording]
     varied = clip_variations([item.wording for item in named if item.wording], variations)
     sentences = _distinct(named, varied)
@@ -126,18 +110,23 @@ def annotate_store(
     info = {
         "encoder": encoder.identity,
         "threshold_m": threshold_m,
-        "points": points,
-        "forms": forms,
+        "points": contact.points,
+        "forms": settings.forms,
         "variations": {**asdict(variations), **varied.facts()},
         "counts": counts,
     }
-    with atomic_folder(out_folder) as part:
-        write_table(part / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
-        write_hand_distances(part / "hand_distance.npz", [item.evidence for item in found])
-        write_table(part / "text.parquet", _text_rows(named, varied, sentences), TEXT_TABLE)
-        _write_embeddings(part / "embeddings.npz", encoder, sentences)
-        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+    with atomic_folder(out_folder) as partial:
+        write_table(partial / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
+        write_hand_distances(partial / "hand_distance.npz", [item.evidence for item in found])
+        write_table(partial / "text.parquet", _text_rows(named, varied, sentences), TEXT_TABLE)
+        _write_embeddings(partial / "embeddings.npz", encoder, sentences)
+        (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
+
+
+def _encoder(encoder: str | TextEncoder, features: str | Path | None) -> TextEncoder:
+    encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
+    return encoder if features is None else DiskCachedEncoder(encoder, features)
 
 
 @dataclass(frozen=True)

@@ -4,13 +4,11 @@ A sample lives in the *model frame*: the clip's world turned so that things fall
 is known) and moved so that the object's origin lies at zero in the first frame. The stored clips are never changed;
 ``world_from_model`` takes every sample back.
 
-Features follow Text2HOI (Cha et al. 2024, Sec. 3.2.1). One hand, 99 numbers per frame: wrist position (3, metres), then
-16 local rotations in 6D, the global one first, absolute. One object, 10 numbers: position (3), rotation in 6D, hinge
-angle (radians, 0 for rigid objects). Sides are ordered left, right.
+The layout of the features stands in ``hoidata.clips.features``. Sides are ordered left, right.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -18,26 +16,15 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.batches.requests import ObjectPoints, RequestBatch, conditions
+from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
+from hoidata.clips.features import OBJECT_POSITION, WRIST, hand_features, object_features, upright
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotmat_to_rot6d, rotvec_to_rotmat
-from hoidata.hands import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.store.distances import DistanceEntries
 
-HAND_FEATURES, OBJECT_FEATURES, N_ROTATIONS = 99, 10, 16
 MAX_FRAMES = 150
-CONTACT_THRESHOLD_M = 0.02
 Crop = Literal["random", "start"]
-
-
-@dataclass(frozen=True)
-class ObjectPoints:
-    """The sampled points of one object, in its own frame: points_m, normals (1024, 3), part (1024,) 0 or 1."""
-
-    points_m: np.ndarray
-    normals: np.ndarray
-    part: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -45,8 +32,8 @@ class ClipSample:
     """One clip in the model frame; NumPy arrays, axes (side, frame, ...), metres and radians.
 
     hands (2, F, 99), object (F, 10), joints_m (2, F, 21, 3): features and true joints, with the clip's own hand shape.
-    valid (2, F): frames in which a side was tracked. acts (2,): the sides that take part in the interaction.
-    contact (2, 1024): points that came within 2 cm of a joint of that acting side in these frames.
+    valid (2, F): frames in which a side was tracked. active_hands (2,): the sides that take part in the interaction.
+    contact (2, 1024): points that came within ``contact_threshold_m``, the contact stage's, of a joint of that side.
     text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
     start: first frame within the clip. world_from_model (4, 4).
     """
@@ -65,12 +52,13 @@ class ClipSample:
     object: np.ndarray
     joints_m: np.ndarray
     valid: np.ndarray
-    acts: np.ndarray
+    active_hands: np.ndarray
     betas: np.ndarray
     template_m: np.ndarray | None
     text: np.ndarray
     points: ObjectPoints
     contact: np.ndarray
+    contact_threshold_m: float
     distances: DistanceEntries
     world_from_model: np.ndarray
 
@@ -79,8 +67,8 @@ class ClipSample:
         return len(self.object)
 
     @property
-    def touched(self) -> np.ndarray:
-        """(1024,) bool contact map of Text2HOI: the points touched by any acting hand."""
+    def contact_map(self) -> np.ndarray:
+        """(1024,) bool contact map of Text2HOI: the points touched by any active hand."""
         return np.logical_or(self.contact[0], self.contact[1])
 
     def crop(self, start: int, length: int) -> "ClipSample":
@@ -94,16 +82,16 @@ class ClipSample:
             object=self.object[start:stop],
             joints_m=self.joints_m[:, start:stop],
             valid=self.valid[:, start:stop],
-            contact=contact_of(distances, len(self.points.points_m)),
+            contact=contact_of(distances, len(self.points.points_m), self.contact_threshold_m),
             distances=distances,
         ).recentred()
 
     def recentred(self) -> "ClipSample":
         """The same frames with the object's origin at zero in the first of them."""
-        shift = self.object[0, :3].copy()
+        shift = self.object[0, OBJECT_POSITION].copy()
         hands, objects = self.hands.copy(), self.object.copy()
-        hands[..., :3] -= shift
-        objects[:, :3] -= shift
+        hands[..., WRIST] -= shift
+        objects[:, OBJECT_POSITION] -= shift
         move = np.eye(4)
         move[:3, 3] = shift
         return replace(
@@ -118,6 +106,8 @@ class ClipSample:
 class Annotated(Protocol):
     """What a dataset needs of ``hoidata.store.annotated.AnnotatedStore``."""
 
+    @property
+    def contact_threshold_m(self) -> float: ...
     def split_ids(self, split: str) -> list[str]: ...
     def clip(self, clip_id: str) -> Clip: ...
     def joints(self, clip_id: str, side: Side) -> np.ndarray: ...
@@ -178,11 +168,11 @@ def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
     """The whole clip as a sample in the model frame."""
     clip = annotated.clip(clip_id)
     hand_type = annotated.hand_type(clip_id)
-    acts = np.array([hand_type in (side, "both") for side in SIDES])
+    active_hands = np.array([hand_type in (side, "both") for side in SIDES])
     rotation = upright(clip.gravity)
     origin = clip.object.translation_m[0].astype(np.float64)
     points = _points(annotated, annotated.object_key(clip_id))
-    distances = _acting_entries(annotated.distances(clip_id), acts)
+    distances = _acting_entries(annotated.distances(clip_id), active_hands)
     tracks = [clip.hands[side] for side in SIDES]
     joints = np.stack([(annotated.joints(clip_id, side) - origin) @ rotation.T for side in SIDES])
     return ClipSample(
@@ -200,49 +190,22 @@ def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
         object=object_features(clip.object, rotation, origin),
         joints_m=joints.astype(np.float32),
         valid=np.stack([track.valid for track in tracks]).astype(bool),
-        acts=acts,
+        active_hands=active_hands,
         betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
         template_m=_templates(tracks),
         text=np.asarray(annotated.text_embedding(clip_id), dtype=np.float32),
         points=points,
-        contact=contact_of(distances, len(points.points_m)),
+        contact=contact_of(distances, len(points.points_m), annotated.contact_threshold_m),
+        contact_threshold_m=annotated.contact_threshold_m,
         distances=distances,
         world_from_model=_world_from_model(rotation, origin),
     )
 
 
-def hand_features(track: HandTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
-    """(frame, 99) float32 features in the model frame: rotation ``model_from_world`` (3, 3) about ``origin_m`` (3,)."""
-    rotmats = track_rotmats(track).astype(np.float64)
-    rotmats[:, 0] = model_from_world @ rotmats[:, 0]
-    wrist = (track.wrist_m - origin_m) @ model_from_world.T
-    return np.concatenate((wrist, rotmat_to_rot6d(rotmats).reshape(len(wrist), -1)), axis=1, dtype=np.float32)
-
-
-def object_features(track: ObjectTrack, model_from_world: np.ndarray, origin_m: np.ndarray) -> np.ndarray:
-    """(frame, 10) float32 features in the model frame; the hinge angle of a rigid object is 0."""
-    rotation = model_from_world @ rotvec_to_rotmat(track.rotvec.astype(np.float64))
-    position = (track.translation_m - origin_m) @ model_from_world.T
-    hinge = np.zeros(len(position)) if track.hinge_rad is None else track.hinge_rad
-    return np.concatenate((position, rotmat_to_rot6d(rotation), hinge[:, None]), axis=1, dtype=np.float32)
-
-
-def upright(gravity: np.ndarray | None) -> np.ndarray:
-    """(3, 3) smallest rotation that turns the gravity direction (3,) to -z; the identity where it is unknown."""
-    if gravity is None:
-        return np.eye(3)
-    down = np.asarray(gravity, dtype=np.float64) / np.linalg.norm(gravity)
-    axis = np.cross(down, (0.0, 0.0, -1.0))
-    sine, cosine = float(np.linalg.norm(axis)), float(-down[2])
-    if sine < 1e-9:
-        return np.eye(3) if cosine > 0 else np.diag([1.0, -1.0, -1.0])
-    return rotvec_to_rotmat(axis / sine * np.arctan2(sine, cosine))
-
-
-def contact_of(distances: DistanceEntries, n_points: int) -> np.ndarray:
-    """(2, point) bool: points within 2 cm of a joint of each side in any frame of the entries."""
+def contact_of(distances: DistanceEntries, n_points: int, threshold_m: float) -> np.ndarray:
+    """(2, point) bool: points closer than ``threshold_m`` to a joint of each side in any frame of the entries."""
     contact = np.zeros((2, n_points), dtype=bool)
-    near = distances.distance_m < CONTACT_THRESHOLD_M
+    near = distances.distance_m < threshold_m
     contact[distances.side[near], distances.point[near]] = True
     return contact
 
@@ -265,88 +228,65 @@ def _points(annotated: Annotated, object_key: str) -> ObjectPoints:
     )
 
 
-def _acting_entries(stored: Any, acts: np.ndarray) -> DistanceEntries:
+def _acting_entries(stored: Any, active_hands: np.ndarray) -> DistanceEntries:
     index = {name: np.asarray(getattr(stored, name), np.int64) for name in ("side", "frame", "joint", "point")}
     entries = DistanceEntries(**index, distance_m=np.asarray(stored.distance_m, np.float32))
-    return entries.select(acts[entries.side])
+    return entries.select(active_hands[entries.side])
 
 
-@dataclass(frozen=True)
-class ClipBatch:
-    """Clips padded to the longest of them; tensors with axes (clip, side, frame, ...), padding is zero.
+@dataclass(frozen=True, kw_only=True)
+class ClipBatch(RequestBatch):
+    """Recorded clips padded to the longest of them, with all a model may be asked of them (:class:`RequestBatch`).
 
-    frames (B, F): True where a clip has a frame. present (B, 2, F): the side acts and is tracked in the frame.
-    acts (B, 2). entries: (entry, 5) int64 rows (clip, side, frame, joint, point) and their distances (entry,).
-    hinge_axis, hinge_origin_m (B, 3), zero for rigid objects; articulated (B,). template_m (B, 2, 778, 3) or None.
+    Axes (clip, side, frame, ...), padding is zero. hands (B, 2, F, 99), object (B, F, 10), joints_m (B, 2, F, 21, 3).
+    text (B, 4, 512): the four sentences. present (B, 2, F): the side takes part and is tracked in the frame.
+    contact (B, 2, N), at contact_threshold_m, which is that of all clips. entries: (entry, 5) int64 rows (clip, side,
+    frame, joint, point) and their distances (entry,).
     """
 
     samples: tuple[ClipSample, ...]
     hands: Tensor
     object: Tensor
     joints_m: Tensor
-    frames: Tensor
     present: Tensor
-    acts: Tensor
-    lengths: Tensor
-    betas: Tensor
-    template_m: Tensor | None
-    text: Tensor
-    points_m: Tensor
-    normals: Tensor
-    part: Tensor
     contact: Tensor
+    contact_threshold_m: float
     entries: Tensor
     entry_distance_m: Tensor
-    hinge_axis: Tensor
-    hinge_origin_m: Tensor
-    articulated: Tensor
-
-    def __len__(self) -> int:
-        return len(self.samples)
 
     @property
-    def touched(self) -> Tensor:
-        """(B, 1024) contact map as 0 or 1, float32: both acting hands together."""
+    def contact_map(self) -> Tensor:
+        """(B, N) contact map as 0 or 1, float32: both active hands together."""
         return self.contact.any(1).float()
-
-    def to(self, device: torch.device | str) -> "ClipBatch":
-        """The batch with every tensor on ``device``."""
-        parts = {field.name: getattr(self, field.name) for field in fields(self)}
-        return replace(self, **{name: part.to(device) for name, part in parts.items() if isinstance(part, Tensor)})
 
 
 def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
     """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
-    n_frames = max(sample.length for sample in samples)
-    frames = np.zeros((len(samples), n_frames), dtype=bool)
-    for row, sample in enumerate(samples):
-        frames[row, : sample.length] = True
-    valid = np.stack([_padded(sample.valid, 1, n_frames) for sample in samples])
-    acts = np.stack([sample.acts for sample in samples])
-    hinges = [sample.object_model.hinge for sample in samples]
+    lengths = np.array([sample.length for sample in samples])
+    asked = conditions(
+        [sample.object_model for sample in samples],
+        [sample.points for sample in samples],
+        np.stack([sample.active_hands for sample in samples]),
+        lengths,
+        np.stack([sample.betas for sample in samples]),
+        [sample.template_m for sample in samples],
+    )
+    n_frames = int(lengths.max())
     rows, distance = _entry_rows(samples if with_entries else ())
     arrays = {
+        "text": np.stack([sample.text for sample in samples]),
         "hands": np.stack([_padded(sample.hands, 1, n_frames) for sample in samples]),
         "object": np.stack([_padded(sample.object, 0, n_frames) for sample in samples]),
         "joints_m": np.stack([_padded(sample.joints_m, 1, n_frames) for sample in samples]),
-        "frames": frames,
-        "present": valid & acts[:, :, None] & frames[:, None],
-        "acts": acts,
-        "lengths": np.array([sample.length for sample in samples]),
-        "betas": np.stack([sample.betas for sample in samples]),
-        "text": np.stack([sample.text for sample in samples]),
-        "points_m": np.stack([sample.points.points_m for sample in samples]),
-        "normals": np.stack([sample.points.normals for sample in samples]),
-        "part": np.stack([sample.points.part for sample in samples]).astype(np.int64),
         "contact": np.stack([sample.contact for sample in samples]),
         "entries": rows,
         "entry_distance_m": distance,
-        "hinge_axis": np.stack([np.zeros(3) if h is None else h.axis for h in hinges]).astype(np.float32),
-        "hinge_origin_m": np.stack([np.zeros(3) if h is None else h.origin_m for h in hinges]).astype(np.float32),
-        "articulated": np.array([hinge is not None for hinge in hinges]),
     }
-    tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return ClipBatch(samples=tuple(samples), template_m=_batch_templates(samples), **tensors)
+    tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    valid = torch.from_numpy(np.stack([_padded(sample.valid, 1, n_frames) for sample in samples]))
+    present = valid & asked["active_hands"][:, :, None] & asked["frames"][:, None]
+    threshold_m = _batch_threshold_m(samples)
+    return ClipBatch(samples=tuple(samples), present=present, contact_threshold_m=threshold_m, **asked, **tensors)
 
 
 def _padded(array: np.ndarray, axis: int, n_frames: int) -> np.ndarray:
@@ -365,12 +305,8 @@ def _entry_rows(samples: Sequence[ClipSample]) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows), np.concatenate(distances)
 
 
-def _batch_templates(samples: Sequence[ClipSample]) -> Tensor | None:
-    templates = [sample.template_m for sample in samples]
-    if all(template is None for template in templates):
-        return None
-    if any(template is None for template in templates):
-        raise BadInput(
-            "collate", "personal hand templates in all clips or in none", "a mixture", "batch one dataset at a time"
-        )
-    return torch.from_numpy(np.stack([template for template in templates if template is not None]))
+def _batch_threshold_m(samples: Sequence[ClipSample]) -> float:
+    found = {sample.contact_threshold_m for sample in samples}
+    if len(found) > 1:
+        raise BadInput("collate", "one contact threshold", f"{sorted(found)} m", "batch one dataset at a time")
+    return found.pop()

@@ -6,20 +6,34 @@ index, middle, pinky, ring, thumb.
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Literal, TypeVar
+from typing import ClassVar, Literal, Self
 
 import numpy as np
 
-from hoidata.objects.model import ObjectModel
+from hoidata.geometry.transform import RigidTransform
+from hoidata.objects.model import ObjectModel, articulate
 
 FPS = 30
 Side = Literal["left", "right"]
 HandType = Literal["left", "right", "both"]
 SIDES: tuple[Side, Side] = ("left", "right")
+Frames = slice | np.ndarray
+
+
+class Track:
+    """What has one row per frame. ``PER_FRAME`` names the arrays that have; None stands for one that is not there."""
+
+    PER_FRAME: ClassVar[tuple[str, ...]]
+
+    def take(self, frames: Frames) -> Self:
+        """Some frames of it: a slice, or (frame,) numbers counted from 0."""
+        arrays = {name: getattr(self, name) for name in self.PER_FRAME}
+        rows = {name: array[frames] for name, array in arrays.items() if array is not None}
+        return replace(self, **rows)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
 @dataclass(frozen=True)
-class HandTrack:
+class HandTrack(Track):
     """MANO-layout parameters of one hand, absolute and in the world frame.
 
     wrist_m: (frame, 3) world position of joint 0, metres. Not MANO's ``transl``: joint 0 lies exactly here.
@@ -29,6 +43,8 @@ class HandTrack:
     valid: (frame,) bool; a False frame holds finite numbers that mean nothing.
     template_m: (778, 3) personal rest mesh that replaces the model's template, or None.
     """
+
+    PER_FRAME = ("wrist_m", "global_orient", "hand_pose", "valid")
 
     wrist_m: np.ndarray
     global_orient: np.ndarray
@@ -41,9 +57,13 @@ class HandTrack:
     def n_frames(self) -> int:
         return len(self.wrist_m)
 
+    def take(self, frames: Frames) -> "HandTrack":
+        """Some frames of it; one shape for the whole clip stays one shape."""
+        return replace(super().take(frames), betas=self.betas if len(self.betas) == 1 else self.betas[frames])
+
 
 @dataclass(frozen=True)
-class ObjectTrack:
+class ObjectTrack(Track):
     """Motion of one object.
 
     model: canonical mesh, parts and hinge.
@@ -51,6 +71,8 @@ class ObjectTrack:
     translation_m: (frame, 3) world position of the object frame's origin.
     hinge_rad: (frame,) unwrapped hinge angle, or None for a rigid object.
     """
+
+    PER_FRAME = ("rotvec", "translation_m", "hinge_rad")
 
     model: ObjectModel
     rotvec: np.ndarray
@@ -65,15 +87,30 @@ class ObjectTrack:
     def n_frames(self) -> int:
         return len(self.translation_m)
 
+    @property
+    def world_from_object(self) -> RigidTransform:
+        """The pose of each frame, (frame,) transforms in float64."""
+        rotvec, translation_m = (np.asarray(array, dtype=np.float64) for array in (self.rotvec, self.translation_m))
+        return RigidTransform.from_rotvec(rotvec, translation_m)
+
+    def points_in_world(self, points_m: np.ndarray, part: np.ndarray) -> np.ndarray:
+        """(frame, point, 3) world positions of points of the object, metres.
+
+        points_m: (point, 3) at hinge angle 0, object frame. part: (point,) the part each belongs to, 0 or 1.
+        """
+        return self.world_from_object @ articulate(points_m, part, self.model.hinge, self.hinge_rad)
+
 
 @dataclass(frozen=True)
-class CameraTrack:
+class CameraTrack(Track):
     """A camera that saw the clip, so that frames link back to images.
 
     name: as in the source (``cam4``). rotvec: (frame, 3) axis-angle and position_m: (frame, 3) of
     ``world_from_camera``, OpenCV axes (x right, y down, z ahead). images: (frame,) int32 number of each image in the
     source. intrinsics: (6,) fx, fy, cx, cy, width, height in pixels, or None.
     """
+
+    PER_FRAME = ("rotvec", "position_m", "images")
 
     name: str
     rotvec: np.ndarray
@@ -83,12 +120,14 @@ class CameraTrack:
 
 
 @dataclass(frozen=True)
-class BodyTrack:
+class BodyTrack(Track):
     """SMPL-X parameters of the person (Pavlakos et al. 2019) as the source gives them, in the clip's world frame.
 
     transl_m: (frame, 3); global_orient: (frame, 3); body_pose: (frame, 63); face_pose: (frame, 9) jaw, left eye, right
     eye; axis-angles in radians. expression: (frame, 10) or None. The hands are those of ``Clip.hands``.
     """
+
+    PER_FRAME = ("transl_m", "global_orient", "body_pose", "face_pose", "expression")
 
     transl_m: np.ndarray
     global_orient: np.ndarray
@@ -108,6 +147,15 @@ class SourceContact:
     frame: np.ndarray
     vertex: np.ndarray
     label: np.ndarray
+
+    def take(self, frames: Frames, n_frames: int) -> "SourceContact":
+        """The entries of some frames of a clip of ``n_frames``, counted from the first of those taken."""
+        kept = np.arange(n_frames)[frames]
+        first, stop = np.searchsorted(self.frame, kept), np.searchsorted(self.frame, kept, side="right")
+        count = stop - first
+        new_frame = np.repeat(np.arange(len(kept), dtype=self.frame.dtype), count)
+        entry = np.arange(len(new_frame)) + np.repeat(first - (np.cumsum(count) - count), count)
+        return SourceContact(new_frame, self.vertex[entry], self.label[entry])
 
 
 @dataclass(frozen=True)
@@ -180,49 +228,18 @@ class Clip:
     def n_frames(self) -> int:
         return len(self.source_frames)
 
-    def cut(self, start: int, stop: int) -> "Clip":
-        """Frames ``start`` to ``stop`` (exclusive) as a clip of its own, under the same id."""
-        frames = slice(start, stop)
+    def take(self, frames: Frames) -> "Clip":
+        """Some frames as a clip of its own, under the same id.
+
+        frames: a slice, or (frame,) numbers counted from 0. Frames that are not 1/30 s apart are the caller's affair.
+        """
         return replace(
             self,
-            hands={side: _cut_hand(track, frames) for side, track in self.hands.items()},
-            object=_cut_object(self.object, frames),
-            other_objects=tuple(_cut_object(track, frames) for track in self.other_objects),
+            hands={side: track.take(frames) for side, track in self.hands.items()},
+            object=self.object.take(frames),
+            other_objects=tuple(track.take(frames) for track in self.other_objects),
             source_frames=self.source_frames[frames],
-            camera=None if self.camera is None else _cut_arrays(self.camera, frames, "rotvec", "position_m", "images"),
-            body=None if self.body is None else _cut_body(self.body, frames),
-            source_contact=None if self.source_contact is None else _cut_contact(self.source_contact, start, stop),
+            camera=None if self.camera is None else self.camera.take(frames),
+            body=None if self.body is None else self.body.take(frames),
+            source_contact=None if self.source_contact is None else self.source_contact.take(frames, self.n_frames),
         )
-
-
-def _cut_hand(track: HandTrack, frames: slice) -> HandTrack:
-    return replace(
-        track,
-        wrist_m=track.wrist_m[frames],
-        global_orient=track.global_orient[frames],
-        hand_pose=track.hand_pose[frames],
-        betas=track.betas if len(track.betas) == 1 else track.betas[frames],
-        valid=track.valid[frames],
-    )
-
-
-def _cut_object(track: ObjectTrack, frames: slice) -> ObjectTrack:
-    hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
-    return replace(track, rotvec=track.rotvec[frames], translation_m=track.translation_m[frames], hinge_rad=hinge)
-
-
-def _cut_body(track: BodyTrack, frames: slice) -> BodyTrack:
-    names = ("transl_m", "global_orient", "body_pose", "face_pose")
-    return _cut_arrays(track, frames, *names, *(() if track.expression is None else ("expression",)))
-
-
-def _cut_contact(contact: SourceContact, start: int, stop: int) -> SourceContact:
-    kept = (contact.frame >= start) & (contact.frame < stop)
-    return SourceContact(contact.frame[kept] - start, contact.vertex[kept], contact.label[kept])
-
-
-Track = TypeVar("Track", CameraTrack, BodyTrack)
-
-
-def _cut_arrays(track: Track, frames: slice, *names: str) -> Track:
-    return replace(track, **{name: getattr(track, name)[frames] for name in names})

@@ -1,4 +1,4 @@
-"""A source sequence (or a stretch of one) that did not become clips, and why."""
+"""A source sequence (or a interval of one) that did not become clips, and why."""
 
 from dataclasses import dataclass
 

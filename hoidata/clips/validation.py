@@ -4,9 +4,10 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, SourceContact
 from hoidata.errors import BadInput
+from hoidata.hands.model import N_VERTICES
 
 REMEDY = "the adapter broke a rule of Clip: report it"
-FARTHEST_M = 100.0  # a place farther from the origin than any capture room is wide means a wrong unit
+FARTHEST_M = 100.0  # a position farther from the origin than any capture room is wide means a wrong unit
 OBJECT_SIZE_M = (0.001, 10.0)  # the longest side of a mesh: millimetres or metres taken for each other are far outside
 HAND_SIZE_M = (0.05, 0.5)
 UNIT_TOLERANCE = 1e-6  # of the length of a direction
@@ -66,7 +67,7 @@ def _check_origin(clip: Clip) -> None:
 def _check_camera(where: str, track: CameraTrack, n_frames: int) -> None:
     _check_array(f"{where}.rotvec", track.rotvec, (n_frames, 3))
     _check_array(f"{where}.position_m", track.position_m, (n_frames, 3))
-    _check_places(f"{where}.position_m", track.position_m)
+    _check_positions(f"{where}.position_m", track.position_m)
     _check_whole(f"{where}.images", track.images, (n_frames,))
     if track.intrinsics is not None:
         _check_array(f"{where}.intrinsics", track.intrinsics, (6,))
@@ -77,7 +78,7 @@ def _check_body(where: str, track: BodyTrack, n_frames: int) -> None:
         _check_array(f"{where}.{name}", getattr(track, name), (n_frames, columns))
     if track.expression is not None:
         _check_array(f"{where}.expression", track.expression, (n_frames, 10))
-    _check_places(f"{where}.transl_m", track.transl_m)
+    _check_positions(f"{where}.transl_m", track.transl_m)
 
 
 def _check_contact(where: str, contact: SourceContact, n_frames: int, track: ObjectTrack) -> None:
@@ -100,15 +101,15 @@ def _check_hand(where: str, track: HandTrack, n_frames: int) -> None:
     if track.valid.dtype != bool or track.valid.shape != (n_frames,):
         raise BadInput(f"{where}.valid", f"{n_frames} booleans", f"{track.valid.dtype} {track.valid.shape}", REMEDY)
     if track.template_m is not None:
-        _check_array(f"{where}.template_m", track.template_m, (778, 3))
+        _check_array(f"{where}.template_m", track.template_m, (N_VERTICES, 3))
         _check_size(f"{where}.template_m", track.template_m, HAND_SIZE_M)
-    _check_places(f"{where}.wrist_m", track.wrist_m[track.valid])
+    _check_positions(f"{where}.wrist_m", track.wrist_m[track.valid])
 
 
 def _check_object(where: str, track: ObjectTrack, n_frames: int) -> None:
     _check_array(f"{where}.rotvec", track.rotvec, (n_frames, 3))
     _check_array(f"{where}.translation_m", track.translation_m, (n_frames, 3))
-    _check_places(f"{where}.translation_m", track.translation_m)
+    _check_positions(f"{where}.translation_m", track.translation_m)
     _check_size(f"{where}.model.vertices_m", track.model.vertices_m, OBJECT_SIZE_M)
     if (track.hinge_rad is not None) != track.model.is_articulated:
         raise BadInput(f"{where}.hinge_rad", "an angle exactly where the model has a hinge", "otherwise", REMEDY)
@@ -128,9 +129,9 @@ def _check_whole(where: str, array: np.ndarray, shape: tuple[int, ...]) -> None:
         raise BadInput(where, f"whole numbers of shape {shape}", f"{array.dtype} {array.shape}", REMEDY)
 
 
-def _check_places(where: str, places_m: np.ndarray) -> None:
-    if len(places_m) and np.abs(places_m).max() > FARTHEST_M:
-        farthest = f"{np.abs(places_m).max():.3g} m"
+def _check_positions(where: str, positions_m: np.ndarray) -> None:
+    if len(positions_m) and np.abs(positions_m).max() > FARTHEST_M:
+        farthest = f"{np.abs(positions_m).max():.3g} m"
         raise BadInput(where, f"places within {FARTHEST_M:g} m of the origin", farthest, "check the unit of the file")
 
 

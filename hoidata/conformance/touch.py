@@ -59,25 +59,7 @@ def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
 def _some_frames(clip: Clip) -> Clip:
     """At most 24 frames of a clip, evenly spread; no longer 1/30 s apart."""
     frames = np.unique(np.linspace(0, clip.n_frames - 1, MOST_FRAMES).astype(int))
-    hands = {
-        side: replace(
-            track,
-            wrist_m=track.wrist_m[frames],
-            global_orient=track.global_orient[frames],
-            hand_pose=track.hand_pose[frames],
-            betas=track.betas if len(track.betas) == 1 else track.betas[frames],
-            valid=track.valid[frames],
-        )
-        for side, track in clip.hands.items()
-    }
-    hinge = None if clip.object.hinge_rad is None else clip.object.hinge_rad[frames]
-    thing = replace(
-        clip.object,
-        rotvec=clip.object.rotvec[frames],
-        translation_m=clip.object.translation_m[frames],
-        hinge_rad=hinge,
-    )
-    return replace(clip, hands=hands, object=thing, source_frames=clip.source_frames[frames])
+    return clip.take(frames)
 
 
 def _touch(clip: Clip, hands: HandPair) -> _Touch:
@@ -96,15 +78,11 @@ def _touch(clip: Clip, hands: HandPair) -> _Touch:
 def _distances(clip: Clip, points_m: np.ndarray) -> np.ndarray:
     """(frame, point) distance of world points from the object's surface, each part where its hinge has moved it."""
     track, model = clip.object, clip.object.model
-    rotation = rotvec_to_rotmat(track.rotvec.astype(np.float64))
-    local = (points_m - track.translation_m[:, None]) @ rotation
+    local = track.world_from_object.inverse() @ points_m
     nearest = np.full(local.shape[:2], np.inf)
     for part in np.unique(model.face_part):
         faces = model.faces[model.face_part == part]
-        in_part = local
-        if part == 1 and model.hinge is not None and track.hinge_rad is not None:
-            turn = rotvec_to_rotmat(model.hinge.axis[None] * track.hinge_rad.astype(np.float64)[:, None])
-            in_part = (local - model.hinge.origin_m) @ turn + model.hinge.origin_m
+        in_part = model.object_from_part(int(part), track.hinge_rad).inverse() @ local
         found = closest_points(model.vertices_m, faces, in_part.reshape(-1, 3)).distance_m
         nearest = np.minimum(nearest, found.reshape(nearest.shape))
     return nearest

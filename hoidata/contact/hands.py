@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from hoidata.clips import SIDES, Clip, Side
-from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex, joints_in_object
+from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.store.hand_evidence import HandEvidence
@@ -45,7 +45,7 @@ def acting_hands_at_surface(
         raise BadInput("most_m", f"at least the threshold, {threshold_m:g} m", f"{most_m:g} m")
     distance: dict[Side, np.ndarray] = {}
     for side in SIDES:
-        places = joints_in_object(joints_m[side], clip.object)
+        places = clip.object.world_from_object.inverse() @ joints_m[side].astype(np.float64)
         nearest = index.distance_m(places, clip.object.hinge_rad, most_m).min(axis=1, initial=np.inf)
         distance[side] = np.where(clip.hands[side].valid, nearest, np.inf)
     return HandEvidence(None, distance, threshold_m).at_threshold(threshold_m)

@@ -31,7 +31,7 @@ class CellGrids(NamedTuple):
     low_m: (part, 3) corners; cells_per_m: (part,) inverse edge of a cell; shape: (part, 3) cells along the axes;
     cell: (part,) the first cell of each part. first: (cell + 1,) int32, where a cell's blocks start.
     place_m: (block, 3, 8) float32, coordinates of the candidates, infinite where a cell's last block has room left;
-    point: (block, 8) int16, their numbers, rising within a cell. Small types in one stretch: what is slow is to fetch.
+    point: (block, 8) int16, their numbers, rising within a cell. Small types side by side: what is slow is to fetch.
     """
 
     low_m: np.ndarray

@@ -1,7 +1,8 @@
 """World joints in the frame of each part of a moving object, compiled: one pass, nothing in between in memory.
 
-The same formulas in the same order as ``proximity.joints_in_object`` and ``joints_in_part``, so that distances are the
-same to the last bit: SciPy's rotation by way of the unit quaternion, and products added up as OpenBLAS does.
+The same formulas in the same order as ``ObjectTrack.world_from_object`` and ``ObjectModel.object_from_part``, so that
+distances are the same to the last bit: SciPy's rotation by way of the unit quaternion, and products added up as
+OpenBLAS does.
 """
 
 from collections.abc import Sequence

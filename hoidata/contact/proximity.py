@@ -11,8 +11,6 @@ from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entri
 from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, nearest_of_each, point_boxes
 from hoidata.contact.part_frames import part_motion, part_places
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.objects.model import Hinge
 from hoidata.objects.sampling import SampledPoints
 
 CONTACT_THRESHOLD_M = 0.02
@@ -71,17 +69,3 @@ class ProximityIndex:
     def _places(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(part, frame, joint, 3) float64 joints in the frame of each part."""
         return part_places(joints_m, part_motion(track, self.parts))
-
-
-def joints_in_object(joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
-    """World joints ``(frame, joint, 3)`` in the object frame of their own frame of time; float64 metres."""
-    rotation = rotvec_to_rotmat(track.rotvec.astype(np.float64))
-    return (joints_m.astype(np.float64) - track.translation_m[:, None].astype(np.float64)) @ rotation
-
-
-def joints_in_part(in_object_m: np.ndarray, part: int, hinge: Hinge | None, hinge_rad: np.ndarray | None) -> np.ndarray:
-    """Object-frame joints ``(frame, joint, 3)`` in the frame of a part: the hinge's turn undone for the moving part."""
-    if part == 0 or hinge is None or hinge_rad is None:
-        return in_object_m
-    turn = rotvec_to_rotmat(hinge.axis[None].astype(np.float64) * hinge_rad.astype(np.float64)[:, None])
-    return (in_object_m - hinge.origin_m) @ turn + hinge.origin_m

@@ -4,19 +4,22 @@ The folder it writes is described in ``hoidata.store.annotated``.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from hoidata.clips import SIDES, Side
 from hoidata.contact.maps import distance_entries, touched_frames
-from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ENTRY, ProximityIndex
+from hoidata.contact.proximity import ENTRY, ProximityIndex
+from hoidata.contact.settings import ContactSettings
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
-from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
+from hoidata.objects.sampling import SampledPoints, sample_points
 from hoidata.store.store import Store, open_store
 
 ENTRIES_PER_SHARD = 1 << 23
@@ -41,31 +44,32 @@ CLIPS = pa.schema(
 def contact_store(
     clips_folder: str | Path,
     out_folder: str | Path,
+    settings: ContactSettings | None = None,
     *,
-    points: int = POINT_COUNT,
-    threshold_m: float = CONTACT_THRESHOLD_M,
     hands: HandPair | None = None,
+    **changes: Any,
 ) -> dict[str, int]:
     """Write contact and distance maps of every clip of the store; the folder appears whole or not at all.
 
-    points: sampled points per object. threshold_m: larger distances are not kept. hands: as in ``open_store``.
+    settings, changes: fields of ``changes`` replace those of ``settings``. hands: as in ``open_store``.
     Returns counts: clips, objects, entries, clips_without_contact.
     """
-    store = open_store(clips_folder, hands)
+    settings = replace(settings or ContactSettings(), **changes)
+    store, points = open_store(clips_folder, hands), settings.points
     sampled = sample_objects(store, points)
-    with atomic_folder(out_folder) as part:
-        _write_points(part, sampled, points)
-        writer = _Writer(part, points)
+    with atomic_folder(out_folder) as partial:
+        _write_points(partial, sampled, points)
+        writer = _Writer(partial, points)
         indices = {name: ProximityIndex(cloud) for name, cloud in sampled.items()}
-        for clip_id, entries in clip_entries(store, indices, threshold_m):
+        for clip_id, entries in clip_entries(store, indices, settings.threshold_m):
             writer.add(clip_id, entries)
         counts = writer.finish() | {"objects": len(sampled)}
-        info = {"threshold_m": threshold_m, "points": points, "counts": counts}
-        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+        info = {"threshold_m": settings.threshold_m, "points": points, "counts": counts}
+        (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
 
 
-def sample_objects(store: Store, points: int = POINT_COUNT) -> dict[str, SampledPoints]:
+def sample_objects(store: Store, points: int) -> dict[str, SampledPoints]:
     """Sampled points of every object of a store, by name, in the store's order."""
     return {name: sample_points(store.object_model(name), points) for name in store.objects["object"]}
 

@@ -75,8 +75,9 @@ def convert_dataset(
     on stdout.
 
     A run that ends early, even by ``kill -9``, leaves ``.<name>.work`` beside ``out``; the next one takes up what was
-    finished there if neither raw files, code nor settings have changed. Raises BadInput when a worker process is
-    lost, when ``out`` is being written by another run, or when there is no room.
+    finished there if neither raw files, code nor settings have changed. A sequence whose worker process dies, and dies
+    again when it is tried alone, is left out; it stays so until the store is finished, and a later conversion tries
+    it anew. Raises BadInput when ``out`` is being written by another run, or when there is no room.
     """
     hands = hands_for(adapter.hand_convention, hands)
     keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
@@ -124,6 +125,10 @@ class SequenceConverter:
         else:
             self.work.keep(key, results, raw.sources)
 
+    def leave_out(self, lost: WorkerLost) -> None:
+        """Keep the reason in the place of the clips; a run that goes on does not try it again."""
+        self.work.keep(lost.item, [_left_out(lost.item, self.root, lost)], ())
+
     def _checked(self, item: Clip | Quarantined) -> Clip | Quarantined:
         return item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
 
@@ -135,22 +140,9 @@ def _convert_all(convert: SequenceConverter, keys: Sequence[SequenceKey], jobs: 
     title = f"convert {convert.adapter.name}" + (f" ({taken_up} finished before)" if taken_up else "")
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
         task = bar.add_task(title, total=len(keys), completed=taken_up)
-        done = 0
-        try:
-            for _ in in_workers(convert, missing, jobs, lock):
-                done += 1
-                bar.advance(task)
-        except WorkerLost as error:
-            raise _worker_lost(error, taken_up + done, len(keys)) from error
+        for _ in in_workers(convert, missing, jobs, lock, convert.leave_out):
+            bar.advance(task)
     return taken_up
-
-
-def _worker_lost(error: WorkerLost, finished: int, total: int) -> BadInput:
-    remedy = (
-        f"run it again: {finished} of {total} sequences are finished and kept; if memory ran out, set HOIDATA_JOBS=1"
-    )
-    where = ", ".join(map(str, error.in_flight)) or "conversion"
-    return BadInput(where, "worker processes that live until they are done", f"one lost ({error.cause})", remedy)
 
 
 def _left_out(key: SequenceKey, root: Path, error: BadInput) -> Quarantined:

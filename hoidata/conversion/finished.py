@@ -24,6 +24,7 @@ from hoidata.clips.clip import Clip, SourceFile
 from hoidata.clips.quarantine import Quarantined
 from hoidata.conversion.packing import Packer, unpack
 from hoidata.datasets.base import Adapter, SequenceKey
+from hoidata.datasets.registry import FACTS
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, sha256_bytes, sha256_file
 from hoidata.files.arrays import read_npz, write_npz
@@ -31,7 +32,7 @@ from hoidata.hands import HandPair
 from hoidata.store.store import SCHEMA_VERSION
 
 # The code a conversion runs: these rooms of hoidata, and the adapter's own file wherever it lies.
-ROOMS = ("adapters", "schema", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
+ROOMS = ("conversion", "datasets", "store", "clips", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
 LIBRARIES = ("numpy", "scipy", "torch", "trimesh")
 _CACHED_ARRAYS = 32
 
@@ -141,6 +142,7 @@ def job_of(
     return {
         "adapter": f"{kind.__module__}:{kind.__qualname__}",
         "settings": {name: repr(value) for name, value in sorted(_settings(adapter).items())},
+        "facts": {name: repr(getattr(adapter, name)) for name in FACTS},
         "hands": hands.digest,
         "schema": SCHEMA_VERSION,
         "code": _code_digest(kind),

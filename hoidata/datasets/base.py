@@ -10,16 +10,17 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 from hoidata.clips.clip import Clip, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
 from hoidata.clips.quarantine import Quarantined
+from hoidata.dataset_folders import DatasetFacts
 from hoidata.errors import BadInput
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 
-__all__ = ["Adapter", "DatasetPart", "Quarantined", "RawTree", "SequenceKey"]
+__all__ = ["Adapter", "DatasetPart", "Described", "Quarantined", "RawTree", "SequenceKey"]
 
 _SMALL_BYTES = 65536
 _LARGEST_FILE = 256 << 20
@@ -106,6 +107,40 @@ class Adapter(Protocol):
         Every file is reached through ``raw``. Raises BadInput when the whole sequence cannot be used.
         """
         ...
+
+
+class Described:
+    """The facts of an adapter, as ``facts.toml`` of its folder states them; it declares ``facts`` alone."""
+
+    facts: ClassVar[DatasetFacts]
+
+    @property
+    def name(self) -> str:
+        return self.facts.name
+
+    @property
+    def version(self) -> str:
+        return self.facts.version
+
+    @property
+    def licence(self) -> str:
+        return self.facts.licence
+
+    @property
+    def may_be_shared(self) -> bool:
+        return self.facts.may_be_shared
+
+    @property
+    def where_to_register(self) -> str:
+        return self.facts.where_to_register
+
+    @property
+    def needs_mano(self) -> bool:
+        return self.facts.needs_mano
+
+    @property
+    def source_fps(self) -> float:
+        return float(self.facts.source_fps)
 
 
 @dataclass

@@ -1,42 +1,31 @@
-"""Which adapters there are: the built-in ones and those other packages register.
+"""Which adapters there are: one per dataset folder, and those other packages register.
 
-A package adds one with an entry point: ``[project.entry-points."hoidata.adapters"]  taco = "my_package:TacoAdapter"``.
+A folder of hoidata/datasets, or one the user lists (see ``hoidata.dataset_folders``), is a dataset: its ``adapter.py``
+holds one class whose name ends in ``Adapter``. A package adds one with an entry point::
+
+    [project.entry-points."hoidata.adapters"]
+    kitchen = "kitchen_hoi:KitchenAdapter"
 """
 
+import sys
 from dataclasses import dataclass, fields, is_dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any
 
+from hoidata.dataset_folders import built_in_names, dataset_folder, outside_folders
 from hoidata.datasets.base import Adapter
 from hoidata.errors import BadInput, MissingResource
 
 ENTRY_POINT_GROUP = "hoidata.adapters"
-BUILT_IN = {
-    "h2o": "hoidata.datasets.h2o.adapter:H2OAdapter",
-    "grab": "hoidata.datasets.grab.adapter:GrabAdapter",
-    "arctic": "hoidata.datasets.arctic.adapter:ArcticAdapter",
-    "manipnet": "hoidata.datasets.manipnet.adapter:ManipNetAdapter",
-    "taco": "hoidata.datasets.taco.adapter:TacoAdapter",
-}
-# What an adapter states about its dataset (see ``Adapter``); its other fields are settings.
-FACTS = (
-    "name",
-    "version",
-    "licence",
-    "may_be_shared",
-    "where_to_register",
-    "needs_mano",
-    "source_fps",
-    "frame",
-    "hand_convention",
-    "parts",
-)
+# What an adapter states about its dataset; its other fields are settings.
+FACTS = tuple(name for name, value in vars(Adapter).items() if isinstance(value, property))
 
 
 @dataclass(frozen=True)
 class Registered:
-    """One known adapter. origin: "built in", or the package and version that registers it.
+    """One known adapter. origin: "built in", the user's folder, or the package and version that registers it.
 
     settings: the fields that may be given to ``get_adapter``, with their defaults. adapter: one with these defaults,
     or None with the ``problem`` that kept it from being made.
@@ -50,8 +39,8 @@ class Registered:
 
 
 def adapter_names() -> list[str]:
-    """Names of all known adapters, built-in ones first."""
-    return [*BUILT_IN, *sorted({point.name for point in _added()})]
+    """Names of all known adapters: built-in ones, then those of the user's folders, then those of other packages."""
+    return [*built_in_names(), *sorted(outside_folders()), *sorted({point.name for point in _added()})]
 
 
 def registered_adapters() -> list[Registered]:
@@ -75,7 +64,8 @@ def get_adapter(name: str, **settings: Any) -> Adapter:
 
 
 def _registered(name: str) -> Registered:
-    origin = "built in" if name in BUILT_IN else ", ".join(_package(point) for point in _added() if point.name == name)
+    packages = ", ".join(_package(point) for point in _added() if point.name == name)
+    origin = "built in" if name in built_in_names() else packages or str(outside_folders()[name])
     try:
         kind = _kind(name)
         return Registered(name, origin, _settings(kind), kind())
@@ -84,8 +74,8 @@ def _registered(name: str) -> Registered:
 
 
 def _added() -> list[EntryPoint]:
-    """Entry points of other packages; a built-in name cannot be taken over."""
-    return [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name not in BUILT_IN]
+    """Entry points of other packages; the name of a folder cannot be taken over."""
+    return [point for point in entry_points(group=ENTRY_POINT_GROUP) if dataset_folder(point.name) is None]
 
 
 def _package(point: EntryPoint) -> str:
@@ -99,9 +89,8 @@ def _settings(kind: Any) -> dict[str, Any]:
 
 
 def _kind(name: str) -> Any:
-    if name in BUILT_IN:
-        module, _, attribute = BUILT_IN[name].partition(":")
-        return getattr(import_module(module), attribute)
+    if dataset_folder(name) is not None:
+        return _kind_of_folder(name)
     points = [point for point in _added() if point.name == name]
     if not points:
         raise MissingResource(f"there is no adapter {name!r}; known ones: {', '.join(adapter_names())}")
@@ -115,3 +104,23 @@ def _kind(name: str) -> Any:
     except Exception as error:  # importing a package of others can raise anything
         text = f"{type(error).__name__}: {error}"
         raise MissingResource(f"the adapter {name!r} of {_package(points[0])} cannot be imported: {text}") from error
+
+
+def _kind_of_folder(name: str) -> type:
+    """The one adapter class of a dataset's folder."""
+    room, above = sys.modules["hoidata.datasets"].__path__, str(Path(str(dataset_folder(name))).parent)
+    if above not in room:  # named since this process imported the room
+        room.append(above)
+    try:
+        module = import_module(f"hoidata.datasets.{name}.adapter")
+    except BadInput:
+        raise
+    except Exception as error:  # so can importing a folder of the user's own
+        text = f"{type(error).__name__}: {error}"
+        raise MissingResource(f"the adapter in {dataset_folder(name)} cannot be imported: {text}") from error
+    kinds = [kind for kind in vars(module).values() if isinstance(kind, type) and kind.__module__ == module.__name__]
+    found = [kind for kind in kinds if kind.__name__.endswith("Adapter")]
+    if len(found) != 1:
+        names = ", ".join(kind.__name__ for kind in found) or "none"
+        raise BadInput(f"{module.__file__}", "one class whose name ends in Adapter", names, "rename the others")
+    return found[0]

@@ -1,15 +1,14 @@
 """Writing that leaves either the old file or the whole new one, never a part; and one writer at a time."""
 
-import contextlib
-import fcntl
 import os
 import re
 import shutil
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from filelock import FileLock, Timeout
 
 from hoidata.errors import BadInput
 
@@ -81,37 +80,20 @@ def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
     The system frees the lock when the last process that has the descriptor ends, however it ends. Raises BadInput
     when another process still holds it after ``wait_s`` seconds.
     """
-    path = Path(path)
+    path, descriptors = Path(path), []
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = path.parent / f".{path.name}.lock"
-    descriptor = _lock(lock, path, time.monotonic() + wait_s)
+    holding = FileLock(lock, wait_s, on_acquired=descriptors.append)
     try:
-        os.truncate(descriptor, 0)
-        os.write(descriptor, str(os.getpid()).encode())
-        yield descriptor
+        holding.acquire()
+    except Timeout:
+        holder = lock.read_text() if lock.exists() else ""
+        got = f"process {holder or 'unknown'} at work on it"
+        remedy = "wait for that run to end, or end it, and run again"
+        raise BadInput(path, "nobody else to write it", got, remedy) from None
+    try:
+        lock.write_text(str(os.getpid()))
+        yield descriptors[0]
     finally:
-        lock.unlink(missing_ok=True)
-        os.close(descriptor)
-
-
-def _lock(lock: Path, path: Path, deadline: float) -> int:
-    while True:
-        descriptor = os.open(lock, os.O_CREAT | os.O_RDWR, 0o644)
-        with contextlib.suppress(BlockingIOError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _is_still(descriptor, lock):
-                return descriptor
-        os.close(descriptor)
-        if time.monotonic() > deadline:
-            holder = lock.read_text() if lock.exists() else ""
-            got = f"process {holder or 'unknown'} at work on it"
-            raise BadInput(path, "nobody else to write it", got, "wait for that run to end, or end it, and run again")
-        time.sleep(0.05)
-
-
-def _is_still(descriptor: int, lock: Path) -> bool:
-    """The locked file is the one of that name: its holder before us deletes it when he is done."""
-    try:
-        return os.path.samestat(os.fstat(descriptor), lock.stat())
-    except FileNotFoundError:
-        return False
+        lock.unlink(missing_ok=True)  # while it is held: filelock holds none on a file that has lost its name
+        holding.release()

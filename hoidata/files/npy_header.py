@@ -88,7 +88,8 @@ def _is_length(value: Any) -> bool:
 
 def read_plain_array(stream: Any, header: NpyHeader, available: int, where: str | Path) -> np.ndarray:
     """The numbers or texts behind a header, as an own array. available: bytes there are, before any is allocated."""
-    if header.n_bytes > available:
+    # NumPy makes room for a character where a text has none.
+    if max(header.n_bytes, 0 if header.dtype.itemsize else math.prod(header.shape)) > available:
         expected = f"{header.n_bytes} bytes of data for shape {header.shape}"
         raise BadInput(where, expected, f"{available} bytes")
     shape = header.shape[::-1] if header.by_columns else header.shape

@@ -1,9 +1,10 @@
-"""Read plain pickles that hold torch tensors (TACO's hand files) without torch and without executing anything.
+"""Read plain pickles that hold torch tensors (TACO's hand files) without executing anything.
 
 ``pickle.dump`` of a tensor writes a call of ``torch.storage._load_from_bytes`` on the bytes of ``torch.save`` in its
-legacy format (torch/serialization.py, ``_legacy_save``): five pickles (magic number, protocol, system, the storage as
-a persistent id, keys), then the number of elements (int64) and the elements. torch would open those bytes with an
-unrestricted unpickler; here they are parsed by the rules below, and tensors come back as NumPy arrays.
+legacy format: five pickles (magic number, protocol, system, the storage as a persistent id, keys), the number of
+elements and the elements. torch itself would open those bytes with an unrestricted unpickler; here the outer pickle is
+read by rules of ours, the bytes by torch's ``weights_only`` loading, once it is known that they name nothing but a
+storage and claim no more than there is. Tensors come back as NumPy arrays.
 """
 
 import io
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from hoidata.errors import BadInput
-from hoidata.files.pickle_check import REFUSED_OPCODES, check_opcodes
+from hoidata.files.pickle_check import REFUSED_OPCODES
 from hoidata.files.restricted_pickle import (
     Allow,
     Budget,
@@ -32,23 +33,17 @@ MAX_FILE_BYTES = 256 << 20
 _REPEATED_BYTES = 64 << 20
 _MAX_DIMENSIONS = 8
 _MAGIC = 0x1950A86A20F9469CFC6C
-_PROTOCOL = 1001
+_LEAST_LENGTH = 1001  # the protocol's number is as large, in the storage of a single element too
 _LEGACY_PICKLES = 5
 _MOST_OPCODES = 1000  # of each; torch writes 30 at most
-# Little-endian. BFloat16 and quantised storages have no NumPy type and are refused.
-_STORAGE_DTYPES = {
-    "DoubleStorage": "<f8",
-    "FloatStorage": "<f4",
-    "HalfStorage": "<f2",
-    "LongStorage": "<i8",
-    "IntStorage": "<i4",
-    "ShortStorage": "<i2",
-    "CharStorage": "<i1",
-    "ByteStorage": "<u1",
-    "BoolStorage": "|b1",
-}
-# torch up to 1.9 names CUDA storages as classes of torch.cuda; later ones by their location only.
-STORAGE_CLASSES = {(module, name): kind for module in ("torch", "torch.cuda") for name, kind in _STORAGE_DTYPES.items()}
+_REFUSED_IN_STORAGES = REFUSED_OPCODES - {"BINPERSID"} | {"STACK_GLOBAL", "REDUCE", "NEWOBJ", "NEWOBJ_EX", "BUILD"}
+# torch up to 1.9 names CUDA storages as classes of torch.cuda; later ones by their location only. BFloat16 and
+# quantised storages have no NumPy type.
+STORAGE_NAMES = frozenset(
+    f"{module} {kind}Storage"
+    for module in ("torch", "torch.cuda")
+    for kind in ("Double", "Float", "Half", "Long", "Int", "Short", "Char", "Byte", "Bool")
+)
 
 
 def load_torch_pickle(source: str | Path | bytes, where: str | Path) -> Any:
@@ -64,15 +59,15 @@ def load_torch_pickle(source: str | Path | bytes, where: str | Path) -> Any:
         raise BadInput(where, "a pickle of tensors", f"{type(error).__name__}: {error.strerror}") from None
     with stream:
         data = read_at_most(stream, MAX_FILE_BYTES + 1)
-    return restricted_load(data, tensor_globals(where, len(data)), where=where, max_bytes=MAX_FILE_BYTES)
+    return restricted_load(data, tensor_globals(len(data)), where=where, max_bytes=MAX_FILE_BYTES)
 
 
-def tensor_globals(where: str | Path, n_bytes: int) -> Allow:
+def tensor_globals(n_bytes: int) -> Allow:
     """The exact allow-list of one file of ``n_bytes``, which also limits how large its tensors get together."""
-    budget = Budget(n_bytes + _REPEATED_BYTES)
+    budget = Budget(2 * n_bytes + _REPEATED_BYTES)  # every storage, and every tensor of them
 
     def load_from_bytes(data: Any) -> _Storage:
-        return _load_from_bytes(where, data)
+        return _load_from_bytes(budget, data)
 
     def rebuild_tensor(*arguments: Any) -> CheckedArray:
         return _rebuild_tensor(budget, *arguments)
@@ -86,7 +81,7 @@ def tensor_globals(where: str | Path, n_bytes: int) -> Allow:
 
 
 class _Storage(StandIn):
-    """The elements of one storage, (element,), read-only. A pickle can only hand it on."""
+    """The elements of one storage, (element,). A pickle can only hand it on."""
 
     __slots__ = ("elements",)
 
@@ -131,77 +126,26 @@ def _ordered_dict(items: Any = ()) -> dict:
     return dict(items)
 
 
-def _load_from_bytes(where: str | Path, data: Any) -> _Storage:
+def _load_from_bytes(budget: Budget, data: Any) -> _Storage:
     """The storage in bytes written by ``torch.save(storage, _use_new_zipfile_serialization=False)``."""
     if not isinstance(data, bytes):
         raise pickle.UnpicklingError(f"a {type(data).__name__} in the place of a storage")
-    (magic, protocol, system, head, keys), elements = _split(data)
-    if restricted_load(magic, {}, where=where) != _MAGIC or restricted_load(protocol, {}, where=where) != _PROTOCOL:
-        raise pickle.UnpicklingError("a storage that torch.save did not write")
-    facts = restricted_load(system, {}, where=where)
-    if not isinstance(facts, dict) or facts.get("little_endian") is not True:
-        raise pickle.UnpicklingError("a storage of a big-endian machine")
-    dtype, key, length = _storage_head(head)
-    if restricted_load(keys, {}, where=where) != [key]:
-        raise pickle.UnpicklingError("a storage without its key")
-    if int.from_bytes(elements[:8], "little") != length or len(elements) != 8 + length * dtype.itemsize:
-        raise pickle.UnpicklingError(f"a storage of {length} {dtype} in {len(elements)} bytes")
-    return _Storage(np.frombuffer(elements, dtype, length, offset=8))
+    budget.spend(len(data))  # a pickle can ask for the same bytes many times
+    _check_storage(data)
+    import torch
+
+    storage = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    if not isinstance(storage, torch.TypedStorage):
+        raise pickle.UnpicklingError(f"a {type(storage).__name__} in the place of a storage")
+    return _Storage(torch.empty(0, dtype=storage.dtype).set_(storage._untyped_storage).numpy())
 
 
-def _split(data: bytes) -> tuple[list[bytes], memoryview]:
-    """The five pickles of the legacy format and what follows them."""
-    stream, parts = io.BytesIO(data), []
+def _check_storage(data: bytes) -> None:
+    """Refuse what no storage needs; torch allocates the length a storage claims before it looks how much there is."""
+    stream = io.BytesIO(data)
     for _ in range(_LEGACY_PICKLES):
-        start = stream.tell()
-        for number, _opcode in enumerate(pickletools.genops(stream)):
-            if number > _MOST_OPCODES:
-                raise pickle.UnpicklingError("a storage that torch.save did not write")
-        parts.append(data[start : stream.tell()])
-    return parts, memoryview(data)[stream.tell() :]  # not copied: a pickle can ask for the same storage many times
-
-
-def _storage_head(data: bytes) -> tuple[np.dtype, str, int]:
-    """Type, key and number of elements from ``("storage", class, key, location, length, None)``."""
-    check_opcodes(data, REFUSED_OPCODES - {"BINPERSID"})
-    found = _HeadUnpickler(io.BytesIO(data), fix_imports=False).load()
-    if not isinstance(found, _Head):
-        raise pickle.UnpicklingError("something else in the place of a storage")
-    return found.dtype, found.key, found.length
-
-
-class _Head(StandIn):
-    """What a storage's persistent id says; any location (``cuda:0``) is the CPU here."""
-
-    __slots__ = ("dtype", "key", "length")
-
-    def __init__(self, dtype: np.dtype, key: str, length: int) -> None:
-        self.dtype, self.key, self.length = dtype, key, length
-
-
-class _HeadUnpickler(pickle.Unpickler):
-    """Knows the names of storage classes and nothing else; they stand for NumPy types."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        try:
-            kind = STORAGE_CLASSES[module, name]
-        except KeyError:
-            raise pickle.UnpicklingError(f"it names {module}.{name}, which is not allowed") from None
-        return _StorageClass(np.dtype(kind))
-
-    def persistent_load(self, pid: Any) -> _Head:
-        word, kind, key, location, length, view = pid
-        if word != "storage" or not isinstance(kind, _StorageClass) or view is not None:
-            raise pickle.UnpicklingError("a persistent id that is no whole storage")
-        if not (isinstance(key, str) and isinstance(location, str) and _is_natural(length)):
-            raise pickle.UnpicklingError("a persistent id that is no whole storage")
-        return _Head(kind.dtype, key, length)
-
-
-class _StorageClass(StandIn):
-    """Stands for a class such as ``torch.FloatStorage``; cannot be called or changed."""
-
-    __slots__ = ("dtype",)
-
-    def __init__(self, dtype: np.dtype) -> None:
-        self.dtype = dtype
+        for number, (opcode, argument, _place) in enumerate(pickletools.genops(stream)):
+            is_large = isinstance(argument, int) and _MAGIC != argument > max(len(data), _LEAST_LENGTH)
+            is_foreign = opcode.name == "GLOBAL" and argument not in STORAGE_NAMES
+            if number > _MOST_OPCODES or is_large or is_foreign or opcode.name in _REFUSED_IN_STORAGES:
+                raise pickle.UnpicklingError(f"a storage with {opcode.name} {argument}, which is not allowed"[:120])

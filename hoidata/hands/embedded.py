@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.hands.model import N_JOINTS, N_POSE_FEATURES, N_VERTICES, PARENTS, HandModel, HandPair, checked_model
+from hoidata.hands.model import N_POSE_FEATURES, N_ROTATIONS, N_VERTICES, PARENTS, HandModel, HandPair, checked_model
 
 ASSET = Path(__file__).with_name("assets") / "embedded_hand.npz"
 _REMEDY = "reinstall hoidata"
@@ -54,7 +54,7 @@ def _read_right() -> HandModel:
 
 def _dense_weights(joint: np.ndarray, value: np.ndarray) -> np.ndarray:
     total = value[:, 0] + value[:, 1] + value[:, 2] + value[:, 3]
-    weights = np.zeros((N_VERTICES, N_JOINTS))
+    weights = np.zeros((N_VERTICES, N_ROTATIONS))
     for column in range(joint.shape[1]):
         np.add.at(weights, (np.arange(N_VERTICES), joint[:, column]), value[:, column] / total)
     return weights
@@ -63,9 +63,9 @@ def _dense_weights(joint: np.ndarray, value: np.ndarray) -> np.ndarray:
 def _dense_regressor(stored: dict[str, np.ndarray]) -> np.ndarray:
     joint, vertex = stored["regressor_joint"], stored["regressor_vertex"]
     value = stored["regressor_value"].astype(np.float64)
-    total = np.zeros(N_JOINTS)
+    total = np.zeros(N_ROTATIONS)
     np.add.at(total, joint, value)
-    regressor = np.zeros((N_JOINTS, N_VERTICES))
+    regressor = np.zeros((N_ROTATIONS, N_VERTICES))
     regressor[joint, vertex] = value / total[joint]
     return regressor
 
@@ -80,8 +80,8 @@ def pose_correctives(template_m: np.ndarray, faces: np.ndarray, weights: np.ndar
     normals = vertex_normals(template_m, faces)
     dorsal_share = 0.5 * (1 + normals[:, 1])
     sine_m = _DORSAL_M * dorsal_share + _PALMAR_M * (1 - dorsal_share)
-    directions = np.zeros((N_VERTICES, 3, N_JOINTS - 1, 3, 3))
-    for joint in range(1, N_JOINTS):
+    directions = np.zeros((N_VERTICES, 3, N_ROTATIONS - 1, 3, 3))
+    for joint in range(1, N_ROTATIONS):
         shared = 4 * weights[:, joint] * weights[:, PARENTS[joint]]
         directions[:, :, joint - 1, 1, 0] = normals * (shared * sine_m)[:, None]
         directions[:, :, joint - 1, 0, 0] = normals * (shared * _BULGE_M)[:, None]
@@ -106,8 +106,8 @@ def mirrored(model: HandModel) -> HandModel:
     """
     rotation_sign = _MIRROR[:, None] * _MIRROR
     pose_sign = _MIRROR[:, None, None, None] * rotation_sign
-    pose = model.pose_directions.reshape(N_VERTICES, 3, N_JOINTS - 1, 3, 3) * pose_sign
-    axis_sign = np.tile([1.0, -1.0, -1.0], N_JOINTS - 1)
+    pose = model.pose_directions.reshape(N_VERTICES, 3, N_ROTATIONS - 1, 3, 3) * pose_sign
+    axis_sign = np.tile([1.0, -1.0, -1.0], N_ROTATIONS - 1)
     return checked_model(
         f"mirror of {model.name}",
         _REMEDY,

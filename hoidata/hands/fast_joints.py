@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from hoidata.hands.model import N_JOINTS, PARENTS, TIP_VERTICES, HandModel
+from hoidata.hands.model import N_JOINTS, N_ROTATIONS, PARENTS, TIP_VERTICES, HandModel
 from hoidata.hands.tracks import HandTrackLike
 
 _CHUNK_FRAMES = 256  # the rotations of so many frames stay in the processor's cache
@@ -26,14 +26,14 @@ def fast_track_joints(track: HandTrackLike, model: HandModel) -> np.ndarray:
     rest_joints = model.rest_joints_m(betas, track.template_m)
     template = model.template_m if track.template_m is None else np.asarray(track.template_m, dtype=np.float64)
     rest_tips = template[_TIPS] + tips.pose_origin_m + (betas @ tips.shape).reshape(-1, 5, 3)
-    out = np.empty((len(track.wrist_m), 21, 3), dtype=np.float32)
+    out = np.empty((len(track.wrist_m), N_JOINTS, 3), dtype=np.float32)
     for start in range(0, len(out), _CHUNK_FRAMES):
         frames = slice(start, start + _CHUNK_FRAMES)
         own = frames if len(betas) > 1 else slice(None)
         turns = _rotations(track.global_orient[frames], track.hand_pose[frames])
         # Blend shapes of the pose act on R - I; the share of -I lies in ``pose_origin_m``.
         moved_tips = (turns[:, 9:] @ tips.pose).reshape(-1, 5, 3) + rest_tips[own]
-        _place(track.wrist_m[frames], turns, rest_joints[own], moved_tips, tips.weights, out[frames])
+        _place_joints(track.wrist_m[frames], turns, rest_joints[own], moved_tips, tips.weights, out[frames])
     return out
 
 
@@ -49,7 +49,7 @@ class _Tips(NamedTuple):
 @lru_cache(maxsize=8)
 def _tips_of(model: HandModel) -> _Tips:
     pose = model.pose_directions[_TIPS].reshape(15, -1).T
-    identity = np.tile(np.eye(3).ravel(), N_JOINTS - 1)
+    identity = np.tile(np.eye(3).ravel(), N_ROTATIONS - 1)
     return _Tips(
         shape=np.ascontiguousarray(model.shape_directions[_TIPS].reshape(15, -1).T),
         pose=np.ascontiguousarray(pose),
@@ -91,41 +91,41 @@ def _rotation(x, y, z, turn):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _place(wrist, turns, rest_joints, rest_tips, weights, out):  # pragma: no cover (compiled)
-    """World places of joints and tips. rest_joints: (frame or 1, 16, 3); rest_tips: (frame, 5, 3), blended."""
-    world, places = np.empty((16, 9)), np.empty((16, 3))
+def _place_joints(wrist, turns, rest_joints, rest_tips, weights, out):  # pragma: no cover (compiled)
+    """World positions of joints and tips. rest_joints: (frame or 1, 16, 3); rest_tips: (frame, 5, 3), blended."""
+    world, positions = np.empty((16, 9)), np.empty((16, 3))
     for frame in range(len(out)):
         rest = rest_joints[frame if len(rest_joints) > 1 else 0]
         world[0] = turns[frame, :9]
         for axis in range(3):
-            places[0, axis] = wrist[frame, axis]
+            positions[0, axis] = wrist[frame, axis]
         for joint in range(1, 16):
-            _hang(joint, _PARENTS[joint], turns[frame, 9 * joint : 9 * joint + 9], rest, world, places)
-        out[frame, :16] = places
+            _hang(joint, _PARENTS[joint], turns[frame, 9 * joint : 9 * joint + 9], rest, world, positions)
+        out[frame, :16] = positions
         for tip in range(5):
-            _skin(rest_tips[frame, tip], weights[tip], rest, world, places, out[frame, 16 + tip])
+            _skin(rest_tips[frame, tip], weights[tip], rest, world, positions, out[frame, 16 + tip])
 
 
 @njit(cache=True)
-def _hang(joint, parent, turn, rest, world, places):  # pragma: no cover (compiled)
-    """World rotation and place of a joint from its parent's."""
+def _hang(joint, parent, turn, rest, world, positions):  # pragma: no cover (compiled)
+    """World rotation and position of a joint from its parent's."""
     x, y, z = rest[joint, 0] - rest[parent, 0], rest[joint, 1] - rest[parent, 1], rest[joint, 2] - rest[parent, 2]
     for row in range(3):
         a, b, c = world[parent, 3 * row], world[parent, 3 * row + 1], world[parent, 3 * row + 2]
-        places[joint, row] = places[parent, row] + a * x + b * y + c * z
+        positions[joint, row] = positions[parent, row] + a * x + b * y + c * z
         for column in range(3):
             world[joint, 3 * row + column] = a * turn[column] + b * turn[3 + column] + c * turn[6 + column]
 
 
 @njit(cache=True)
-def _skin(point, weights, rest, world, places, out):  # pragma: no cover (compiled)
+def _skin(point, weights, rest, world, positions, out):  # pragma: no cover (compiled)
     """Linear blend skinning of one vertex, over the joints that have a weight in it."""
     x, y, z = 0.0, 0.0, 0.0
     for joint in range(16):
         if weights[joint] != 0:
             dx, dy, dz = point[0] - rest[joint, 0], point[1] - rest[joint, 1], point[2] - rest[joint, 2]
             turn, weight = world[joint], weights[joint]
-            x += weight * (turn[0] * dx + turn[1] * dy + turn[2] * dz + places[joint, 0])
-            y += weight * (turn[3] * dx + turn[4] * dy + turn[5] * dz + places[joint, 1])
-            z += weight * (turn[6] * dx + turn[7] * dy + turn[8] * dz + places[joint, 2])
+            x += weight * (turn[0] * dx + turn[1] * dy + turn[2] * dz + positions[joint, 0])
+            y += weight * (turn[3] * dx + turn[4] * dy + turn[5] * dz + positions[joint, 1])
+            z += weight * (turn[6] * dx + turn[7] * dy + turn[8] * dz + positions[joint, 2])
     out[0], out[1], out[2] = x, y, z

@@ -15,12 +15,11 @@ from torch import Tensor
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
-from hoidata.hands.model import N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
+from hoidata.hands.model import N_JOINTS, N_SHAPE, TIP_VERTICES, HandModel, HandPair, Side
 from hoidata.hands.solver import FINGER_POINTS, Pose, Problem, pose_step, predict, settled, shape_step
 from hoidata.hands.tracks import kinematics_of
 
 KNUCKLES = [1, 4, 7, 10, 13]
-N_KEYPOINTS = 21
 THUMB = 4
 # Fingertips touch things, so they count most; knuckles and wrist are where datasets disagree about what a joint is.
 DEFAULT_WEIGHTS = (1.0, *(1.0, 2.0, 3.0) * 5, *(6.0,) * 5)
@@ -125,7 +124,7 @@ def _fit_side(side: Side, points: np.ndarray, model: HandModel, betas: Tensor, s
 
 def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSettings) -> Problem:
     points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 3 or points.shape[1:] != (N_KEYPOINTS, 3) or not len(points):
+    if points.ndim != 3 or points.shape[1:] != (N_JOINTS, 3) or not len(points):
         raise BadInput(f"{side} hand keypoints", "an array (frame, 21, 3)", f"shape {points.shape}", "check the caller")
     known = np.asarray(np.isfinite(points).all(axis=-1))
     palm = known[:, [0, *KNUCKLES]].sum(axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.hands.model import N_JOINTS, N_SHAPE, PARENTS, TIP_VERTICES, HandModel
+from hoidata.hands.model import N_ROTATIONS, N_SHAPE, PARENTS, TIP_VERTICES, HandModel
 
 _LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
 
@@ -44,33 +44,37 @@ class HandKinematics(nn.Module):
         world-from-hand, the others relative to the parent joint; absolute, the identity is the flat hand.
         betas: (batch or 1, 10). template_m: (778, 3) or (batch, 778, 3) personal rest mesh.
         """
-        rotations, places, rest = self._chain(wrist_m, rotmats, betas, template_m)
-        tips = self.tips(rotmats, betas, rotations, places, rest, template_m)
-        return torch.cat((places, tips), 1)
+        rotations, positions, rest = self._chain(wrist_m, rotmats, betas, template_m)
+        tips = self.tips(rotmats, betas, rotations, positions, rest, template_m)
+        return torch.cat((positions, tips), 1)
 
     def forward(
         self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None = None
     ) -> tuple[Tensor, Tensor]:
         """Vertices (batch, 778, 3) and joints (batch, 21, 3); arguments as in ``joints``."""
-        rotations, places, rest = self._chain(wrist_m, rotmats, betas, template_m)
-        vertices = self.mesh(rotmats, betas, rotations, places, rest, template_m)
-        return vertices, torch.cat((places, vertices[:, list(TIP_VERTICES)]), 1)
+        rotations, positions, rest = self._chain(wrist_m, rotmats, betas, template_m)
+        vertices = self.mesh(rotmats, betas, rotations, positions, rest, template_m)
+        return vertices, torch.cat((positions, vertices[:, list(TIP_VERTICES)]), 1)
 
     def _chain(
         self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
         """World rotations (batch, 16, 3, 3) and positions (batch, 16, 3) of the joints, and the rest joints."""
         base = self.rest_joints_m if template_m is None else self.joint_regressor @ template_m
-        rest = base + (betas @ self.joint_directions).reshape(-1, N_JOINTS, 3)
+        rest = base + (betas @ self.joint_directions).reshape(-1, N_ROTATIONS, 3)
         bones = (rest[:, 1:] - rest[:, list(PARENTS[1:])]).expand(len(wrist_m), -1, -1)
-        rotations, places = [rotmats[:, :1].expand(-1, 5, -1, -1)], [wrist_m[:, None].expand(-1, 5, -1)]
+        rotations, positions = [rotmats[:, :1].expand(-1, 5, -1, -1)], [wrist_m[:, None].expand(-1, 5, -1)]
         for level in _LEVELS:
             bone = bones[:, [joint - 1 for joint in level], :, None]
-            places.append(places[-1] + (rotations[-1] @ bone)[..., 0])
+            positions.append(positions[-1] + (rotations[-1] @ bone)[..., 0])
             rotations.append(rotations[-1] @ rotmats[:, list(level)])
         fingers_rotation = torch.stack(rotations[1:], 2).flatten(1, 2)
-        fingers_place = torch.stack(places[1:], 2).flatten(1, 2)
-        return torch.cat((rotmats[:, :1], fingers_rotation), 1), torch.cat((wrist_m[:, None], fingers_place), 1), rest
+        fingers_position = torch.stack(positions[1:], 2).flatten(1, 2)
+        return (
+            torch.cat((rotmats[:, :1], fingers_rotation), 1),
+            torch.cat((wrist_m[:, None], fingers_position), 1),
+            rest,
+        )
 
     def _buffer(self, name: str, value: np.ndarray, dtype: torch.dtype) -> None:
         self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
@@ -95,12 +99,18 @@ class _Skin(nn.Module):
             self.register_buffer(name, torch.tensor(value, dtype=dtype).contiguous(), persistent=False)
 
     def forward(
-        self, rotmats: Tensor, betas: Tensor, rotations: Tensor, places: Tensor, rest: Tensor, template_m: Tensor | None
+        self,
+        rotmats: Tensor,
+        betas: Tensor,
+        rotations: Tensor,
+        positions: Tensor,
+        rest: Tensor,
+        template_m: Tensor | None,
     ) -> Tensor:
         """World positions (batch, vertex, 3)."""
         n_batch = len(rotmats)
-        moves = torch.cat((rotations, (places[..., None] - rotations @ rest[..., None])), -1)
-        blended = moves.reshape(n_batch, N_JOINTS, 12).transpose(1, 2) @ self.weights
+        moves = torch.cat((rotations, (positions[..., None] - rotations @ rest[..., None])), -1)
+        blended = moves.reshape(n_batch, N_ROTATIONS, 12).transpose(1, 2) @ self.weights
         x, y, z, shift = blended.reshape(n_batch, 3, 4, -1).unbind(2)
         rested = self._rested(rotmats, betas, template_m)
         placed = x * rested[:, :1] + y * rested[:, 1:2] + z * rested[:, 2:] + shift

@@ -13,7 +13,7 @@ import numpy as np
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import ARRAYS, Record, atomic_file, restricted_load
-from hoidata.hands.model import N_JOINTS, N_SHAPE, PARENTS, HandModel, HandPair, Side, checked_model
+from hoidata.hands.model import N_ROTATIONS, N_SHAPE, PARENTS, HandModel, HandPair, Side, checked_model
 
 MANO_SITE = "https://mano.is.tue.mpg.de"
 FILE_NAMES: dict[Side, str] = {"left": "MANO_LEFT.pkl", "right": "MANO_RIGHT.pkl"}
@@ -64,9 +64,9 @@ def _load_side(folder: Path, side: Side) -> HandModel:
 
 
 def _find(folder: Path, name: str) -> Path:
-    for place in (folder, folder / "models", folder / "mano_v1_2" / "models"):
-        if (place / name).is_file():
-            return place / name
+    for parent in (folder, folder / "models", folder / "mano_v1_2" / "models"):
+        if (parent / name).is_file():
+            return parent / name
     raise MissingResource(
         f"{folder}: expected {name} of the MANO hand model, found none; register at {MANO_SITE}, download "
         f"mano_v1_2.zip, unpack it and give its 'models' folder (MANO may not be redistributed, so hoidata has no copy)"
@@ -154,7 +154,7 @@ def write_mano_pickle(model: HandModel, path: str | Path) -> None:
         "J_regressor": model.joint_regressor,
         "J": model.joint_regressor @ model.template_m,
         "weights": model.skin_weights,
-        "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_JOINTS)], dtype=np.int64),
+        "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_ROTATIONS)], dtype=np.int64),
         "f": model.faces.astype(np.uint32),
         "hands_mean": model.mean_pose,
         "hands_components": model.components,
@@ -162,5 +162,5 @@ def write_mano_pickle(model: HandModel, path: str | Path) -> None:
         "bs_style": "lbs",
         "bs_type": "lrotmin",
     }
-    with atomic_file(path) as part:
-        part.write_bytes(pickle.dumps(content, protocol=2))
+    with atomic_file(path) as partial:
+        partial.write_bytes(pickle.dumps(content, protocol=2))

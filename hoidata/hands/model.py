@@ -15,8 +15,10 @@ from hoidata.files import sha256_bytes
 
 Side = Literal["left", "right"]
 
-N_VERTICES, N_FACES, N_JOINTS, N_SHAPE, N_POSE = 778, 1538, 16, 10, 45
-N_POSE_FEATURES = (N_JOINTS - 1) * 9
+N_VERTICES, N_FACES, N_SHAPE, N_POSE = 778, 1538, 10, 45
+N_ROTATIONS = 16  # joints that turn, the wrist among them
+N_JOINTS = 21  # those, then the fingertips
+N_POSE_FEATURES = (N_ROTATIONS - 1) * 9
 PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
 # Fingertip vertices of MANO's mesh as used by Text2HOI and manopth: index, middle, pinky, ring, thumb.
 TIP_VERTICES = (317, 445, 673, 556, 745)
@@ -30,9 +32,9 @@ _SHAPES = {
     "template_m": (N_VERTICES, 3),
     "shape_directions": (N_VERTICES, 3, N_SHAPE),
     "pose_directions": (N_VERTICES, 3, N_POSE_FEATURES),
-    "joint_regressor": (N_JOINTS, N_VERTICES),
-    "skin_weights": (N_VERTICES, N_JOINTS),
-    "parents": (N_JOINTS,),
+    "joint_regressor": (N_ROTATIONS, N_VERTICES),
+    "skin_weights": (N_VERTICES, N_ROTATIONS),
+    "parents": (N_ROTATIONS,),
     "faces": (N_FACES, 3),
     "mean_pose": (N_POSE,),
     "components": (N_POSE, N_POSE),
@@ -67,22 +69,22 @@ class HandModel:
     @cached_property
     def digest(self) -> str:
         """SHA-256 over side, shapes and little-endian bytes of all arrays: equal digest, equal kinematics."""
-        parts = [self.side.encode()]
+        pieces = [self.side.encode()]
         for field in fields(self):
             if field.name in _SHAPES:
                 array = getattr(self, field.name)
                 kind = "<i8" if array.dtype.kind in "iu" else "<f8"
-                parts += [field.name.encode(), repr(array.shape).encode(), np.ascontiguousarray(array, kind).tobytes()]
-        return sha256_bytes(b"\0".join(parts))
+                pieces += [field.name.encode(), repr(array.shape).encode(), np.ascontiguousarray(array, kind).tobytes()]
+        return sha256_bytes(b"\0".join(pieces))
 
     def rest_joints_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
         """Joints of the unposed hand in the model's own frame: betas (frame, 10) to (frame, 16, 3), metres.
 
-        template_m: (778, 3) personal rest mesh in place of the model's template.
+        template_m: (778, 3) personal rest mesh instead of the model's template.
         """
         betas = np.asarray(betas, dtype=np.float64)
         template = self.template_m if template_m is None else np.asarray(template_m, dtype=np.float64)
-        shift = (betas @ self.joint_directions).reshape(*betas.shape[:-1], N_JOINTS, 3)
+        shift = (betas @ self.joint_directions).reshape(*betas.shape[:-1], N_ROTATIONS, 3)
         return self.joint_regressor @ template + shift
 
     def wrist_offset_m(self, betas: np.ndarray, template_m: np.ndarray | None = None) -> np.ndarray:
@@ -93,7 +95,7 @@ class HandModel:
     def joint_directions(self) -> np.ndarray:
         """(10, 48) metres per unit of beta: shape directions of the 16 rest joints, joint by joint."""
         directions = np.tensordot(self.joint_regressor, self.shape_directions, axes=1)
-        return directions.transpose(2, 0, 1).reshape(N_SHAPE, N_JOINTS * 3)
+        return directions.transpose(2, 0, 1).reshape(N_SHAPE, N_ROTATIONS * 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,11 +122,11 @@ def checked_model(where: str, remedy: str, **values) -> HandModel:
     arrays = {}
     for key, shape in _SHAPES.items():
         value = np.asarray(values.pop(key))
-        place = f"{where}: {key}"
+        field = f"{where}: {key}"
         if value.shape != shape:
-            raise BadInput(place, f"shape {shape}", f"shape {value.shape}", remedy)
+            raise BadInput(field, f"shape {shape}", f"shape {value.shape}", remedy)
         if value.dtype.kind not in "fiu" or not np.isfinite(value).all():
-            raise BadInput(place, "finite real numbers", f"dtype {value.dtype} with other values", remedy)
+            raise BadInput(field, "finite real numbers", f"dtype {value.dtype} with other values", remedy)
         arrays[key] = np.ascontiguousarray(value, np.int64 if key in ("parents", "faces") else np.float64)
     _check_meaning(where, remedy, arrays)
     return HandModel(**values, **arrays)

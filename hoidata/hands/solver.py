@@ -176,7 +176,7 @@ def _normal_equations(
 
 
 def _palm_derivative(predicted: Tensor) -> Tensor:
-    """(frame, 21, 3, 6) of every keypoint by the wrist's place and a small turn of the hand about it, world axes."""
+    """(frame, 21, 3, 6) of every keypoint by the wrist's position and a small turn of the hand about it, world axes."""
     identity = torch.eye(3, dtype=predicted.dtype).expand(*predicted.shape, 3)
     return torch.cat((identity, -skew(predicted - predicted[:, :1])), -1)
 

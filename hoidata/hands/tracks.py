@@ -8,13 +8,13 @@ import torch
 
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands.kinematics import HandKinematics
-from hoidata.hands.model import HandModel
+from hoidata.hands.model import N_JOINTS, N_ROTATIONS, HandModel
 
 _CHUNK_FRAMES = 512
 
 
 class HandTrackLike(Protocol):
-    """What ``schema.HandTrack`` offers; units and shapes as there."""
+    """What ``hoidata.clips.HandTrack`` offers; units and shapes as there."""
 
     @property
     def wrist_m(self) -> np.ndarray: ...
@@ -30,7 +30,7 @@ class HandTrackLike(Protocol):
 
 def track_joints(track: HandTrackLike, model: HandModel) -> np.ndarray:
     """(frame, 21, 3) float32 world joints, metres, of every frame of the track, valid or not."""
-    return _in_chunks(track, model, 21, lambda layer, inputs: layer.joints(*inputs))
+    return _in_chunks(track, model, N_JOINTS, lambda layer, inputs: layer.joints(*inputs))
 
 
 def track_vertices(track: HandTrackLike, model: HandModel) -> np.ndarray:
@@ -47,7 +47,7 @@ def kinematics_of(model: HandModel, dtype: torch.dtype = torch.float32) -> HandK
 def track_rotmats(track: HandTrackLike) -> np.ndarray:
     """(frame, 16, 3, 3) local rotations of a track, the global one first."""
     rotvec = np.concatenate((track.global_orient, track.hand_pose), axis=1, dtype=np.float64)
-    return rotvec_to_rotmat(rotvec.reshape(len(rotvec), 16, 3))
+    return rotvec_to_rotmat(rotvec.reshape(len(rotvec), N_ROTATIONS, 3))
 
 
 def _in_chunks(track: HandTrackLike, model: HandModel, n_points: int, run) -> np.ndarray:
@@ -61,7 +61,7 @@ def _in_chunks(track: HandTrackLike, model: HandModel, n_points: int, run) -> np
     out = np.empty((len(wrist), n_points, 3), dtype=np.float32)
     with torch.no_grad():
         for start in range(0, len(wrist), _CHUNK_FRAMES):
-            part = slice(start, start + _CHUNK_FRAMES)
-            own_betas = betas if len(betas) == 1 else betas[part]
-            out[part] = run(layer, (wrist[part], rotmats[part], own_betas, template)).numpy()
+            rows = slice(start, start + _CHUNK_FRAMES)
+            own_betas = betas if len(betas) == 1 else betas[rows]
+            out[rows] = run(layer, (wrist[rows], rotmats[rows], own_betas, template)).numpy()
     return out

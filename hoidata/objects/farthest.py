@@ -24,7 +24,7 @@ def farthest_rows(points: np.ndarray, count: int) -> np.ndarray:
 
 
 def _buckets(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows bucket by bucket, rising in each, and where each starts: stretches of a Morton curve through the points."""
+    """Rows bucket by bucket, rising in each, and where each starts: intervals of a Morton curve through the points."""
     above = points.astype(np.float64) - points.min(axis=0)
     cell = (above / (above.max() or 1) * 1023).astype(np.uint32)
     x, y, z = _spread_bits(cell).T
@@ -54,8 +54,8 @@ def _choose(x, y, z, order, first, low, high, points, count):  # pragma: no cove
         for bucket in range(len(low)):
             if _square_to_box(last, low[bucket], high[bucket]) * _ROUNDING < farthest[bucket]:
                 start, stop = first[bucket], first[bucket + 1]
-                place = start + _lower(x[start:stop], y[start:stop], z[start:stop], last, nearest[start:stop])
-                farthest[bucket], winner[bucket] = nearest[place], order[place]
+                row = start + _lower(x[start:stop], y[start:stop], z[start:stop], last, nearest[start:stop])
+                farthest[bucket], winner[bucket] = nearest[row], order[row]
             if farthest[bucket] > best or (farthest[bucket] == best and winner[bucket] < best_row):
                 best, best_row = farthest[bucket], winner[bucket]
         chosen[step] = best_row
@@ -63,20 +63,20 @@ def _choose(x, y, z, order, first, low, high, points, count):  # pragma: no cove
 
 
 @njit(cache=True)
-def _square_to_box(place, low, high):  # pragma: no cover (compiled)
-    """Square of the distance from a place to a box, 0 inside."""
+def _square_to_box(point, low, high):  # pragma: no cover (compiled)
+    """Square of the distance from a point to a box, 0 inside."""
     square = np.float32(0)
     for axis in range(3):
-        outside = max(low[axis] - place[axis], place[axis] - high[axis], np.float32(0))
+        outside = max(low[axis] - point[axis], point[axis] - high[axis], np.float32(0))
         square += outside * outside
     return square
 
 
 @njit(cache=True)
-def _lower(x, y, z, place, nearest):  # pragma: no cover (compiled)
-    """Lower each distance to that from ``place`` where it is smaller; where the largest is, the first of equals."""
+def _lower(x, y, z, point, nearest):  # pragma: no cover (compiled)
+    """Lower each distance to that from ``point`` where it is smaller; where the largest is, the first of equals."""
     for row in range(len(x)):
-        dx, dy, dz = x[row] - place[0], y[row] - place[1], z[row] - place[2]
+        dx, dy, dz = x[row] - point[0], y[row] - point[1], z[row] - point[2]
         square = (dx * dx + dy * dy) + dz * dz
         nearest[row] = min(nearest[row], square)
     # Bits of floats that are not negative are in the order of their values, and a largest integer is found on vectors.

@@ -2,7 +2,7 @@
 
 Compiled with numba, float64, one thread. All that call each other stand in this file: numba keeps compiled code by the
 file it is in, and does not see a change in another. Inside is what the surface winds around: where a line through the
-place leaves the surface behind it oftener than it enters.
+position leaves the surface behind it oftener than it enters.
 """
 
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from hoidata.objects.triangle_tree import DEEPEST, TriangleTree
 OUTSIDE, INSIDE, UNSURE = 0, 1, 2
 
 
-class Stretches(NamedTuple):
+class Intervals(NamedTuple):
     """Lines through a solid, one in the middle of each cell of a lattice in y and z.
 
     low_m: (2,) y and z of the lattice's corner; cell_m: edge of a cell; shape: (2,) cells. first: (line + 1,) where
-    each line's stretches inside the solid start; start_m, stop_m: (stretch,) x of their ends, rising along a line.
+    each line's intervals inside the solid start; start_m, stop_m: (interval,) x of their ends, rising along a line.
     """
 
     low_m: np.ndarray
@@ -30,24 +30,27 @@ class Stretches(NamedTuple):
     stop_m: np.ndarray
 
 
-def stretches_inside(tree: TriangleTree, cell_m: float) -> Stretches:
-    """The lattice lies evenly about the middle of the surface's box."""
+def intervals_inside(tree: TriangleTree, cell_m: float) -> Intervals:
+    """The intervals of the lines of a lattice that lie inside a closed surface.
+
+    tree: its triangles, metres. cell_m: distance of the lines; they lie evenly about the middle of the surface's box.
+    """
     low, high = tree.box[0, 1:3], tree.box[0, 4:]
     shape = np.ceil((high - low) / cell_m - 1e-9).astype(np.int64)  # a size that is so many cells but for rounding
     corner = (low + high) / 2 - shape * cell_m / 2
-    return Stretches(corner, cell_m, shape, *_stretches(tree, corner, cell_m, shape))
+    return Intervals(corner, cell_m, shape, *_intervals(tree, corner, cell_m, shape))
 
 
 @njit(cache=True)
-def settle_sides(tree, places_m, side):  # pragma: no cover (compiled)
-    """Where ``side (place,)`` is UNSURE, set it to INSIDE or OUTSIDE for ``places_m (place, 3)``."""
+def settle_sides(tree, positions_m, side):  # pragma: no cover (compiled)
+    """Where ``side (position,)`` is UNSURE, set it to INSIDE or OUTSIDE for ``positions_m (position, 3)``."""
     _, box, link, _, corner, vertices_m = tree
     stack, crossed, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
-    for place in range(len(places_m)):
-        if side[place] == UNSURE:
-            x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
+    for row in range(len(positions_m)):
+        if side[row] == UNSURE:
+            x, y, z = positions_m[row, 0], positions_m[row, 1], positions_m[row, 2]
             count = _crossings(box, link, corner, vertices_m, y, z, stack, crossed, turns)
-            side[place] = INSIDE if _winding(crossed, turns, count, x) > 0 else OUTSIDE
+            side[row] = INSIDE if _winding(crossed, turns, count, x) > 0 else OUTSIDE
 
 
 @njit(cache=True)
@@ -73,10 +76,10 @@ def _winding(crossed, turns, count, x):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _crossings(box, link, corner, vertices_m, y, z, stack, places, turns):  # pragma: no cover (compiled)
+def _crossings(box, link, corner, vertices_m, y, z, stack, positions, turns):  # pragma: no cover (compiled)
     """Where the line along x through (y, z) crosses the triangles: how many times.
 
-    places: x of each crossing. turns: +1 where the outward normal points to +x (the line leaves the solid), -1 where
+    positions: x of each crossing. turns: +1 where the outward normal points to +x (the line leaves the solid), -1 where
     it enters. A line through an edge or a corner counts as moved by nothing to +y, then by less to +z, so that a closed
     surface is left as often as it is entered.
     """
@@ -93,16 +96,16 @@ def _crossings(box, link, corner, vertices_m, y, z, stack, places, turns):  # pr
             size += 2
             continue
         for number in range(link[node, 1], link[node, 2]):
-            turn, place = _crossing(vertices_m, corner[number, 0], corner[number, 1], corner[number, 2], y, z)
+            turn, position = _crossing(vertices_m, corner[number, 0], corner[number, 1], corner[number, 2], y, z)
             if turn != 0:
-                places[count], turns[count] = place, turn
+                positions[count], turns[count] = position, turn
                 count += 1
     return count
 
 
 @njit(cache=True)
 def _crossing(vertices_m, a, b, c, y, z):  # pragma: no cover (compiled)
-    """The turn with which the line along x through (y, z) crosses a triangle, 0 where it misses, and the place.
+    """The turn with which the line along x through (y, z) crosses a triangle, 0 where it misses, and the position.
 
     See ``_crossings``.
     """
@@ -134,44 +137,44 @@ def _side_of_edge(vertices_m, start, stop, y, z):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _stretches(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
+def _intervals(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
     """Where each line runs inside the solid."""
     _, box, link, _, corner, vertices_m = tree
-    stack, places, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
+    stack, positions, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
     first = np.zeros(shape[0] * shape[1] + 1, np.int64)
     start, stop = [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for j in range(shape[0]):
         for k in range(shape[1]):
             y, z = low_m[0] + (j + 0.5) * cell_m, low_m[1] + (k + 0.5) * cell_m
-            count = _crossings(box, link, corner, vertices_m, y, z, stack, places, turns)
-            _sort(places, turns, count)
+            count = _crossings(box, link, corner, vertices_m, y, z, stack, positions, turns)
+            _sort(positions, turns, count)
             winding = 0.0
             for number in range(count):
                 if winding > 0:
-                    start.append(places[number - 1])
-                    stop.append(places[number])
+                    start.append(positions[number - 1])
+                    stop.append(positions[number])
                 winding -= turns[number]
             first[j * shape[1] + k + 1] = len(start)
     return first, np.array(start), np.array(stop)
 
 
 @njit(cache=True)
-def _sort(places, turns, count):  # pragma: no cover (compiled)
-    """By place; a line has a handful of crossings."""
+def _sort(positions, turns, count):  # pragma: no cover (compiled)
+    """By position; a line has a handful of crossings."""
     for number in range(1, count):
-        place, turn, at = places[number], turns[number], number
-        while at and places[at - 1] > place:
-            places[at], turns[at] = places[at - 1], turns[at - 1]
+        position, turn, at = positions[number], turns[number], number
+        while at and positions[at - 1] > position:
+            positions[at], turns[at] = positions[at - 1], turns[at - 1]
             at -= 1
-        places[at], turns[at] = place, turn
+        positions[at], turns[at] = position, turn
 
 
 @njit(cache=True)
-def common_length_m(vertices_m, faces, stretches):  # pragma: no cover (compiled)
-    """Summed over all lines, the length inside both a closed surface (vertex, 3), (face, 3) and the stretches."""
-    low_m, cell_m, shape, first, start_m, stop_m = stretches
+def common_length_m(vertices_m, faces, intervals):  # pragma: no cover (compiled)
+    """Summed over all lines, the length inside both a closed surface (vertex, 3), (face, 3) and the intervals."""
+    low_m, cell_m, shape, first, start_m, stop_m = intervals
     newest = np.full(shape[0] * shape[1], -1, np.int64)  # of each line, its newest crossing
-    older, places, turns = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
+    older, positions, turns = [0 for _ in range(0)], [0.0 for _ in range(0)], [0.0 for _ in range(0)]
     for face in range(len(faces)):
         a, b, c = faces[face]
         j_start, j_stop = _cells_between(vertices_m, a, b, c, 1, low_m[0], cell_m, shape[0])
@@ -182,13 +185,13 @@ def common_length_m(vertices_m, faces, stretches):  # pragma: no cover (compiled
                 if first[line] == first[line + 1]:
                     continue
                 y, z = low_m[0] + (j + 0.5) * cell_m, low_m[1] + (k + 0.5) * cell_m
-                turn, place = _crossing(vertices_m, a, b, c, y, z)
+                turn, position = _crossing(vertices_m, a, b, c, y, z)
                 if turn != 0:
                     older.append(int(newest[line]))
-                    newest[line] = len(places)
-                    places.append(place)
+                    newest[line] = len(positions)
+                    positions.append(position)
                     turns.append(turn)
-    return _summed(newest, older, places, turns, first, start_m, stop_m)
+    return _summed(newest, older, positions, turns, first, start_m, stop_m)
 
 
 @njit(cache=True, inline="always")
@@ -202,21 +205,21 @@ def _cells_between(vertices_m, a, b, c, axis, low_m, cell_m, count):  # pragma: 
 
 
 @njit(cache=True)
-def _summed(newest, older, places, turns, first, start_m, stop_m):  # pragma: no cover (compiled)
+def _summed(newest, older, positions, turns, first, start_m, stop_m):  # pragma: no cover (compiled)
     length = 0.0
-    own_places, own_turns = np.empty(len(places)), np.empty(len(places))
+    own_positions, own_turns = np.empty(len(positions)), np.empty(len(positions))
     for line in range(len(newest)):
         count, number = 0, newest[line]
         while number >= 0:
-            own_places[count], own_turns[count] = places[number], turns[number]
+            own_positions[count], own_turns[count] = positions[number], turns[number]
             count += 1
             number = older[number]
-        _sort(own_places, own_turns, count)
+        _sort(own_positions, own_turns, count)
         winding = 0.0
         for number in range(count):
             if winding > 0:
-                for stretch in range(first[line], first[line + 1]):
-                    begin = max(own_places[number - 1], start_m[stretch])
-                    length += max(min(own_places[number], stop_m[stretch]) - begin, 0.0)
+                for interval in range(first[line], first[line + 1]):
+                    begin = max(own_positions[number - 1], start_m[interval])
+                    length += max(min(own_positions[number], stop_m[interval]) - begin, 0.0)
             winding -= own_turns[number]
     return length

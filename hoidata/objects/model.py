@@ -4,7 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.geometry.transform import IDENTITY, RigidTransform
 
 
 @dataclass(frozen=True)
@@ -16,6 +18,11 @@ class Hinge:
 
     axis: np.ndarray
     origin_m: np.ndarray
+
+    def turn(self, hinge_rad: np.ndarray) -> RigidTransform:
+        """``object_from_part`` of the moving part at angles (frame,), radians."""
+        rotvec = np.asarray(self.axis, dtype=np.float64) * np.asarray(hinge_rad, dtype=np.float64)[..., None]
+        return RigidTransform(rotvec_to_rotmat(rotvec), self.origin_m, self.origin_m)
 
 
 @dataclass(frozen=True)
@@ -37,19 +44,24 @@ class ObjectModel:
         """(face,) part of each face: the moving part when at least two of its vertices move."""
         return (self.part[self.faces].sum(axis=1) >= 2).astype(np.uint8)
 
+    def object_from_part(self, part: int, hinge_rad: np.ndarray | None) -> RigidTransform:
+        """Where a part lies in the object frame, seen from its rest position (hinge angle 0), in which its mesh is.
+
+        part: 0 for the base, which never moves against the object frame; 1 for the part the hinge moves.
+        hinge_rad: (frame,) radians, needed for part 1 only. Raises BadInput where it is missing.
+        """
+        if part == 0 or self.hinge is None:
+            return IDENTITY
+        if hinge_rad is None:
+            raise BadInput(f"motion of {self.name!r}", "a hinge angle for every frame", "none", "give the angles")
+        return self.hinge.turn(hinge_rad)
+
 
 def articulate(points_m: np.ndarray, part: np.ndarray, hinge: Hinge | None, hinge_rad: np.ndarray | None) -> np.ndarray:
-    """Points (point, 3) of the object frame at each hinge angle (frame,): (frame, point, 3), still in the object frame.
+    """Points of an object at each hinge angle: (frame, point, 3) metres, object frame; (1, point, 3) if it is rigid.
 
-    Rigid objects (no hinge) give one frame, (1, point, 3).
+    points_m: (point, 3) at hinge angle 0, object frame. part: (point,) 0 or 1. hinge_rad: (frame,) radians.
     """
     if hinge is None or hinge_rad is None:
         return points_m[None]
-    rotation = rotvec_to_rotmat(hinge.axis[None] * np.asarray(hinge_rad)[:, None])
-    moved = (points_m - hinge.origin_m) @ rotation.transpose(0, 2, 1) + hinge.origin_m
-    return np.where(part[None, :, None] == 1, moved, points_m[None])
-
-
-def place(points_m: np.ndarray, rotvec: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
-    """Object-frame points (1 or frame, point, 3) to the world at each frame's pose: (frame, point, 3), metres."""
-    return points_m @ rotvec_to_rotmat(rotvec).transpose(0, 2, 1) + translation_m[:, None]
+    return np.where(part[None, :, None] == 1, hinge.turn(hinge_rad) @ points_m, points_m[None])

@@ -126,22 +126,22 @@ def _read_rows(rows: _Rows, element: _Element) -> Iterator[list[np.ndarray]]:
 
 class _BinaryRows:
     def __init__(self, data: bytes, start: int, order: str) -> None:
-        self.data, self.place, self.order = data, start, order
+        self.data, self.offset, self.order = data, start, order
         self.row_bytes = 0
 
     def lengths(self, element: _Element) -> list[int]:
-        place, found = self.place, []
+        offset, found = self.offset, []
         for item in element.properties:
             length = 1
             if item.count_kind is not None:
                 kind = np.dtype(self.order + item.count_kind)
-                if place + kind.itemsize > len(self.data):
+                if offset + kind.itemsize > len(self.data):
                     raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-                length = _checked_length(np.frombuffer(self.data, kind, 1, place)[0])
-                place += kind.itemsize
-            place += length * np.dtype(item.kind).itemsize
+                length = _checked_length(np.frombuffer(self.data, kind, 1, offset)[0])
+                offset += kind.itemsize
+            offset += length * np.dtype(item.kind).itemsize
             found.append(length)
-        if place > len(self.data):
+        if offset > len(self.data):
             raise ValueError(f"the file ends within its element {element.name[:40]!r}")
         return found
 
@@ -153,8 +153,8 @@ class _BinaryRows:
             fields.append((f"values{number}", self.order + item.kind, (length,)))
         kind = np.dtype(fields)
         self.row_bytes = kind.itemsize
-        fitting = min(most, (len(self.data) - self.place) // max(1, kind.itemsize))
-        table = np.frombuffer(self.data, kind, fitting, self.place)
+        fitting = min(most, (len(self.data) - self.offset) // max(1, kind.itemsize))
+        table = np.frombuffer(self.data, kind, fitting, self.offset)
         found = []
         for number, item in enumerate(element.properties):
             stated = None if item.count_kind is None else table[f"length{number}"]
@@ -162,35 +162,35 @@ class _BinaryRows:
         return found
 
     def advance(self, rows: int) -> None:
-        self.place += rows * self.row_bytes
+        self.offset += rows * self.row_bytes
 
 
 class _TextRows:
     def __init__(self, text: bytes) -> None:
         self.words = text.split()
-        self.place = self.width = 0
+        self.offset = self.width = 0
         if max(map(len, self.words), default=0) > _LONGEST_WORD:
             raise ValueError(f"a word of more than {_LONGEST_WORD} characters among its numbers")
 
     def lengths(self, element: _Element) -> list[int]:
-        place, found = self.place, []
+        offset, found = self.offset, []
         for item in element.properties:
             length = 1
             if item.count_kind is not None:
-                if place >= len(self.words):
+                if offset >= len(self.words):
                     raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-                length = _checked_length(float(self.words[place]))
-                place += 1
-            place += length
+                length = _checked_length(float(self.words[offset]))
+                offset += 1
+            offset += length
             found.append(length)
-        if place > len(self.words):
+        if offset > len(self.words):
             raise ValueError(f"the file ends within its element {element.name[:40]!r}")
         return found
 
     def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
         self.width = sum(lengths) + sum(item.count_kind is not None for item in element.properties)
-        fitting = min(most, (len(self.words) - self.place) // self.width)
-        words = np.array(self.words[self.place : self.place + fitting * self.width])
+        fitting = min(most, (len(self.words) - self.offset) // self.width)
+        words = np.array(self.words[self.offset : self.offset + fitting * self.width])
         with np.errstate(all="ignore"):  # what does not fit its type becomes infinite, and is refused as such
             return self._columns(element, lengths, words.astype(np.float64).reshape(fitting, self.width))
 
@@ -207,7 +207,7 @@ class _TextRows:
         return found
 
     def advance(self, rows: int) -> None:
-        self.place += rows * self.width
+        self.offset += rows * self.width
 
 
 def _checked_length(value: float) -> int:
@@ -218,18 +218,18 @@ def _checked_length(value: float) -> int:
 
 def _positions(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
     names = [item.name for item in element.properties]
-    places = [names.index(axis) for axis in "xyz" if axis in names]
-    if len(places) < 3 or any(element.properties[place].count_kind is not None for place in places):
+    numbers = [names.index(axis) for axis in "xyz" if axis in names]
+    if len(numbers) < 3 or any(element.properties[number].count_kind is not None for number in numbers):
         raise ValueError("vertices without x, y and z")
-    return np.concatenate([columns[place] for place in places], axis=1).astype(np.float64)
+    return np.concatenate([columns[number] for number in numbers], axis=1).astype(np.float64)
 
 
 def _fans(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
     """Triangles (0, 1, 2), (0, 2, 3) and so on of each polygon."""
-    places = [number for number, item in enumerate(element.properties) if item.name in _CORNERS and item.count_kind]
-    if not places:
+    numbers = [number for number, item in enumerate(element.properties) if item.name in _CORNERS and item.count_kind]
+    if not numbers:
         raise ValueError("faces without vertex_indices")
-    corners = columns[places[0]]
+    corners = columns[numbers[0]]
     if len(corners) and corners.shape[1] < 3:
         raise ValueError(f"a face of {corners.shape[1]} corners")
     whole = np.asarray(corners, dtype=np.float64)

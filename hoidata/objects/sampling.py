@@ -27,7 +27,7 @@ class SampledPoints:
     """Points on an object's surface, in the object frame with the hinge at zero.
 
     points_m: (point, 3) float32. normals: (point, 3) float32, unit. face: (point,) int32, the triangle each lies on;
-    barycentric: (point, 3) float32, its place there. part: (point,) uint8, 1 where the hinge moves the point.
+    barycentric: (point, 3) float32, its position there. part: (point,) uint8, 1 where the hinge moves the point.
     """
 
     points_m: np.ndarray

@@ -1,6 +1,6 @@
-"""One object's surface, ready for many questions: is a place nearer than a threshold, how far is it, how deep inside.
+"""One object's surface, ready for many questions: is a point nearer than a threshold, how far is it, how deep inside.
 
-Places are given in the object frame; each part answers in its own rest frame, where its surface never changes, so one
+Positions are in the object frame; each part answers in its own rest frame, where its surface never changes, so one
 index serves every frame of every clip at every hinge angle. All answers are exact: a grid of distances only saves
 looking at triangles, and is made when an object is asked about so often that this pays.
 """
@@ -11,7 +11,6 @@ from collections import OrderedDict
 import numpy as np
 
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.distance import merged_surface
 from hoidata.objects.distance_grid import (
     DistanceGrid,
@@ -26,7 +25,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, solid_of
 from hoidata.objects.triangle_tree import triangle_tree
 
-GRID_PAYS_FROM = 1_000_000  # places; a grid takes 0.1-0.5 s and saves 0.05 us (within) to 0.3 us (depth) on each
+GRID_PAYS_FROM = 1_000_000  # positions; a grid takes 0.1-0.5 s and saves 0.05 us (within) to 0.3 us (depth) on each
 MOST_TRIANGLES_KEPT = 1_000_000  # in memory, about 200 MB
 _indices: OrderedDict[str, "SurfaceIndex"] = OrderedDict()
 
@@ -47,7 +46,7 @@ class SurfaceIndex:
 
     solids: by part, the solid it bounds, or why there is none. solid_note: None where every part is one as it is, else
     a sentence that says what was repaired or left out of depths. grid_from: a part gets its grid when it is asked about
-    more places than this. Raises BadInput for a part without triangles.
+    more positions than this. Raises BadInput for a part without triangles.
     """
 
     def __init__(self, model: ObjectModel, grid_from: int = GRID_PAYS_FROM) -> None:
@@ -66,46 +65,46 @@ class SurfaceIndex:
                 merged = merged_surface(model.vertices_m, faces[part])
                 self._surfaces[part] = _Surface(merged.vertices_m, merged.faces, False, grid_from)
 
-    def within(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, threshold_m: float) -> np.ndarray:
-        """(frame, place) bool: the distance to the surface is less than ``threshold_m``.
+    def within(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None, threshold_m: float) -> np.ndarray:
+        """(frame, position) bool: the distance to the surface is less than ``threshold_m``.
 
-        places_m: (frame, place, 3), object frame, metres. hinge_rad: (frame,) for a hinged object, else None.
-        Places that are not finite are not within.
+        positions_m: (frame, position, 3), object frame, metres. hinge_rad: (frame,) for a hinged object, else None.
+        Positions that are not finite are not within.
         """
-        within = np.zeros(places_m.shape[:2], bool)
+        within = np.zeros(positions_m.shape[:2], bool)
         for part, surface in self._surfaces.items():
-            places = self._in_part(places_m, hinge_rad, part)
-            mark_within(surface.tree, surface.grid_for(places), places, float(threshold_m), within.reshape(-1))
+            positions = self._in_part(positions_m, hinge_rad, part)
+            mark_within(surface.tree, surface.grid_for(positions), positions, float(threshold_m), within.reshape(-1))
         return within
 
-    def distance_m(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, most_m: float = np.inf) -> np.ndarray:
-        """(frame, place) float64 distance to the surface, metres, never negative; infinite where it exceeds ``most_m``.
+    def distance_m(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None, most_m: float = np.inf) -> np.ndarray:
+        """(frame, position) float64 distance to the surface, metres, never negative; infinite beyond ``most_m``.
 
         Arguments as in ``within``.
         """
-        distance = np.full(places_m.shape[:2], np.inf)
+        distance = np.full(positions_m.shape[:2], np.inf)
         for part, surface in self._surfaces.items():
-            places = self._in_part(places_m, hinge_rad, part)
-            lower_distances(surface.tree, surface.grid_for(places), places, float(most_m), distance.reshape(-1))
+            positions = self._in_part(positions_m, hinge_rad, part)
+            lower_distances(surface.tree, surface.grid_for(positions), positions, float(most_m), distance.reshape(-1))
         return distance
 
-    def depth_m(self, places_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
-        """(frame, place) float64 distance to the surface for places inside the solid, metres, 0 outside.
+    def depth_m(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
+        """(frame, position) float64 distance to the surface for positions inside the solid, metres, 0 outside.
 
         Inside is what the surface winds around (a cavity is outside, two shells that overlap count as one solid); of
         two parts the one that it is deeper in counts. Arguments as in ``within``. Raises BadInput where no part
         encloses a solid.
         """
         self.check_solid()
-        depth = np.zeros(places_m.shape[:2])
+        depth = np.zeros(positions_m.shape[:2])
         for part, surface in self._closed.items():
-            places = self._in_part(places_m, hinge_rad, part)
-            grid = surface.grid_for(places)
-            side = sides(surface.tree, grid, places)
-            settle_sides(surface.tree, places, side)
+            positions = self._in_part(positions_m, hinge_rad, part)
+            grid = surface.grid_for(positions)
+            side = sides(surface.tree, grid, positions)
+            settle_sides(surface.tree, positions, side)
             inside = np.flatnonzero(side == INSIDE)
             own = np.full(len(inside), np.inf)
-            lower_distances(surface.tree, grid, places[inside], np.inf, own)
+            lower_distances(surface.tree, grid, positions[inside], np.inf, own)
             depth.reshape(-1)[inside] = np.maximum(depth.reshape(-1)[inside], own)
         return depth
 
@@ -125,20 +124,10 @@ class SurfaceIndex:
             why = "; ".join(sorted({solid.why for solid in self.solids.values() if isinstance(solid, NoSolid)}))
             raise BadInput(f"mesh of {self.model.name!r}", "a mesh that encloses a solid", why, "repair the mesh")
 
-    def _in_part(self, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
-        """(frame x place, 3) places in the part's rest frame."""
-        return np.ascontiguousarray(in_part(self.model, places_m, hinge_rad, part).reshape(-1, 3))
-
-
-def in_part(model: ObjectModel, places_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
-    """Object-frame places (frame, place, 3) in the rest frame of a part, float64: the hinge undone for part 1."""
-    places, hinge = np.asarray(places_m, dtype=np.float64), model.hinge
-    if part == 0 or hinge is None:
-        return places
-    if hinge_rad is None:
-        raise BadInput(f"motion of {model.name!r}", "a hinge angle for every frame", "none", "give the angles")
-    turn = rotvec_to_rotmat(np.asarray(hinge.axis, dtype=np.float64) * np.asarray(hinge_rad, dtype=np.float64)[:, None])
-    return (places - hinge.origin_m) @ turn + hinge.origin_m
+    def _in_part(self, positions_m: np.ndarray, hinge_rad: np.ndarray | None, part: int) -> np.ndarray:
+        """(frame x position, 3) positions in the part's rest frame."""
+        part_from_object = self.model.object_from_part(part, hinge_rad).inverse()
+        return np.ascontiguousarray((part_from_object @ np.asarray(positions_m, np.float64)).reshape(-1, 3))
 
 
 class _Surface:
@@ -152,9 +141,9 @@ class _Surface:
     def has_grid(self) -> bool:
         return self._grid.value.size > 0
 
-    def grid_for(self, places_m: np.ndarray) -> DistanceGrid:
-        """The grid to answer about these places with."""
-        self._asked += len(places_m)
+    def grid_for(self, positions_m: np.ndarray) -> DistanceGrid:
+        """The grid to answer about these positions with."""
+        self._asked += len(positions_m)
         if not self.has_grid and self._asked > self._grid_from:
             self._grid = distance_grid(self.tree, self.closed)
         return self._grid

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.geometry.transform import RigidTransform
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
 
@@ -42,6 +42,10 @@ class ObjectPoses(NamedTuple):
     translation_m: np.ndarray
     hinge_rad: np.ndarray | None = None
 
+    def world_from_part(self, model: ObjectModel, part: int) -> RigidTransform:
+        """(frame,) poses of one part: the object's own for the base, turned by the hinge for part 1."""
+        return RigidTransform(self.rotmats, self.translation_m) @ model.object_from_part(part, self.hinge_rad)
+
     def taken(self, frames: np.ndarray | slice) -> "ObjectPoses":
         hinge = None if self.hinge_rad is None else self.hinge_rad[frames]
         return ObjectPoses(self.rotmats[frames], self.translation_m[frames], hinge)
@@ -52,7 +56,7 @@ class CapsuleContacts(NamedTuple):
 
     frame, capsule: (contact,) int. part: (contact,) touched part. depth_m: (contact,) radius less signed distance of
     the deepest axis point. point_m: (contact, 3) nearest surface point to it. normal: (contact, 3) unit, out of the
-    object, the gradient of the signed distance there. along: (contact,) place of the deepest point on the axis, 0 to 1.
+    object, the gradient of the signed distance there. along: (contact,) where on the axis the deepest point is, 0 to 1.
     """
 
     frame: np.ndarray
@@ -79,7 +83,7 @@ def capsule_contacts(
     instead of those nearest to its deepest point; depth and overlap are the same.
     """
     found = [
-        _part_contacts(model, part, part_poses(model, poses, part), capsules, tolerance_m, at_centre)
+        _part_contacts(model, part, poses.world_from_part(model, part), capsules, tolerance_m, at_centre)
         for part in _parts(model)
     ]
     every = CapsuleContacts(*(np.concatenate(column) for column in zip(*found, strict=True)))
@@ -89,31 +93,20 @@ def capsule_contacts(
     return CapsuleContacts(*(column[order][first] for column in every))
 
 
-def part_poses(model: ObjectModel, poses: ObjectPoses, part: int) -> ObjectPoses:
-    """World-from-part of one part: the object's own pose for the base, turned by the hinge for part 1."""
-    if part == 0 or model.hinge is None:
-        return ObjectPoses(poses.rotmats, poses.translation_m)
-    if poses.hinge_rad is None:
-        raise ValueError(f"{model.name}: hinge angles are needed to place the moving part")
-    turn = rotvec_to_rotmat(model.hinge.axis[None] * np.asarray(poses.hinge_rad, dtype=np.float64)[:, None])
-    shift = model.hinge.origin_m - turn @ model.hinge.origin_m
-    return ObjectPoses(poses.rotmats @ turn, poses.translation_m + np.einsum("fij,fj->fi", poses.rotmats, shift))
-
-
-def to_part_frame(points_m: np.ndarray, poses: ObjectPoses) -> np.ndarray:
-    """World points (frame, point, 3) in the frame of a rigid part."""
-    return (points_m - poses.translation_m[:, None]) @ poses.rotmats
-
-
 def _parts(model: ObjectModel) -> list[int]:
     return [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
 
 
 def _part_contacts(
-    model: ObjectModel, part: int, poses: ObjectPoses, capsules: Capsules, tolerance_m: float, at_centre: bool
+    model: ObjectModel,
+    part: int,
+    world_from_part: RigidTransform,
+    capsules: Capsules,
+    tolerance_m: float,
+    at_centre: bool,
 ) -> CapsuleContacts:
     faces = model.faces[model.face_part == part] if model.is_articulated else model.faces
-    start, end = to_part_frame(capsules.start_m, poses), to_part_frame(capsules.end_m, poses)
+    start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
     frame, capsule = _candidates(model.vertices_m[np.unique(faces)], start, end, capsules.radius_m + tolerance_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
     middle, half = (start + end) / 2, np.linalg.norm(end - start, axis=1) / 2
@@ -125,8 +118,8 @@ def _part_contacts(
         _, point, normal = _distances(model, faces, (start + end) / 2)
     hit = distance < radius + tolerance_m
     frame = frame[hit]
-    point = np.einsum("nij,nj->ni", poses.rotmats[frame], point[hit]) + poses.translation_m[frame]
-    normal = np.einsum("nij,nj->ni", poses.rotmats[frame], normal[hit])
+    point = (world_from_part[frame] @ point[hit][:, None])[:, 0]
+    normal = world_from_part[frame].turn(normal[hit][:, None])[:, 0]
     depth = (radius - distance)[hit]
     return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal, along[hit])
 
@@ -141,7 +134,7 @@ def _candidates(
 
 
 def _deepest(model: ObjectModel, faces: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """(segment,) place on each axis, 0 to 1, where the signed distance is least."""
+    """(segment,) position on each axis, 0 to 1, where the signed distance is least."""
     grid = np.linspace(0, 1, COARSE_SAMPLES)
     along = np.broadcast_to(grid, (len(start), COARSE_SAMPLES))
     step = grid[1]

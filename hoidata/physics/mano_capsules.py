@@ -55,10 +55,10 @@ def fit_capsules(model: HandModel, betas: np.ndarray, template_m: np.ndarray | N
 def hand_capsules(track: HandTrackLike, model: HandModel) -> Capsules:
     """World capsules (frame, 19) of a recorded hand; its shape is that of the first frame."""
     local = fit_capsules(model, np.asarray(track.betas, dtype=np.float64)[0], track.template_m)
-    places = track_joints(track, model)[:, local.joint].astype(np.float64)
+    positions = track_joints(track, model)[:, local.joint].astype(np.float64)
     rotmats = world_rotmats(track)[:, local.joint]
-    start = places + np.einsum("fcij,cj->fci", rotmats, local.start_m)
-    end = places + np.einsum("fcij,cj->fci", rotmats, local.end_m)
+    start = positions + np.einsum("fcij,cj->fci", rotmats, local.start_m)
+    end = positions + np.einsum("fcij,cj->fci", rotmats, local.end_m)
     return Capsules(start, end, local.radius_m)
 
 
@@ -88,7 +88,7 @@ def _fitted(skin: np.ndarray, start: np.ndarray, end: np.ndarray, is_tip: bool) 
 
 
 def _to_axis(points: np.ndarray, start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of points from the line through two ends, and place along it, 0 at the start and 1 at the end."""
+    """Distance of points from the line through two ends, and position along it, 0 at the start and 1 at the end."""
     axis = end - start
     along = (points - start) @ axis / (axis @ axis)
     return np.linalg.norm(points - start - along[:, None] * axis, axis=1), along

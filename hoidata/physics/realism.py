@@ -133,7 +133,7 @@ def measure(
     smooth = {
         side: smoothness_m_s2(motion.joints_m, motion.wrist_rotmats, scene.fps)
         for side, motion in motions.items()
-        if _has_acceleration(motion.joints_m, scene.fps)
+        if has_acceleration(motion.joints_m, scene.fps)
     }
     shares = {name: result.share for name, result in results.items()}
     return Measures(shares, floors, len(first.frames), first.colliding_m, smooth)
@@ -156,7 +156,7 @@ def smoothness_m_s2(joints_m: np.ndarray, wrist_rotmats: np.ndarray, fps: float)
     world_from_wrist. Second differences at ManipNet's 60 Hz where the frames are a multiple of it, else at ``fps``.
     Raises ValueError without three frames in a row.
     """
-    if not _has_acceleration(joints_m, fps):
+    if not has_acceleration(joints_m, fps):
         rate = fps / _stride(fps)
         raise ValueError(f"three frames in a row are needed for accelerations, got {len(joints_m)} at {rate:g} Hz")
     every = _stride(fps)
@@ -168,6 +168,7 @@ def _stride(fps: float) -> int:
     return max(1, round(fps / SMOOTHNESS_FPS))
 
 
-def _has_acceleration(joints_m: np.ndarray, fps: float) -> bool:
+def has_acceleration(joints_m: np.ndarray, fps: float) -> bool:
+    """Whether ``smoothness_m_s2`` finds three frames in a row with the hand. Arguments as there."""
     there = np.asarray(np.isfinite(joints_m).all(axis=(1, 2)))[:: _stride(fps)]
     return bool((there[2:] & there[1:-1] & there[:-2]).any())

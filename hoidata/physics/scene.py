@@ -7,7 +7,6 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
@@ -55,7 +54,7 @@ class Scene:
         """(frame, vertex, 3) of the object in the world."""
         model = self.model
         local = articulate(model.vertices_m, model.part, model.hinge, self.poses.hinge_rad)
-        return local @ self.poses.rotmats.transpose(0, 2, 1) + self.poses.translation_m[:, None]
+        return self.poses.world_from_part(model, 0) @ local
 
     @cached_property
     def lowest_m(self) -> np.ndarray:
@@ -92,9 +91,6 @@ def clip_scene(clip: Clip, hands: HandPair, table_m: float | None = None) -> Sce
             Capsules(np.where(valid, own.start_m, np.nan), np.where(valid, own.end_m, np.nan), own.radius_m)
         )
     track = clip.object
-    poses = ObjectPoses(
-        rotvec_to_rotmat(np.asarray(track.rotvec, dtype=np.float64)),
-        np.asarray(track.translation_m, dtype=np.float64),
-        None if track.hinge_rad is None else np.asarray(track.hinge_rad, dtype=np.float64),
-    )
+    hinge = None if track.hinge_rad is None else np.asarray(track.hinge_rad, dtype=np.float64)
+    poses = ObjectPoses(track.world_from_object.rotation, track.world_from_object.translation, hinge)
     return Scene(clip.object.model, poses, joined(capsules), FPS, clip.gravity, table_m)

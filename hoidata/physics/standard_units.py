@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hoidata.physics.capsules import CapsuleContacts, ObjectPoses, part_poses, to_part_frame
+from hoidata.physics.capsules import CapsuleContacts
 from hoidata.physics.contact_forces import FRICTION, RESIDUAL_LIMIT, cone_edges
 from hoidata.physics.nnls import wrench_residuals
 from hoidata.physics.scene import Scene
@@ -81,25 +81,20 @@ def sliding_velocity(scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
     result = np.zeros((len(contacts.frame), 3))
     for part in np.unique(contacts.part):
         own = contacts.part == part
-        poses = part_poses(scene.model, scene.poses, int(part))
+        world_from_part = scene.poses.world_from_part(scene.model, int(part))
         frame, capsule = contacts.frame[own], contacts.capsule[own]
         before, after = np.maximum(frame - 1, 0), np.minimum(frame + 1, scene.n_frames - 1)
-        start, end = (to_part_frame(array, poses) for array in (scene.capsules.start_m, scene.capsules.end_m))
+        start, end = (world_from_part.inverse() @ ends for ends in (scene.capsules.start_m, scene.capsules.end_m))
         rate = (scene.fps / np.maximum(after - before, 1))[:, None]
         start_rate = (start[after, capsule] - start[before, capsule]) * rate
         axis_rate = (end[after, capsule] - end[before, capsule]) * rate - start_rate
         axis, along = (end - start)[frame, capsule], contacts.along[own, None]
         spin = np.cross(axis, axis_rate) / np.maximum((axis**2).sum(axis=1), 1e-12)[:, None]
-        point = to_part_frame_each(contacts.point_m[own], poses, frame)
+        point = (world_from_part[frame].inverse() @ contacts.point_m[own, None])[:, 0]
         skin = start_rate + along * axis_rate + np.cross(spin, point - start[frame, capsule] - along * axis)
-        result[own] = np.einsum("nij,nj->ni", poses.rotmats[frame], np.nan_to_num(skin))
+        result[own] = world_from_part[frame].turn(np.nan_to_num(skin)[:, None])[:, 0]
     inward = np.einsum("ni,ni->n", result, contacts.normal)
     return result - inward[:, None] * contacts.normal
-
-
-def to_part_frame_each(points_m: np.ndarray, poses: ObjectPoses, frame: np.ndarray) -> np.ndarray:
-    """World points (point, 3), each at its own frame (point,), in the part's frame."""
-    return np.einsum("ni,nij->nj", points_m - poses.translation_m[frame], poses.rotmats[frame])
 
 
 def table_contacts(scene: Scene, table_m: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import HandModel
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.mesh import MassProperties, mass_properties
@@ -38,11 +38,6 @@ class Contacts(NamedTuple):
     normals: np.ndarray
 
 
-def to_object_frame(points_m: np.ndarray, rotmats: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
-    """World points (frame, point, 3) in the object frame, given world-from-object (frame, 3, 3), (frame, 3)."""
-    return (points_m - translation_m[:, None]) @ rotmats
-
-
 def surface_distances(
     model: ObjectModel, hinge_rad: np.ndarray | None, points_m: np.ndarray, reach_m: float = REACH_M
 ) -> SurfaceDistances:
@@ -51,22 +46,15 @@ def surface_distances(
     best = SurfaceDistances(np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros((*shape, 3)))
     for part in np.unique(model.face_part) if model.is_articulated else [None]:
         faces = model.faces if part is None else model.faces[model.face_part == part]
-        turn = _part_rotation(model, hinge_rad) if part == 1 else None
-        _merge_nearer(best, _part_distances(model, faces, turn, points_m, reach_m))
+        object_from_part = model.object_from_part(int(part or 0), hinge_rad)
+        _merge_nearer(best, _part_distances(model, faces, object_from_part, points_m, reach_m))
     return best
 
 
-def _part_rotation(model: ObjectModel, hinge_rad: np.ndarray | None) -> np.ndarray:
-    if model.hinge is None or hinge_rad is None:
-        raise ValueError(f"{model.name}: hinge angles are needed to place the moving part")
-    return rotvec_to_rotmat(model.hinge.axis[None] * np.asarray(hinge_rad, dtype=np.float64)[:, None])
-
-
 def _part_distances(
-    model: ObjectModel, faces: np.ndarray, turn: np.ndarray | None, points_m: np.ndarray, reach_m: float
+    model: ObjectModel, faces: np.ndarray, object_from_part: RigidTransform, points_m: np.ndarray, reach_m: float
 ) -> SurfaceDistances:
-    origin = model.hinge.origin_m if model.hinge is not None else np.zeros(3)
-    local = points_m if turn is None else (points_m - origin) @ turn + origin
+    local = object_from_part.inverse() @ points_m
     used = model.vertices_m[np.unique(faces)]
     near = ((local > used.min(0) - reach_m) & (local < used.max(0) + reach_m)).all(-1)
     distance = np.full(points_m.shape[:2], np.inf)
@@ -75,10 +63,7 @@ def _part_distances(
         found = signed_distance(model.vertices_m, faces, local[near])
         distance[near], closest[near], normal[near] = found.distance_m, found.closest_m, found.normal
         distance[distance > reach_m] = np.inf
-    if turn is not None:
-        closest = (closest - origin) @ turn.transpose(0, 2, 1) + origin
-        normal = normal @ turn.transpose(0, 2, 1)
-    return SurfaceDistances(distance, closest, normal)
+    return SurfaceDistances(distance, object_from_part @ closest, object_from_part.turn(normal))
 
 
 def _merge_nearer(best: SurfaceDistances, other: SurfaceDistances) -> None:
@@ -140,9 +125,9 @@ def body_motion(
     shares = part_mass_properties(model)
     centres, inertias = [], []
     for index, (_, part) in enumerate(shares):
-        turn = _part_rotation(model, hinge_rad) if index == 1 else np.broadcast_to(np.eye(3), (n_frames, 3, 3))
-        origin = model.hinge.origin_m if index == 1 and model.hinge is not None else np.zeros(3)
-        centres.append(turn @ (part.centre_m - origin) + origin)
+        object_from_part = model.object_from_part(index, hinge_rad)
+        turn = np.broadcast_to(object_from_part.rotation, (n_frames, 3, 3))
+        centres.append((object_from_part @ np.broadcast_to(part.centre_m, (n_frames, 1, 3)))[:, 0])
         inertias.append(turn @ part.inertia_kg_m2 @ turn.transpose(0, 2, 1))
     centre = sum(share * c for (share, _), c in zip(shares, centres, strict=True))
     inertia = np.zeros((n_frames, 3, 3))

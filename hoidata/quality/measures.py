@@ -7,13 +7,12 @@ from typing import Any
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
-from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints, track_vertices
-from hoidata.objects.model import ObjectModel, articulate, place
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.quality import motion
 from hoidata.quality.meshes import SurfaceFacts, part_faces, part_facts
-from hoidata.quality.penetration import depths_m, object_frame
+from hoidata.quality.penetration import depths_m
 from hoidata.quality.shape import largest_beta, meant_betas
 from hoidata.quality.thresholds import Thresholds
 from hoidata.quality.timing import ObjectMotion, time_offset
@@ -71,7 +70,7 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
     """Every measure of a clip but ``beta_distance``, which needs the subject's other clips; NaN where there is none."""
     seen: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
     joints: Joints = {side: track_joints(clip.hands[side], hands[side]) for side in seen}
-    corners = placed(clip.object, facts.corners_m, facts.corner_part)
+    corners = clip.object.points_in_world(facts.corners_m, facts.corner_part)
     valid = {side: track.valid for side, track in clip.hands.items()}
     return {
         **_shaking(clip, joints, corners, thresholds),
@@ -86,23 +85,13 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
     }
 
 
-def placed(track: ObjectTrack, points_m: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """(frame, point, 3) world places of object-frame points (point, 3) of the given parts, metres."""
-    moved = articulate(points_m, part, track.model.hinge, track.hinge_rad)
-    return place(moved, np.asarray(track.rotvec, np.float64), np.asarray(track.translation_m, np.float64))
-
-
 def object_motion(track: ObjectTrack, facts: ObjectFacts) -> ObjectMotion:
     """World poses of the object's parts, and its points."""
-    rotmats = rotvec_to_rotmat(np.asarray(track.rotvec, np.float64))[None]
-    places = np.asarray(track.translation_m, np.float64)[None]
-    hinge = track.model.hinge
-    if hinge is not None and track.hinge_rad is not None:
-        turn = rotvec_to_rotmat(hinge.axis[None] * np.asarray(track.hinge_rad, np.float64)[:, None])
-        shift = hinge.origin_m - turn @ hinge.origin_m
-        rotmats = np.concatenate([rotmats, rotmats @ turn])
-        places = np.concatenate([places, places + np.einsum("fij,fj->fi", rotmats[0], shift)[None]])
-    return ObjectMotion(placed(track, facts.points_m, facts.part), facts.part, rotmats, places)
+    poses, motions = track.world_from_object, [track.world_from_object]
+    if track.model.is_articulated:
+        motions.append(poses @ track.model.object_from_part(1, track.hinge_rad))
+    rotmats, positions = (np.stack([getattr(pose, name) for pose in motions]) for name in ("rotation", "translation"))
+    return ObjectMotion(track.points_in_world(facts.points_m, facts.part), facts.part, rotmats, positions)
 
 
 def _box_corners(vertices_m: np.ndarray) -> np.ndarray:
@@ -112,10 +101,10 @@ def _box_corners(vertices_m: np.ndarray) -> np.ndarray:
 
 def _shaking(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
     wrists, fingers = [], []
-    for side, places in joints.items():
+    for side, positions in joints.items():
         valid = clip.hands[side].valid
-        wrists.append(motion.accelerations_m_s2(places[:, :1], valid))
-        fingers.append(motion.accelerations_m_s2(places[:, 1:] - places[:, :1], valid))
+        wrists.append(motion.accelerations_m_s2(positions[:, :1], valid))
+        fingers.append(motion.accelerations_m_s2(positions[:, 1:] - positions[:, :1], valid))
     thing = motion.accelerations_m_s2(corners, np.ones(len(corners), bool))
     shaking = np.array([series > thresholds.shaking_m_s2 for series in (*wrists, *fingers, thing)]).any(axis=0)
     return {
@@ -134,7 +123,7 @@ def _median(values: np.ndarray) -> float:
 
 def _jumps(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Thresholds) -> dict[str, float]:
     rule = thresholds.sudden_m, thresholds.large_m, thresholds.sudden_ratio
-    steps = [motion.steps_m(places, clip.hands[side].valid) for side, places in joints.items()]
+    steps = [motion.steps_m(positions, clip.hands[side].valid) for side, positions in joints.items()]
     hand = max((motion.largest_jump(step, *rule) for step in steps), default=motion.Jump(NAN, -1))
     thing = motion.largest_jump(motion.steps_m(corners, np.ones(len(corners), bool)), *rule)
     return {
@@ -150,7 +139,9 @@ def _frozen(clip: Clip, joints: Joints, corners: np.ndarray) -> dict[str, float]
     same: Joints = {
         side: motion.equal_steps(_hand_numbers(clip.hands[side]), clip.hands[side].valid) for side in joints
     }
-    moves: Joints = {side: motion.steps_m(places, clip.hands[side].valid) > STILL_M for side, places in joints.items()}
+    moves: Joints = {
+        side: motion.steps_m(positions, clip.hands[side].valid) > STILL_M for side, positions in joints.items()
+    }
     thing_moves = motion.steps_m(corners, always) > STILL_M
     alone = [same[side] & (thing_moves | _any(moves, but=side, like=thing_moves)) for side in joints]
     things = [motion.equal_steps(_object_numbers(track), always) for track in (clip.object, *clip.other_objects)]
@@ -193,23 +184,16 @@ def _penetration(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Th
 
 def _hand_depths(clip: Clip, side: Side, frames: np.ndarray, facts: ObjectFacts, hands: HandPair) -> np.ndarray:
     track, thing = clip.hands[side], clip.object
-    chosen = replace(
-        track,
-        wrist_m=track.wrist_m[frames],
-        global_orient=track.global_orient[frames],
-        hand_pose=track.hand_pose[frames],
-        betas=track.betas if len(track.betas) == 1 else track.betas[frames],
-        valid=track.valid[frames],
-    )
-    vertices = track_vertices(chosen, hands[side])
-    local = object_frame(vertices, thing.rotvec[frames], thing.translation_m[frames])
+    vertices = track_vertices(track.take(frames), hands[side])
+    # Stored bytes depend on it: the translation is taken away in float32, as it is stored.
+    pose = replace(thing.world_from_object, offset=thing.translation_m)[frames]
     hinge = None if thing.hinge_rad is None else thing.hinge_rad[frames]
-    return depths_m(facts.model, hinge, local, facts.solid_parts)
+    return depths_m(facts.model, hinge, pose.inverse() @ vertices, facts.solid_parts)
 
 
 def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Thresholds) -> dict[str, float]:
     found = time_offset(
-        [(places.astype(np.float64), clip.hands[side].valid) for side, places in joints.items()],
+        [(positions.astype(np.float64), clip.hands[side].valid) for side, positions in joints.items()],
         object_motion(clip.object, facts),
     )
     sure = found.confidence >= thresholds.offset_confidence

@@ -1,6 +1,6 @@
-"""Faults in motion: shaking, jumps, frozen stretches, hands that are lost for a while. Pure functions on arrays.
+"""Faults in motion: shaking, jumps, frozen intervals, hands that are lost for a while. Pure functions on arrays.
 
-points_m: (frame, point, 3) places of points fixed to a body (joints of a hand, corners of an object), metres, one
+points_m: (frame, point, 3) positions of points fixed to a body (joints of a hand, corners of an object), metres, one
 frame of reference. usable: (frame,) bool, which frames mean something. Everything is at ``FPS`` frames per second.
 """
 
@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hoidata.clips.clip import FPS
-from hoidata.geometry.stretches import runs, sudden_steps
+from hoidata.geometry.intervals import runs, sudden_steps
 
 # A tracker repeats its last numbers exactly; float32 storage of equal numbers stays within this.
 EQUAL = 1e-7

@@ -1,10 +1,13 @@
-"""How deep hands lie inside the object, where its mesh is solid enough to have an inside."""
+"""How deep hands lie inside the object, where its mesh is solid enough to have an inside.
+
+The same depth as the metrics' (``hoidata.objects.surface_index``): of the deepest vertex, to the nearest surface. It is
+asked of libigl here because the two differ in the last bit (1e-17 m), and quality's outputs are to keep their bytes.
+"""
 
 from collections.abc import Collection
 
 import numpy as np
 
-from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
 from hoidata.quality.meshes import part_faces
@@ -13,27 +16,16 @@ from hoidata.quality.meshes import part_faces
 def depths_m(
     model: ObjectModel, hinge_rad: np.ndarray | None, points_m: np.ndarray, parts: Collection[int]
 ) -> np.ndarray:
-    """(frame,) depth of the deepest of ``points_m (frame, point, 3)`` inside the solid ``parts``, metres; 0 outside.
+    """(frame,) depth of the deepest point inside the object, metres; 0 outside.
 
-    points_m: object frame. hinge_rad: (frame,) for an articulated object: the moving part is met in its rest frame.
+    hinge_rad: (frame,) for an articulated object: the moving part is met in its rest frame.
+    points_m: (frame, point, 3) object frame. parts: those that are solid.
     """
     depth = np.zeros(len(points_m))
     for part in parts:
-        local = points_m if part == 0 else _rest_frame(model, hinge_rad, points_m)
+        local = model.object_from_part(part, hinge_rad).inverse() @ points_m
         depth = np.maximum(depth, _depths_in(model.vertices_m, part_faces(model, part), local))
     return depth
-
-
-def object_frame(points_m: np.ndarray, rotvec: np.ndarray, translation_m: np.ndarray) -> np.ndarray:
-    """World points (frame, point, 3) in the object frame, given ``world_from_object``: axis-angle, metres."""
-    return (points_m - translation_m[:, None]) @ rotvec_to_rotmat(np.asarray(rotvec, dtype=np.float64))
-
-
-def _rest_frame(model: ObjectModel, hinge_rad: np.ndarray | None, points_m: np.ndarray) -> np.ndarray:
-    assert model.hinge is not None
-    assert hinge_rad is not None
-    turn = rotvec_to_rotmat(model.hinge.axis[None] * np.asarray(hinge_rad, dtype=np.float64)[:, None])
-    return (points_m - model.hinge.origin_m) @ turn + model.hinge.origin_m
 
 
 def _depths_in(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> np.ndarray:

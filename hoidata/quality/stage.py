@@ -6,9 +6,8 @@ meshes.parquet   one row per object: likewise, ``thresholds.MESH_MEASURES``
 info.json        thresholds, counts
 """
 
+import functools
 from collections import Counter
-from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from rich.console import Console
 from rich.progress import Progress
 
 from hoidata.clips.clip import SIDES
-from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
@@ -33,8 +31,9 @@ from hoidata.quality.thresholds import (
     reasons_of,
     verdict_of,
 )
+from hoidata.settings import plain_config
 from hoidata.store.store import Store, open_store
-from hoidata.workers import WorkerLost, in_workers
+from hoidata.workers import in_workers
 
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 50_000
@@ -86,18 +85,12 @@ def quality_store(
     for row in meshes:
         _judge(row, mesh_findings[row["object"]])
     counts = _counts(clips, meshes)
-    with atomic_folder(out_folder) as part:
-        write_table(part / "clips.parquet", [_nulled(row, CLIPS) for row in clips], CLIPS)
-        write_table(part / "meshes.parquet", [_nulled(row, MESHES) for row in meshes], MESHES)
-        info = {"thresholds": as_json(thresholds), "counts": counts}
-        (part / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
+    with atomic_folder(out_folder) as partial:
+        write_table(partial / "clips.parquet", [_nulled(row, CLIPS) for row in clips], CLIPS)
+        write_table(partial / "meshes.parquet", [_nulled(row, MESHES) for row in meshes], MESHES)
+        info = {"thresholds": plain_config(thresholds), "counts": counts}
+        (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
-
-
-def as_json(thresholds: Thresholds) -> dict[str, Any]:
-    """The thresholds in the form of their section of params.yaml."""
-    limits = {name: limit._asdict() for name, limit in thresholds.limits.items()}
-    return asdict(thresholds) | {"limits": limits}
 
 
 def _inherited(name: str, found: list[Finding]) -> list[Finding]:
@@ -114,22 +107,13 @@ def _measured(
 ) -> list[dict[str, Any]]:
     """The rows of all clips in the store's order."""
     store.hand_pair()
-    measure = partial(_measure, store, facts, thresholds)
+    measure = functools.partial(_measure, store, facts, thresholds)
     frames = sum(store.sequences["n_frames"].tolist())
     jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
     rows: dict[str, dict[str, Any]] = {}
-    try:
-        with Progress(console=Console(stderr=True), disable=not progress) as bar:
-            rows |= bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality")
-    except WorkerLost as error:
-        raise _worker_lost(error) from error
+    with Progress(console=Console(stderr=True), disable=not progress) as bar:
+        rows |= bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality")
     return [rows[clip_id] for clip_id in store.ids]
-
-
-def _worker_lost(error: WorkerLost) -> BadInput:
-    where = ", ".join(map(str, error.in_flight)) or "quality"
-    remedy = "run it again; if memory ran out, set HOIDATA_JOBS=1"
-    return BadInput(where, "worker processes that live until they are done", f"one lost ({error.cause})", remedy)
 
 
 def _measure(store: Store, facts: dict[str, ObjectFacts], thresholds: Thresholds, clip_id: str) -> dict[str, Any]:

@@ -49,7 +49,8 @@ MESH_MEASURES = (
 MEASURES = {measure.name: measure for measure in (*CLIP_MEASURES, *MESH_MEASURES)}
 
 
-class Limit(NamedTuple):
+@dataclass(frozen=True)
+class Limit:
     """A measure above ``warn`` is reported; above ``leave_out`` its clip is not used. None: never."""
 
     warn: float | None
@@ -84,7 +85,7 @@ DEFAULT_LIMITS: dict[str, Limit] = {
 
 @dataclass(frozen=True)
 class Thresholds:
-    """Settings of the measures and limits on them; the same as the section ``quality`` of params.yaml.
+    """Settings of the measures and limits on them: the section ``quality`` of params.yaml.
 
     penetration_every: penetration is measured in every n-th frame, the first included. too_deep_m: from where a hand
     counts as too deep. shaking_m_s2: from which acceleration a frame counts as shaking. sudden_m, sudden_ratio: a step
@@ -146,5 +147,5 @@ def reasons_of(found: Sequence[Finding]) -> str:
 
 def _reason(measure: Measure, values: Mapping[str, float], limit: float) -> str:
     unit = f" {measure.unit}" if measure.unit else ""
-    place = f" at frame {values[measure.frame]:g}" if measure.frame else ""
-    return f"{measure.words}: {values[measure.name]:.3g}{unit}{place}, above {limit:g}{unit}"
+    frame = f" at frame {values[measure.frame]:g}" if measure.frame else ""
+    return f"{measure.words}: {values[measure.name]:.3g}{unit}{frame}, above {limit:g}{unit}"

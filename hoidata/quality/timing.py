@@ -35,14 +35,14 @@ class TimeOffset(NamedTuple):
 class ObjectMotion(NamedTuple):
     """An object for this purpose. points_m: (frame, point, 3) spread over its surface, world, metres; part: (point,).
 
-    rotmats: (part, frame, 3, 3) and places_m: (part, frame, 3), each part's world pose; the parts share no frame of
+    rotmats: (part, frame, 3, 3) and positions_m: (part, frame, 3), each part's world pose; the parts share no frame of
     reference but the world.
     """
 
     points_m: np.ndarray
     part: np.ndarray
     rotmats: np.ndarray
-    places_m: np.ndarray
+    positions_m: np.ndarray
 
 
 class Pairs(NamedTuple):
@@ -100,11 +100,11 @@ def _nearest(
     return columns[0], columns[1], columns[2]
 
 
-def _carried_velocity(thing: ObjectMotion, part: np.ndarray, frame: np.ndarray, places_m: np.ndarray) -> np.ndarray:
-    """(sample, 3) m/s of points fixed to a part that lie at ``places_m (sample, 3)`` in ``frame (sample,)``."""
-    fixed = np.einsum("sij,si->sj", thing.rotmats[part, frame], places_m - thing.places_m[part, frame])
+def _carried_velocity(thing: ObjectMotion, part: np.ndarray, frame: np.ndarray, positions_m: np.ndarray) -> np.ndarray:
+    """(sample, 3) m/s of points fixed to a part that lie at ``positions_m (sample, 3)`` in ``frame (sample,)``."""
+    fixed = np.einsum("sij,si->sj", thing.rotmats[part, frame], positions_m - thing.positions_m[part, frame])
     before, after = (
-        np.einsum("sij,sj->si", thing.rotmats[part, then], fixed) + thing.places_m[part, then]
+        np.einsum("sij,sj->si", thing.rotmats[part, then], fixed) + thing.positions_m[part, then]
         for then in (frame - 1, frame + 1)
     )
     return (after - before) * (FPS / 2)

@@ -1,6 +1,6 @@
 """Which clips train, validate and test: rules, named splits kept as data, leak check, training statistics."""
 
-from hoidata.splits.definitions import Definition, choose, definition_names, definitions_for
+from hoidata.splits.definitions import Definition, choose, definitions_for
 from hoidata.splits.leaks import PROMISES, Leaks, find_leaks
 from hoidata.splits.published import Published, published
 from hoidata.splits.rules import PARTS, SplitRule, assign_split
@@ -15,7 +15,6 @@ __all__ = [
     "SplitRule",
     "assign_split",
     "choose",
-    "definition_names",
     "definitions_for",
     "find_leaks",
     "published",

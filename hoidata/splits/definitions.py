@@ -1,4 +1,7 @@
-"""Named splits, kept as data: ``definitions/<name>.json`` says where a split is from, its version and its rules."""
+"""Named splits, kept as data: rules in the folder of the dataset they split, ``splits/<name>.json``.
+
+Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -8,6 +11,7 @@ from typing import Any
 
 import orjson
 
+from hoidata.dataset_folders import dataset_facts, dataset_folder
 from hoidata.errors import BadInput
 from hoidata.splits.leaks import PROMISES, Promise
 from hoidata.splits.published import published
@@ -25,6 +29,7 @@ USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
     "prefix": ("sequence", "file"),
     "time": (),
     "rounds": (),
+    "drawn": ("sequence", "file"),
 }
 
 
@@ -43,23 +48,22 @@ class Definition:
         return facts | {"rule": self.rule.as_json(), "promises": list(self.promises)}
 
 
-def definition_names() -> list[str]:
-    """All named splits."""
-    return sorted(path.stem for path in FOLDER.glob("*.json"))
-
-
 def definitions_for(dataset: str) -> dict[str, Definition]:
     """The named splits a dataset has, by name."""
-    found = {name: _read(name) for name in definition_names()}
-    return {name: rules[dataset] for name, rules in found.items() if dataset in rules}
+    folder = dataset_folder(dataset)
+    paths = [] if folder is None else (folder / "splits").glob("*.json")
+    return {path.stem: _read(path) for path in sorted(paths, key=lambda path: path.stem)}
 
 
 def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
-    """The split params.yaml chooses for a dataset: a name, or a rule of the user's own (a mapping, see ``SplitRule``).
+    """The split of a dataset: what params.yaml chooses, else what its facts do.
 
+    wanted: a name, a rule of the user's own (a mapping, see ``SplitRule``), or None where params.yaml says nothing.
     Raises BadInput that lists the known names, or the known keys of a rule.
     """
     where, known = f"params.yaml: split.{dataset}", definitions_for(dataset)
+    facts = dataset_facts(dataset)
+    wanted = facts.split or None if facts and wanted is None else wanted
     names = ", ".join(known) or "none for this dataset"
     if isinstance(wanted, Mapping):
         return _own(where, dataset, wanted)
@@ -98,11 +102,14 @@ def _rule_and_promises(where: str, values: Mapping[str, Any]) -> tuple[SplitRule
 
 
 @lru_cache
-def _read(name: str) -> dict[str, Definition]:
-    """The rules of one named split, by dataset."""
-    path = FOLDER / f"{name}.json"
-    values = orjson.loads(path.read_bytes())
-    return {
-        dataset: Definition(name, values["version"], values["source"], *_rule_and_promises(f"{path}: {dataset}", rule))
-        for dataset, rule in values["datasets"].items()
-    }
+def _read(path: Path) -> Definition:
+    """One dataset's rule of a named split."""
+    general = FOLDER / path.name
+    try:
+        values = (orjson.loads(general.read_bytes()) if general.is_file() else {}) | orjson.loads(path.read_bytes())
+    except (orjson.JSONDecodeError, TypeError) as error:
+        raise BadInput(path, "a JSON object", str(error), "correct it") from error
+    origin = {key: values.pop(key, None) for key in ("version", "source")}
+    if not all(origin.values()):
+        raise BadInput(path, "the split's version and source", f"{origin}", "state them there")
+    return Definition(path.stem, origin["version"], origin["source"], *_rule_and_promises(str(path), values))

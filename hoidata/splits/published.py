@@ -1,12 +1,11 @@
-"""What the makers of a dataset publish about its sequences: names and counts, kept as data in ``published/``."""
+"""What the makers of a dataset publish about its sequences: ``published.json`` of the dataset's folder."""
 
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import orjson
 
-FOLDER = Path(__file__).with_name("published")
+from hoidata.dataset_folders import dataset_folder
 
 
 @dataclass(frozen=True)
@@ -32,9 +31,10 @@ class Published:
 
 @lru_cache
 def published(dataset: str) -> Published:
-    """What is known of a dataset; nothing (an empty ``source``) of one that is not listed here."""
-    path = FOLDER / f"{dataset}.json"
-    if not path.is_file():
+    """What is known of a dataset; nothing (an empty ``source``) of one without a list."""
+    folder = dataset_folder(dataset)
+    path = None if folder is None else folder / "published.json"
+    if path is None or not path.is_file():
         return Published("")
     values = orjson.loads(path.read_bytes())
     lists = {key: tuple(value) for key, value in values.items() if key != "source"}

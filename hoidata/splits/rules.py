@@ -7,12 +7,14 @@ from typing import Any, Literal, get_args
 import pandas as pd
 
 from hoidata.errors import BadInput
+from hoidata.files import sha256_bytes
 
 Part = Literal["train", "validation", "test"]
-Kind = Literal["subject", "object", "sequence", "prefix", "time", "rounds"]
+Kind = Literal["subject", "object", "sequence", "prefix", "time", "rounds", "drawn"]
 PARTS: tuple[Part, ...] = get_args(Part)
 KINDS: tuple[Kind, ...] = get_args(Kind)
 IN_TIME = ("time", "rounds")
+BY_SHARE = (*IN_TIME, "drawn")  # rules that list no names
 REST = "rest"
 ROUND: tuple[Part, ...] = ("train", "train", "train", "validation", "test")
 REMEDY = "mend params.yaml"
@@ -31,6 +33,8 @@ class SplitRule:
     them validate (rounded, at least one clip each where a sequence has three or more).
     by "rounds": in time order of every source sequence, of five successive clips three train, one validates, one tests
     (the shares are not used). For recordings whose end shows other actions than their beginning.
+    by "drawn": whole source sequences in the order of the SHA-256 of their names; shares as by "time". For a dataset of
+    which no list of sequences is known.
     """
 
     by: Kind = "subject"
@@ -46,7 +50,7 @@ class SplitRule:
             object.__setattr__(self, part, value if value == REST and part == "train" else _names(part, value))
         if self.by not in KINDS:
             raise BadInput("split rule: by", ", ".join(KINDS), repr(self.by), REMEDY)
-        if self.by in IN_TIME:
+        if self.by in BY_SHARE:
             self._check_shares()
         elif not self.train:
             raise BadInput("split rule: train", f"a list of names, or `{REST}` for all others", "nothing", REMEDY)
@@ -62,7 +66,7 @@ class SplitRule:
         """The rule as params.yaml and the definitions write it."""
         if self.by == "rounds":
             return {"by": self.by}
-        if self.by == "time":
+        if self.by in BY_SHARE:
             return {"by": self.by, "validation_share": self.validation_share, "test_share": self.test_share}
         lists = {part: list(self.names(part)) for part in PARTS}
         return {"by": self.by, **lists, **({"train": REST} if self.train == REST else {})}
@@ -96,6 +100,9 @@ def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
     rows = sequences.reset_index(drop=True)
     if rule.by in IN_TIME:
         parts = _in_time(rows, rule)
+    elif rule.by == "drawn":
+        drawn = _drawn(rows["sequence"], rule)
+        parts = [drawn[name] for name in rows["sequence"]]
     elif rule.by == "prefix":
         parts = [_by_prefix(name, rule) for name in rows["sequence"]]
     elif rule.by == "object":
@@ -147,19 +154,25 @@ def _in_time(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
     parts: list[Part | None] = [None] * len(rows)
     ordered = rows.sort_values(["sequence", "first_source_frame", "clip_id"], kind="stable")
     for _, group in ordered.groupby("sequence"):
-        found = _by_rounds(len(group)) if rule.by == "rounds" else _by_time(len(group), rule)
+        found = _by_rounds(len(group)) if rule.by == "rounds" else _by_share(len(group), rule)
         for row, part in zip(group.index, found, strict=True):
             parts[row] = part
     return parts
 
 
-def _by_time(n_clips: int, rule: SplitRule) -> Sequence[Part]:
-    """Parts of the clips of one sequence, in time order."""
+def _by_share(n_clips: int, rule: SplitRule) -> Sequence[Part]:
+    """Parts of the clips of one sequence, in time order; or of sequences, in the order drawn."""
     least = 1 if n_clips >= 3 else 0
     test = max(least, round(rule.test_share * n_clips)) if rule.test_share else 0
     validation = max(least, round(rule.validation_share * n_clips)) if rule.validation_share else 0
     validation = min(validation, n_clips - test)  # both may be rounded up
     return (*["train"] * (n_clips - validation - test), *["validation"] * validation, *["test"] * test)  # type: ignore[return-value]
+
+
+def _drawn(sequences: Iterable[str], rule: SplitRule) -> dict[str, Part]:
+    """Part of each sequence: with every sequence that is added few others change theirs."""
+    names = sorted(set(sequences), key=lambda name: sha256_bytes(name.encode()))
+    return dict(zip(names, _by_share(len(names), rule), strict=True))
 
 
 def _by_rounds(n_clips: int) -> Sequence[Part]:

@@ -16,11 +16,11 @@
                   distances-*.npz     frame int16, point int16, joint int8, distance_m float32: one row per entry
                   info.json           threshold_m, points, counts
     splits/       splits.parquet      clip_id, split (the chosen one), one column per named split
-                  info.json           definitions, clips per part, leak checks
-                  statistics.json     of every stored quantity over the training part
+                  info.json           definitions, clips per subset (train, validation, test), leak checks
+                  statistics.json     of every stored quantity over the training subset
 
 A clip without an acting hand, or without words, has a row with the reason in hand_type.parquet and no sentence; it
-belongs to no part of a split, and neither does a clip that no part of the split covers.
+belongs to no subset of a split. Clips that match no rule of a split are excluded too.
 """
 
 from collections.abc import Sequence
@@ -70,7 +70,7 @@ class AnnotatedStore:
         self.hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
         chosen = pd.read_parquet(root / "splits" / "splits.parquet", columns=["clip_id", "split"])
         self.splits: dict[str, str | None] = {
-            clip_id: None if pd.isna(part) else str(part) for clip_id, part in chosen.itertuples(index=False)
+            clip_id: None if pd.isna(subset) else str(subset) for clip_id, subset in chosen.itertuples(index=False)
         }
         self.split_info: dict[str, Any] = orjson.loads((root / "splits" / "info.json").read_bytes())
         self.annotation_info: dict[str, Any] = orjson.loads((annotation / "info.json").read_bytes())
@@ -92,17 +92,22 @@ class AnnotatedStore:
         return len(self.ids())
 
     def ids(self, split: str | None = None) -> list[str]:
-        """Clips of one part of the chosen split, or all, in the store's order; clips without sentences are left out."""
+        """Clips with sentences, of one subset of the chosen split or all, in the store's order."""
         return [key for key in self._sentences if split is None or self.splits[key] == split]
 
     def split_ids(self, split: str) -> list[str]:
-        """Clips of one part of the chosen split, in the store's order."""
+        """Clips of one subset of the chosen split, in the store's order."""
         return self.ids(split)
 
     @property
     def info(self) -> dict[str, Any]:
         """The store's ``meta/info.json``: dataset, synthetic, hand model, licence."""
         return self.store.info
+
+    @property
+    def contact_threshold_m(self) -> float:
+        """The contact stage's: contact maps and distances hold what is closer, metres."""
+        return float(self.contact_info["threshold_m"])
 
     def clip(self, clip_id: str) -> Clip:
         return self.store.clip(clip_id)
@@ -184,8 +189,8 @@ class AnnotatedStore:
     def distances(self, clip_id: str, side: Side | None = None) -> DistanceEntries:
         """All joint-point distances under the threshold, of one hand or of both (left first)."""
         sides = SIDES if side is None else (side,)
-        parts = [self._entries(clip_id, name) for name in sides]
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        columns_of_sides = [self._entries(clip_id, name) for name in sides]
+        columns = [np.concatenate(column) for column in zip(*columns_of_sides, strict=True)]
         return DistanceEntries(*columns)
 
     def _entries(self, clip_id: str, side: Side) -> tuple[np.ndarray, ...]:

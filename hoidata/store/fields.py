@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from hoidata.clips.clip import SIDES
+from hoidata.hands.model import N_VERTICES
 
 SCHEMA_VERSION = "1.1.0"
 UNITS = {"length": "metre", "angle": "radian", "time": "second"}
@@ -171,7 +172,7 @@ TEMPLATES = StoreFile(
     "arrays/templates.npz",
     "personal rest meshes; a member's name is the start of the SHA-256 of its bytes",
     "members by name",
-    (Field("<template>", "float32", "replaces MANO's template", (778, 3), ("vertex", "xyz"), "metre", "hand"),),
+    (Field("<template>", "float32", "replaces MANO's template", (N_VERTICES, 3), ("vertex", "xyz"), "metre", "hand"),),
 )
 
 _TEXT, _WHOLE, _ROW = "string", "int32", "int64"

@@ -23,13 +23,13 @@ class ShardWriter:
         self._start()
 
     def _start(self) -> None:
-        self.parts = {file.path: {f.name: [empty_array(f)] for f in file.fields} for file in _SHARDED}
+        self.pieces = {file.path: {f.name: [empty_array(f)] for f in file.fields} for file in _SHARDED}
         self.lengths = {file.path: {field.name: 0 for field in file.fields} for file in _SHARDED}
 
     def append(self, file: StoreFile, name: str, array: np.ndarray) -> int:
         """Add rows to one member, in its dtype; the row they start at."""
-        parts, lengths = self.parts[file.path], self.lengths[file.path]
-        parts[name].append(np.array(array, parts[name][0].dtype))
+        pieces, lengths = self.pieces[file.path], self.lengths[file.path]
+        pieces[name].append(np.array(array, pieces[name][0].dtype))
         lengths[name] += len(array)
         return lengths[name] - len(array)
 
@@ -54,9 +54,9 @@ class ShardWriter:
 
     def _flush(self) -> None:
         for file in _SHARDED:
-            parts = self.parts.pop(file.path)
+            pieces = self.pieces.pop(file.path)
             if file is FRAMES or any(self.lengths[file.path].values()):
-                arrays = {name: np.concatenate(parts.pop(name)) for name in list(parts)}
+                arrays = {name: np.concatenate(pieces.pop(name)) for name in list(pieces)}
                 write_npz(self.folder / file.path.replace("*", f"{self.number:05d}"), arrays)
         self.number += 1
         self._start()

@@ -47,10 +47,10 @@ def write_store(folder: str | Path, clips: Iterable[Clip | Quarantined], info: d
     and for an info that lacks a required fact.
     """
     check_info(info)
-    with atomic_folder(folder) as part:
-        (part / "meta").mkdir()
-        (part / "arrays").mkdir()
-        writer = _Writer(part)
+    with atomic_folder(folder) as partial:
+        (partial / "meta").mkdir()
+        (partial / "arrays").mkdir()
+        writer = _Writer(partial)
         for item in clips:
             if isinstance(item, Quarantined):
                 writer.quarantined.append(vars(item))

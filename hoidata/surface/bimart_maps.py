@@ -13,8 +13,7 @@ average (table 6).
 import numpy as np
 from numba import njit
 
-from hoidata.contact.proximity import joints_in_part
-from hoidata.objects.model import Hinge
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
 from hoidata.surface.contact import PlacedHand
 
@@ -23,18 +22,18 @@ STEP_M = 0.0008
 BEYOND = 255
 
 
-def bimart_map(hand: PlacedHand, points: SampledPoints, hinge: Hinge | None) -> np.ndarray:
+def bimart_map(hand: PlacedHand, points: SampledPoints, model: ObjectModel) -> np.ndarray:
     """(frame, point) float32 distance from each sampled point to the nearest vertex of one hand, metres.
 
-    points, hinge: of the object the hand is placed before; points of the moving part go with the hinge. Infinite in
+    points, model: of the object the hand is placed before; points of the moving part go with the hinge. Infinite in
     frames where the hand is not valid, and everywhere beyond 20 cm.
     """
     nearest = np.full((len(hand.vertices_m), len(points)), np.inf, np.float32)
     for part in np.unique(points.part) if len(hand.vertices_m) else ():
-        places = joints_in_part(hand.vertices_m, int(part), hinge, hand.hinge_rad)
+        positions = model.object_from_part(int(part), hand.hinge_rad).inverse() @ hand.vertices_m
         members = np.flatnonzero(points.part == part)
         cloud = np.ascontiguousarray(points.points_m[members].T, np.float32)
-        nearest[:, members] = _nearest_m(np.ascontiguousarray(places.transpose(0, 2, 1), np.float32), cloud)
+        nearest[:, members] = _nearest_m(np.ascontiguousarray(positions.transpose(0, 2, 1), np.float32), cloud)
     return hand.over_clip(nearest, np.inf)
 
 
@@ -54,30 +53,30 @@ def unpacked_map(packed: np.ndarray) -> np.ndarray:
     return np.where(packed == BEYOND, np.inf, packed * STEP_M).astype(np.float32)
 
 
-def _nearest_m(places_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:
-    """(frame, point) float32 distance to the nearest place, infinite beyond 20 cm.
+def _nearest_m(positions_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    """(frame, point) float32 distance to the nearest position, infinite beyond 20 cm.
 
-    places_m: (frame, 3, place), points_m: (3, point), float32. A frame whose boxes lie too far apart is not looked at.
+    positions_m: (frame, 3, position), points_m: (3, point), float32. Frames whose boxes lie too far apart are skipped.
     """
     apart = np.maximum(
-        places_m.min(axis=2) - points_m.max(axis=1), points_m.min(axis=1) - places_m.max(axis=2)
+        positions_m.min(axis=2) - points_m.max(axis=1), points_m.min(axis=1) - positions_m.max(axis=2)
     )  # (frame, 3) gap along each axis
-    distances = np.sqrt(_nearest_squares(places_m, points_m, (apart <= REACH_M).all(axis=1)))
+    distances = np.sqrt(_nearest_squares(positions_m, points_m, (apart <= REACH_M).all(axis=1)))
     return np.where(distances <= np.float32(REACH_M), distances, np.float32(np.inf))
 
 
 @njit(cache=True)
-def _nearest_squares(places_m, points_m, wanted):  # pragma: no cover (compiled)
-    """(frame, point) float32 square of the distance to the nearest place; infinite in frames that are not wanted.
+def _nearest_squares(positions_m, points_m, wanted):  # pragma: no cover (compiled)
+    """(frame, point) float32 square of the distance to the nearest position; infinite in frames that are not wanted.
 
-    Every pair is looked at, but many points at a time: 0.08 ns a pair, which no tree over 778 places comes near to.
+    Every pair is looked at, but many points at a time: 0.08 ns a pair, which no tree over 778 positions comes near to.
     """
-    squares = np.full((len(places_m), points_m.shape[1]), np.float32(np.inf), np.float32)
+    squares = np.full((len(positions_m), points_m.shape[1]), np.float32(np.inf), np.float32)
     xs, ys, zs = points_m[0], points_m[1], points_m[2]
-    for frame in range(len(places_m)):
+    for frame in range(len(positions_m)):
         best = squares[frame]
-        for place in range(places_m.shape[2] if wanted[frame] else 0):
-            x, y, z = places_m[frame, 0, place], places_m[frame, 1, place], places_m[frame, 2, place]
+        for vertex in range(positions_m.shape[2] if wanted[frame] else 0):
+            x, y, z = positions_m[frame, 0, vertex], positions_m[frame, 1, vertex], positions_m[frame, 2, vertex]
             for point in range(len(best)):
                 dx, dy, dz = xs[point] - x, ys[point] - y, zs[point] - z
                 square = dx * dx + dy * dy + dz * dz

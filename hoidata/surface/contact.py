@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from hoidata.clips.clip import Clip, Side
-from hoidata.contact.proximity import joints_in_object
 from hoidata.hands import HandPair, track_vertices
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.surface.solid_overlap import SolidOverlap
@@ -42,9 +41,9 @@ class PlacedHand:
 def placed_hand(clip: Clip, side: Side, hands: HandPair) -> PlacedHand:
     """The posed mesh of one hand in the object frame of each frame in which it is valid."""
     track, frames = clip.object, np.flatnonzero(clip.hands[side].valid)
-    vertices = joints_in_object(track_vertices(clip.hands[side], hands[side]), track)[frames]
+    vertices = track.world_from_object.inverse() @ track_vertices(clip.hands[side], hands[side]).astype(np.float64)
     hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
-    return PlacedHand(vertices, frames, hinge, hands[side].faces, clip.n_frames)
+    return PlacedHand(vertices[frames], frames, hinge, hands[side].faces, clip.n_frames)
 
 
 def touched_vertices(hand: PlacedHand, index: SurfaceIndex, threshold_m: float = TOUCH_M) -> np.ndarray:

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 import numpy as np
 
 from hoidata.clips.clip import Clip, Side
-from hoidata.contact.proximity import joints_in_object
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
@@ -80,7 +79,7 @@ def measure_hand(
     watch, index = stopwatch or Stopwatch(), shape.index
     with watch("hands"):
         hand = placed_hand(clip, side, hands)
-        joints = joints_in_object(joints_m, clip.object)[hand.frames]
+        joints = (clip.object.world_from_object.inverse() @ joints_m.astype(np.float64))[hand.frames]
     with watch("contact"):
         touched = touched_vertices(hand, index, touch_m)
     with watch("depth"):
@@ -90,7 +89,7 @@ def measure_hand(
     with watch("joints"):
         joint = hand.over_clip(index.distance_m(joints, hand.hinge_rad).min(axis=1), np.inf)
     with watch("maps"):
-        packed = packed_map(bimart_map(hand, shape.points, clip.object.model.hinge))
+        packed = packed_map(bimart_map(hand, shape.points, clip.object.model))
     return SideSurface(touched, depth, joint, packed, volume)
 
 

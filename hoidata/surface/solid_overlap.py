@@ -12,9 +12,9 @@ by 0.05 cm3 at most, cells of 2 mm by 0.25 cm3.
 import numpy as np
 
 from hoidata.errors import BadInput
-from hoidata.objects.line_crossings import Stretches, common_length_m, stretches_inside
+from hoidata.objects.line_crossings import Intervals, common_length_m, intervals_inside
 from hoidata.objects.solid import Solid, patched_holes, volume_m3
-from hoidata.objects.surface_index import SurfaceIndex, in_part
+from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.objects.triangle_tree import triangle_tree
 
 CELL_M = 0.001
@@ -44,10 +44,11 @@ class SolidOverlap:
         """
         volume = np.zeros(len(vertices_m))
         for part, lines in self._lines.items():
-            local = in_part(self.index.model, vertices_m, hinge_rad, part)
+            part_from_object = self.index.model.object_from_part(part, hinge_rad).inverse()
+            local = part_from_object @ np.asarray(vertices_m, np.float64)
             near = _frames_near(local, lines)
-            places, closed = patched_holes(local[near], np.asarray(faces, dtype=np.int64))
-            for frame, own in zip(near, places, strict=True):
+            positions, closed = patched_holes(local[near], np.asarray(faces, dtype=np.int64))
+            for frame, own in zip(near, positions, strict=True):
                 volume[frame] += common_length_m(np.ascontiguousarray(own), closed, lines) * self.cell_m**2
         return volume
 
@@ -57,15 +58,15 @@ def hand_volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
     return volume_m3(*patched_holes(vertices_m, faces))
 
 
-def _lines_through(name: str, solid: Solid, cell_m: float) -> Stretches:
+def _lines_through(name: str, solid: Solid, cell_m: float) -> Intervals:
     size = np.ptp(solid.vertices_m, axis=0)
     if not cell_m > 0 or np.prod(size[1:] / cell_m) > _MOST_LINES:
         got = " x ".join(f"{side:.3g}" for side in size)
         raise BadInput(f"mesh of {name!r}", f"at most {_MOST_LINES} cells of {cell_m} m", f"{got} m", "larger cells")
-    return stretches_inside(triangle_tree(solid.vertices_m, solid.faces), cell_m)
+    return intervals_inside(triangle_tree(solid.vertices_m, solid.faces), cell_m)
 
 
-def _frames_near(local_m: np.ndarray, lines: Stretches) -> np.ndarray:
+def _frames_near(local_m: np.ndarray, lines: Intervals) -> np.ndarray:
     """Frames in which the boxes of hand and part overlap."""
     if not len(lines.start_m):
         return np.zeros(0, int)

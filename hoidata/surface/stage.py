@@ -24,10 +24,18 @@ from hoidata.store.store import Store, open_store
 from hoidata.surface.contact import TOUCH_M
 from hoidata.surface.measure import ObjectShape, Stopwatch, encloses_solid, measure_hand
 from hoidata.surface.store import ClipSurface, SideSurface, SurfaceWriter
-from hoidata.workers import WorkerLost, in_workers
+from hoidata.workers import in_workers
 
 # Below this a second process costs more to start than it saves.
 FRAMES_PER_JOB = 20_000
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """enabled: only the pages read what it measures. touch_m: a hand vertex closer to the surface touches it."""
+
+    enabled: bool = True
+    touch_m: float = TOUCH_M
 
 
 class SurfaceReport(NamedTuple):
@@ -40,8 +48,8 @@ class SurfaceReport(NamedTuple):
     def cost(self) -> str:
         """Processor time per 1,000 frames, in words."""
         thousands = max(self.counts["frames"], 1) / 1000
-        parts = ", ".join(f"{name} {seconds / thousands:.3f}" for name, seconds in self.seconds.items())
-        return f"{sum(self.seconds.values()) / thousands:.3f} s per 1,000 frames of two hands ({parts})"
+        operations = ", ".join(f"{name} {seconds / thousands:.3f}" for name, seconds in self.seconds.items())
+        return f"{sum(self.seconds.values()) / thousands:.3f} s per 1,000 frames of two hands ({operations})"
 
 
 def surface_store(
@@ -71,9 +79,11 @@ def surface_store(
     bench = _Bench(store, touch_m, points, left_out or {})
     seconds: defaultdict[str, float] = defaultdict(float)
     jobs = min(jobs, 1 + sum(store.sequences["n_frames"].tolist()) // FRAMES_PER_JOB)
-    with atomic_folder(out_folder) as part, Progress(console=Console(stderr=True), disable=not progress) as bar:
-        writer = SurfaceWriter(part, points, touch_m)
-        for clip, spent in _in_order(bar.track(_measured(bench, jobs), len(store), description="surface"), store.ids):
+    with atomic_folder(out_folder) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
+        writer = SurfaceWriter(partial, points, touch_m)
+        for clip, spent in _in_order(
+            bar.track(in_workers(bench.measure, store.ids, jobs), len(store), description="surface"), store.ids
+        ):
             writer.add(clip)
             for name, value in spent.items():
                 seconds[name] += value
@@ -123,16 +133,6 @@ class _Bench:
         if model.name not in self.shapes:
             self.shapes[model.name] = ObjectShape(model, sample_points(model, self.points))
         return self.shapes[model.name]
-
-
-def _measured(bench: _Bench, jobs: int) -> Iterator[tuple[str, _Result]]:
-    try:
-        yield from in_workers(bench.measure, bench.store.ids, jobs)
-    except WorkerLost as error:
-        where = ", ".join(map(str, error.in_flight)) or "surface"
-        remedy = "run it again; if memory ran out, set HOIDATA_JOBS=1"
-        expected, got = "worker processes that live until they are done", f"one lost ({error.cause})"
-        raise BadInput(where, expected, got, remedy) from error
 
 
 def _in_order(found: Iterable[tuple[str, _Result]], clip_ids: Sequence[str]) -> Iterator[_Result]:

@@ -36,12 +36,12 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files import canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
+from hoidata.hands.model import N_VERTICES
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.mapped import map_npz
 from hoidata.surface.bimart_maps import BEYOND, REACH_M, STEP_M, clip_map, unpacked_map
 
 VERSION = 1
-VERTICES = 778
 FRAMES_PER_SHARD = 1 << 15
 REMEDY = "run the stage 'surface' of this dataset again"
 _TEXT, _COUNT, _NUMBER = pa.string(), pa.int32(), pa.float64()
@@ -125,7 +125,7 @@ class SurfaceWriter:
         return {**_summary(found), "map_row": row, "map_first": first, "map_stop": stop}
 
     def _write_shard(self) -> None:
-        arrays = {name: np.concatenate(parts) for name, parts in self._pending.items()}
+        arrays = {name: np.concatenate(pieces) for name, pieces in self._pending.items()}
         write_npz(self._folder / _shard_name(self._shard), arrays)
         self._shard += 1
         self._start_shard()
@@ -147,7 +147,7 @@ class SurfaceWriter:
         write_table(self._folder / "clips.parquet", self._rows, CLIPS)
         write_table(self._folder / "objects.parquet", objects, OBJECTS)
         info = {
-            **{"surface_version": VERSION, "touch_m": self._touch_m, "points": self._points, "vertices": VERTICES},
+            **{"surface_version": VERSION, "touch_m": self._touch_m, "points": self._points, "vertices": N_VERTICES},
             **{"map_step_m": STEP_M, "map_reach_m": REACH_M, "counts": counts},
         }
         (self._folder / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
@@ -167,7 +167,7 @@ def _summary(found: SideSurface) -> dict[str, Any]:
 
 def _no_frames(points: int) -> dict[str, np.ndarray]:
     kinds = {
-        "touched": np.zeros((0, -(-VERTICES // 8)), np.uint8),
+        "touched": np.zeros((0, -(-N_VERTICES // 8)), np.uint8),
         "depth_m": np.zeros(0, np.float32),
         "joint_m": np.zeros(0, np.float32),
         "map": np.zeros((0, points), np.uint8),

@@ -34,12 +34,12 @@ def write_corpus(
     if dataset not in DATASET_IDS:
         raise HoidataError(f"no embedded corpus named {dataset!r}; there are {', '.join(DATASET_IDS)}")
     tasks = tasks_of(dataset, seed, size)
-    with _progress() as progress, worker_pool(min(jobs, len(tasks))) as run, atomic_folder(root) as part:
+    with _progress() as progress, worker_pool(min(jobs, len(tasks))) as run, atomic_folder(root) as partial:
         made = _shown(progress, f"{dataset}: making", len(tasks), run(make_action, tasks))
         ordered = sorted((pair for pairs in made for pair in pairs), key=lambda pair: pair[0])
         sequences = place_in_raw_sequences(dataset, [truth for _, truth in ordered])
-        write_shared_files(dataset, sequences, part)
-        writing = [_WriteTask(dataset, part, members) for members in _by_raw_sequence(sequences)]
+        write_shared_files(dataset, sequences, partial)
+        writing = [_WriteTask(dataset, partial, members) for members in _by_raw_sequence(sequences)]
         list(_shown(progress, f"{dataset}: writing", len(writing), run(_write_task, writing)))
     return sequences
 

@@ -151,11 +151,11 @@ def capsule_points(
         axis=2,
     )
     turned = np.broadcast_to(np.eye(3), (*bones.shape[:2], 3, 3))
-    places = [joints[:, _KNUCKLES]]
+    positions = [joints[:, _KNUCKLES]]
     for segment in range(3):
         turned = turned @ local[:, :, segment]
-        places.append(places[-1] + (turned @ bones[:, :, segment, :, None])[..., 0])
-    chain = np.stack(places, axis=2)
+        positions.append(positions[-1] + (turned @ bones[:, :, segment, :, None])[..., 0])
+    chain = np.stack(positions, axis=2)
     starts = chain[:, :, :3].reshape(len(chain), 15, 3)
     ends = chain[:, :, 1:].reshape(len(chain), 15, 3)
     palm = _palm_axes(joints)

@@ -17,7 +17,6 @@ from hoidata.physics.surface import (
     patch_contacts,
     penetration_depth_m,
     surface_distances,
-    to_object_frame,
 )
 from hoidata.synthetic.truth import GRAVITY, TruthSequence
 
@@ -98,15 +97,15 @@ def _residuals(
 
 
 def _in_world(truth: TruthSequence, frame: int, contacts: list[Contacts]) -> tuple[np.ndarray, np.ndarray]:
-    rotation = rotvec_to_rotmat(truth.object.rotvec[frame])
+    world_from_object = truth.object.world_from_object[frame]
     points = np.concatenate([contact.points_m for contact in contacts])
     normals = np.concatenate([contact.normals for contact in contacts])
-    return points @ rotation.T + truth.object.translation_m[frame], normals @ rotation.T
+    return world_from_object @ points, world_from_object.turn(normals)
 
 
 def _object_points(truth: TruthSequence, points_m: np.ndarray, shift_m: np.ndarray | None) -> np.ndarray:
     moved = points_m.astype(np.float64) + (0.0 if shift_m is None else shift_m)
-    return to_object_frame(moved, rotvec_to_rotmat(truth.object.rotvec), truth.object.translation_m)
+    return truth.object.world_from_object.inverse() @ moved
 
 
 def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.ndarray | None) -> SurfaceDistances:
@@ -143,12 +142,12 @@ def _idle(truth: TruthSequence, pair: HandPair) -> float:
     base = track.model.vertices_m
     middle = (base.min(0) + base.max(0)) / 2
     radius = np.linalg.norm(base - middle, axis=1).max()
-    centre = rotvec_to_rotmat(track.rotvec) @ middle + track.translation_m
+    centre = track.world_from_object @ middle[None]
     nearest = np.inf
     for side in SIDES:
         hand = truth.hands[side]
         if side in truth.acting_sides or not hand.valid.any():
             continue
-        gap = np.linalg.norm(track_joints(hand, pair[side]) - centre[:, None], axis=2).min() - radius
+        gap = np.linalg.norm(track_joints(hand, pair[side]) - centre, axis=2).min() - radius
         nearest = min(nearest, float(gap))
     return nearest

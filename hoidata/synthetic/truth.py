@@ -18,7 +18,7 @@ class TruthSequence:
     "s1/mug_drink_1", ARCTIC "s01/box_use_01"). raw_start: its first frame there. source_fps: 30, or 120 for GRAB.
     verb, object_words: in words. object_name: the source's name. hand_type: the hands that touch.
     hands: both sides; ``valid`` is False where the source says the hand is absent. object: pose and hinge.
-    clip: first frame and one past the last of the labelled part. contact: the same for the firm grasp.
+    clip: first frame and one past the last of the labelled interval. contact: the same for the firm grasp.
     held: (frame,) the object is more than 1.5 cm above its rest. stand_m: height of the stand it rests on.
     """
 
@@ -66,22 +66,18 @@ class TruthSequence:
     def at_30_fps(self) -> "TruthSequence":
         """The whole action, approach and retreat included, every ``stride``-th raw frame."""
         frames = np.arange(self.n_frames)
-        return self.picked(frames[(frames + self.raw_start) % self.stride == 0])
+        return self.take(frames[(frames + self.raw_start) % self.stride == 0])
 
     def clip_truth(self) -> "TruthSequence":
-        """The labelled part alone, at 30 fps: what an adapter must find."""
-        return self.picked(self.clip_frames)
+        """The labelled interval alone, at 30 fps: what an adapter must find."""
+        return self.take(self.clip_frames)
 
-    def picked(self, frames: np.ndarray) -> "TruthSequence":
+    def take(self, frames: np.ndarray) -> "TruthSequence":
         """Only the given own frames; ``clip`` and ``contact`` then span what is left of them."""
-        track = self.object
-        hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
         return replace(
             self,
-            hands={side: _picked_hand(hand, frames) for side, hand in self.hands.items()},
-            object=replace(
-                track, rotvec=track.rotvec[frames], translation_m=track.translation_m[frames], hinge_rad=hinge
-            ),
+            hands={side: hand.take(frames) for side, hand in self.hands.items()},
+            object=self.object.take(frames),
             held=self.held[frames],
             clip=_span(frames, self.clip),
             contact=_span(frames, self.contact),
@@ -90,16 +86,6 @@ class TruthSequence:
     def joints(self, pair: HandPair) -> dict[Side, np.ndarray]:
         """(frame, 21, 3) world joints of both hands at every frame of this sequence."""
         return {side: track_joints(self.hands[side], pair[side]) for side in SIDES}
-
-
-def _picked_hand(hand: HandTrack, frames: np.ndarray) -> HandTrack:
-    return replace(
-        hand,
-        wrist_m=hand.wrist_m[frames],
-        global_orient=hand.global_orient[frames],
-        hand_pose=hand.hand_pose[frames],
-        valid=hand.valid[frames],
-    )
 
 
 def _span(frames: np.ndarray, span: tuple[int, int]) -> tuple[int, int]:

@@ -11,9 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hoidata.clips.clip import SIDES, HandTrack, Side
-from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_vertices
-from hoidata.physics.surface import to_object_frame
 from hoidata.synthetic.catalogue import GRAB_OBJECTS, object_model
 from hoidata.synthetic.object_files import write_npz, write_ply
 from hoidata.synthetic.shapes import sharp_box
@@ -133,10 +131,10 @@ def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
     labels = np.zeros(len(truth.object.model.vertices_m), dtype=np.int8)
     nearest = np.full(len(labels), np.inf)
     track = truth.object.model.vertices_m
-    one = truth.picked(np.array([(start + stop) // 2]))
+    one = truth.take(np.array([(start + stop) // 2]))
     for side in truth.acting_sides:
         vertices = track_vertices(one.hands[side], pair[side]).astype(np.float64)
-        local = to_object_frame(vertices, rotvec_to_rotmat(one.object.rotvec), one.object.translation_m)[0]
+        local = (one.object.world_from_object.inverse() @ vertices)[0]
         distance, index = KDTree(local).query(track)
         joint = pair[side].skin_weights.argmax(1)[index]
         ids = np.where(joint == 0, _HAND_ID[side], _FINGER_ID[side] + joint - 1)

@@ -17,22 +17,13 @@ from torch import Tensor, nn
 from hoidata.errors import BadInput
 from hoidata.files import atomic_file, canonical_json
 from models.common.config import build_config, plain_config
+from models.common.family import Network
 from models.common.features import Normaliser
-from models.text2hoi.contact import ContactConfig, ContactModel
-from models.text2hoi.diffusion import DiffusionConfig, DiffusionModel, MotionGenerator
-from models.text2hoi.length import LengthConfig, LengthModel
-from models.text2hoi.refiner import RefinerConfig, RefinerModel
 
 FORMAT = 1
 METADATA_KEY = "hoidata"
 FILE_NAME = "model.safetensors"
 EMPTY_NAME = "empty.json"
-NETWORKS: dict[str, tuple[type, type[nn.Module]]] = {
-    "contact": (ContactConfig, ContactModel),
-    "length": (LengthConfig, LengthModel),
-    "diffusion": (DiffusionConfig, DiffusionModel),
-    "refiner": (RefinerConfig, RefinerModel),
-}
 _WEIGHTS, _NORMALISER = "weights.", "normaliser."
 
 
@@ -50,11 +41,6 @@ class Checkpoint:
     @property
     def facts(self) -> dict[str, Any]:
         return self.info["facts"]
-
-    @property
-    def contact_threshold(self) -> float:
-        """The probability from which a point counts as touched, chosen on validation clips (contact model only)."""
-        return float(self.info["results"]["contact_threshold"])
 
 
 def save_checkpoint(
@@ -80,41 +66,33 @@ def read_info(path: str | Path) -> dict[str, Any]:
         info = json.loads(metadata[METADATA_KEY])
     except (OSError, SafetensorError, KeyError, ValueError) as error:
         raise BadInput(path, "a checkpoint of hoidata", f"{type(error).__name__}: {error}", "train it again") from error
-    if info.get("format") != FORMAT or info.get("model") not in NETWORKS:
-        got = f"format {info.get('format')} of model {info.get('model')}"
-        raise BadInput(path, f"format {FORMAT} of a known model", got, "train it again with this version")
+    if not isinstance(info, dict) or info.get("format") != FORMAT:
+        raise BadInput(path, f"format {FORMAT}", "another one", "train it again with this version")
     return info
 
 
-def load_checkpoint(folder: str | Path, expected: str | None = None, device: torch.device | str = "cpu") -> Checkpoint:
-    """The checkpoint in ``folder``, or of a file. Raises BadInput where there is none, or one of another model."""
+def load_checkpoint(folder: str | Path, network: Network, device: torch.device | str = "cpu") -> Checkpoint:
+    """The checkpoint of ``network`` in ``folder``, or of a file. Raises BadInput where there is none, or of another."""
     path = Path(folder) if str(folder).endswith(".safetensors") else Path(folder) / FILE_NAME
     if not path.is_file():
         raise BadInput(path, "a trained model", empty_reason(path.parent) or "no file", "run `dvc repro`")
     info = read_info(path)
-    if expected is not None and info["model"] != expected:
-        raise BadInput(path, f"a checkpoint of {expected}", f"one of {info['model']}", "point to the right folder")
-    config_type, network_type = NETWORKS[info["model"]]
-    network = network_type(build_config(config_type, info["config"], f"{path}: config"))
+    if info.get("model") != network.name:
+        remedy = "point to the right folder"
+        raise BadInput(path, f"a checkpoint of {network.name}", f"one of {info.get('model')}", remedy)
+    module = network.build(build_config(network.config, info["config"], f"{path}: config"))
     with safe_open(path, framework="pt") as stored:
         tensors: dict[str, Tensor] = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
     try:
-        network.load_state_dict(_below(tensors, _WEIGHTS))
+        module.load_state_dict(_below(tensors, _WEIGHTS))
     except RuntimeError as error:
         raise BadInput(path, "weights that fit its config", str(error).splitlines()[0], "train it again") from error
     normaliser = _below(tensors, _NORMALISER)
     return Checkpoint(
-        network.to(device).eval().requires_grad_(False),
+        module.to(device).eval().requires_grad_(False),
         Normaliser(**normaliser).to(device) if normaliser else None,
         info,
     )
-
-
-def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:
-    """The motion generator of a diffusion checkpoint."""
-    assert isinstance(checkpoint.network, DiffusionModel)
-    assert checkpoint.normaliser is not None
-    return MotionGenerator(checkpoint.network, checkpoint.normaliser)
 
 
 def write_empty(folder: str | Path, reason: str) -> Path:

@@ -1,6 +1,6 @@
 """Motion features to rotations, joints and placed points, in torch; and the normalisation learnt from training clips.
 
-Feature layout: ``hoidata.batches.dataset``. Axes (batch, side, frame, ...); sides left, right; metres, model frame.
+Feature layout: ``hoidata.clips.features``. Axes (batch, side, frame, ...); sides left, right; metres, model frame.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import HAND_FEATURES, N_ROTATIONS, OBJECT_FEATURES, ClipBatch, ClipSample
+from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.clip import SIDES
+from hoidata.clips.features import (
+    HAND_FEATURES,
+    HAND_ROTATIONS_6D,
+    N_ROTATIONS,
+    OBJECT_FEATURES,
+    OBJECT_HINGE,
+    OBJECT_POSITION,
+    OBJECT_ROTATION_6D,
+    WRIST,
+)
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandPair
 
@@ -26,37 +36,39 @@ def scaled_text(text: Tensor) -> Tensor:
 
 def hand_wrist_m(hands: Tensor) -> Tensor:
     """Wrist positions (..., 3) of hand features (..., 99)."""
-    return hands[..., :3]
+    return hands[..., WRIST]
 
 
 def hand_rotmats(hands: Tensor) -> Tensor:
     """Local rotations (..., 16, 3, 3) of hand features (..., 99), the global one first."""
-    return rot6d_to_rotmat(hands[..., 3:].reshape(*hands.shape[:-1], N_ROTATIONS, 6))
+    return rot6d_to_rotmat(hands[..., HAND_ROTATIONS_6D].reshape(*hands.shape[:-1], N_ROTATIONS, 6))
 
 
 def object_position_m(objects: Tensor) -> Tensor:
     """Positions (..., 3) of object features (..., 10)."""
-    return objects[..., :3]
+    return objects[..., OBJECT_POSITION]
 
 
 def object_rotmat(objects: Tensor) -> Tensor:
     """Rotations (..., 3, 3) of object features (..., 10)."""
-    return rot6d_to_rotmat(objects[..., 3:9])
+    return rot6d_to_rotmat(objects[..., OBJECT_ROTATION_6D])
 
 
 def object_hinge_rad(objects: Tensor) -> Tensor:
     """Hinge angles (...,) of object features (..., 10)."""
-    return objects[..., 9]
+    return objects[..., OBJECT_HINGE]
 
 
 def proper_hands(hands: Tensor) -> Tensor:
     """Hand features (..., 99) with every 6D part made the first two columns of a rotation."""
-    return torch.cat((hands[..., :3], rotmat_to_rot6d(hand_rotmats(hands)).flatten(-2)), -1)
+    return torch.cat((hands[..., WRIST], rotmat_to_rot6d(hand_rotmats(hands)).flatten(-2)), -1)
 
 
 def proper_object(objects: Tensor) -> Tensor:
     """Object features (..., 10) with the 6D part made the first two columns of a rotation."""
-    return torch.cat((objects[..., :3], rotmat_to_rot6d(object_rotmat(objects)), objects[..., 9:]), -1)
+    return torch.cat(
+        (objects[..., OBJECT_POSITION], rotmat_to_rot6d(object_rotmat(objects)), objects[..., OBJECT_HINGE:]), -1
+    )
 
 
 def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:
@@ -122,7 +134,7 @@ class Normaliser:
         """From training samples; frames of a side that does not act are left out."""
         means, scales = np.zeros((2, HAND_FEATURES)), np.ones((2, HAND_FEATURES))
         for side in range(2):
-            frames = [s.hands[side][s.valid[side]] for s in samples if s.acts[side]]
+            frames = [s.hands[side][s.valid[side]] for s in samples if s.active_hands[side]]
             means[side], scales[side] = _moments(frames, HAND_FEATURES)
         object_mean, object_scale = _moments([sample.object for sample in samples], OBJECT_FEATURES)
         arrays = (means, scales, object_mean, object_scale)
@@ -152,8 +164,7 @@ def _moments(frames: list[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarra
     if not len(rows):
         return np.zeros(size), np.ones(size)
     scale = rows.std(axis=0)
-    groups = ((0, 3),) if size == HAND_FEATURES else ((0, 3), (3, 9))
-    for start, stop in groups:
+    for group in (WRIST,) if size == HAND_FEATURES else (OBJECT_POSITION, OBJECT_ROTATION_6D):
         # One scale per position (and per object rotation) keeps directions comparable.
-        scale[start:stop] = np.sqrt((scale[start:stop] ** 2).mean())
+        scale[group] = np.sqrt((scale[group] ** 2).mean())
     return rows.mean(axis=0), np.maximum(scale, SMALLEST_SCALE)

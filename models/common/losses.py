@@ -1,14 +1,13 @@
 """Losses of generator and refiner: Text2HOI eq. 5-7 and 9-11, as means over what is present.
 
-All geometry is in metres in the model frame. Distances to surfaces come from ``models.common.fields``, whose gradient
-reaches the query points only. Masks are 0/1 tensors; an empty mask gives zero.
+All geometry is in metres in the model frame. Distances to surfaces come from
+``hoidata.objects.signed_distance_grid``, whose gradient reaches the query points only. Masks are 0/1 tensors; an empty
+mask gives zero.
 """
 
 import torch
 from torch import Tensor
 from torch.nn import functional
-
-from hoidata.batches.dataset import CONTACT_THRESHOLD_M
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -23,11 +22,12 @@ def simple_loss(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
 
 
 def distance_map_loss(
-    joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor, scale_m: float = CONTACT_THRESHOLD_M
+    joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor, scale_m: float
 ) -> Tensor:
-    """Eq. 6: squared error of the joint-to-point distances that are below 2 cm in the truth, in units of ``scale_m``.
+    """Eq. 6: squared error of the joint-to-point distances listed in the truth, in units of ``scale_m``.
 
     joints_m (B, 2, F, 21, 3), points_m (B, F, 1024, 3), entries (entry, 5): clip, side, frame, joint, point.
+    scale_m: the threshold below which they are listed (``ClipBatch.contact_threshold_m``).
     """
     if not len(entries):
         return joints_m.sum() * 0
@@ -58,20 +58,22 @@ def penetration_loss(signed_distance_m: Tensor, mask: Tensor, scale_m: float = 0
     return masked_mean(depth.square().sum(-1), mask)
 
 
-def contact_loss(distance_m: Tensor, true_distance_m: Tensor, mask: Tensor, scale_m: float = 0.01) -> Tensor:
-    """Eq. 11: joints that touch (within 2 cm of the surface in the truth) come as near as they truly are.
+def contact_loss(
+    distance_m: Tensor, true_distance_m: Tensor, mask: Tensor, threshold_m: float, scale_m: float = 0.01
+) -> Tensor:
+    """Eq. 11: joints that touch (closer than ``threshold_m`` in the truth) come as near as they truly are.
 
     Signed distances (B, 2, F, 21), mask (B, 2, F). A joint lies a finger's radius below its skin: pulling it onto the
     surface itself, as the paper does, would push the skin inside. Squared up to 3 cm of error, linear beyond (Huber).
     """
-    near = touching_joints(true_distance_m) & (mask[..., None] > 0)
+    near = touching_joints(true_distance_m, threshold_m) & (mask[..., None] > 0)
     apart = (distance_m - true_distance_m) / scale_m
     return masked_mean(2 * functional.huber_loss(apart, torch.zeros_like(apart), reduction="none", delta=3.0), near)
 
 
-def touching_joints(distance_m: Tensor) -> Tensor:
-    """Joints within 2 cm of the surface, on either side of it."""
-    return distance_m.abs() < CONTACT_THRESHOLD_M
+def touching_joints(distance_m: Tensor, threshold_m: float) -> Tensor:
+    """Joints closer than ``threshold_m`` to the surface, on either side of it."""
+    return distance_m.abs() < threshold_m
 
 
 def pick_frames(frames: Tensor, count: int, generator: torch.Generator) -> Tensor:

@@ -4,7 +4,8 @@ Text2HOI: 1,000 steps, cosine schedule (Nichol and Dhariwal 2021), x0-prediction
 2020); DDIM strides over them (Song et al. 2021). A denoiser here is ``x0 = denoise(x_t, t)`` on a pair (hands, object).
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,8 @@ import torch
 from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from torch import Tensor
+
+from hoidata.batches.dataset import MAX_FRAMES
 
 TRAIN_STEPS = 1000
 Motion = tuple[Tensor, Tensor]
@@ -39,34 +42,60 @@ def noise_schedule(kind: str = "ddim") -> DDIMScheduler | DDPMScheduler:
     )
 
 
-def alphas_bar(device: torch.device | str = "cpu") -> Tensor:
+def alphas_cumprod(device: torch.device | str = "cpu") -> Tensor:
     """(1000,) cumulative signal share of the schedule, alpha-bar of Ho et al. 2020."""
     return noise_schedule().alphas_cumprod.to(device)
 
 
 def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, signal: Tensor) -> Tensor:
-    """The noised motion at steps (B,): Text2HOI eq. 1. ``signal`` is :func:`alphas_bar`."""
+    """The noised motion at steps (B,): Text2HOI eq. 1. ``signal`` is :func:`alphas_cumprod`."""
     share = signal[steps].reshape(-1, *[1] * (clean.ndim - 1))
     return share.sqrt() * clean + (1 - share).sqrt() * noise
 
 
+def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], generator: torch.Generator) -> Motion:
+    """Noise of the given shapes (B, ...) from one generator, a row after the other."""
+    sizes = [math.prod(shape[1:]) for shape in (hands_shape, object_shape)]
+    return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
+
+
+def draw_each(hand_features: int, object_features: int, n_frames: int, generators: Sequence[torch.Generator]) -> Motion:
+    """Noise (B, 2, F, D) and (B, F, D), a generator for each of B motions.
+
+    The longest motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
+    """
+    rows = [
+        (
+            torch.randn(MAX_FRAMES, 2, hand_features, generator=generator)[:n_frames].transpose(0, 1),
+            torch.randn(MAX_FRAMES, object_features, generator=generator)[:n_frames],
+        )
+        for generator in generators
+    ]
+    return torch.stack([hands for hands, _ in rows]), torch.stack([objects for _, objects in rows])
+
+
 @torch.no_grad()
 def sample_motion(
-    denoise: Denoise, hands_shape: tuple, object_shape: tuple, config: SamplerConfig, generator: torch.Generator
+    denoise: Denoise, noise: Motion, config: SamplerConfig, generator: torch.Generator | list[torch.Generator]
 ) -> Motion:
-    """Motions (hands, object) of the given shapes from noise drawn from ``generator``, on the generator's device."""
+    """Motions (hands, object) from noise, on the noise's device.
+
+    generator: of the noise that DDPM adds, one for all motions or one for each.
+    """
     scheduler = noise_schedule(config.kind)
     scheduler.set_timesteps(config.steps)
-    flat_sizes = [int(torch.tensor(shape[1:]).prod()) for shape in (hands_shape, object_shape)]
-    x = torch.randn(hands_shape[0], sum(flat_sizes), generator=generator, device=generator.device)
-    for step in scheduler.timesteps:
-        hands, objects = _unflatten(x, flat_sizes, hands_shape, object_shape)
-        steps = torch.full((len(x),), int(step), device=x.device)
-        clean = torch.cat([part.flatten(1) for part in denoise(hands, objects, steps)], 1)
-        x = scheduler.step(clean, int(step), x, generator=generator, return_dict=False)[0]
-    return _unflatten(x, flat_sizes, hands_shape, object_shape)
+    shapes = noise[0].shape, noise[1].shape
+    x = torch.cat([part.flatten(1) for part in noise], 1)
+    for timestep in scheduler.timesteps:
+        hands, objects = _unflatten(x, *shapes)
+        timesteps = torch.full((len(x),), int(timestep), device=x.device)
+        clean = torch.cat([part.flatten(1) for part in denoise(hands, objects, timesteps)], 1)
+        # diffusers draws from a list of generators too, one for each row, though its signature does not say so.
+        step = scheduler.step(clean, int(timestep), x, generator=generator, return_dict=False)  # pyright: ignore[reportArgumentType]
+        x = step[0]
+    return _unflatten(x, *shapes)
 
 
-def _unflatten(x: Tensor, sizes: list[int], hands_shape: tuple, object_shape: tuple) -> Motion:
-    hands, objects = x.split(sizes, 1)
+def _unflatten(x: Tensor, hands_shape: tuple[int, ...], object_shape: tuple[int, ...]) -> Motion:
+    hands, objects = x.split([math.prod(hands_shape[1:]), math.prod(object_shape[1:])], 1)
     return hands.reshape(hands_shape), objects.reshape(object_shape)

@@ -35,8 +35,8 @@ class Block(nn.Module):
     def __init__(self, config: TransformerConfig) -> None:
         super().__init__()
         self.heads, self.norm_first, self.dropout = config.heads, config.norm_first, config.dropout
-        self.query_key_value = nn.Linear(config.width, 3 * config.width)
-        self.attended = nn.Linear(config.width, config.width)
+        self.in_proj = nn.Linear(config.width, 3 * config.width)
+        self.out_proj = nn.Linear(config.width, config.width)
         self.norm_attention, self.norm_feed_forward = nn.LayerNorm(config.width), nn.LayerNorm(config.width)
         self.feed_forward = nn.Sequential(
             nn.Linear(config.width, config.feed_forward),
@@ -46,24 +46,26 @@ class Block(nn.Module):
         )
         self.drop = nn.Dropout(config.dropout)
 
-    def forward(self, x: Tensor, seen: Tensor) -> Tensor:
-        """x: (batch, token, width). seen: (batch, token) bool, the tokens that may be attended to."""
+    def forward(self, x: Tensor, attention_mask: Tensor) -> Tensor:
+        """x: (batch, token, width). attention_mask: (batch, token) bool, the tokens that may be attended to."""
         if self.norm_first:
-            x = x + self.drop(self.attend(self.norm_attention(x), seen))
+            x = x + self.drop(self.attend(self.norm_attention(x), attention_mask))
             return x + self.drop(self.feed_forward(self.norm_feed_forward(x)))
-        x = self.norm_attention(x + self.drop(self.attend(x, seen)))
+        x = self.norm_attention(x + self.drop(self.attend(x, attention_mask)))
         return self.norm_feed_forward(x + self.drop(self.feed_forward(x)))
 
-    def attend(self, x: Tensor, seen: Tensor) -> Tensor:
+    def attend(self, x: Tensor, attention_mask: Tensor) -> Tensor:
         """Multi-head self-attention (Vaswani et al. 2017, eq. 1)."""
         batch, tokens, width = x.shape
-        query, key, value = self.query_key_value(x).reshape(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
+        query, key, value = self.in_proj(x).reshape(batch, tokens, 3, self.heads, -1).permute(2, 0, 3, 1, 4)
         dropout = self.dropout if self.training else 0.0
         # On CPUs plain matrix products beat the fused kernel, whose backward pass alone takes half a training step.
         kernels = [SDPBackend.MATH] if x.device.type == "cpu" else FUSED_FIRST
         with sdpa_kernel(kernels):
-            mixed = functional.scaled_dot_product_attention(query, key, value, seen[:, None, None], dropout_p=dropout)
-        return self.attended(mixed.transpose(1, 2).reshape(batch, tokens, width))
+            mixed = functional.scaled_dot_product_attention(
+                query, key, value, attention_mask[:, None, None], dropout_p=dropout
+            )
+        return self.out_proj(mixed.transpose(1, 2).reshape(batch, tokens, width))
 
 
 class Encoder(nn.Module):
@@ -74,10 +76,10 @@ class Encoder(nn.Module):
         self.blocks = nn.ModuleList([Block(config) for _ in range(config.layers)])
         self.last_norm = nn.LayerNorm(config.width) if config.norm_first else nn.Identity()
 
-    def forward(self, x: Tensor, seen: Tensor) -> Tensor:
-        """(batch, token, width) to the same; ``seen`` as in :class:`Block`."""
+    def forward(self, x: Tensor, attention_mask: Tensor) -> Tensor:
+        """(batch, token, width) to the same; ``attention_mask`` as in :class:`Block`."""
         for block in self.blocks:
-            x = block(x, seen)
+            x = block(x, attention_mask)
         return self.last_norm(x)
 
 
@@ -124,6 +126,6 @@ def smoothed(x: Tensor, frames: Tensor, width_frames: float) -> Tensor:
     return weight.reshape(len(x), *[1] * (x.ndim - 3), *weight.shape[1:]) @ x
 
 
-def tokens_seen(frames: Tensor, frames_per_token: int) -> Tensor:
+def attention_mask_of(frames: Tensor, frames_per_token: int) -> Tensor:
     """(..., token) True where a token holds at least one frame of ``frames`` (..., F) bool."""
     return to_tokens(frames[..., None].float(), frames_per_token).amax(-1) > 0

@@ -12,20 +12,22 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import HAND_FEATURES, MAX_FRAMES, OBJECT_FEATURES, ClipBatch
+from hoidata.batches.dataset import MAX_FRAMES
+from hoidata.batches.requests import RequestBatch
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from models.common.features import Normaliser, proper_hands, proper_object, scaled_text
-from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_bar, sample_motion
+from models.common.point_net import PointNet, PointNetConfig, normalised_points
+from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
 from models.common.transformer import (
     Encoder,
     TransformerConfig,
     agent_codes,
+    attention_mask_of,
     sinusoid,
     smoothed,
     to_frames,
     to_tokens,
-    tokens_seen,
 )
-from models.text2hoi.contact import PointNet, PointNetConfig, normalised_points
 
 CONTACT_MOMENTS = 13
 
@@ -51,43 +53,42 @@ class DiffusionConfig:
 @dataclass(frozen=True)
 class Condition:
     """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3);
-    touched (B, N) contact map; acts (B, 2) hand flags; frames (B, F) True up to each length."""
+    contact_map (B, N); active_hands (B, 2) hand flags; frames (B, F) True up to each length."""
 
     text: Tensor
     object: Tensor
     points_m: Tensor
     normals: Tensor
-    touched: Tensor
-    acts: Tensor
+    contact_map: Tensor
+    active_hands: Tensor
     frames: Tensor
 
     @classmethod
-    def of(cls, batch: ClipBatch, object_feature: Tensor, text: Tensor, touched: Tensor | None = None) -> "Condition":
-        """From a batch: its own contact map unless ``touched`` is given."""
-        touched = batch.touched if touched is None else touched
-        return cls(text, object_feature, batch.points_m, batch.normals, touched, batch.acts, batch.frames)
+    def of(cls, batch: RequestBatch, object_feature: Tensor, text: Tensor, contact_map: Tensor) -> "Condition":
+        """From a batch, with one sentence (B, 512) and one contact map (B, N) of each motion."""
+        return cls(text, object_feature, batch.points_m, batch.normals, contact_map, batch.active_hands, batch.frames)
 
     def repeat(self, count: int) -> "Condition":
         """Every clip ``count`` times in a row."""
         return Condition(*(getattr(self, name).repeat_interleave(count, 0) for name in self.__dataclass_fields__))
 
 
-def contact_moments(points_m: Tensor, normals: Tensor, touched: Tensor) -> Tensor:
+def contact_moments(points_m: Tensor, normals: Tensor, contact_map: Tensor) -> Tensor:
     """(B, 13) summary of a contact map (B, N) that does not depend on the order of the points.
 
     Mean and spread of the touched points about the object's centre, in units of its size and in metres (mean), their
     mean normal, and the share of points touched.
     """
     points, scale = normalised_points(points_m)
-    weight = touched / touched.sum(1, keepdim=True).clamp_min(1.0)
+    weight = contact_map / contact_map.sum(1, keepdim=True).clamp_min(1.0)
     mean = (weight[..., None] * points).sum(1)
     spread = (weight[..., None] * (points - mean[:, None]).square()).sum(1).clamp_min(1e-8).sqrt()
     normal = (weight[..., None] * normals).sum(1)
-    return torch.cat((mean, spread, normal, mean * scale * 10, touched.mean(1, keepdim=True)), -1)
+    return torch.cat((mean, spread, normal, mean * scale * 10, contact_map.mean(1, keepdim=True)), -1)
 
 
 class DiffusionModel(nn.Module):
-    """``x0 = model(hands, object, steps, condition)`` in normalised features."""
+    """``x0 = model(hands, object, timesteps, condition)`` in normalised features."""
 
     def __init__(self, config: DiffusionConfig) -> None:
         super().__init__()
@@ -114,25 +115,28 @@ class DiffusionModel(nn.Module):
         return self.object_net(normalised_points(points_m)[0])[0]
 
     def forward(
-        self, hands: Tensor, objects: Tensor, steps: Tensor, condition: Condition, keep: Tensor | None = None
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, keep: Tensor | None = None
     ) -> Motion:
-        """Clean hands (B, 2, F, 99) and object (B, F, 10) from noised ones at steps (B,).
+        """Clean hands (B, 2, F, 99) and object (B, F, 10) from noised ones at timesteps (B,).
 
         keep: (B, 2) factors 0 or 1 of the text and object conditions, for condition dropout and guidance.
         Padding and hands that do not act neither enter nor influence anything; their outputs mean nothing.
         """
         n_frames, k = hands.shape[2], self.config.transformer.frames_per_token
         frames = condition.frames
-        alive = torch.cat((condition.acts, torch.ones_like(condition.acts[:, :1])), 1)[:, :, None] & frames[:, None]
+        attended = (
+            torch.cat((condition.active_hands, torch.ones_like(condition.active_hands[:, :1])), 1)[:, :, None]
+            & frames[:, None]
+        )
         objects = objects * frames[..., None]
-        hands = hands * alive[:, :2, :, None]
+        hands = hands * attended[:, :2, :, None]
         agents = [layer(to_tokens(hands[:, side], k)) for side, layer in enumerate(self.hands_in)]
         tokens = torch.stack((*agents, self.object_in(to_tokens(objects, k))), 1)
         tokens = tokens + self._codes(frames, tokens.shape[2])
-        first = self._condition(steps, condition, keep)[:, None]
-        seen = tokens_seen(alive, k)
+        first = self._condition(timesteps, condition, keep)[:, None]
+        attention_mask = attention_mask_of(attended, k)
         x = torch.cat((first, tokens.flatten(1, 2)), 1)
-        x = self.encoder(x, torch.cat((seen.new_ones(len(seen), 1), seen.flatten(1)), 1))
+        x = self.encoder(x, torch.cat((attention_mask.new_ones(len(attention_mask), 1), attention_mask.flatten(1)), 1))
         left, right, body = x[:, 1:].unflatten(1, tokens.shape[1:3]).unbind(1)
         both = [to_frames(layer(t), n_frames, k) for layer, t in zip(self.hands_out, (left, right), strict=True)]
         return torch.stack(both, 1), to_frames(self.object_out(body), n_frames, k)
@@ -147,34 +151,34 @@ class DiffusionModel(nn.Module):
             codes = codes + self.to_go_in(sinusoid(to_go.clamp_min(0), width))[:, None]
         return codes
 
-    def _condition(self, steps: Tensor, condition: Condition, keep: Tensor | None) -> Tensor:
+    def _condition(self, timesteps: Tensor, condition: Condition, keep: Tensor | None) -> Tensor:
         """The condition token (B, width): Text2HOI eq. 2 and 3, plus hand flags and length."""
         _, scale = normalised_points(condition.points_m)
-        contact = condition.touched
+        contact = condition.contact_map
         if self.config.contact_input == "moments":
-            contact = contact_moments(condition.points_m, condition.normals, condition.touched)
+            contact = contact_moments(condition.points_m, condition.normals, condition.contact_map)
         text = self.text_in(scaled_text(condition.text))
         body = self.object_condition_in(torch.cat((condition.object, contact, scale), -1))
         if keep is not None:
             text, body = text * keep[:, :1], body * keep[:, 1:]
         length = condition.frames.sum(1, keepdim=True) / MAX_FRAMES
-        extent = self.extent_in(torch.cat((condition.acts.float(), length), -1))
-        time = self.step_in(sinusoid(steps, self.config.transformer.width))
+        extent = self.extent_in(torch.cat((condition.active_hands.float(), length), -1))
+        time = self.step_in(sinusoid(timesteps, self.config.transformer.width))
         return time + text + body + extent
 
 
 def guided(model: DiffusionModel, condition: Condition, guidance: float) -> Denoise:
     """The model as a denoiser for ``sample_motion``; classifier-free guidance (Ho and Salimans 2022) if not 1."""
 
-    def denoise(hands: Tensor, objects: Tensor, steps: Tensor) -> Motion:
-        return model(hands, objects, steps, condition)
+    def denoise(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
+        return model(hands, objects, timesteps, condition)
 
-    def denoise_guided(hands: Tensor, objects: Tensor, steps: Tensor) -> Motion:
-        told = model(hands, objects, steps, condition)
-        untold = model(hands, objects, steps, condition, hands.new_zeros(len(hands), 2))
+    def denoise_guided(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
+        conditional = model(hands, objects, timesteps, condition)
+        unconditional = model(hands, objects, timesteps, condition, hands.new_zeros(len(hands), 2))
         return (
-            untold[0] + guidance * (told[0] - untold[0]),
-            untold[1] + guidance * (told[1] - untold[1]),
+            unconditional[0] + guidance * (conditional[0] - unconditional[0]),
+            unconditional[1] + guidance * (conditional[1] - unconditional[1]),
         )
 
     return denoise if guidance == 1 else denoise_guided
@@ -188,26 +192,31 @@ class MotionGenerator:
     normaliser: Normaliser
 
     @torch.no_grad()
-    def sample(self, condition: Condition, sampler: SamplerConfig, generator: torch.Generator) -> Motion:
-        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise of ``generator``."""
-        n_clips, n_frames = condition.frames.shape
+    def sample(
+        self,
+        condition: Condition,
+        sampler: SamplerConfig,
+        noise: Motion,
+        generator: torch.Generator | list[torch.Generator],
+    ) -> Motion:
+        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise of these shapes; generator: of DDPM's."""
         denoise = guided(self.network, condition, sampler.guidance)
-        shapes = (n_clips, 2, n_frames, HAND_FEATURES), (n_clips, n_frames, OBJECT_FEATURES)
-        hands, objects = sample_motion(denoise, *shapes, sampler, generator)
+        device = condition.text.device
+        hands, objects = sample_motion(denoise, (noise[0].to(device), noise[1].to(device)), sampler, generator)
         width = self.network.config.smoothing_frames
         return self._features((smoothed(hands, condition.frames, width), smoothed(objects, condition.frames, width)))
 
     @torch.no_grad()
     def denoise_once(
-        self, hands: Tensor, objects: Tensor, steps: Tensor, condition: Condition, generator: torch.Generator
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, generator: torch.Generator
     ) -> Motion:
-        """Given motions, noised to ``steps`` (B,) and denoised by a single call."""
-        signal = alphas_bar(steps.device)
+        """Given motions, noised to ``timesteps`` (B,) and denoised by a single call."""
+        signal = alphas_cumprod(timesteps.device)
         noised = []
         for clean in self.normaliser.encode(hands, objects):
-            noise = torch.randn(clean.shape, generator=generator, device=generator.device)
-            noised.append(add_noise(clean, noise.to(clean.device), steps, signal))
-        return self._features(self.network(noised[0], noised[1], steps, condition))
+            noise = torch.randn(clean.shape, generator=generator)
+            noised.append(add_noise(clean, noise.to(clean.device), timesteps, signal))
+        return self._features(self.network(noised[0], noised[1], timesteps, condition))
 
     def _features(self, motion: Motion) -> Motion:
         hands, objects = self.normaliser.decode(*motion)

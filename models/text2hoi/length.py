@@ -38,20 +38,20 @@ class LengthModel(nn.Module):
             nn.Linear(config.width, 2),
         )
 
-    def forward(self, text: Tensor, acts: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_spread = self.layers(torch.cat((scaled_text(text), acts.float()), -1)).unbind(-1)
+    def forward(self, text: Tensor, active_hands: Tensor) -> tuple[Tensor, Tensor]:
+        mean, log_spread = self.layers(torch.cat((scaled_text(text), active_hands.float()), -1)).unbind(-1)
         # Between 1 and 55 frames, reached smoothly: a hard limit would have no gradient.
         return mean + 0.5, 2 * log_spread.tanh() - 3
 
     @torch.no_grad()
-    def expected_frames(self, text: Tensor, acts: Tensor) -> Tensor:
+    def expected_frames(self, text: Tensor, active_hands: Tensor) -> Tensor:
         """(B,) expected number of frames, not rounded."""
-        return (self(text, acts)[0] * MAX_FRAMES).clamp(SHORTEST_FRAMES, MAX_FRAMES)
+        return (self(text, active_hands)[0] * MAX_FRAMES).clamp(SHORTEST_FRAMES, MAX_FRAMES)
 
     @torch.no_grad()
-    def sample(self, text: Tensor, acts: Tensor, generator: torch.Generator) -> Tensor:
+    def sample(self, text: Tensor, active_hands: Tensor, generator: torch.Generator) -> Tensor:
         """(B,) whole numbers of frames, 8 to 150, with noise drawn from ``generator``."""
-        mean, log_spread = self(text, acts)
+        mean, log_spread = self(text, active_hands)
         noise = torch.randn(len(text), generator=generator, device=generator.device)
         frames = (mean + log_spread.exp() * noise) * MAX_FRAMES
         return frames.round().clamp(SHORTEST_FRAMES, MAX_FRAMES).long()

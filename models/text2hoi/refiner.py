@@ -12,17 +12,17 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import HAND_FEATURES
+from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, HAND_POSE_6D, HAND_ROTATIONS_6D, WRIST
 from models.common.features import object_position_m, object_rotmat, proper_hands
 from models.common.transformer import (
     Encoder,
     TransformerConfig,
     agent_codes,
+    attention_mask_of,
     sinusoid,
     smoothed,
     to_frames,
     to_tokens,
-    tokens_seen,
 )
 
 JOINT_FEATURES = 63
@@ -51,7 +51,7 @@ class CoarseMotion:
     """What the refiner sees: hands (B, 2, F, 99) and object (B, F, 10) in metres; and in the object's frame joints_m
     (B, 2, F, 21, 3), their signed distance_m (B, 2, F, 21) and offset_m to the nearest surface point (B, 2, F, 21, 3).
 
-    present (B, 2, F) masks; points_m (B, N, 3) the object's sampled points; touched (B, N) the contact map.
+    present (B, 2, F) masks; points_m (B, N, 3) the object's sampled points; contact_map (B, N) the contact map.
     """
 
     hands: Tensor
@@ -61,7 +61,7 @@ class CoarseMotion:
     offset_m: Tensor
     present: Tensor
     points_m: Tensor
-    touched: Tensor
+    contact_map: Tensor
 
 
 def attention_map(offset_m: Tensor) -> Tensor:
@@ -84,9 +84,9 @@ def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
 
 def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
     """Wrist and global 6D turned by ``rotation`` about ``origin``."""
-    wrist = (rotation @ (hands[..., :3] - origin)[..., None])[..., 0]
-    columns = rotation @ hands[..., 3:9].unflatten(-1, (3, 2))
-    return torch.cat((wrist, columns.flatten(-2), hands[..., 9:]), -1)
+    wrist = (rotation @ (hands[..., WRIST] - origin)[..., None])[..., 0]
+    columns = rotation @ hands[..., GLOBAL_ORIENT_6D].unflatten(-1, (3, 2))
+    return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
 
 
 class RefinerModel(nn.Module):
@@ -106,7 +106,7 @@ class RefinerModel(nn.Module):
             nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
             nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
         reach = torch.full((HAND_FEATURES,), config.rotation_reach)
-        reach[:3] = config.wrist_reach_m
+        reach[WRIST] = config.wrist_reach_m
         self.register_buffer("reach", reach, persistent=False)
 
     def forward(self, coarse: CoarseMotion) -> Tensor:
@@ -119,16 +119,16 @@ class RefinerModel(nn.Module):
         place = torch.arange(tokens.shape[2], device=tokens.device) * k
         width = self.config.transformer.width
         tokens = tokens + sinusoid(place, width) + agent_codes(width, tokens.device)[:2, None]
-        seen = tokens_seen(coarse.present, k).flatten(1)
+        attention_mask = attention_mask_of(coarse.present, k).flatten(1)
         # A clip without any present hand still needs one key to attend to; its result is masked anyway.
-        seen[:, 0] |= ~seen.any(1)
-        both = self.encoder(tokens.flatten(1, 2), seen).unflatten(1, tokens.shape[1:3]).unbind(1)
+        attention_mask[:, 0] |= ~attention_mask.any(1)
+        both = self.encoder(tokens.flatten(1, 2), attention_mask).unflatten(1, tokens.shape[1:3]).unbind(1)
         change = [to_frames(layer(x), n_frames, k) for layer, x in zip(self.hands_out, both, strict=True)]
         residual = smoothed(torch.stack(change, 1), coarse.present.any(1), self.config.smoothing_frames)
         return hands_in_world(local + residual * self.reach, coarse.object)
 
     def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:
-        scaled = torch.cat((local[..., :3] * 10, local[..., 3:]), -1)
+        scaled = torch.cat((local[..., WRIST] * 10, local[..., HAND_ROTATIONS_6D]), -1)
         offset = coarse.offset_m / (coarse.offset_m.norm(dim=-1, keepdim=True) + REACH_M)
         parts = [
             scaled,
@@ -141,7 +141,7 @@ class RefinerModel(nn.Module):
             shape = (*local.shape[:-1], self.config.points)
             # In the object's frame the norms of the points do not change with the motion.
             norms = coarse.points_m.norm(dim=-1)[:, None, None].expand(shape)
-            parts += [norms, coarse.touched[:, None, None].expand(shape)]
+            parts += [norms, coarse.contact_map[:, None, None].expand(shape)]
         return torch.cat(parts, -1)
 
 

@@ -18,7 +18,10 @@ def repro(
 
 
 def up() -> None:
-    """Start a Prefect server and worker for this folder, with its deployments; Ctrl-C stops both."""
+    """Start a Prefect server and worker for this folder, with its deployments; Ctrl-C stops both.
+
+    They listen on this machine alone, and only to who can read .prefect/api-key: `prefect` typed here finds it itself.
+    """
     enter_project()
     from pipelines.prefect_server import serve
 

@@ -1,9 +1,17 @@
 """The project folder and its settings, as commands find them."""
 
 import os
+import re
+import subprocess
 from pathlib import Path
 
 from hoidata.errors import MissingResource
+
+# Either profile, and the other one.
+PROFILES = {"embedded": "own", "own": "embedded"}
+PROFILE = re.compile("^profile: .*", re.MULTILINE)
+FILTER = "hoidata-profile"
+CHOSEN = "hoidata-profile.sed"
 
 
 def enter_project() -> Path:
@@ -27,23 +35,46 @@ def current_profile() -> str:
 
 
 def set_profile(profile: str) -> bool:
-    """Set the profile line of params.yaml, comments untouched; False when it said so already."""
+    """Set the profile line of params.yaml, for this copy of the project alone; False when it said so already."""
     path = Path("params.yaml")
-    lines = path.read_text().splitlines(keepends=True)
-    changed = [f"profile: {profile}\n" if line.startswith("profile:") else line for line in lines]
-    if changed == lines:
-        return False
-    path.write_text("".join(changed))
-    return True
+    text, before = path.read_text(), current_profile()
+    _keep_profile_from_git(profile)
+    if before != profile:
+        path.write_text(PROFILE.sub(_profile_line(profile), text, count=1))
+    return before != profile
+
+
+def _profile_line(profile: str) -> str:
+    """Equally long for both profiles: git looks closer at a file of the same size before it calls it changed."""
+    return f"profile: {profile}  # or {PROFILES[profile]}"
+
+
+def _keep_profile_from_git(profile: str) -> None:
+    """A filter of this clone (see gitattributes): git stores the line as delivered and checks out what is chosen."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], check=True, capture_output=True, text=True).stdout.strip()
+
+    try:
+        chosen = Path(git("rev-parse", "--git-path", CHOSEN))
+    except (OSError, subprocess.CalledProcessError):
+        return  # no git here, no work tree to keep clean
+    chosen.write_text(f"s/{PROFILE.pattern}/{_profile_line(profile)}/\n")
+    git("config", f"filter.{FILTER}.clean", f"sed -e 's/{PROFILE.pattern}/{_profile_line('embedded')}/'")
+    git("config", f"filter.{FILTER}.smudge", f'sed -e "$(cat "$(git rev-parse --git-path {CHOSEN})" 2>/dev/null)"')
 
 
 def remember_root(name: str, root: Path) -> None:
-    """Note a raw folder in hoidata.toml, which version control ignores."""
+    """Note a raw folder in hoidata.toml, which version control ignores; its other sections stay."""
     import json
+    import re
     import tomllib
 
     path = Path("hoidata.toml")
-    settings = tomllib.loads(path.read_text()) if path.is_file() else {}
+    text = path.read_text() if path.is_file() else ""
+    settings = tomllib.loads(text)
     roots = {**settings.get("roots", {}), name: str(root)}
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in sorted(roots.items())]
-    path.write_text("# Where your raw files lie. Written by `hoidata raw scan`.\n[roots]\n" + "".join(lines))
+    head = "# Where your raw files lie. Written by `hoidata raw scan`.\n[roots]\n"
+    others = re.sub(rf"({re.escape(head)}|^\[roots\]\n)[^\[]*", "", text, flags=re.MULTILINE)
+    path.write_text(f"{others.rstrip()}\n\n".lstrip() + head + "".join(lines))

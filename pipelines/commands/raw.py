@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.commands.project import current_profile, enter_project, remember_root, set_profile
+from pipelines.commands.project import PROFILES, current_profile, enter_project, remember_root, set_profile
 
 app = typer.Typer(no_args_is_help=True)
 Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
@@ -20,12 +20,15 @@ def scan(
 ) -> None:
     """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
     enter_project()
+    from pipelines.lineage.graph import read_params
     from pipelines.lineage.manifests import write_manifest
+    from pipelines.stages.adapters import ensure_manifests
     from pipelines.stages.base import HAND, Place
 
     name = HAND if dataset == "mano" else dataset
     place = Place("own", name)
     manifest = _scan_hand(place, root) if name == HAND else _scan_dataset(place, root)
+    ensure_manifests("own", read_params(Path())["datasets"])
     write_manifest(place.manifest, manifest)
     remember_root(name, root)
     size = sum(entry.size for entry in manifest.files)
@@ -34,7 +37,21 @@ def scan(
         return
     _state_terms(manifest)
     if set_profile("own"):
-        typer.echo("params.yaml: profile set to own (set it back to embedded to return; nothing is retrained)")
+        typer.echo("params.yaml: profile set to own (`hoidata profile embedded` returns; nothing is retrained)")
+
+
+def profile(
+    name: Annotated[str, typer.Argument(help="embedded or own; nothing: say which one it is.")] = "",
+) -> None:
+    """Say which data this copy of the project works on, or choose it; git does not see the choice."""
+    enter_project()
+    from hoidata.errors import BadInput
+
+    if name and name not in PROFILES:
+        raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
+    if name:
+        set_profile(name)
+    typer.echo(current_profile())
 
 
 def _scan_dataset(place, root: Path):
@@ -49,22 +66,10 @@ def _scan_dataset(place, root: Path):
     if place.dataset not in known:
         remedy = f"add {place.dataset} to `datasets` in params.yaml"
         raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
-    _ensure_manifests(adapter)
     # First what was asked about, then what it needs besides.
     _require_parts(adapter, root, also=_hand_problem(place))
     require_hand(place)
     return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
-
-
-def _ensure_manifests(adapter) -> None:
-    """A dataset new to the project is absent from both profiles until it is scanned."""
-    from pipelines.lineage.manifests import absent_manifest, write_manifest
-    from pipelines.stages.base import Place
-
-    for profile in ("embedded", "own"):
-        path = Place(profile, adapter.name).manifest
-        if not path.is_file():
-            write_manifest(path, absent_manifest(adapter))
 
 
 def _hand_problem(place) -> str:
@@ -111,13 +116,13 @@ def _scan_hand(place, root: Path):
     from hoidata.clips.clip import SourceFile
     from hoidata.errors import BadInput
     from hoidata.files import sha256_file
-    from pipelines.lineage.manifests import read_manifest
+    from pipelines.lineage.manifests import ABSENT_HAND
 
     missing = [name for name in MANO_FILES if not (root / name).is_file()]
     if missing:
         raise BadInput(root, " and ".join(MANO_FILES), f"no {', '.join(missing)}", "see https://mano.is.tue.mpg.de")
     files = [SourceFile(name, (root / name).stat().st_size, sha256_file(root / name)) for name in sorted(MANO_FILES)]
-    return replace(read_manifest(place.manifest), present=True, files=tuple(files))
+    return replace(ABSENT_HAND, present=True, files=tuple(files))
 
 
 @app.command()
@@ -137,12 +142,12 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     asked_for: by name, so that its absence is a complaint.
     """
     from hoidata.errors import MissingResource
-    from pipelines.lineage.manifests import absent_manifest, read_manifest, verify_files
-    from pipelines.stages.adapters import configured_adapter
+    from pipelines.lineage.manifests import read_manifest, verify_files
+    from pipelines.stages.adapters import configured_adapter, manifest_of
     from pipelines.stages.base import Place, raw_root
 
     place, adapter = Place(current_profile(), dataset), configured_adapter(dataset)
-    manifest = read_manifest(place.manifest) if place.manifest.is_file() else absent_manifest(adapter)
+    manifest = manifest_of(place)
     if not manifest.present:
         typer.echo(f"{dataset}: not present in the profile {place.profile}: no raw files were scanned")
         _say_where_to_get(adapter)

@@ -1,14 +1,14 @@
 """``hoidata share``: whether ``dvc push`` sends what was made from the data."""
 
-import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from pipelines.commands.project import current_profile, enter_project
 
-LINE = re.compile(r"^( +push: )(true|false)$", re.MULTILINE)
+# The remote all derived outputs belong to: by .dvc/config the cache they lie in, so that nothing is sent.
+DERIVED = "derived"
 
 
 def share(
@@ -19,20 +19,42 @@ def share(
     Most of these datasets forbid passing on what is derived from them. Whether you may is yours to know.
     """
     enter_project()
-    path = Path("dvc.yaml")
-    text, count = LINE.subn(rf"\g<1>{'true' if on else 'false'}", path.read_text())
-    path.write_text(text)
     for line in _terms() if on else ():
         typer.echo(line)
-    typer.echo(f"dvc.yaml: push set to {'true' if on else 'false'} in {count} outputs")
+    typer.echo(f".dvc/config.local: what is derived from data {f'goes to {_lead_out()}' if on else _keep_here()}")
+
+
+def _lead_out() -> str:
+    """Make the project's default remote, with all its options, that of derived outputs too; returns its address."""
+    from hoidata.errors import MissingResource
+
+    config = _config()
+    name = config["core"].get("remote")
+    if name is None:
+        raise MissingResource("no remote to share with; add one first: `dvc remote add --default NAME ADDRESS`")
+    with config.edit("local") as local:
+        local["remote"][DERIVED] = dict(config["remote"][name])
+    return str(config["remote"][name]["url"])
+
+
+def _keep_here() -> str:
+    with _config().edit("local") as local:
+        local["remote"].pop(DERIVED, None)
+    return "stays here"
+
+
+def _config() -> Any:
+    from dvc.config import Config
+
+    return Config(dvc_dir=str(Path(".dvc").absolute()))
 
 
 def _terms() -> list[str]:
     """One line per dataset of the current profile whose licence does not let derived data be passed on."""
     from pipelines.lineage.graph import read_params
-    from pipelines.lineage.manifests import read_manifest
+    from pipelines.stages.adapters import manifest_of
     from pipelines.stages.base import Place
 
     places = [Place(current_profile(), name) for name in read_params(Path())["datasets"]]
-    bound = [manifest for place in places if (manifest := read_manifest(place.manifest)).present]
+    bound = [manifest for place in places if (manifest := manifest_of(place)).present]
     return [f"{item.dataset}: {item.licence}" for item in bound if not item.may_be_shared]

@@ -1,6 +1,5 @@
 """What a file, a folder or a piece of code is, by content: equal digests, equal content."""
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from hoidata.files import canonical_json, sha256_bytes, sha256_file
@@ -28,11 +27,6 @@ def _files_of(folder: Path) -> list[Path]:
 
 def _is_noise(path: Path) -> bool:
     return path.suffix == ".pyc" or any(part in COMPILED or part.startswith(".") for part in path.parts)
-
-
-def paths_digests(root: Path, paths: Iterable[str]) -> dict[str, str | None]:
-    """Digest of each path below ``root``."""
-    return {path: path_digest(root / path) for path in sorted(paths)}
 
 
 def value_digest(value: object) -> str:

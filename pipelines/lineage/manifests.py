@@ -88,6 +88,10 @@ def absent_manifest(adapter: Adapter) -> Manifest:
     return Manifest(adapter.name, False, "files", adapter.licence, adapter.where_to_register, **facts)
 
 
+# The hand of a profile for which no MANO files were scanned.
+ABSENT_HAND = Manifest("hand", False, "files", "MANO: non-commercial research licence", "https://mano.is.tue.mpg.de")
+
+
 def scan_files(root: Path, parts: Sequence[DatasetPart] | None = None) -> tuple[SourceFile, ...]:
     """Every raw file below ``root``, digested; images, videos and archives are passed over.
 

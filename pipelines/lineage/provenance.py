@@ -60,7 +60,7 @@ def _record(root: Path, stage: Stage, params: dict[str, Any], known: dict[str, s
 
     return {
         "params": {key: look_up(params, key) for key in sorted(stage.params)},
-        "code": digests(stage.code),
+        "code": {path: digest for file in stage.code for path, digest in json.loads((root / file).read_text()).items()},
         "inputs": digests(stage.data),
         "outputs": digests(stage.outs),
     }

@@ -6,8 +6,9 @@ from typing import Any, Literal
 
 from hoidata.errors import BadInput
 from pipelines.lineage.digests import path_digest
-from pipelines.lineage.graph import look_up, read_graph, read_params
+from pipelines.lineage.graph import Stage, look_up, read_graph, read_params
 from pipelines.lineage.provenance import read_provenance
+from pipelines.stages.code import code_today
 
 Kind = Literal["checkpoint", "stage", "param", "code", "data", "manifest"]
 Status = Literal["same", "changed", "missing"]
@@ -38,7 +39,8 @@ class _Comparison:
     stages: dict[str, Any]
     params: dict[str, Any]
     made_by: dict[str, str]
-    deps_today: dict[str, set[str]]
+    stages_today: dict[str, Stage]
+    code_today: dict[str, dict[str, str]]
     shown: set[str] = field(default_factory=set)
     digests: dict[str, str | None] = field(default_factory=dict)
 
@@ -54,8 +56,7 @@ def lineage_tree(root: Path, checkpoint: Path) -> tuple[Node, dict[str, Any]]:
     provenance = read_provenance(checkpoint)
     stages = provenance["stages"]
     made_by = {path: name for name, record in stages.items() for path in record.get("outputs", ())}
-    deps = {name: {*stage.deps, *stage.params} for name, stage in read_graph(root).items()}
-    comparison = _Comparison(root, stages, read_params(root), made_by, deps)
+    comparison = _Comparison(root, stages, read_params(root), made_by, read_graph(root), code_today(root))
     top = _stage_node(comparison, provenance["stage"])
     return Node("checkpoint", checkpoint.as_posix(), "same", _summary(provenance), (top,)), provenance
 
@@ -87,13 +88,15 @@ def _stage_node(comparison: _Comparison, name: str) -> Node:
     comparison.shown.add(name)
     record = comparison.stages[name]
     children = [_param_node(comparison, key, value) for key, value in record["params"].items()]
-    children.append(_code_node(comparison, record["code"]))
+    today = comparison.stages_today.get(name)
+    files = today.code if today else ()
+    code_today = {path: digest for file in files for path, digest in comparison.code_today.get(file, {}).items()}
+    children.append(_code_node(record["code"], code_today))
     children += [_input_node(comparison, path, digest) for path, digest in record["inputs"].items()]
-    recorded = {*record["code"], *record["inputs"], *record["params"]}
-    today = comparison.deps_today.get(name, recorded)
-    status: Status = "same" if today == recorded else "changed"
-    detail = "" if status == "same" else f"depends on other things now: {', '.join(sorted(today ^ recorded))}"
-    return Node("stage", name, status, detail, tuple(children))
+    recorded = {*record["inputs"], *record["params"]}
+    other = recorded ^ {*today.data, *today.params} if today else set()
+    detail = f"depends on other things now: {', '.join(sorted(other))}" if other else ""
+    return Node("stage", name, "changed" if other else "same", detail, tuple(children))
 
 
 def _param_node(comparison: _Comparison, key: str, recorded: Any) -> Node:
@@ -115,13 +118,16 @@ def _value_changes(before: Any, after: Any, key: str = "") -> list[str]:
     return [change for part in parts for change in part]
 
 
-def _code_node(comparison: _Comparison, recorded: dict[str, str | None]) -> Node:
-    """One node for a stage's code, with a child for each path."""
-    children = tuple(
-        Node("code", path, comparison.path_status(path, digest), _short(digest)) for path, digest in recorded.items()
-    )
+def _code_node(recorded: dict[str, str], today: dict[str, str]) -> Node:
+    """One node for a stage's code, with a child for each file it ran then or would run now."""
+    children = tuple(_file_node(path, recorded.get(path), today.get(path)) for path in sorted({*recorded, *today}))
     worst, changed = overall_status(Node("code", "code", "same", children=children)), _changed_names(children)
-    return Node("code", "code", worst, changed or f"{len(children)} paths", children)
+    return Node("code", "code", worst, changed or f"{len(children)} files", children)
+
+
+def _file_node(path: str, recorded: str | None, today: str | None) -> Node:
+    status: Status = "same" if today == recorded else "missing" if today is None else "changed"
+    return Node("code", path, status, _short(recorded))
 
 
 def _changed_names(nodes: tuple[Node, ...]) -> str:

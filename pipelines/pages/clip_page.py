@@ -75,8 +75,8 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
         has_players=True,
         script=_script(),
     )
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return Path(path)
 
 

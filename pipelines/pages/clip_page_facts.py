@@ -21,14 +21,14 @@ NOTHING = "none"
 
 @dataclass(frozen=True)
 class HandFacts:
-    """One hand in the hand test: each a text; acts: whether the hand takes part. surface_*: against the surface."""
+    """One hand in the hand test: each a text; active: whether the hand takes part. surface_*: against the surface."""
 
     side: str
     valid: str
     nearest: str
     where: str
     within: str
-    acts: bool
+    active: bool
     surface_nearest: str
     surface_within: str
     surface_acts: bool
@@ -106,7 +106,7 @@ def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side:
         nearest=f"{distance[frame] * 100:.2f} cm",
         where=f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}",
         within=f"{within} of {clip.n_frames}",
-        acts=within > 0,
+        active=within > 0,
         surface_nearest=f"{surface.closest_m(side) * 100:.2f} cm",
         surface_within=f"{exact} of {clip.n_frames}",
         surface_acts=exact > 0,

@@ -13,7 +13,6 @@ from hoidata.contact import HandEvidence
 from hoidata.contact.maps import LONGEST_CLIP
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.surface_index import surface_index
-from hoidata.quality.measures import placed
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.surface.contact import TOUCH_M
 from hoidata.surface.measure import ObjectShape, encloses_solid, measure_hand
@@ -98,7 +97,7 @@ def _touched(annotated: AnnotatedStore, clip: Clip, side: Side) -> np.ndarray:
 def _centre_m(annotated: AnnotatedStore, clip: Clip) -> np.ndarray:
     """(frame, 3) mean of the sampled points in the world: the moving part counts as far as its surface goes."""
     points = annotated.points(annotated.object_key(clip.clip_id))
-    return placed(clip.object, points.points_m, points.part).mean(axis=1)
+    return clip.object.points_in_world(points.points_m, points.part).mean(axis=1)
 
 
 def _speed_m_s(centre_m: np.ndarray) -> np.ndarray:

@@ -48,7 +48,7 @@ class Chart:
 
 
 @dataclass(frozen=True)
-class ChartPlace:
+class ChartSpan:
     """A chart on the page. top: per cent of the drawing's height; values: per line, None where there is none."""
 
     title: str
@@ -64,7 +64,7 @@ class Timeline:
     svg: Markup
     left: float
     right: float
-    charts: list[ChartPlace] = field(default_factory=list)
+    charts: list[ChartSpan] = field(default_factory=list)
 
 
 def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> list[Chart]:
@@ -110,13 +110,13 @@ def draw_timeline(charts: Sequence[Chart], salt: str) -> Timeline:
 
     svg = figure_svg((WIDTH_INCHES, ROW_INCHES * len(charts) + FOOT_INCHES), salt, draw)
     boxes = [axes.get_position() for axes in drawn]
-    places = [
-        ChartPlace(
+    spans = [
+        ChartSpan(
             chart.title, chart.unit, _percent(1 - box.y1), [_readout(line, chart.decimals) for line in chart.lines]
         )
         for chart, box in zip(charts, boxes, strict=True)
     ]
-    return Timeline(Markup(svg), _percent(boxes[0].x0), _percent(boxes[0].x1), places)
+    return Timeline(Markup(svg), _percent(boxes[0].x0), _percent(boxes[0].x1), spans)
 
 
 def _draw_chart(axes: Axes, chart: Chart) -> None:

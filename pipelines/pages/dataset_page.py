@@ -91,8 +91,8 @@ def write_dataset_page(
         has_players=True,
     )
     path = Path(out) / f"{name}.html"
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return path
 
 
@@ -181,7 +181,7 @@ def _examples(out: str | Path, annotated: AnnotatedStore, hands: HandPair, count
 def still_of(annotated: AnnotatedStore, clip_id: str, hands: HandPair, title: str) -> Player:
     """The clip in the frame in which most points are touched, with its contact map; without a legend."""
     clip, frame = annotated.clip(clip_id), _busiest_frame(annotated, clip_id)
-    still = motion_player(clip.cut(frame, frame + 1), hands, title, contact=true_contact(annotated, clip_id))
+    still = motion_player(clip.take(slice(frame, frame + 1)), hands, title, contact=true_contact(annotated, clip_id))
     return replace(still, legend=(), contact_label="")
 
 

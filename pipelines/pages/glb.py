@@ -28,8 +28,8 @@ CONTACT_COLOURS = ((0.0, OBJECT_COLOUR), (0.5, (0.95, 0.62, 0.25)), (1.0, (0.78,
 
 def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> Path:
     """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable."""
-    with atomic_file(path) as part:
-        part.write_bytes(glb_bytes(clip, hands, contact))
+    with atomic_file(path) as partial:
+        partial.write_bytes(glb_bytes(clip, hands, contact))
     return Path(path)
 
 

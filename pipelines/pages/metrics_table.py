@@ -1,125 +1,127 @@
-"""Evaluation figures as tables: every figure beside its baselines, and which of the two is better."""
+"""What evaluation found, as tables: rows are families, columns the metrics of the registry."""
 
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich import box
+from rich.table import Table
+
+from hoidata.metrics.registry import METRICS, Metric, is_better
+
+TRUTH, LOOKUP = "ground-truth", "nearest-clip"
+NO_FIGURE = "-"
 
 
 @dataclass(frozen=True)
-class Comparison:
-    """How one figure of a metrics file is shown: its key, its words, and the keys and words of what it is held against.
+class Cell:
+    """A figure in text. mark: "good" for the best of all families, "bad" where it loses to nearest-clip, else ""."""
 
-    required: the baselines the figure has to beat, by ``margin`` (added) and ``factor`` (multiplied).
-    """
-
-    key: str
-    words: str
-    baselines: tuple[tuple[str, str], ...]
-    required: tuple[str, ...]
-    higher_is_better: bool = False
-    margin: float = 0.0
-    factor: float = 1.0
-
-    def is_met(self, figures: dict) -> bool | None:
-        """Whether the figure beats its baselines as required; None where one of them is missing."""
-        if not {self.key, *self.required} <= figures.keys():
-            return None
-        value = figures[self.key]
-        bounds = [figures[key] * self.factor + self.margin for key in self.required]
-        return all(value >= bound if self.higher_is_better else value <= bound for bound in bounds)
-
-
-COMPARISONS = {
-    "contact": (
-        Comparison(
-            "f1",
-            "F1 of the contact map",
-            (
-                ("f1_mean_map", "mean map of the training clips"),
-                ("f1_mean_map_of_same_object", "mean map of the same object"),
-            ),
-            ("f1_mean_map",),
-            higher_is_better=True,
-            margin=0.05,
-        ),
-    ),
-    "length": (
-        Comparison(
-            "mae_frames",
-            "error of the length, frames",
-            (("mae_mean_length_frames", "mean length"),),
-            ("mae_mean_length_frames",),
-            factor=0.85,
-        ),
-    ),
-    "diffusion": (
-        Comparison(
-            "joint_error_mm",
-            "joint error of the best sample, mm",
-            (
-                ("joint_error_mean_pose_mm", "mean pose"),
-                ("joint_error_mean_motion_mm", "mean motion"),
-                ("joint_error_shuffled_prompt_mm", "another clip's prompt"),
-            ),
-            ("joint_error_mean_pose_mm", "joint_error_shuffled_prompt_mm"),
-        ),
-    ),
-    "refiner": (
-        Comparison(
-            "penetration_after_mm",
-            "penetration, mm",
-            (("penetration_before_mm", "before refinement"),),
-            ("penetration_before_mm",),
-        ),
-        Comparison(
-            "contact_distance_after_mm",
-            "distance of contact joints, mm",
-            (("contact_distance_before_mm", "before refinement"),),
-            ("contact_distance_before_mm",),
-        ),
-    ),
-}
+    text: str
+    mark: str = ""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One figure. verdict: "good", "bad" or "" (nothing to beat)."""
+    """One family. loses: titles of the metrics in which it loses to nearest-clip. empty: why it has no figures.
 
-    name: str
-    value: str
-    baselines: list[tuple[str, str]]
-    verdict: str
+    diagnostics: what the family says of its own networks, as (name, value).
+    """
+
+    family: str
+    cells: list[Cell] = field(default_factory=list)
+    loses: list[str] = field(default_factory=list)
+    empty: str = ""
+    note: str = ""
+    diagnostics: list[tuple[str, str]] = field(default_factory=list)
+
+    @property
+    def words(self) -> str:
+        return f"loses to {LOOKUP}: {', '.join(self.loses)}" if self.loses else ""
 
 
 @dataclass(frozen=True)
-class Table:
-    """Figures of one model. notes: what else the metrics file says, as "name value"; empty: why there is no figure."""
+class MetricsTable:
+    """All families of one dataset. columns: (title, unit, which figures are better)."""
 
-    model: str
-    rows: list[Row] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    empty: str = ""
+    columns: list[tuple[str, str, str]]
+    rows: list[Row]
 
 
-def metrics_tables(values: dict) -> list[Table]:
-    """One table per model of a metrics file; figures without a known comparison become notes, nothing is dropped."""
-    known = [name for name in COMPARISONS if name in values]
-    others = [name for name, figures in values.items() if name not in known and isinstance(figures, dict)]
-    return [_table(model, values[model]) for model in (*known, *others)]
+def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
+    """The table of ``folder/<family>.json``, families in the order given; metrics that none has are not shown."""
+    folder = Path(folder)
+    found = {family: _read(folder / f"{family}.json") for family in families}
+    figures = {family: values["figures"] for family, values in found.items() if "figures" in values}
+    shown = [metric for metric in METRICS if any(metric.name in values for values in figures.values())]
+    columns = [(metric.title, metric.unit, _better(metric)) for metric in shown]
+    return MetricsTable(columns, [_row(family, found[family], shown, figures) for family in families])
 
 
-def _table(model: str, figures: dict) -> Table:
-    if "empty" in figures:
-        return Table(model, empty=str(figures["empty"]))
-    shown: set[str] = set()
-    rows: list[Row] = []
-    for comparison in COMPARISONS.get(model, ()):
-        if comparison.key not in figures:
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"empty": "not evaluated"}
+
+
+def _row(family: str, values: dict[str, Any], shown: list[Metric], figures: Mapping[str, Mapping[str, float]]) -> Row:
+    if "figures" not in values:
+        return Row(family, empty=str(values["empty"]))
+    cells, loses = [], []
+    for metric in shown:
+        column = {name: own[metric.name] for name, own in figures.items() if metric.name in own}
+        if family not in column:
+            cells.append(Cell(NO_FIGURE))
             continue
-        found = [(words, number(figures[key])) for key, words in comparison.baselines if key in figures]
-        shown |= {comparison.key, *(key for key, _ in comparison.baselines)}
-        verdict = {True: "good", False: "bad", None: ""}[comparison.is_met(figures)]
-        rows.append(Row(comparison.words, number(figures[comparison.key]), found, verdict))
-    rest = {key: value for key, value in _flat(figures).items() if key not in shown}
-    return Table(model, rows, [f"{key.replace('_', ' ')} {number(value)}" for key, value in rest.items()])
+        worse = loses_to_lookup(metric, family, column)
+        loses += [metric.title] if worse else []
+        mark = "bad" if worse else "good" if family in best_families(metric, column) else ""
+        cells.append(Cell(number(column[family]), mark))
+    diagnostics = [(name, number(value)) for name, value in _flat(values.get("diagnostics", {})).items()]
+    left_out = len(values.get("left_out", []))
+    note = f"{values['motions']:,} motions of {values['held_out_clips']:,} clips"
+    note += f", {left_out:,} left out" if left_out else ""
+    return Row(family, cells, loses, note=note, diagnostics=diagnostics)
+
+
+def best_families(metric: Metric, column: Mapping[str, float]) -> list[str]:
+    """Families that no other beats in a metric; the truth itself does not compete."""
+    truth = column.get(TRUTH)
+    rivals = {name: value for name, value in column.items() if name != TRUTH}
+    if metric.floor_of or (metric.direction == "nearer the truth" and truth is None):
+        return []
+    return [
+        name
+        for name, value in rivals.items()
+        if not any(is_better(metric, other, value, truth) for other in rivals.values())
+    ]
+
+
+def loses_to_lookup(metric: Metric, family: str, column: Mapping[str, float]) -> bool:
+    """Whether looking up the nearest training clip gives a better figure than this family."""
+    if family in (TRUTH, LOOKUP) or LOOKUP not in column:
+        return False
+    return bool(is_better(metric, column[LOOKUP], column[family], column.get(TRUTH)))
+
+
+def printed_table(found: Mapping[str, Any]) -> Table:
+    """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
+    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips"
+    table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
+    for name in ("metric", "figure", "unit", "better", "clips", "values"):
+        table.add_column(name, justify="right" if name in ("figure", "clips", "values") else "left")
+    for metric in METRICS:
+        if metric.name in found["figures"]:
+            counts = found["counts"][metric.name]
+            sizes = (f"{counts['clips']:,}", f"{counts['values']:,}")
+            table.add_row(metric.title, number(found["figures"][metric.name]), metric.unit, _better(metric), *sizes)
+    return table
+
+
+def _better(metric: Metric) -> str:
+    if metric.floor_of:
+        return "a floor"
+    return metric.direction if metric.direction == "nearer the truth" else f"{metric.direction} is better"
 
 
 def number(value: object) -> str:
@@ -131,8 +133,9 @@ def number(value: object) -> str:
     return f"{value:,.1f}" if abs(value) >= 100 else f"{value:#.3g}"
 
 
-def _flat(figures: dict, before: str = "") -> dict[str, object]:
+def _flat(figures: Mapping[str, Any], before: str = "") -> dict[str, object]:
     flat: dict[str, object] = {}
     for key, value in figures.items():
-        flat |= _flat(value, f"{before}{key} ") if isinstance(value, dict) else {f"{before}{key}": value}
+        name = f"{before}{key}".replace("_", " ")
+        flat |= _flat(value, f"{name} ") if isinstance(value, Mapping) else {name: value}
     return flat

@@ -1,23 +1,18 @@
 """Self-contained pages that play motions: three.js and the GLB inside the one HTML file, nothing fetched.
 
-three.js (MIT) and its GLTFLoader are taken at run time from the viewer that the installed trimesh ships, so no copy of
-them lives in this repository; a trimesh without that viewer is named as such.
+three.js and its GLTFLoader (MIT) lie in ``vendor``, where their version and licence are stated.
 """
 
 import base64
-import re
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
-import trimesh.resources
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from hoidata.clips.clip import SIDES, Clip
-from hoidata.errors import MissingResource
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
@@ -25,8 +20,6 @@ from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import View, still_view, view_of
 
 _ROOM = Path(__file__).parent
-_VIEWER = Path(trimesh.resources.__file__ or "").parent / "templates" / "viewer.zip"
-_THREE = re.compile(r"<script>(/\*\*.*?THREE\.GLTFLoader=GLTFLoader;\}\)\(\);)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -59,9 +52,9 @@ def motion_player(
     title: str,
     caption: str = "",
     contact: ContactPaint | None = None,
-    contact_label: str = "within 2 cm of a joint",
+    contact_label: str = "",
 ) -> Player:
-    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it."""
+    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it. contact_label: its meaning."""
     return Player(
         glb=glb_bytes(clip, hands, contact),
         title=title,
@@ -80,7 +73,7 @@ def contact_player(
     look_from: (3,) where the camera starts, see ``touched_side``. label: what the colours mean.
     """
     absent = {side: replace(track, valid=np.zeros_like(track.valid)) for side, track in clip.hands.items()}
-    still = replace(clip, hands=absent, other_objects=()).cut(0, 1)
+    still = replace(clip, hands=absent, other_objects=()).take(slice(0, 1))
     view = still_view(still, look_from)
     return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
 
@@ -118,8 +111,8 @@ def write_motion_page(
         "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
         files=files or [], arrays=arrays or [], figures=trusted_figures(figures or []), has_players=True,
     )  # fmt: skip
-    with atomic_file(path) as part:
-        part.write_text(page, encoding="utf-8")
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return Path(path)
 
 
@@ -130,19 +123,8 @@ def trusted_figures(figures: list[dict[str, str]]) -> list[dict[str, str]]:
 
 @lru_cache(maxsize=1)
 def three_javascript() -> str:
-    """three.js and GLTFLoader (minified, MIT notice included) from the installed trimesh.
-
-    Raises MissingResource when that trimesh carries no such viewer.
-    """
-    remedy = f"install trimesh as pinned in constraints.txt (found {trimesh.__version__})"
-    if not _VIEWER.is_file():
-        raise MissingResource(f"{_VIEWER}: expected trimesh's bundled viewer, got no such file; {remedy}")
-    with ZipFile(_VIEWER) as archive:
-        page = archive.read("viewer.html.template").decode("utf-8")
-    found = _THREE.search(page)
-    if found is None:
-        raise MissingResource(f"{_VIEWER}: expected three.js followed by GLTFLoader, got another layout; {remedy}")
-    return found.group(1)
+    """three.js and GLTFLoader, with the MIT notice at the top."""
+    return "\n".join((_ROOM / "vendor" / name).read_text("utf-8") for name in ("three.min.js", "GLTFLoader.min.js"))
 
 
 def css_colour(colour: tuple[float, float, float]) -> str:

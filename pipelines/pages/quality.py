@@ -99,9 +99,9 @@ def _draw_measure(axes: Axes, measure: Measure, values: np.ndarray, limit: dict[
     right = seen if leave_out is None or leave_out > FARTHEST * seen else max(seen, leave_out)
     axes.hist(values, bins=np.linspace(0, right * 1.04, BINS + 1).tolist(), color=COLOURS[0])
     axes.set_xlim(0, right * 1.04)
-    for place, colour in ((warn, WARN_COLOUR), (leave_out, LEAVE_OUT_COLOUR)):
-        if place is not None and place <= right:
-            axes.axvline(place, color=colour, linewidth=1.4)
+    for limit_value, colour in ((warn, WARN_COLOUR), (leave_out, LEAVE_OUT_COLOUR)):
+        if limit_value is not None and limit_value <= right:
+            axes.axvline(limit_value, color=colour, linewidth=1.4)
     if leave_out is not None and leave_out > right:
         axes.set_xlim(0, right * 1.3)
         axes.annotate(f"{leave_out:g} →", (1, 0.86), xycoords="axes fraction", ha="right", color=LEAVE_OUT_COLOUR)

@@ -1,26 +1,26 @@
 """The report of one profile: a self-contained page over all its datasets, and beside it a page per dataset."""
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from markupsafe import Markup
 
+from hoidata.clips.clip import Clip
+from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
+from hoidata.store.annotated import AnnotatedStore
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
-from pipelines.pages.examples import contact_examples, generated_example, is_trained, shown_ids, true_contact
-from pipelines.pages.generation_page import generated_contact, generation_facts
-from pipelines.pages.metrics_table import Table, metrics_tables
+from pipelines.pages.examples import first_motion, motion_contact, shown_ids, true_contact
+from pipelines.pages.metrics_table import MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.quality import QualityFacts, read_quality
+from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
-MODELS = ("contact", "length", "diffusion", "refiner")
-TITLES = {"h2o": "H2O", "grab": "GRAB", "arctic": "ARCTIC", "manipnet": "ManipNet"}
 CONTACT_EXAMPLES = 3
 
 
@@ -30,12 +30,12 @@ class ReportFolders:
 
     data: Path
     checkpoints: Path
+    samples: Path
     metrics: Path
 
     @classmethod
     def of(cls, profile: str, root: str | Path = ".") -> "ReportFolders":
-        root = Path(root)
-        return cls(root / "data" / profile, root / "checkpoints" / profile, root / "metrics" / profile)
+        return cls(*(Path(root, name, profile) for name in ("data", "checkpoints", "samples", "metrics")))
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,7 @@ class Section:
     motions: list[Player] = field(default_factory=list)
     motion_facts: list[tuple[str, str]] = field(default_factory=list)
     contact: list[tuple[str, list[Player]]] = field(default_factory=list)
-    tables: list[Table] = field(default_factory=list)
-    metrics_note: str = ""
+    table: MetricsTable | None = None
     curves: list[dict[str, str]] = field(default_factory=list)
     missing: list[tuple[str, str]] = field(default_factory=list)
 
@@ -63,19 +62,19 @@ def write_report(
     out: str | Path,
     profile: str,
     datasets: Sequence[str],
+    families: Sequence[str],
     hands: HandPair,
     folders: ReportFolders | None = None,
-    seed: int = 0,
 ) -> Path:
     """Write ``out/index.html`` from what the stages of ``profile`` left in ``folders`` (below the current folder).
 
     Beside it the page of each dataset, ``out/<dataset>.html``, and in ``out/clips`` those of its examples.
 
-    Where all four models of a dataset are trained, a motion is generated for a held-out clip and shown beside it; seed:
-    of what they draw. Equal inputs give equal bytes. Datasets without clips are listed with their reason.
+    families: their figures are shown in this order; motions of the first one stand beside the recorded ones.
+    Equal inputs give equal bytes. Datasets without clips are listed with their reason.
     """
     folders = folders or ReportFolders.of(profile)
-    all_sections = [_section(name, folders, hands, seed) for name in datasets]
+    all_sections = [_section(name, folders, families, hands) for name in datasets]
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact for section in sections)
@@ -93,14 +92,14 @@ def write_report(
     return path
 
 
-def _section(name: str, folders: ReportFolders, hands: HandPair, seed: int) -> Section:
+def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: HandPair) -> Section:
     facts = read_dataset(folders.data / name, name, hands)
-    title = TITLES.get(name, name)
+    title = dataset_title(name)
     if facts.empty:
         return Section(facts, title)
-    checkpoints = folders.checkpoints / name
-    tables, note = _metrics(folders.metrics / f"{name}.json")
-    motions, motion_facts = _motions(facts, hands, checkpoints, seed)
+    networks = sorted(path for path in (folders.checkpoints / name).glob("*") if path.is_dir())
+    samples = folders.samples / name / families[0]
+    motions, motion_facts = _motions(facts, hands, samples)
     return Section(
         facts,
         title,
@@ -109,21 +108,11 @@ def _section(name: str, folders: ReportFolders, hands: HandPair, seed: int) -> S
         quality=read_quality(folders.data / name / "quality", name),
         motions=motions,
         motion_facts=motion_facts,
-        contact=_contact_pairs(facts, checkpoints / "contact", seed),
-        tables=tables,
-        metrics_note=note,
-        curves=[chart for model in MODELS if (chart := _loss_chart(name, model, checkpoints / model / "log.csv"))],
-        missing=[(model, reason) for model in MODELS if (reason := reason_for_nothing(checkpoints / model))],
+        contact=_contact_pairs(facts, hands, samples),
+        table=metrics_tables(folders.metrics / name, families),
+        curves=[chart for folder in networks if (chart := _loss_chart(name, folder.name, folder / "log.csv"))],
+        missing=[(folder.name, reason) for folder in networks if (reason := reason_for_nothing(folder))],
     )
-
-
-def _metrics(path: Path) -> tuple[list[Table], str]:
-    if not path.is_file():
-        return [], "The models of this dataset have not been evaluated."
-    values = json.loads(path.read_text(encoding="utf-8"))
-    if "empty" in values:
-        return [], f"Not evaluated: {values['empty']}."
-    return metrics_tables(values), ""
 
 
 def _what_is_shown(facts: DatasetFacts) -> str:
@@ -131,40 +120,51 @@ def _what_is_shown(facts: DatasetFacts) -> str:
     return "A clip of the test split" if held_out else "A clip (this dataset has no test split)"
 
 
-def _motions(
-    facts: DatasetFacts, hands: HandPair, checkpoints: Path, seed: int
-) -> tuple[list[Player], list[tuple[str, str]]]:
-    """A recorded clip, beside it a motion generated for its sentence and object, and how that one came about."""
+def _motions(facts: DatasetFacts, hands: HandPair, samples: Path) -> tuple[list[Player], list[tuple[str, str]]]:
+    """A recorded clip, and beside it the motion a family made for its sentence and object."""
     annotated = facts.annotated
     if annotated is None or not (ids := shown_ids(annotated, 1)):
         return [], []
-    sentence = annotated.sentences(ids[0])[0]
-    caption = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}: {sentence}"
-    paint = true_contact(annotated, ids[0])
-    recorded = motion_player(annotated.clip(ids[0]), hands, sentence, caption, paint, "within 2 cm of a joint")
-    if not is_trained(checkpoints):
-        return [recorded], [("clip", ids[0])]
-    motion = generated_example(annotated, checkpoints, hands, ids[0], seed)
-    paint, caption = generated_contact(motion), f"Generated: {sentence}"
-    generated = motion_player(motion.clip, hands, sentence, caption, paint, "contact it was made for")
-    return [recorded, generated], [("clip", ids[0]), *generation_facts(motion)]
+    recorded = f"{'Synthetic ground truth' if facts.synthetic else 'Recorded'}"
+    players = [_player(annotated, ids[0], annotated.clip(ids[0]), hands, recorded, true_contact(annotated, ids[0]))]
+    motion = first_motion(samples, ids[0], hands)
+    if motion is not None:
+        paint = motion_contact(annotated, ids[0], motion, hands)
+        players.append(_player(annotated, ids[0], motion, hands, "Generated", paint))
+    return players, [("clip", ids[0]), *([("motion", motion.clip_id)] if motion else [])]
 
 
-def _contact_pairs(facts: DatasetFacts, folder: Path, seed: int) -> list[tuple[str, list[Player]]]:
+def _player(
+    annotated: AnnotatedStore, clip_id: str, clip: Clip, hands: HandPair, kind: str, paint: ContactPaint
+) -> Player:
+    sentence = annotated.sentences(clip_id)[0]
+    return motion_player(clip, hands, sentence, f"{kind}: {sentence}", paint, touch_words(annotated))
+
+
+def touch_words(annotated: AnnotatedStore) -> str:
+    """What a contact map shows, with the threshold it was made with."""
+    return f"within {annotated.contact_threshold_m * 100:g} cm of a joint"
+
+
+def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[tuple[str, list[Player]]]:
+    """For some test clips the points that are touched in the clip, and those a family's motion touches."""
     annotated = facts.annotated
-    if annotated is None or not (folder / "model.safetensors").is_file():
+    if annotated is None:
         return []
     pairs = []
-    for example in contact_examples(annotated, folder, shown_ids(annotated, CONTACT_EXAMPLES), seed):
-        look = touched_side(example.clip, example.truth)
+    for clip_id in shown_ids(annotated, CONTACT_EXAMPLES):
+        if (motion := first_motion(samples, clip_id, hands)) is None:
+            continue
+        clip, sentence = annotated.clip(clip_id), annotated.sentences(clip_id)[0]
+        truth = true_contact(annotated, clip_id)
+        paints = {"ground truth": truth, "generated": motion_contact(annotated, clip_id, motion, hands)}
         players = [
-            contact_player(example.clip, paint, f"{caption}: {example.sentence}", caption, look, label)
-            for caption, paint, label in (
-                ("ground truth", example.truth, "within 2 cm of a joint"),
-                ("predicted", example.predicted, "chance of contact, 0 to 1"),
+            contact_player(
+                clip, paint, f"{caption}: {sentence}", caption, touched_side(clip, truth), touch_words(annotated)
             )
+            for caption, paint in paints.items()
         ]
-        pairs.append((example.sentence, players))
+        pairs.append((sentence, players))
     return pairs
 
 

@@ -52,14 +52,14 @@ def crease_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     triangles = vertices_m[faces].astype(np.float64)
     doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     unit = doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-20)
-    _, place = np.unique(np.round(vertices_m, 6), axis=0, return_inverse=True)
-    corner_place = place.reshape(-1)[faces.reshape(-1)]
-    ones = np.ones(len(corner_place))
-    incidence = csr_array((ones, (np.arange(len(corner_place)), corner_place)))
+    _, vertex = np.unique(np.round(vertices_m, 6), axis=0, return_inverse=True)
+    corner_vertex = vertex.reshape(-1)[faces.reshape(-1)]
+    ones = np.ones(len(corner_vertex))
+    incidence = csr_array((ones, (np.arange(len(corner_vertex)), corner_vertex)))
     pairs = (incidence @ incidence.T).tocoo()
     first, second = pairs.coords
     smooth = np.einsum("ij,ij->i", unit[first // 3], unit[second // 3]) > np.cos(CREASE_RAD)
-    normals = np.zeros((len(corner_place), 3))
+    normals = np.zeros((len(corner_vertex), 3))
     np.add.at(normals, first[smooth], doubled[second[smooth] // 3])
     normals += 1e-12 * np.repeat(unit, 3, axis=0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
@@ -95,8 +95,8 @@ def _subdivide(corners: np.ndarray, normals: np.ndarray, edge_m: float) -> tuple
 
 
 def _merge(corners: np.ndarray, normals: np.ndarray) -> Surface:
-    """Corners of equal place (1 um) and normal become one vertex."""
+    """Corners of equal position (1 um) and normal become one vertex."""
     rows = np.concatenate([np.round(corners.reshape(-1, 3), 6), np.round(normals.reshape(-1, 3), 4)], axis=1)
     unique, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    place = corners.reshape(-1, 3)[first]
-    return Surface(place, unique[:, 3:], inverse.reshape(-1, 3))
+    positions = corners.reshape(-1, 3)[first]
+    return Surface(positions, unique[:, 3:], inverse.reshape(-1, 3))

@@ -7,7 +7,6 @@ import numpy as np
 from hoidata.clips.clip import FPS, Clip, ObjectTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints
-from hoidata.objects.model import articulate, place
 from pipelines.pages.glb import upright_rotation
 from pipelines.pages.surface import ContactPaint
 
@@ -81,8 +80,7 @@ def _object_points(track: ObjectTrack) -> np.ndarray:
     """(frame, point, 3) world points of an object, thinned evenly."""
     model = track.model
     step = max(1, len(model.vertices_m) // _POINTS_FOR_VIEW)
-    local = articulate(model.vertices_m[::step], model.part[::step], model.hinge, track.hinge_rad)
-    return place(local, track.rotvec, track.translation_m)
+    return track.points_in_world(model.vertices_m[::step], model.part[::step])
 
 
 def _hand_joints(clip: Clip, hands: HandPair) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -1,20 +1,34 @@
-"""``python -m pipelines.stages STAGE --profile P [--dataset D] [--model M]``: what dvc.yaml runs."""
+"""``python -m pipelines.stages STAGE --profile P [--dataset D] [--model M] [--family F]``: what dvc.yaml runs."""
 
 import argparse
 import importlib
 import os
 import sys
 
-STAGES = ("raw", "convert", "quality", "annotate", "contact", "surface", "split", "train", "evaluate", "report")
+STAGES = (
+    "code",
+    "raw",
+    "convert",
+    "quality",
+    "annotate",
+    "contact",
+    "surface",
+    "split",
+    "train",
+    "sample",
+    "evaluate",
+    "report",
+)
 
 
 def main() -> int:
     """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do."""
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
-    parser.add_argument("--profile", choices=("embedded", "own"), required=True)
+    parser.add_argument("--profile", choices=("embedded", "own"), default="embedded")
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
+    parser.add_argument("--family", default="")
     options = parser.parse_args()
     # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read as torch loads.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -31,7 +45,7 @@ def _run(module, options: argparse.Namespace) -> int:
     from hoidata.errors import HoidataError
     from pipelines.stages.base import Place
 
-    place = Place(options.profile, options.dataset, options.model)
+    place = Place(options.profile, options.dataset, options.model, options.family)
     try:
         module.run(place)
     except HoidataError as error:

@@ -1,19 +1,29 @@
 """The adapter of a dataset with the settings of params.yaml: what scanning, checking and converting share."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
-
-from pydantic import Field
 
 from hoidata.datasets.base import Adapter
 from hoidata.datasets.registry import get_adapter
-from pipelines.stages.base import StageParams, load_params
+from hoidata.errors import BadInput
+from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
+from pipelines.stages.base import Place, load_settings
 
 
-class ConvertParams(StageParams):
-    """margin_frames: kept before and after each interaction, at 30 fps. adapters: settings of single datasets."""
+@dataclass(frozen=True)
+class ConvertSettings:
+    """margin_frames: kept before and after each interaction at 30 fps, None: as each adapter does by itself.
 
-    margin_frames: int = Field(default=0, ge=0)
-    adapters: dict[str, dict[str, Any] | None] = Field(default_factory=dict)
+    adapters: by dataset, the fields of its adapter's class that are to differ.
+    """
+
+    margin_frames: int | None = None
+    adapters: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.margin_frames is not None and self.margin_frames < 0:
+            raise BadInput("convert.margin_frames", "0 or more frames", f"{self.margin_frames}", "correct it")
 
     def adapter(self, name: str) -> Adapter:
         """The adapter of that dataset with its settings; its own ``margin_frames`` wins over the common one."""
@@ -22,6 +32,22 @@ class ConvertParams(StageParams):
         return get_adapter(name, **{**common, **(self.adapters.get(name) or {})})
 
 
+def manifest_of(place: Place) -> Manifest:
+    """What is known of a dataset's raw files; that it is absent where nothing has been scanned."""
+    path = place.manifest
+    return read_manifest(path) if path.is_file() else absent_manifest(configured_adapter(place.dataset))
+
+
+def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:
+    """Write the manifests the graph depends on where nobody has: those datasets, and the hand, are absent."""
+    for place in (Place(profile, name) for name in datasets):
+        if not place.manifest.is_file():
+            write_manifest(place.manifest, manifest_of(place))
+    hand = Place(profile).hand_manifest
+    if not hand.is_file():
+        write_manifest(hand, ABSENT_HAND)
+
+
 def configured_adapter(name: str) -> Adapter:
     """The adapter with the settings of params.yaml. Raises MissingResource for an unknown name, BadInput else."""
-    return load_params(ConvertParams, "convert").adapter(name)
+    return load_settings(ConvertSettings, "convert").adapter(name)

@@ -3,6 +3,7 @@
 import json
 import os
 import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -13,6 +14,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
+from hoidata.settings import build_config
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -28,6 +30,7 @@ class StageParams(BaseModel):
 
 
 Params = TypeVar("Params", bound=StageParams)
+Settings = TypeVar("Settings")
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,10 @@ class Place:
     profile: str
     dataset: str = ""
     model: str = ""
+    family: str = ""
 
     def __str__(self) -> str:
-        return "-".join(filter(None, (self.profile, self.dataset, self.model)))
+        return "-".join(filter(None, (self.profile, self.dataset, self.model, self.family)))
 
     @property
     def data(self) -> Path:
@@ -90,8 +94,12 @@ class Place:
         return self.checkpoints / self.model
 
     @property
+    def samples(self) -> Path:
+        return Path("samples", self.profile, self.dataset, self.family)
+
+    @property
     def metrics(self) -> Path:
-        return Path("metrics", self.profile, f"{self.dataset}.json")
+        return Path("metrics", self.profile, self.dataset, f"{self.family}.json")
 
     @property
     def report(self) -> Path:
@@ -102,12 +110,22 @@ class Place:
         return Path(".hoidata", "raw", self.profile, self.dataset)
 
 
+def load_settings(kind: type[Settings], section: str, path: Path = Path("params.yaml")) -> Settings:
+    """One section of params.yaml over the library's defaults. Raises BadInput as ``build_config`` does."""
+    return build_config(kind, read_section(section, path), f"{path}: {section}")
+
+
+def read_section(section: str, path: Path = Path("params.yaml")) -> dict[str, Any]:
+    """One section of params.yaml as it stands there; an empty one where nothing is chosen."""
+    return _sections(path).get(section) or {}
+
+
 def load_params(kind: type[Params], section: str, path: Path = Path("params.yaml")) -> Params:
     """One section of params.yaml, checked. Raises BadInput that names the wrong key and lists the known ones."""
-    values = _sections(path).get(section)
+    values = read_section(section, path)
     known = ", ".join(kind.model_fields) or "none"
     try:
-        return kind.model_validate(values or {})
+        return kind.model_validate(values)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(map(str, first["loc"]))
@@ -165,13 +183,18 @@ def load_hands(profile: str) -> "HandPair":
     """The hand of the profile: the embedded one, or in ``own`` the user's MANO files where they are registered."""
     from hoidata.hands import load_embedded_hands, load_mano_hands
 
-    values = json.loads(Place(profile).hand_manifest.read_text())
-    if profile == "embedded" or not values["present"]:
+    if profile == "embedded" or not hand_is_present(profile):
         return load_embedded_hands()
     root = own_root(HAND)
     if root is None or not root.is_dir():
         raise MissingResource(f"the MANO files are not at {root}; set {root_variable(HAND)} to their folder")
     return load_mano_hands(root)
+
+
+def hand_is_present(profile: str) -> bool:
+    """Whether the profile has a hand of its own: the embedded one, or MANO files that were scanned."""
+    path = Place(profile).hand_manifest
+    return path.is_file() and bool(json.loads(path.read_text())["present"])
 
 
 def empty_reason(folder: Path) -> str | None:
@@ -190,6 +213,11 @@ def write_empty(folder: Path, reason: str) -> None:
     """An output that holds nothing but the reason."""
     with atomic_folder(folder) as part:
         note_empty(part, reason)
+
+
+def print_counts(place: Place, counts: Mapping[str, int]) -> None:
+    """What a stage says of a run that went well."""
+    print(f"{place}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
 
 
 def write_json(path: Path, values: Any) -> None:

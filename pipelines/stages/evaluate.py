@@ -1,23 +1,18 @@
-"""Stage evaluate: held-out figures of the four models of one dataset, each beside its baselines."""
+"""Stage evaluate: every metric of one family's motions of one dataset. It knows no network and no family."""
 
-from pathlib import Path
-from typing import Any
+import json
 
-from pipelines.lineage.graph import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, write_json
 
 
 def run(place: Place) -> None:
-    """Write the metrics; a dataset without clips gets the reason in their place."""
-    params = read_params(Path())["evaluate"]
-    if reason := empty_reason(place.clips):
+    """Write the metrics; a dataset or family without motions gets the reason in their place."""
+    folders = (place.clips, place.annotation, place.contact, place.splits, place.samples)
+    if reason := next(filter(None, map(empty_reason, folders)), None):
         write_json(place.metrics, {"empty": reason, "held_out_clips": 0})
         return
-    evaluate(place, params)
+    from hoidata.metrics.evaluate import evaluate_store
 
-
-def evaluate(place: Place, params: dict[str, Any]) -> None:
-    """Measure on the test split; the evaluation checks its own settings."""
-    from models.common.evaluation import evaluate_dataset
-
-    evaluate_dataset(place.data, place.checkpoints, place.metrics, params, hands=load_hands(place.profile))
+    found = evaluate_store(place.samples / "clips", place.data, load_hands(place.profile), progress=True)
+    diagnostics = json.loads((place.samples / "diagnostics.json").read_text(encoding="utf-8"))
+    write_json(place.metrics, found | {"diagnostics": diagnostics})

@@ -5,18 +5,19 @@ from pathlib import Path
 from hoidata.clips.clip import SourceFile
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_file
-from pipelines.lineage.digests import paths_digests, value_digest
-from pipelines.lineage.graph import read_graph
-from pipelines.lineage.manifests import Manifest, read_manifest, scan_files, verify_files, write_manifest
-from pipelines.stages.adapters import configured_adapter
-from pipelines.stages.base import Place, jobs, raw_root, root_variable
+from pipelines.lineage.closure import SourceTree
+from pipelines.lineage.digests import value_digest
+from pipelines.lineage.manifests import Manifest, scan_files, verify_files, write_manifest
+from pipelines.stages.adapters import configured_adapter, manifest_of
+from pipelines.stages.base import Place, hand_is_present, jobs, raw_root, root_variable
 
 SHOWN_DIFFERENCES = 5
+WRITER = "hoidata.synthetic.corpus"
 
 
 def run(place: Place) -> None:
     """Write ``raw.json``: the committed manifest itself, or for a generated corpus the files its recipe gives."""
-    manifest = read_manifest(place.manifest)
+    manifest = manifest_of(place)
     if manifest.present and manifest.synthetic:
         manifest = manifest.with_files(generated_files(place, manifest))
     elif manifest.present:
@@ -29,7 +30,7 @@ def run(place: Place) -> None:
 def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
     """Write the corpus of the manifest's recipe, unless the same recipe and code already did, and list its files."""
     root = place.generated_raw
-    stamp, wanted = root.with_suffix(".recipe"), recipe_digest(place, manifest)
+    stamp, wanted = root.with_suffix(".recipe"), recipe_digest(manifest)
     if not (root.is_dir() and stamp.is_file() and stamp.read_text() == wanted):
         write_generated(place, manifest, root)
         with atomic_file(stamp) as part:
@@ -37,15 +38,9 @@ def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
     return scan_files(root, configured_adapter(place.dataset).parts)
 
 
-def recipe_digest(place: Place, manifest: Manifest) -> str:
-    """Digest of the recipe and of the code that follows it; adapters only say which of the files count."""
-    project = Path()
-    code = [
-        path
-        for path in read_graph(project)[f"raw@{place}"].code
-        if not path.startswith(("hoidata/datasets", "hoidata/conversion"))
-    ]
-    return value_digest([manifest.recipe, paths_digests(project, code)])
+def recipe_digest(manifest: Manifest) -> str:
+    """Digest of the recipe and of the code that follows it; what reads the files afterwards does not count."""
+    return value_digest([manifest.recipe, SourceTree(Path()).closure([WRITER], {})])
 
 
 def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
@@ -60,7 +55,7 @@ def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
 
 def require_hand(place: Place) -> None:
     """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
-    if not configured_adapter(place.dataset).needs_mano or read_manifest(place.hand_manifest).present:
+    if not configured_adapter(place.dataset).needs_mano or hand_is_present(place.profile):
         return
     raise MissingResource(
         f"{place.dataset} holds MANO parameters and no MANO files are registered. Register at "

@@ -1,29 +1,21 @@
 """Stage split: the parts of every named split, the chosen one, its leak check, and the training statistics."""
 
-from pydantic import ConfigDict
+from typing import Any
 
-from pipelines.stages.base import Place, StageParams, empty_reason, load_params, write_empty
-
-
-class SplitParams(StageParams):
-    """Per dataset the name of a split, or a rule of the user's own (see ``hoidata.splits.SplitRule``)."""
-
-    model_config = ConfigDict(extra="allow", frozen=True)
+from pipelines.stages.base import Place, empty_reason, print_counts, read_section, write_empty
 
 
 def run(place: Place) -> None:
     """Split the annotated clips; a dataset without clips gives an empty output."""
-    params = load_params(SplitParams, "split")
+    wanted = read_section("split").get(place.dataset)
     if reason := empty_reason(place.annotation):
         write_empty(place.splits, reason)
         return
-    split(place, params)
+    split(place, wanted)
 
 
-def split(place: Place, params: SplitParams) -> None:
-    """Clips and words to parts and statistics."""
+def split(place: Place, wanted: Any) -> None:
+    """Clips and words to parts and statistics. wanted: a split's name, or a rule (``hoidata.splits.SplitRule``)."""
     from hoidata.splits import split_store
 
-    wanted = (params.model_extra or {}).get(place.dataset)
-    counts = split_store(place.clips, place.annotation, place.splits, wanted)
-    print(f"{place}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
+    print_counts(place, split_store(place.clips, place.annotation, place.splits, wanted))

@@ -24,7 +24,7 @@ from hoidata.objects.distance_grid import distance_grid
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.solid import Solid
-from hoidata.objects.surface_index import SurfaceIndex, in_part
+from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.objects.triangle_tree import triangle_tree
 from hoidata.surface.solid_overlap import SolidOverlap
 from tests.bench.harness import Times, medians, show
@@ -259,7 +259,8 @@ def depths_wrong(asked: Asked, depth_m: np.ndarray) -> str:
     truth = np.zeros(depth_m.size)
     for part, solid in SurfaceIndex(asked.model).solids.items():
         if isinstance(solid, Solid):
-            places = np.ascontiguousarray(in_part(asked.model, asked.places_m, asked.hinge_rad, part).reshape(-1, 3))
+            part_from_object = asked.model.object_from_part(part, asked.hinge_rad).inverse()
+            places = np.ascontiguousarray((part_from_object @ asked.places_m).reshape(-1, 3))
             maybe = ((places > solid.vertices_m.min(axis=0)) & (places < solid.vertices_m.max(axis=0))).all(axis=1)
             own = places[maybe]
             inside = igl.winding_number(solid.vertices_m, solid.faces, own) > 0.5

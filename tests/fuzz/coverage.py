@@ -1,5 +1,6 @@
-"""Which lines of a parser an input reaches: a tracer that looks at chosen functions only."""
+"""Which lines of a parser inputs reach: a tracer that looks at chosen functions only."""
 
+import contextlib
 import inspect
 import sys
 from collections.abc import Callable, Iterable
@@ -33,52 +34,32 @@ def _nested(code: CodeType) -> list[CodeType]:
     return [code, *(inner for const in code.co_consts if isinstance(const, CodeType) for inner in _nested(const))]
 
 
-class LineCoverage:
-    """Lines and steps from line to line reached so far."""
+def lines_of(owners: Iterable[Any]) -> set[Line]:
+    """The lines of these functions and classes, but for those with ``def``."""
+    return {
+        (code.co_filename, line)
+        for code in code_objects(owners)
+        for _, _, line in code.co_lines()
+        if line is not None and line != code.co_firstlineno
+    }
 
-    def __init__(self, codes: Iterable[CodeType]) -> None:
-        self._codes = {code: code.co_filename for code in codes}
-        self.lines: set[Line] = {
-            (code.co_filename, line)
-            for code in self._codes
-            for _, _, line in code.co_lines()
-            if line is not None and line != code.co_firstlineno
-        }
-        self.reached: set[Line] = set()
-        self.steps: set[tuple[int, int, int]] = set()
 
-    def trace(self, run: Callable[[bytes], Any], data: bytes) -> bool:
-        """Run and note what was reached; True when it took a step no input took before. Exceptions pass."""
-        steps: set[tuple[int, int, int]] = set()
-        previous = 0
+def lines_reached(owners: Iterable[Any], run: Callable[[bytes], Any], inputs: Iterable[bytes]) -> set[Line]:
+    """Those of ``lines_of`` that any of the inputs reaches. Exceptions pass."""
+    codes, reached = set(code_objects(owners)), set()
 
-        def on_line(frame: FrameType, event: str, _: Any) -> Any:
-            nonlocal previous
-            if event == "line":
-                steps.add((id(frame.f_code), previous, frame.f_lineno))
-                previous = frame.f_lineno
-            return on_line
+    def on_line(frame: FrameType, event: str, _: Any) -> Any:
+        if event == "line":
+            reached.add((frame.f_code.co_filename, frame.f_lineno))
+        return on_line
 
-        def on_call(frame: FrameType, event: str, _: Any) -> Any:
-            return on_line if frame.f_code in self._codes else None
+    def on_call(frame: FrameType, event: str, _: Any) -> Any:
+        return on_line if frame.f_code in codes else None
 
-        before = sys.gettrace()
+    before = sys.gettrace()
+    for data in inputs:
         sys.settrace(on_call)
-        try:
+        with contextlib.suppress(Exception):
             run(data)
-        finally:
-            sys.settrace(before)
-            is_new = not steps <= self.steps
-            if is_new:
-                self.steps |= steps
-                files = {id(code): name for code, name in self._codes.items()}
-                self.reached |= {(files[code], line) for code, _, line in steps} & self.lines
-        return is_new
-
-    @property
-    def missing(self) -> list[Line]:
-        return sorted(self.lines - self.reached)
-
-    @property
-    def share(self) -> float:
-        return len(self.reached) / max(1, len(self.lines))
+        sys.settrace(before)
+    return reached & lines_of(owners)

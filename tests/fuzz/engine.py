@@ -1,40 +1,43 @@
-"""Fuzzing of one parser in one process: mutate, run, keep what reaches new lines, stop at nothing but the count.
+"""Fuzzing of one parser by atheris (libFuzzer), in a process of its own.
 
-A fault is any exception but BadInput and MissingResource, any warning, a call over one second, or memory refused by
-the limit of 1 GiB above what the process had at its start. Faults are saved, and the run goes on.
+A fault is any exception but BadInput and MissingResource, any warning, a call over one second of processor time, no end
+within 30 s, or memory refused by the limit of 1 GiB above what the process had at its start. The first fault ends the
+parser's run, and its input is saved.
 """
 
 import contextlib
-import hashlib
-import mmap
+import faulthandler
+import multiprocessing
+import os
 import random
+import re
 import resource
-import struct
+import shutil
 import time
-import traceback
+import types
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import atheris
+
 from hoidata.errors import BadInput, MissingResource
-from tests.fuzz.coverage import LineCoverage, code_objects
-from tests.fuzz.mutation import LONGEST, mutate
-from tests.fuzz.structure import Bytes
+from hoidata.files import sha256_bytes
+from tests.fuzz.coverage import code_objects, lines_of, lines_reached
+from tests.fuzz.structure import LONGEST, NUMBERS, Bytes
 
 SLOWEST_S = 1.0
-_NOTABLE_S = 0.1  # longer calls are repeated: the machine may have been busy
+HANG_S = 30
 MEMORY_BYTES = 1 << 30
-_TRACED = 24  # one execution in so many is traced; the others run at full speed
 _STRUCTURED = 0.6
-_MOST_FAULTS = 20
-_LARGEST_CORPUS = 400
+_LONGEST_WORD = 64  # libFuzzer takes no longer ones
 
 
 @dataclass(frozen=True)
 class Target:
-    """One parser. seeds: small valid files; run: parses bytes; code: functions whose lines count.
+    """One parser. seeds: small valid files; run: parses bytes; code: functions that guide, and whose lines count.
 
     structure: mutation that knows the format; longest: inputs are not made larger than this.
     """
@@ -51,138 +54,121 @@ class Target:
 
 @dataclass
 class Outcome:
-    """What happened to one target. slowest_s: of one call; peak_bytes: of the whole process."""
+    """What happened to one target. fault: what it was, or empty; input_path: the input that did it."""
 
     name: str
     executions: int = 0
-    accepted: int = 0
     seconds: float = 0.0
-    slowest_s: float = 0.0
-    peak_bytes: int = 0
+    peak_mib: int = 0
     lines: int = 0
-    reached: int = 0
     missing: list[str] = field(default_factory=list)
-    faults: list[dict[str, str]] = field(default_factory=list)
-
-
-class Watched:
-    """A file the parent reads: how many inputs were started, and the one that is running."""
-
-    def __init__(self, path: Path, longest: int) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(bytes(16 + longest))
-        with open(path, "r+b") as stream:
-            self._map = mmap.mmap(stream.fileno(), 0)
-
-    def note(self, number: int, data: bytes) -> None:
-        self._map[:16] = struct.pack("<QQ", number, len(data))
-        self._map[16 : 16 + len(data)] = data
-
-    @staticmethod
-    def read(path: Path) -> tuple[int, bytes]:
-        content = path.read_bytes() if path.is_file() else bytes(16)
-        number, length = struct.unpack("<QQ", content[:16])
-        return number, content[16 : 16 + length]
+    fault: str = ""
+    input_path: str = ""
 
 
 def fuzz(target: Target, seed: int, executions: int, seconds: float, folder: Path) -> Outcome:
-    """Run one target until either limit. Inputs depend on ``seed`` alone; folder: where faults are saved."""
-    seeds = list(target.seeds())
-    coverage = LineCoverage(code_objects(target.code))
-    watched = Watched(folder / "running" / target.name, max(target.longest, *map(len, seeds)))
-    limit_memory()
-    warnings.simplefilter("error")  # a file must not make a conversion print warnings either
-    outcome = Outcome(target.name, lines=len(coverage.lines))
-    corpus, rng = list(seeds), random.Random(f"{seed} {target.name}")
-    start = time.perf_counter()
-    while outcome.executions < executions and time.perf_counter() - start < seconds:
-        number = outcome.executions
-        data = seeds[number] if number < len(seeds) else _next_input(rng, target, corpus)
-        watched.note(number, data)
-        traced = number < len(seeds) or number % _TRACED == 0
-        if _execute(target, data, coverage if traced else None, outcome, folder) and number >= len(seeds):
-            corpus.append(data)
-            del corpus[len(seeds) : len(corpus) - _LARGEST_CORPUS]
-        outcome.executions += 1
-        if len(outcome.faults) >= _MOST_FAULTS:
-            break
-    outcome.seconds = time.perf_counter() - start
-    outcome.reached = len(coverage.reached)
-    outcome.missing = [f"{Path(file).name}:{line}" for file, line in coverage.missing]
-    outcome.peak_bytes = peak_bytes()
+    """Run one target until either limit. folder: gets the corpus, libFuzzer's log and an input that failed."""
+    own = folder.resolve() / target.name
+    shutil.rmtree(own, ignore_errors=True)
+    (own / "corpus").mkdir(parents=True)
+    for number, data in enumerate(target.seeds()):
+        (own / "corpus" / f"seed-{number:03d}").write_bytes(data)
+    words = {word for word in (*target.tokens, *NUMBERS) if 0 < len(word) <= _LONGEST_WORD}
+    escaped = ("".join(f"\\x{byte:02x}" for byte in word) for word in sorted(words))
+    (own / "words").write_text("".join(f'"{word}"\n' for word in escaped))
+    begin = time.perf_counter()
+    # Forked: what all parsers import is imported once.
+    process = multiprocessing.get_context("fork").Process(target=_run, args=(target, seed, executions, seconds, own))
+    process.start()
+    process.join(seconds + 4 * HANG_S)
+    process.kill()
+    process.join()
+    outcome = _outcome(target, own, process.exitcode)
+    outcome.seconds = time.perf_counter() - begin
     return outcome
 
 
-def _next_input(rng: random.Random, target: Target, corpus: list[bytes]) -> bytes:
-    data = rng.choice(corpus)
-    if target.structure is not None and (target.structured_only or rng.random() < _STRUCTURED):
-        data = target.structure(rng, data)
-        if target.structured_only or rng.random() < 0.85:
-            return data[: target.longest]
-    return mutate(rng, data, corpus, target.tokens)[: target.longest]
+def _run(target: Target, seed: int, executions: int, seconds: float, own: Path) -> None:
+    """In the child: hands the process to libFuzzer, which ends it."""
+    log = os.open(own / "log", os.O_CREAT | os.O_WRONLY)
+    os.dup2(log, 1)
+    os.dup2(log, 2)
+    faulthandler.disable()  # pytest's: libFuzzer sets no handler of its own where there is one
+    _guide_by(target.code)
+    mutator = {"custom_mutator": lambda *given: _mutated(target, *given)} if target.structure else {}
+    longest = max(target.longest, *(path.stat().st_size for path in (own / "corpus").iterdir()))
+    options = {
+        "runs": executions, "max_total_time": int(seconds), "seed": seed + 1, "max_len": longest, "timeout": HANG_S,
+        "rss_limit_mb": 0, "print_final_stats": 1, "artifact_prefix": f"{own}/", "dict": own / "words",
+    }  # fmt: skip
+    flags = [f"-{name}={value}" for name, value in options.items()]
+    atheris.Setup(
+        [target.name, *flags, str(own / "corpus")], lambda data: _check_and_save(target, data, own), **mutator
+    )
+    _limit_memory()
+    warnings.simplefilter("error")  # a file must not make a conversion print warnings either
+    atheris.Fuzz()
 
 
-def _execute(target: Target, data: bytes, coverage: LineCoverage | None, outcome: Outcome, folder: Path) -> bool:
-    """One call; True when it reached something new."""
-    steps_before = len(coverage.steps) if coverage else 0
-    begin = time.perf_counter()
+def check_call(target: Target, data: bytes) -> None:
+    """Run the parser; what is raised here is a fault."""
+    begin = time.process_time()
     try:
-        coverage.trace(target.run, data) if coverage else target.run(data)
-        outcome.accepted += 1
+        target.run(data)
     except (BadInput, MissingResource) as error:
         if "MemoryError" in str(error):
-            _note_fault(target, data, f"memory: {str(error)[:200]}", outcome, folder)
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
             raise
-        _note_fault(target, data, _described(error), outcome, folder)
-    duration = time.perf_counter() - begin
-    if duration > _NOTABLE_S:
-        duration = min(duration, _repeated(target, data))
-        if duration > SLOWEST_S:
-            _note_fault(target, data, f"{duration:.2f} s", outcome, folder)
-    outcome.slowest_s = max(outcome.slowest_s, duration)
-    return coverage is not None and len(coverage.steps) > steps_before
+    if time.process_time() - begin > SLOWEST_S:
+        raise TimeoutError(f"{time.process_time() - begin:.2f} s")
 
 
-def _repeated(target: Target, data: bytes) -> float:
-    """The shortest of two more runs: a busy machine may have taken the time."""
-    durations = []
-    for _ in range(2):
-        begin = time.perf_counter()
-        with contextlib.suppress(Exception):
-            target.run(data)
-        durations.append(time.perf_counter() - begin)
-    return min(durations)
+def _check_and_save(target: Target, data: bytes, own: Path) -> None:
+    """libFuzzer itself saves the inputs of hangs and crashes of compiled code only."""
+    try:
+        check_call(target, data)
+    except BaseException:
+        (own / f"crash-{sha256_bytes(data)[:16]}").write_bytes(data)
+        raise
 
 
-def _described(error: BaseException) -> str:
-    """Type and the last place in our own code: one defect, one description."""
-    places = [frame for frame in traceback.extract_tb(error.__traceback__) if "/site-packages/" not in frame.filename]
-    ours = [frame for frame in places if "/hoidata/" in frame.filename or "/pipelines/" in frame.filename] or places
-    return f"{type(error).__name__} at {Path(ours[-1].filename).name}:{ours[-1].lineno}"
+def _mutated(target: Target, data: bytes, longest: int, seed: int) -> bytes:
+    rng = random.Random(seed)
+    if target.structure is not None and (target.structured_only or rng.random() < _STRUCTURED):
+        # What cannot be taken apart may raise or warn in many ways.
+        with contextlib.suppress(Exception), warnings.catch_warnings(action="ignore"):
+            return target.structure(rng, bytes(data))[:longest]
+    return atheris.Mutate(data, longest)
 
 
-def _note_fault(target: Target, data: bytes, what: str, outcome: Outcome, folder: Path) -> None:
-    if any(fault["what"] == what for fault in outcome.faults):
-        return
-    path = save_fault(folder, target.name, data)
-    outcome.faults.append({"what": what, "path": str(path)})
+def _guide_by(owners: Sequence[Any]) -> None:
+    """Let atheris count the branches of functions and of the methods of classes."""
+    wanted = set(code_objects(owners))
+    for owner in owners:
+        for item in vars(owner).values() if isinstance(owner, type) else (owner,):
+            function = getattr(item, "__func__", item)
+            if isinstance(function, types.FunctionType) and function.__code__ in wanted:
+                atheris.instrument_func(function)
 
 
-def save_fault(folder: Path, name: str, data: bytes) -> Path:
-    path = folder / name / f"{hashlib.sha256(data).hexdigest()[:16]}.bin"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
-    return path
+def _outcome(target: Target, own: Path, exit_code: int | None) -> Outcome:
+    """What libFuzzer left. Lines are counted where nothing failed only: an input may end this process, too."""
+    log = (own / "log").read_text(errors="replace")
+    number = {name: int(value) for name, value in re.findall(r"^stat::(\w+): +(\d+)$", log, re.MULTILINE)}
+    outcome = Outcome(target.name, number.get("number_of_executed_units", 0), peak_mib=number.get("peak_rss_mb", 0))
+    saved = [path for path in own.iterdir() if path.name.startswith(("crash-", "timeout-", "oom-"))]
+    if saved or exit_code:
+        raised = re.search(r"=== Uncaught Python exception: ===\n(.*)", log)
+        outcome.fault = raised.group(1)[:300] if raised else f"the process ended with {exit_code}, see {own / 'log'}"
+        outcome.input_path = str(saved[0]) if saved else ""
+        return outcome
+    lines = lines_of(target.code)
+    paths = sorted((own / "corpus").iterdir())
+    missing = lines - lines_reached(target.code, target.run, (path.read_bytes() for path in paths))
+    outcome.lines, outcome.missing = len(lines), [f"{Path(file).name}:{line}" for file, line in sorted(missing)]
+    return outcome
 
 
-def limit_memory() -> None:
+def _limit_memory() -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * resource.getpagesize() + MEMORY_BYTES
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
-
-
-def peak_bytes() -> int:
-    """The most memory this process ever held (Linux counts in KiB)."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

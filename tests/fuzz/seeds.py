@@ -240,7 +240,7 @@ Frame Time: 0.008333
 
 
 def gzipped() -> list[bytes]:
-    return [gzip.compress(BVH, mtime=0), gzip.compress("é\n".encode(), mtime=0), gzip.compress(b"", mtime=0)]
+    return [gzip.compress(text, mtime=0) for text in (BVH, "é\n".encode(), b"", bytes(5000))]
 
 
 def as_json(*values: object) -> list[bytes]:

@@ -47,6 +47,7 @@ ARCHIVES = {
     "unclosed header (TokenError)": archive(npy("{'descr': '<f8', 'shape': (\n")),
     "empty header (IndexError)": archive(npy("()")),
     "huge shape (MemoryError)": archive(shaped("(1000000000000,)")),
+    "huge shape of texts without characters (MemoryError)": archive(shaped("(2147483648, 65535)", "<U0")),
     "endless shape (OverflowError)": archive(shaped("(99999999999999999999,)")),
     "shape of flags (TypeError)": archive(shaped("(None,)")),
     "impossible text (SystemError)": archive(shaped("()", "<U1")[:-32] + b"\xff\xff\xff\x7f"),

@@ -48,7 +48,7 @@ def clips(make_clip):
     odd = replace(
         hinged,
         hands={"left": odd_left, "right": odd_right},
-        other_objects=(plain.cut(0, 30).object, hinged.object),
+        other_objects=(plain.object.take(slice(0, 30)), hinged.object),
         labelled_hand="left",
         source_frames=np.arange(7, 167, 4, dtype=np.int32),
         source_from_world=np.diag([10.0, -10.0, 10.0, 1.0]),

@@ -17,6 +17,7 @@ from hoidata.splits import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from tests.models.toy import PARAMS, train
 
 torch.set_num_threads(1)
 GRASP_HEIGHT_M = 0.01
@@ -66,11 +67,11 @@ def make_clip(number: int, plan: Plan) -> Clip:
     start = np.array([0.3, -0.2, 0.9])
     top = float(plan.model.vertices_m[:, 2].max()) + GRASP_HEIGHT_M
     hands = {}
-    for side, acts, shift in (("left", plan.left, -0.04), ("right", plan.right, 0.04)):
+    for side, active_hands, shift in (("left", plan.left, -0.04), ("right", plan.right, 0.04)):
         wrist = path + start + np.array([shift, 0, top]) + away[:, None] * np.array([0, 0, 1.0])
         orient = np.tile(np.array([0.1 * number, 0.2, 0.0]), (frames, 1))
         hands[side] = HandTrack(
-            (wrist if acts else wrist + 1).astype(np.float32),
+            (wrist if active_hands else wrist + 1).astype(np.float32),
             orient.astype(np.float32),
             np.full((frames, 45), 0.05, np.float32),
             np.full((1, 10), 0.3, np.float32),
@@ -110,3 +111,12 @@ def annotated(annotated_root: Path) -> AnnotatedStore:
 def batch(annotated: AnnotatedStore) -> ClipBatch:
     """The three training clips: left, right and both hands, of different length."""
     return collate(list(HoiDataset(annotated, "train")))
+
+
+@pytest.fixture(scope="session")
+def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a checkpoint of each of Text2HOI's networks, of the toy dataset."""
+    out = tmp_path_factory.mktemp("checkpoints")
+    for name in PARAMS:
+        train(name, annotated_root, out)
+    return out

@@ -9,13 +9,13 @@ from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.signed_distance_grid import DistanceFields
 from models.common import losses
 from models.common.features import Hands, object_rotmat, place_points, scaled_text, to_object_frame
-from models.common.fields import DistanceFields
 from models.common.sampling import add_noise
-from models.common.surface import Surface
 from models.text2hoi.contact import ContactLossConfig, contact_loss
 from models.text2hoi.length import length_loss
+from models.text2hoi.surface import Surface
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_joints_of_the_features_are_the_stored_joints(batch: ClipBatch, hands: H
 def test_the_distance_map_loss_is_zero_at_the_truth_and_grows_with_a_shift(batch: ClipBatch) -> None:
     points = place_points(batch, batch.object)
     found = [
-        float(losses.distance_map_loss(batch.joints_m + shift, points, batch.entries, batch.entry_distance_m))
+        float(losses.distance_map_loss(batch.joints_m + shift, points, batch.entries, batch.entry_distance_m, 0.02))
         for shift in (0.0, 0.01, 0.02)
     ]
     assert found[0] < 1e-6
@@ -49,7 +49,7 @@ def test_distances_of_chosen_frames_are_those_of_all_frames(batch: ClipBatch) ->
     )
     joints, objects = losses.take_frames(batch.joints_m, chosen, 2), losses.take_frames(batch.object, chosen, 1)
     assert len(rows) > 0
-    assert float(losses.distance_map_loss(joints, place_points(batch, objects), rows, distance)) < 1e-6
+    assert float(losses.distance_map_loss(joints, place_points(batch, objects), rows, distance, 0.02)) < 1e-6
 
 
 def test_relative_orientation_ignores_the_world_and_sees_the_hand(batch: ClipBatch) -> None:
@@ -73,10 +73,12 @@ def test_contact_pulls_only_joints_that_truly_touch() -> None:
     true = torch.tensor([0.010, 0.021, -0.010]).reshape(1, 1, 1, 3)
     now = torch.tensor([0.020, 5.0, 0.010]).reshape(1, 1, 1, 3)
     # Joints one and three count, off by 1 cm and 2 cm: (1 + 4) / 2.
-    assert float(losses.contact_loss(now, true, torch.ones(1, 1, 1))) == pytest.approx(2.5)
-    assert float(losses.contact_loss(true, true, torch.ones(1, 1, 1))) == 0
+    assert float(losses.contact_loss(now, true, torch.ones(1, 1, 1), 0.02)) == pytest.approx(2.5)
+    assert float(losses.contact_loss(true, true, torch.ones(1, 1, 1), 0.02)) == 0
+    # At a threshold of 1 cm (strictly below) none of them touches.
+    assert float(losses.contact_loss(now, true, torch.ones(1, 1, 1), 0.01)) == 0
     # 10 cm off: linear beyond 3 cm, 2 x 3 x (10 - 1.5) instead of 100.
-    assert float(losses.contact_loss(true + 0.1, true, torch.ones(1, 1, 1))) == pytest.approx(51, rel=1e-5)
+    assert float(losses.contact_loss(true + 0.1, true, torch.ones(1, 1, 1), 0.02)) == pytest.approx(51, rel=1e-5)
 
 
 def test_a_field_reads_the_distance_of_a_sphere() -> None:
@@ -101,7 +103,7 @@ def test_a_field_reads_the_distance_of_a_sphere() -> None:
 
 
 def test_a_field_turns_the_moving_part_with_the_hinge(batch: ClipBatch, hands: Hands) -> None:
-    surface = Surface.of(hands, batch.samples, 40, torch.device("cpu"))
+    surface = Surface.of(hands, batch.objects, 40, torch.device("cpu"))
     points = place_points(batch, batch.object)
     both = points[:, None].expand(-1, 2, -1, -1, -1)
     _, distance, _ = surface.measure(batch, both, batch.object)

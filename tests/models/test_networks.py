@@ -10,13 +10,13 @@ from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common.features import Hands, Normaliser
-from models.common.sampling import SamplerConfig, add_noise, alphas_bar, noise_schedule, sample_motion
-from models.common.surface import Surface
+from models.common.sampling import SamplerConfig, add_noise, alphas_cumprod, draw_motion, noise_schedule, sample_motion
 from models.common.transformer import TransformerConfig, smoothed
 from models.text2hoi.contact import ContactConfig, ContactLossConfig, ContactModel, PointNetConfig, contact_loss
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
+from models.text2hoi.surface import Surface
 
 SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2
@@ -31,12 +31,12 @@ def diffusion_model(**changes) -> DiffusionModel:
 
 
 def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
-    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0])
+    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0], batch.contact_map)
 
 
 def coarse_of(batch: ClipBatch) -> CoarseMotion:
-    surface = Surface.of(Hands(load_embedded_hands()), batch.samples, 24, torch.device("cpu"))
-    return surface.coarse(batch, batch.hands, batch.object, batch.touched)
+    surface = Surface.of(Hands(load_embedded_hands()), batch.objects, 24, torch.device("cpu"))
+    return surface.coarse(batch, batch.hands, batch.object, batch.contact_map, batch.present)
 
 
 @pytest.mark.parametrize("frames_per_token", [1, 2, 5])
@@ -46,7 +46,7 @@ def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, frames_per_
     hands, objects = batch.hands.clone(), batch.object.clone()
     with torch.no_grad():
         before = model(hands, objects, steps, condition)
-        hands[~batch.acts] = 100.0
+        hands[~batch.active_hands] = 100.0
         hands.transpose(1, 2)[~batch.frames] = -50.0
         objects[~batch.frames] = 50.0
         after = model(hands, objects, steps, condition)
@@ -60,7 +60,7 @@ def test_a_clip_gives_the_same_alone_as_padded_in_a_batch(annotated: AnnotatedSt
     with torch.no_grad():
         many = model(batch.hands, batch.object, torch.full((3,), 300), condition_of(batch, model))
         one = model(alone.hands, alone.object, torch.full((1,), 300), condition_of(alone, model))
-    length, side = batch.samples[0].length, int(batch.acts[0].float().argmax())
+    length, side = batch.samples[0].length, int(batch.active_hands[0].float().argmax())
     torch.testing.assert_close(many[0][0, side, :length], one[0][0, side], atol=1e-5, rtol=1e-4)
     torch.testing.assert_close(many[1][0, :length], one[1][0], atol=1e-5, rtol=1e-4)
 
@@ -70,8 +70,8 @@ def test_hand_flags_length_text_and_contact_are_seen(batch: ClipBatch) -> None:
     condition = condition_of(batch, model)
     changes = {
         "text": condition.text + 1,
-        "touched": 1 - condition.touched,
-        "acts": torch.ones_like(condition.acts),
+        "contact_map": 1 - condition.contact_map,
+        "active_hands": torch.ones_like(condition.active_hands),
     }
     with torch.no_grad():
         before = model(batch.hands, batch.object, steps, condition)[1]
@@ -139,7 +139,9 @@ def test_a_perfect_denoiser_gives_the_clean_motion_back() -> None:
     truth = torch.randn(3, 2, 7, 99, generator=generator), torch.randn(3, 7, 10, generator=generator)
     for kind, steps in (("ddim", 1), ("ddim", 20), ("ddpm", 50)):
         config = SamplerConfig(kind, steps)  # pyright: ignore[reportArgumentType]
-        hands, objects = sample_motion(lambda *_: truth, truth[0].shape, truth[1].shape, config, generator)
+        hands, objects = sample_motion(
+            lambda *_: truth, draw_motion(truth[0].shape, truth[1].shape, generator), config, generator
+        )
         torch.testing.assert_close(hands, truth[0], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
         torch.testing.assert_close(objects, truth[1], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
 
@@ -148,12 +150,12 @@ def test_the_schedule_is_nichol_and_dhariwals_cosine() -> None:
     time = torch.arange(1001, dtype=torch.float64) / 1000
     curve = torch.cos((time + 0.008) / 1.008 * torch.pi / 2) ** 2
     betas = (1 - curve[1:] / curve[:-1]).clamp_max(0.999)
-    torch.testing.assert_close(alphas_bar().double(), (1 - betas).cumprod(0), atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(alphas_cumprod().double(), (1 - betas).cumprod(0), atol=1e-5, rtol=1e-4)
 
 
 def test_one_ddim_step_is_the_closed_form() -> None:
     """Song et al. 2021, eq. 12 with sigma 0: x' = sqrt(a') x0 + sqrt(1 - a') (x - sqrt(a) x0) / sqrt(1 - a)."""
-    scheduler, signal = noise_schedule(), alphas_bar()
+    scheduler, signal = noise_schedule(), alphas_cumprod()
     scheduler.set_timesteps(10)
     x, clean = torch.tensor([1.3]), torch.tensor([0.4])
     now, then = (signal[int(step)] for step in scheduler.timesteps[4:6])
@@ -205,13 +207,18 @@ def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
     noise = torch.randn(2, 4, generator=torch.Generator().manual_seed(0))
 
     def loss() -> Tensor:
-        logits, mean, spread = model(two.points_m, two.text[:, 0], two.acts, two.touched, noise)
-        return contact_loss(logits, two.touched, mean, spread, ContactLossConfig())["total"]
+        logits, mean, spread = model(two.points_m, two.text[:, 0], two.active_hands, two.contact_map, noise)
+        return contact_loss(logits, two.contact_map, mean, spread, ContactLossConfig())["total"]
 
     fitted(model.parameters(), loss, 60, 1e-2)
     model.eval()
-    chance = model.sample(two.points_m, two.text[:, 0], two.acts, 8, torch.Generator().manual_seed(1)).mean(1)
-    assert ((chance > 0.5) == (two.touched > 0.5)).float().mean() > 0.95
+    probability = model.sample(
+        two.points_m,
+        two.text[:, 0],
+        two.active_hands,
+        model.draw_latents(8, len(two), torch.Generator().manual_seed(1)),
+    ).mean(1)
+    assert ((probability > 0.5) == (two.contact_map > 0.5)).float().mean() > 0.95
 
 
 def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatch) -> None:
@@ -219,10 +226,14 @@ def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatc
     two = two_clips(batch)
     model = LengthModel(LengthConfig(width=64, dropout=0.0))
     lengths = torch.tensor([40, 120])
-    fitted(model.parameters(), lambda: length_loss(*model(two.text[:, 0], two.acts), lengths)["total"], rate=5e-4)
-    torch.testing.assert_close(model.expected_frames(two.text[:, 0], two.acts), lengths.float(), atol=2.0, rtol=0)
+    fitted(
+        model.parameters(), lambda: length_loss(*model(two.text[:, 0], two.active_hands), lengths)["total"], rate=5e-4
+    )
+    torch.testing.assert_close(
+        model.expected_frames(two.text[:, 0], two.active_hands), lengths.float(), atol=2.0, rtol=0
+    )
     drawn = model.sample(
-        two.text[:1, 0].expand(200, -1), two.acts[:1].expand(200, -1), torch.Generator().manual_seed(0)
+        two.text[:1, 0].expand(200, -1), two.active_hands[:1].expand(200, -1), torch.Generator().manual_seed(0)
     )
     assert drawn.float().std() > 0.5
     assert drawn.min() >= 8
@@ -233,7 +244,7 @@ def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
     model = diffusion_model().train()
     normaliser = Normaliser.of(list(two.samples))
     hands, objects = normaliser.encode(two.hands, two.object)
-    signal, generator = alphas_bar(), torch.Generator().manual_seed(0)
+    signal, generator = alphas_cumprod(), torch.Generator().manual_seed(0)
     condition = condition_of(two, model)
 
     def loss() -> Tensor:
@@ -249,7 +260,7 @@ def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
 def test_normalisation_leaves_out_hands_that_do_not_act_and_comes_back(annotated: AnnotatedStore) -> None:
     train = list(HoiDataset(annotated, "train"))
     normaliser = Normaliser.of(train)
-    left = torch.cat([torch.from_numpy(s.hands[0]) for s in train if s.acts[0]])
+    left = torch.cat([torch.from_numpy(s.hands[0]) for s in train if s.active_hands[0]])
     torch.testing.assert_close(normaliser.hand_mean[0], left.mean(0), atol=1e-5, rtol=1e-4)
     both = collate(train)
     hands, objects = normaliser.decode(*normaliser.encode(both.hands, both.object))

@@ -1,4 +1,4 @@
-"""The whole of training, evaluation and generation on the toy dataset, and what its files promise."""
+"""Training and generation on the toy dataset, and what their files promise."""
 
 import json
 from dataclasses import replace
@@ -18,43 +18,10 @@ from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import load_checkpoint, save_checkpoint
 from models.common.corpus import batches
-from models.common.evaluation import evaluate_dataset
-from models.common.training import TrainingConfig, learning_rate_factor, train_model
+from models.common.training import TrainingConfig, learning_rate_factor, train_network
+from models.registry import load_network
 from models.text2hoi.generation import GeneratedMotion, generate
-
-POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
-TRANSFORMER = {
-    "width": 32, "layers": 1, "heads": 2, "feed_forward": 64, "dropout": 0.1, "norm_first": True, "frames_per_token": 5,
-}  # fmt: skip
-BUDGET = {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "average": 0.5}
-PARAMS = {
-    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
-    "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
-    "diffusion": {"network": {"transformer": TRANSFORMER, "contact_input": "moments"}, "training": BUDGET},
-    "refiner": {
-        "network": {"transformer": TRANSFORMER, "contact_map": False},
-        "training": BUDGET,
-        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
-    },
-}
-UPSTREAM = {"diffusion": "contact", "refiner": "diffusion"}
-EVALUATION = {"samples": 2, "refined": 1, "sampler_steps": 2, "frame_stride": 10, "contact_samples": 4}
-
-
-def train(name: str, root: Path, out: Path) -> Path:
-    upstream = {UPSTREAM[name]: out / UPSTREAM[name]} if name in UPSTREAM else {}
-    return train_model(
-        name, root, out / name, PARAMS[name], provenance=lambda facts: {"model": facts["model"]}, upstream=upstream,
-        threads=2,
-    )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("checkpoints")
-    for name in PARAMS:
-        train(name, annotated_root, out)
-    return out
+from tests.models.toy import PARAMS, train
 
 
 def test_training_twice_gives_the_same_bytes(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
@@ -81,7 +48,7 @@ def test_a_checkpoint_has_one_metadata_key_and_says_what_it_was_trained_on(train
 def test_saving_what_was_loaded_gives_the_same_bytes_every_time(trained: Path, tmp_path: Path) -> None:
     original = (trained / "diffusion" / "model.safetensors").read_bytes()
     for number in range(3):
-        loaded = load_checkpoint(trained / "diffusion", "diffusion")
+        loaded = load_checkpoint(trained / "diffusion", load_network("diffusion"))
         info = {key: value for key, value in loaded.info.items() if key not in ("format", "model", "config")}
         again = save_checkpoint(tmp_path / str(number), "diffusion", loaded.network, loaded.normaliser, info)
         assert again.read_bytes() == original
@@ -96,51 +63,33 @@ def test_the_log_has_training_and_validation_losses(trained: Path) -> None:
 
 def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:
     with pytest.raises(BadInput, match="no file"):
-        load_checkpoint(tmp_path, "contact")
+        load_checkpoint(tmp_path, load_network("contact"))
     with pytest.raises(BadInput, match="one of length"):
-        load_checkpoint(trained / "length", "contact")
+        load_checkpoint(trained / "length", load_network("contact"))
     broken = tmp_path / "model.safetensors"
     broken.write_bytes(b"not a checkpoint")
     with pytest.raises(BadInput, match="a checkpoint of hoidata"):
-        load_checkpoint(tmp_path, "contact")
+        load_checkpoint(tmp_path, load_network("contact"))
 
 
 def test_unknown_settings_are_refused_with_the_known_ones(annotated_root: Path, tmp_path: Path) -> None:
+    length, diffusion = load_network("length"), load_network("diffusion")
     with pytest.raises(BadInput, match="learning_rate"):
-        train_model("length", annotated_root, tmp_path, {"training": {"stepz": 3}})
+        train_network(length, annotated_root, tmp_path, {"training": {"stepz": 3}})
     with pytest.raises(BadInput, match="network"):
-        train_model("length", annotated_root, tmp_path, {"optimizer": {}})
+        train_network(length, annotated_root, tmp_path, {"optimizer": {}})
     with pytest.raises(BadInput, match="contact"):
-        train_model("ponytail", annotated_root, tmp_path, {})
-    with pytest.raises(BadInput, match="checkpoint folder of contact"):
-        train_model("diffusion", annotated_root, tmp_path, {})
+        load_network("ponytail")
+    with pytest.raises(BadInput, match="none of contact"):
+        train_network(diffusion, annotated_root, tmp_path, {})
 
 
 def test_nothing_to_train_on_gives_a_note_with_the_reason(trained: Path, tmp_path: Path) -> None:
     root, out = tmp_path / "data", tmp_path / "out"
     (root / "clips").mkdir(parents=True)
     (root / "clips" / "empty.json").write_text('{"reason":"grab is not present"}')
-    written = train_model("contact", root, out / "contact", PARAMS["contact"])
-    assert json.loads(written.read_text()) == {"reason": "grab is not present"}
-    after = train_model(
-        "diffusion", trained, out / "diffusion", PARAMS["diffusion"], upstream={"contact": out / "contact"}
-    )
-    assert json.loads(after.read_text()) == {"reason": "grab is not present"}
-    figures = evaluate_dataset(root, out, tmp_path / "metrics.json", EVALUATION)
-    assert figures == {"empty": "grab is not present", "held_out_clips": 0}
-
-
-def test_evaluation_puts_every_figure_beside_its_baseline(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
-    figures = evaluate_dataset(annotated_root, trained, tmp_path / "metrics.json", EVALUATION, threads=1)
-    assert json.loads((tmp_path / "metrics.json").read_text()) == figures
-    assert figures["held_out_clips"] == 2
-    assert figures["synthetic"] is True
-    assert {"f1", "f1_mean_map", "f1_mean_map_by_index", "f1_mean_map_by_place"} <= set(figures["contact"])
-    # Training lengths 24, 32, 28 with mean 28; test lengths 24 and 33.
-    assert figures["length"]["mae_mean_length_frames"] == pytest.approx(4.5)
-    assert {"joint_error_mean_pose_mm", "joint_error_shuffled_prompt_mm"} <= set(figures["diffusion"])
-    assert {"penetration_before_mm", "contact_distance_after_mm"} <= set(figures["refiner"])
-    assert all(np.isfinite(value) for part in figures.values() if isinstance(part, dict) for value in part.values())
+    for name in ("contact", "diffusion"):
+        assert json.loads(train(name, root, out).read_text()) == {"reason": "grab is not present"}
 
 
 def user_box() -> ObjectModel:

@@ -19,6 +19,7 @@ PARTS = (
     "dvc.yaml",
     "params.yaml",
     ".dvcignore",
+    ".gitattributes",
     ".gitignore",
     "prefect.toml",
     "prefect.yaml",

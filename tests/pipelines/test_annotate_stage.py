@@ -1,6 +1,5 @@
 """Stage annotate in the pipeline: every setting of params.yaml reaches the library."""
 
-import inspect
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +9,11 @@ import pandas as pd
 import pytest
 import yaml
 
-from hoidata.annotation.clip_variations import VariationSettings
 from hoidata.annotation.reference_mode import reference_sentences
-from hoidata.annotation.stage import annotate_store
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, MissingResource
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
-from pipelines.stages import annotate, quality
+from pipelines.stages import annotate, contact, quality
 from pipelines.stages.base import Place
 
 PROJECT = Path(__file__).parents[2]
@@ -35,27 +32,32 @@ def project(tmp_path, monkeypatch, make_clip):
     return clips
 
 
-def annotated_with(**settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
+def annotated_with(of_contact: dict | None = None, **settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
     """Hand types and sentences by clip, and the facts, of a run with these settings."""
     params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    params["annotate"] |= {"encoder": "hash", **settings}
+    params |= {"annotate": {"encoder": "hash", **settings}, "contact": of_contact or {}}
     Path("params.yaml").write_text(yaml.safe_dump(params))
+    contact.run(PLACE)
     annotate.run(PLACE)
     hands, text = (pd.read_parquet(PLACE.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
     return hands.set_index("clip_id"), text, orjson.loads((PLACE.annotation / "info.json").read_bytes())
 
 
-def test_params_hold_the_defaults_of_the_library() -> None:
-    params = yaml.safe_load((PROJECT / "params.yaml").read_text())["annotate"]
-    defaults = {name: item.default for name, item in inspect.signature(annotate_store).parameters.items()}
-    assert VariationSettings(**params.pop("variations")) == VariationSettings()
-    assert params == {name: defaults[name] for name in params}
-
-
-def test_threshold_and_points_decide_which_hand_acts(project) -> None:
-    hands, _, info = annotated_with(threshold_m=1e-6, points=64)
+def test_threshold_and_points_of_the_contact_stage_decide_which_hand_acts(project) -> None:
+    hands, _, info = annotated_with({"threshold_m": 1e-6, "points": 64})
     assert (info["threshold_m"], info["points"]) == (1e-6, 64)
     assert hands["hand_type"].isna().all()
+
+
+def test_hand_types_may_have_a_threshold_of_their_own(project) -> None:
+    hands, _, info = annotated_with({"threshold_m": 1e-6}, threshold_m=0.02)
+    assert info["threshold_m"] == 0.02
+    assert hands["hand_type"].notna().all()
+
+
+def test_the_contact_stage_has_to_run_first(project) -> None:
+    with pytest.raises(MissingResource, match="run the stage 'contact'"):
+        annotate.run(PLACE)
 
 
 def test_forms_are_those_asked_for(project) -> None:

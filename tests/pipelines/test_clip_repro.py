@@ -36,7 +36,8 @@ def write_tiny_clip(path: Path) -> None:
 
 
 def lock(folder: Path) -> dict[str, dict]:
-    return yaml.safe_load((folder / "dvc.lock").read_text())["stages"]
+    locks = [folder / "dvc.lock", *folder.glob("models/*/dvc.lock")]
+    return {name: stage for path in locks for name, stage in yaml.safe_load(path.read_text())["stages"].items()}
 
 
 def outputs(stage: dict) -> dict[str, str]:
@@ -95,7 +96,7 @@ def test_nothing_is_left_to_do_and_the_models_generate_with_their_own_encoder_al
     before_and_after, project_tools, tmp_path: Path
 ) -> None:
     folder, *_ = before_and_after
-    assert "up to date" in project_tools.run(folder, "dvc", "repro").stdout
+    assert project_tools.run(folder, "dvc", "repro").stdout.count("Running stage") == 1  # code, which always runs
     params = (folder / "params.yaml").read_text()
     thing = str(pd.read_parquet(folder / "data/embedded/grab/clips/meta/objects.parquet")["object"][0])
     generate = (*GENERATE, thing, "--dataset", "grab")

@@ -6,21 +6,20 @@ import pytest
 
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput
-from pipelines.lineage.graph import read_graph, read_params
-from pipelines.stages.adapters import ConvertParams
-from pipelines.stages.base import load_params
+from pipelines.stages.adapters import ConvertSettings
+from pipelines.stages.base import load_settings
 
 PROJECT = Path(__file__).parents[2]
 
 
-def params_of(folder: Path, text: str) -> ConvertParams:
+def params_of(folder: Path, text: str) -> ConvertSettings:
     path = folder / "params.yaml"
     path.write_text(text)
-    return load_params(ConvertParams, "convert", path)
+    return load_settings(ConvertSettings, "convert", path)
 
 
 def test_the_committed_settings_are_every_adapters_defaults():
-    params = load_params(ConvertParams, "convert", PROJECT / "params.yaml")
+    params = load_settings(ConvertSettings, "convert", PROJECT / "params.yaml")
     assert params.adapter("grab") == GrabAdapter()
 
 
@@ -33,7 +32,7 @@ def test_a_dataset_may_have_a_margin_of_its_own(tmp_path):
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("convert: {margin: 5}", "margin_frames, adapters, got margin"),
+        ("convert: {margin: 5}", "keys among: margin_frames, adapters, got margin"),
         ("convert: {margin_frames: -1}", "margin_frames"),
         ("convert: {adapters: {grab: {margin: 1}}}", "settings of the adapter grab.*margin_frames.*got margin"),
     ],
@@ -41,11 +40,3 @@ def test_a_dataset_may_have_a_margin_of_its_own(tmp_path):
 def test_a_wrong_setting_is_named_with_the_known_ones(tmp_path, text, problem):
     with pytest.raises(BadInput, match=problem):
         params_of(tmp_path, text).adapter("grab")
-
-
-def test_a_setting_of_one_dataset_decides_no_other_datasets_conversion():
-    graph, values = read_graph(PROJECT), read_params(PROJECT)
-    assert set(values["convert"]["adapters"]) >= set(values["datasets"])
-    for name in values["datasets"]:
-        stage = graph[f"convert@{values['profile']}-{name}"]
-        assert stage.params == ("convert.margin_frames", f"convert.adapters.{name}")

@@ -2,6 +2,8 @@
 
 import json
 import os
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,13 +12,34 @@ from typer.testing import CliRunner, Result
 
 from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
+from hoidata.synthetic.corpus import write_corpus
 from pipelines.cli import app
+from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
+from pipelines.stages.adapters import manifest_of
 from pipelines.stages.base import Place, load_params
 from pipelines.stages.train import TrainParams
 
+PROJECT = Path(__file__).parents[2]
 
-def manifest(folder: Path, name: str) -> dict:
-    return json.loads((folder / "manifests/own" / f"{name}.json").read_text())
+
+def is_present(folder: Path, name: str) -> bool:
+    path = folder / "manifests/own" / f"{name}.json"
+    return path.is_file() and json.loads(path.read_text())["present"]
+
+
+def make_present(folder: Path, name: str) -> None:
+    """As if the dataset had been scanned."""
+    found = manifest_of(Place("own", name))
+    write_manifest(folder / "manifests/own" / f"{name}.json", replace(found, present=True))
+
+
+def commit(folder: Path, tools) -> None:
+    for words in (("add", "-A"), ("-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "as delivered")):
+        assert tools.run(folder, "git", *words).returncode == 0
+
+
+def is_clean(folder: Path, tools) -> bool:
+    return not tools.run(folder, "git", "status", "--porcelain").stdout
 
 
 @pytest.mark.slow
@@ -26,13 +49,13 @@ def test_a_dataset_of_mano_parameters_is_refused_without_mano_with_instructions(
     assert result.returncode == 1
     for part in ("mano.is.tue.mpg.de", "MANO_RIGHT.pkl", "hoidata raw scan mano", "HOIDATA_MANO"):
         assert part in " ".join(result.stderr.split())
-    assert not manifest(project, "grab")["present"]
+    assert not is_present(project, "grab")
 
 
 @pytest.mark.slow
-def test_repro_refuses_before_dvc_starts(project, project_tools):
-    path = project / "manifests/own/grab.json"
-    path.write_text(path.read_text().replace('"present": false', '"present": true'))
+def test_repro_refuses_before_dvc_starts(project, project_tools, monkeypatch):
+    monkeypatch.chdir(project)
+    make_present(project, "grab")
     (project / "params.yaml").write_text(
         (project / "params.yaml").read_text().replace("profile: embedded", "profile: own")
     )
@@ -51,10 +74,53 @@ def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, projec
     assert "no MANO_RIGHT.pkl, MANO_LEFT.pkl" in missing.stderr
     for name in ("MANO_RIGHT.pkl", "MANO_LEFT.pkl"):
         (mano / name).write_bytes(name.encode())
+    commit(project, project_tools)
     assert project_tools.run(project, "hoidata", "raw", "scan", "mano", "--root", str(mano)).returncode == 0
-    assert manifest(project, "hand")["present"]
+    assert is_present(project, "hand")
     assert str(mano) in (project / "hoidata.toml").read_text()
     assert "profile: embedded" in (project / "params.yaml").read_text()
+    assert is_clean(project, project_tools)
+
+
+@pytest.mark.slow
+def test_scanning_a_dataset_leaves_the_work_tree_clean_and_dvc_builds_the_users_profile(
+    project, tmp_path, project_tools
+):
+    make_plain_params(project)
+    commit(project, project_tools)
+    write_corpus("grab", tmp_path / "grab", 0, "small", 1)
+    write_manifest(project / "manifests/own/hand.json", replace(ABSENT_HAND, present=True))
+    scanned = project_tools.run(project, "hoidata", "raw", "scan", "grab", "--root", str(tmp_path / "grab"))
+    assert scanned.returncode == 0, scanned.stderr
+    assert yaml.safe_load((project / "params.yaml").read_text())["profile"] == "own"
+    assert is_clean(project, project_tools)
+    built = project_tools.run(project, "dvc", "repro", "raw@own-grab", "raw@own-h2o")
+    assert built.returncode == 0, built.stderr
+    assert len(json.loads((project / "data/own/grab/raw.json").read_text())["files"]) > 5
+    assert not json.loads((project / "data/own/h2o/raw.json").read_text())["present"]
+
+
+def test_the_chosen_profile_is_kept_from_git_and_survives_a_change_of_params_by_git(here, project_tools):
+    make_plain_params(here)
+    commit(here, project_tools)
+    assert hoidata("profile", "own").stdout == "own\n"
+    assert is_clean(here, project_tools)
+    params = here / "params.yaml"
+    params.write_text(params.read_text().replace("seed: 0", "seed: 5"))
+    changed = project_tools.run(here, "git", "diff", "-U0").stdout
+    assert "seed: 5" in changed
+    assert "own" not in changed
+    project_tools.run(here, "git", "checkout", "--quiet", "params.yaml")
+    assert yaml.safe_load(params.read_text())["profile"] == "own"
+    assert "seed: 0" in params.read_text()
+    assert hoidata("profile", "embedded").stdout == hoidata("profile").stdout == "embedded\n"
+    assert is_clean(here, project_tools)
+    assert isinstance(hoidata("profile", "mine").exception, BadInput)
+
+
+def make_plain_params(folder: Path) -> None:
+    """params.yaml as delivered, comments and all."""
+    shutil.copy(PROJECT / "params.yaml", folder)
 
 
 @pytest.mark.slow
@@ -62,7 +128,7 @@ def test_a_folder_without_sequences_is_not_registered(project, tmp_path, project
     (tmp_path / "empty").mkdir()
     result = project_tools.run(project, "hoidata", "raw", "scan", "manipnet", "--root", str(tmp_path / "empty"))
     assert result.returncode == 1
-    assert not manifest(project, "manipnet")["present"]
+    assert not is_present(project, "manipnet")
 
 
 def hoidata(*words: str) -> Result:
@@ -83,8 +149,7 @@ def set_own(folder: Path, present: str = "") -> None:
     params = folder / "params.yaml"
     params.write_text(params.read_text().replace("profile: embedded", "profile: own"))
     if present:
-        path = folder / "manifests/own" / f"{present}.json"
-        path.write_text(path.read_text().replace('"present": false', '"present": true'))
+        make_present(folder, present)
 
 
 @pytest.mark.parametrize("name", ["grab", "taco"])  # taco: not even named in params.yaml
@@ -136,7 +201,7 @@ def test_scanning_speaks_of_the_dataset_before_it_speaks_of_mano(here, tmp_path)
     complete = hoidata("raw", "scan", "taco", "--root", str(root)).exception
     assert isinstance(complete, MissingResource)
     assert str(complete).startswith("taco holds MANO parameters and no MANO files are registered")
-    assert not manifest(here, "taco")["present"]
+    assert not is_present(here, "taco")
 
 
 def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):

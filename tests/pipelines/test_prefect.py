@@ -1,9 +1,6 @@
 """``prefect deployment run annotate-arctic``, exactly as typed, against the server and worker of `hoidata up`."""
 
 import asyncio
-import signal
-import socket
-import subprocess
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,6 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from pipelines.prefect_names import only_one, wrap_lookup
+from tests.pipelines.prefect_up import hoidata_up
 
 FINISHED = {"Completed", "Failed", "Crashed", "Cancelled"}
 
@@ -41,39 +39,12 @@ def test_a_name_that_none_or_several_have_is_refused(found, message):
         only_one("annotate-arctic", found)
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
-def wait_for_line(log: Path, text: str, process: subprocess.Popen, seconds: float) -> None:
-    deadline = time.monotonic() + seconds
-    while text not in log.read_text():
-        assert process.poll() is None, log.read_text()
-        assert time.monotonic() < deadline, log.read_text()
-        time.sleep(0.5)
-
-
 @pytest.mark.slow
-def test_prefect_deployment_run_annotate_arctic_completes(project, tmp_path, project_tools):
-    settings = {
-        "PREFECT_API_URL": f"http://127.0.0.1:{free_port()}/api",
-        "PREFECT_HOME": str(tmp_path / "prefect"),
-    }
-    log = tmp_path / "up.log"
-    with log.open("w") as stream:
-        up = subprocess.Popen(
-            ["hoidata", "up"], cwd=project, env=project_tools.environment(**settings), stdout=stream, stderr=stream
-        )
-    try:
-        wait_for_line(log, "ready: run `prefect deployment run annotate-arctic`", up, 180)
-        asked = project_tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **settings)
+def test_prefect_deployment_run_annotate_arctic_completes(project, project_tools):
+    with hoidata_up(project, project_tools) as up:
+        asked = project_tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
         assert asked.returncode == 0, asked.stdout + asked.stderr
-        assert flow_state(project, project_tools, settings, 300) == "Completed", log.read_text()
-    finally:
-        up.send_signal(signal.SIGTERM)
-        up.wait(60)
+        assert flow_state(project, project_tools, up.settings, 900) == "Completed", up.log.read_text()
     assert (project / "data/embedded/arctic/annotation/text.parquet").is_file()
     assert not (project / "checkpoints").exists()
 

@@ -1,19 +1,19 @@
 """Stage quality in the pipeline: its settings are the library's, and what fails is not annotated."""
 
 import shutil
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
+import orjson
 import pandas as pd
 import pytest
 import yaml
 
 from hoidata.errors import BadInput
-from hoidata.quality.stage import as_json
-from hoidata.quality.thresholds import Thresholds
+from hoidata.quality.thresholds import DEFAULT_LIMITS
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
-from pipelines.stages import annotate, quality
+from pipelines.stages import annotate, contact, quality
 from pipelines.stages.base import Place, empty_reason, write_empty
 
 PROJECT = Path(__file__).parents[2]
@@ -36,10 +36,6 @@ def write(folder: Path, params: dict) -> None:
     (folder / "params.yaml").write_text(yaml.safe_dump(params))
 
 
-def test_params_hold_the_defaults_of_the_library():
-    assert yaml.safe_load((PROJECT / "params.yaml").read_text())["quality"] == as_json(Thresholds())
-
-
 def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(project, make_clip):
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
     place = clips[1].object.translation_m.copy()
@@ -47,6 +43,7 @@ def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(project, ma
     clips[1] = replace(clips[1], object=replace(clips[1].object, translation_m=place))
     write_store(PLACE.clips, clips, generated_info("grab"))
     quality.run(PLACE)
+    contact.run(PLACE)
     annotate.run(PLACE)
     words = pd.read_parquet(PLACE.annotation / "text.parquet")
     hands = pd.read_parquet(PLACE.annotation / "hand_type.parquet").set_index("clip_id")
@@ -56,10 +53,13 @@ def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(project, ma
 
 def test_params_decide_what_is_left_out(project, make_clip):
     write_store(PLACE.clips, [make_clip(40, seed=3)], generated_info("grab"))
-    project["quality"]["limits"]["size_m"] = {"warn": None, "leave_out": 0.05}
+    project["quality"] = {"limits": {"size_m": {"leave_out": 0.05}}}
     write(Path(), project)
     quality.run(PLACE)
     rows = pd.read_parquet(PLACE.quality / "clips.parquet")
+    limits = orjson.loads((PLACE.quality / "info.json").read_bytes())["thresholds"]["limits"]
+    assert limits["size_m"] == {"warn": 1.0, "leave_out": 0.05}
+    assert limits["hand_jump_m"] == asdict(DEFAULT_LIMITS["hand_jump_m"])
     assert rows["reasons"].tolist() == ["object box: longest side of the bounding box: 0.1 m, above 0.05 m"]
 
 
@@ -73,10 +73,9 @@ def test_empty_dataset_passes_through(project):
 
 def test_unknown_setting_and_unknown_measure_are_named(project, make_clip):
     write_store(PLACE.clips, [make_clip(40)], generated_info("grab"))
-    write(Path(), {**project, "quality": {**project["quality"], "too_deep_mm": 10}})
+    write(Path(), {**project, "quality": {"too_deep_mm": 10}})
     with pytest.raises(BadInput, match="too_deep_mm"):
         quality.run(PLACE)
-    limits = {**project["quality"]["limits"], "jerk": {"warn": 1, "leave_out": 2}}
-    write(Path(), {**project, "quality": {**project["quality"], "limits": limits}})
+    write(Path(), {**project, "quality": {"limits": {"jerk": {"warn": 1, "leave_out": 2}}}})
     with pytest.raises(BadInput, match="jerk"):
         quality.run(PLACE)

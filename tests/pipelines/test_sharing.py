@@ -1,5 +1,6 @@
 """What is derived from licensed data stays here unless the user says otherwise."""
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ def outputs(project: Path) -> dict[str, dict]:
 
 
 def kept_here(project: Path) -> set[str]:
-    return {path for path, flags in outputs(project).items() if flags.get("push") is False}
+    return {path for path, flags in outputs(project).items() if flags.get("remote") == "derived"}
 
 
 def test_no_derived_data_is_pushed_as_delivered():
@@ -27,20 +28,19 @@ def test_no_derived_data_is_pushed_as_delivered():
 
 
 @pytest.mark.slow
-def test_sharing_is_switched_on_and_off_for_all_of_it(project, project_tools):
-    before = (project / "dvc.yaml").read_text()
-    shown = project_tools.run(project, "hoidata", "share", "--on")
-    assert shown.returncode == 0, shown.stderr
-    assert kept_here(project) == set()
-    assert project_tools.run(project, "hoidata", "share", "--off").returncode == 0
-    assert (project / "dvc.yaml").read_text() == before
+def test_sharing_needs_a_remote_to_share_with(project, project_tools):
+    refused = project_tools.run(project, "hoidata", "share", "--on")
+    assert refused.returncode == 1
+    assert "dvc remote add" in refused.stderr
 
 
 @pytest.mark.slow
 def test_dvc_push_sends_nothing_derived_until_it_is_shared(project, project_tools, tmp_path):
     built = project_tools.run(project, "dvc", "repro", "convert@embedded-manipnet")
     assert built.returncode == 0, built.stderr
-    project_tools.run(project, "dvc", "remote", "add", "-d", "there", str(tmp_path / "remote"))
+    for words in (("git", "add", "-A"), ("git", "-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "built")):
+        project_tools.run(project, *words)
+    project_tools.run(project, "dvc", "remote", "add", "--local", "-d", "there", str(tmp_path / "remote"))
 
     def pushed() -> int:
         assert project_tools.run(project, "dvc", "push").returncode == 0
@@ -48,4 +48,9 @@ def test_dvc_push_sends_nothing_derived_until_it_is_shared(project, project_tool
 
     kept = pushed()
     assert project_tools.run(project, "hoidata", "share", "--on").returncode == 0
-    assert pushed() > kept
+    shared = pushed()
+    assert shared > kept
+    assert project_tools.run(project, "git", "status", "--porcelain").stdout == ""
+    assert project_tools.run(project, "hoidata", "share", "--off").returncode == 0
+    shutil.rmtree(tmp_path / "remote")
+    assert pushed() == kept

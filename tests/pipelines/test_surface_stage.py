@@ -8,12 +8,10 @@ import pytest
 import yaml
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.objects.sampling import POINT_COUNT
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
-from hoidata.surface.contact import TOUCH_M
 from hoidata.surface.store import open_surface
-from pipelines.stages import quality, surface
+from pipelines.stages import contact, quality, surface
 from pipelines.stages.base import Place, empty_reason, write_empty
 
 PROJECT = Path(__file__).parents[2]
@@ -24,7 +22,7 @@ PLACE = Place("embedded", "grab")
 def project(tmp_path, monkeypatch):
     """Params and hand manifest in the current folder; few points."""
     params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    params["contact"]["points"] = 64
+    params["contact"] = {"points": 64}
     (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
     shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
     monkeypatch.chdir(tmp_path)
@@ -32,13 +30,7 @@ def project(tmp_path, monkeypatch):
 
 
 def with_surface(params: dict, **settings) -> None:
-    Path("params.yaml").write_text(yaml.safe_dump({**params, "surface": {**params["surface"], **settings}}))
-
-
-def test_params_hold_the_defaults_of_the_library():
-    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    assert params["surface"] == {"enabled": True, "touch_m": TOUCH_M}
-    assert params["contact"]["points"] == POINT_COUNT
+    Path("params.yaml").write_text(yaml.safe_dump({**params, "surface": settings}))
 
 
 def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_its_reason(project, make_clip, capsys):
@@ -48,6 +40,7 @@ def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_i
     clips[1] = replace(clips[1], object=replace(clips[1].object, translation_m=place))
     write_store(PLACE.clips, clips, generated_info("grab"))
     quality.run(PLACE)
+    contact.run(PLACE)
     surface.run(PLACE)
     store = open_surface(PLACE.surface)
     assert store.ids == ["test/s1/0"]
@@ -57,8 +50,11 @@ def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_i
     assert "2 clips, 1 left_out, 40 frames" in capsys.readouterr().out
 
 
-def test_quality_control_has_to_run_first(project, make_clip):
+def test_contact_and_quality_control_have_to_run_first(project, make_clip):
     write_store(PLACE.clips, [make_clip(4)], generated_info("grab"))
+    with pytest.raises(MissingResource, match="run the stage 'contact'"):
+        surface.run(PLACE)
+    contact.run(PLACE)
     with pytest.raises(MissingResource, match="run the stage 'quality'"):
         surface.run(PLACE)
 
@@ -80,6 +76,7 @@ def test_unknown_setting_is_named_and_a_threshold_of_nothing_refused(project, ma
     with pytest.raises(BadInput, match="touch_mm"):
         surface.run(PLACE)
     quality.run(PLACE)
+    contact.run(PLACE)
     with_surface(project, touch_m=0)
     with pytest.raises(BadInput, match=r"surface\.touch_m"):
         surface.run(PLACE)

@@ -10,6 +10,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.arctic.files import (
     Description,
@@ -19,7 +20,8 @@ from hoidata.datasets.arctic.files import (
     parse_misc,
     parse_parts,
 )
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.arctic.words import EXCLUDED, object_words
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
@@ -27,12 +29,6 @@ from hoidata.hands import HandPair
 from hoidata.objects.model import Hinge, ObjectModel
 
 MILLIMETRES = 1e-3
-EXCLUDED = {("write", "notebook"), ("operate", "waffleiron"), ("push", "capsulemachine")}  # as Text2HOI does
-OBJECT_WORDS = {
-    "capsulemachine": "capsule machine",
-    "espressomachine": "espresso machine",
-    "waffleiron": "waffle iron",
-}
 TOPS = ("", "data/", "arctic_data/data/")
 HINGE_AXIS = (0.0, 0.0, -1.0)
 FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
@@ -78,7 +74,7 @@ class _Motion:
 
 
 @dataclass(frozen=True)
-class ArcticAdapter:
+class ArcticAdapter(Described):
     """Raw root: the folder with ``raw_seqs/``, ``meta/`` and ``description/`` (or ``data/`` above them).
 
     clips: "described" gives one clip per line of Text2HOI's description files; "whole" one clip per sequence without
@@ -89,19 +85,13 @@ class ArcticAdapter:
     black). body: keep the parameters of the subject's SMPL-X body.
     """
 
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     shortest_frames: int = 20
     clips: Stretches = "described"
     trimmed_frames: int = 0
     all_pairs: bool = False
     body: bool = False
-    name: str = "arctic"
-    version: str = "1.0"
-    licence: str = "ARCTIC licence (MPI): non-commercial research, no redistribution"
-    where_to_register: str = "https://arctic.is.tue.mpg.de (raw_seqs.zip, meta.zip) and Text2HOI's description files"
-    needs_mano: bool = True
-    source_fps: float = 30.0
-    may_be_shared: bool = False
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
 
@@ -193,14 +183,14 @@ class ArcticAdapter:
             source_frames=np.arange(motion.n_frames, dtype=np.int32),
             gravity=np.array([0.0, 0.0, -1.0]),
             verb=None if description is None else description.verb,
-            object_words=OBJECT_WORDS.get(motion.object.model.name, motion.object.model.name),
+            object_words=object_words(motion.object.model.name),
             labelled_hand=None if description is None else description.hand,
             sources=raw.sources,
             source_fps=self.source_fps,
             camera=motion.camera,
             body=motion.body,
         )
-        return whole.cut(start, stop)
+        return whole.take(slice(start, stop))
 
 
 def _found(raw: RawTree, path: str) -> str:

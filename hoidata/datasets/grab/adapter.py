@@ -9,8 +9,9 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, BodyTrack, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.grab.contact import read_contact
 from hoidata.datasets.grab.words import object_words, verb_words
 from hoidata.datasets.known_meshes import raw_mesh
@@ -48,7 +49,7 @@ MOST_COMPONENTS = 45
 
 
 @dataclass(frozen=True)
-class GrabAdapter:
+class GrabAdapter(Described):
     """Raw root: ``grab/sN/<object>_<action>_<n>.npz`` and ``tools/`` beside it, as the official unzip leaves them.
 
     margin_frames: frames (of 30 fps) kept before the first and after the last frame with contact.
@@ -56,16 +57,10 @@ class GrabAdapter:
     body: keep the parameters of the person's SMPL-X body.
     """
 
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     contact: bool = True
     body: bool = False
-    name: str = "grab"
-    version: str = "1.0"
-    licence: str = "GRAB licence (MPI): non-commercial research, no redistribution"
-    where_to_register: str = "https://grab.is.tue.mpg.de (GRAB parts and object_meshes.zip)"
-    needs_mano: bool = True
-    source_fps: float = 120.0
-    may_be_shared: bool = False
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS

@@ -14,19 +14,19 @@ import numpy as np
 
 from hoidata.clips.clip import CameraTrack, Clip, ObjectTrack, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
-    ACTIONS,
     LISTS,
-    OBJECTS,
     HandSource,
     SequenceFrames,
     listed_segments,
     read_frames,
 )
 from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
+from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
@@ -71,7 +71,7 @@ class _Sequence(NamedTuple):
 
 
 @dataclass(frozen=True)
-class H2OAdapter:
+class H2OAdapter(Described):
     """Raw root: ``object/<name>/<name>.obj`` and ``subjectN/<place>/<number>/cam4/<kind>/NNNNNN.txt``.
 
     margin_frames: frames kept before and after each run. shortest_frames: runs must be this long or longer.
@@ -82,15 +82,10 @@ class H2OAdapter:
     a label, not the one that is tracked most.
     """
 
+    facts = facts_beside(__file__)
     margin_frames: int = 0
     shortest_frames: int = 21
     hands: HandSource = "mano"
-    name: str = "h2o"
-    version: str = "1.1"
-    licence: str = "research use after registration; no licence text is published with the files"
-    where_to_register: str = "https://h2odataset.ethz.ch (subjectN_pose_v1_1.tar.gz, object.zip)"
-    source_fps: float = 30.0
-    may_be_shared: bool = False
     frame: WorldFrame = FRAME
     parts: tuple[DatasetPart, ...] = PARTS
 

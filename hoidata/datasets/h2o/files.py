@@ -13,24 +13,9 @@ import orjson
 
 from hoidata.datasets import checks
 from hoidata.datasets.base import RawTree
+from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
 
-OBJECTS = ("", "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")  # by class id
-_SHELF = OBJECTS[1:]
-ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is background
-    ("", ""),
-    *(("grab", noun) for noun in _SHELF),
-    *(("place", noun) for noun in _SHELF),
-    *(("open", noun) for noun in ("lotion", "milk", "chips")),
-    *(("close", noun) for noun in ("lotion", "milk", "chips")),
-    ("pour", "milk"),
-    *(("take out", noun) for noun in ("espresso", "cocoa", "chips", "cappuccino")),
-    *(("put in", noun) for noun in ("espresso", "cocoa", "cappuccino")),
-    *(("apply", noun) for noun in ("lotion", "spray")),
-    *(("read", noun) for noun in ("book", "espresso")),
-    ("spray", "spray"),
-    ("squeeze", "lotion"),
-)
 HandSource = Literal["mano", "keypoints"]
 HAND_FOLDERS: dict[HandSource, tuple[str, int]] = {"mano": ("hand_pose_mano", 124), "keypoints": ("hand_pose", 128)}
 LISTS = "label_split"

@@ -6,7 +6,6 @@ To go right-handed, the world and every joint frame are seen in a mirror with no
 """
 
 import json
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,8 +13,9 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.bvh import BvhMotion, parse_bvh, unpack_text
 from hoidata.datasets.manipnet.segments import (
     LIFTED_M,
@@ -23,13 +23,14 @@ from hoidata.datasets.manipnet.segments import (
     TOUCH_M,
     BodyMotion,
     Cut,
-    Stretch,
+    Interval,
     find_cuts,
     height_above_table,
     interactions,
     motion_verb,
     widened,
 )
+from hoidata.datasets.manipnet.words import object_words
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
@@ -55,14 +56,6 @@ MANO_JOINTS = (
     *THUMB_CHAIN[1:],
 )
 TIP_JOINTS = (*(f"{finger}_DIP_FE" for finger in FINGERS), "THUMB_IP_FE")
-SIZES = {"small": "small", "med": "medium", "large": "large"}
-NOUNS = {
-    "cyl": "cylinder",
-    "hemi": "hemisphere",
-    "tetra": "tetrahedron",
-    "tri prism": "triangular prism",
-    "wineglass": "wine glass",
-}
 FRAME = WorldFrame("+y", "stated", "Unity's world seen in a mirror with normal x: right-handed, y up")
 CONVENTION = HandConvention(
     translation="wrist",
@@ -130,7 +123,7 @@ def surface_distances(
 
 
 @dataclass(frozen=True)
-class ManipNetAdapter:
+class ManipNetAdapter(Described):
     """Raw root: ``sequences/<name>/*.bvh.gz``, ``objects/<group>/<object>.obj.gz``, ``hand/hand_reference.json``.
 
     margin_frames: frames (of 30 fps) kept before and after each interaction, as far as the tracking is usable; ids and
@@ -139,14 +132,8 @@ class ManipNetAdapter:
     depend on which other recordings are there.
     """
 
+    facts = facts_beside(__file__)
     margin_frames: int = 0
-    name: str = "manipnet"
-    version: str = "1.0"
-    licence: str = "CC BY-NC 4.0"
-    where_to_register: str = "no registration: the data release of the ManipNet paper (SIGGRAPH 2021)"
-    needs_mano: bool = False
-    source_fps: float = 120.0
-    may_be_shared: bool = True
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
@@ -183,7 +170,7 @@ class ManipNetAdapter:
         return results
 
     def _clip(
-        self, key: SequenceKey, recording: Recording, stretch: Stretch, betas: np.ndarray, hands: HandPair
+        self, key: SequenceKey, recording: Recording, stretch: Interval, betas: np.ndarray, hands: HandPair
     ) -> Clip:
         """The frames of a stretch as a clip; its id, verb and sources are the caller's to say."""
         frames = slice(*stretch)
@@ -269,14 +256,6 @@ def thirty_fps_frames(n_frames: int, frame_time_s: float) -> np.ndarray:
     count = int(np.floor((n_frames - 1) * frame_time_s * FPS + 1e-3)) + 1
     frames = np.rint(np.arange(count) / (FPS * frame_time_s)).astype(int)
     return frames[frames < n_frames]
-
-
-def object_words(name: str) -> str:
-    """A released object's file name in words: ``cyl_med`` -> "medium cylinder", ``teapot2`` -> "teapot"."""
-    words = [re.sub(r"\d+$", "", word) for word in name.split("_")]
-    sizes = [SIZES[word] for word in words if word in SIZES]
-    noun = " ".join(word for word in words if word not in SIZES and word not in ("body", "old", "simplified"))
-    return " ".join([*sizes, NOUNS.get(noun, noun)])
 
 
 def _hand_path(name: str, side: Side) -> str:

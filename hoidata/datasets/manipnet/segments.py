@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.geometry.stretches import Stretch, runs, sudden_steps
+from hoidata.geometry.intervals import Interval, runs, sudden_steps
 
 FROZEN_SOURCE_FRAMES = 12
 FAR_WRIST_M = 1.0
@@ -76,31 +76,31 @@ def find_cuts(left: BodyMotion, right: BodyMotion, thing: BodyMotion) -> list[Cu
     return sorted(cuts)
 
 
-def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) -> list[Stretch]:
+def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) -> list[Interval]:
     """Stretches of at most 150 frames in which a hand is at the object, each with at most one lift; booleans (frame,).
 
     Touches with gaps of at most 10 frames count as one. Each lift forms a stretch with 15 frames of touch before and
     after, where there are any; what is left of the touch forms its own, or joins the lift when it is shorter than 45
     frames. Long stretches are divided evenly.
     """
-    pieces: list[Stretch] = []
+    pieces: list[Interval] = []
     for touch in runs(_bridged(touched) & usable):
         windows = _lift_windows(touch, _bridged(lifted & _mask(touch, len(lifted))))
         edges = [touch.start, *(edge for window in windows for edge in window), touch.stop]
         for start, stop in pairwise(edges):
             if stop > start:
-                pieces += _divided(Stretch(start, stop))
+                pieces += _divided(Interval(start, stop))
     return pieces
 
 
-def widened(stretch: Stretch, margin: int, usable: np.ndarray) -> Stretch:
+def widened(stretch: Interval, margin: int, usable: np.ndarray) -> Interval:
     """The stretch with up to ``margin`` frames before and after it, as far as the frames are usable (frame,)."""
     start, stop = stretch
     while start > max(0, stretch.start - margin) and usable[start - 1]:
         start -= 1
     while stop < min(len(usable), stretch.stop + margin) and usable[stop]:
         stop += 1
-    return Stretch(start, stop)
+    return Interval(start, stop)
 
 
 def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) -> str | None:
@@ -134,9 +134,9 @@ def rotation_angle(rotation: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip((np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
-def _frozen(*bodies: BodyMotion) -> list[Stretch]:
+def _frozen(*bodies: BodyMotion) -> list[Interval]:
     same = np.all([(body.raw[1:] == body.raw[:-1]).all(axis=1) for body in bodies], axis=0)
-    return [Stretch(a, b + 1) for a, b in runs(same) if b + 1 - a >= FROZEN_SOURCE_FRAMES]
+    return [Interval(a, b + 1) for a, b in runs(same) if b + 1 - a >= FROZEN_SOURCE_FRAMES]
 
 
 def _jumps(body: BodyMotion) -> list[Cut]:
@@ -178,7 +178,7 @@ def _bridged(flags: np.ndarray) -> np.ndarray:
     return filled
 
 
-def _lift_windows(touch: Stretch, lifted: np.ndarray) -> list[Stretch]:
+def _lift_windows(touch: Interval, lifted: np.ndarray) -> list[Interval]:
     """One stretch per lift inside ``touch``, widened, with the rests of touch too short for a clip of their own."""
     lifts = runs(lifted)
     bounds = [touch.start]
@@ -188,15 +188,15 @@ def _lift_windows(touch: Stretch, lifted: np.ndarray) -> list[Stretch]:
         else:
             bounds += [before.stop + APPROACH_FRAMES, after.start - APPROACH_FRAMES]
     bounds.append(touch.stop)
-    windows = [Stretch(bounds[2 * i], bounds[2 * i + 1]) for i in range(len(lifts))]
+    windows = [Interval(bounds[2 * i], bounds[2 * i + 1]) for i in range(len(lifts))]
     if lifts and lifts[0].start - APPROACH_FRAMES - touch.start >= SHORTEST_FRAMES:
-        windows[0] = Stretch(lifts[0].start - APPROACH_FRAMES, windows[0].stop)
+        windows[0] = Interval(lifts[0].start - APPROACH_FRAMES, windows[0].stop)
     if lifts and touch.stop - lifts[-1].stop - APPROACH_FRAMES >= SHORTEST_FRAMES:
-        windows[-1] = Stretch(windows[-1].start, lifts[-1].stop + APPROACH_FRAMES)
+        windows[-1] = Interval(windows[-1].start, lifts[-1].stop + APPROACH_FRAMES)
     return windows
 
 
-def _divided(stretch: Stretch) -> list[Stretch]:
+def _divided(stretch: Interval) -> list[Interval]:
     parts = -(-(stretch.stop - stretch.start) // LONGEST_FRAMES)
     edges = np.linspace(stretch.start, stretch.stop, parts + 1).round().astype(int).tolist()
-    return [Stretch(a, b) for a, b in pairwise(edges)]
+    return [Interval(a, b) for a, b in pairwise(edges)]

@@ -14,8 +14,10 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
+from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
-from hoidata.datasets.base import DatasetPart, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.taco.words import triplet
 from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_torch_pickle
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
@@ -27,7 +29,6 @@ from hoidata.objects.model import ObjectModel
 CENTIMETRES = 1e-2
 TOUCH_M = 0.02
 HANDS, OBJECTS, MODELS = "Hand_Poses", "Object_Poses", "Object_Models"
-TRIPLET = re.compile(r"\(([^,()]+),([^,()]+),([^,()]+)\)")
 FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, or a word before it
 FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
 GRAVITY_NOTE = "TACO's world frame differs from day to day and its axes are not documented"
@@ -48,21 +49,15 @@ Poses = Mapping[Hashable, Any]  # by frame key: {"hand_pose": (48,), "hand_trans
 
 
 @dataclass(frozen=True)
-class TacoAdapter:
+class TacoAdapter(Described):
     """Raw root: ``Hand_Poses/``, ``Object_Poses/`` (``<triplet>/<recording>/``) and ``Object_Models/<id>_cm.obj``.
 
     margin_frames: frames kept before the first and after the last one with a hand within 2 cm of the tool.
     The source names no persons: a recording's subject is its day, the part of its name before the first underscore.
     """
 
+    facts = facts_beside(__file__)
     margin_frames: int = 0
-    name: str = "taco"
-    version: str = "1.0"
-    licence: str = "CC BY 4.0"
-    where_to_register: str = "no registration: links on https://taco2024.github.io (hand poses, object poses, models)"
-    needs_mano: bool = True
-    source_fps: float = 30.0
-    may_be_shared: bool = True
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
@@ -98,18 +93,8 @@ class TacoAdapter:
             source_fps=self.source_fps,
         )
         start, stop = _touched(whole, hands)
-        clip = whole.cut(max(0, start - self.margin_frames), min(whole.n_frames, stop + self.margin_frames))
+        clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
         return [replace(clip, sources=raw.sources)]
-
-
-def triplet(name: str) -> tuple[str, str, str]:
-    """Action, tool and object in words of ``(put in, spoon, bowl)/20230927_034``. Raises BadInput for another form."""
-    folder = name.partition("/")[0]
-    found = TRIPLET.fullmatch(folder)
-    if found is None:
-        raise BadInput(f"{HANDS}/{folder}", "a folder named (action, tool, object)", folder, "restore its name")
-    action, tool, thing = (" ".join(word.replace("_", " ").split()) for word in found.groups())
-    return action.lower(), tool, thing
 
 
 def frames_of(where: str, keys: Mapping[Side, list[Hashable]], n_frames: int) -> dict[Side, dict[Hashable, int]]:

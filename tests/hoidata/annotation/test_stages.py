@@ -11,7 +11,7 @@ from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.objects.model import ObjectModel, articulate, place
+from hoidata.objects.model import ObjectModel, articulate
 from hoidata.objects.sampling import sample_points
 from hoidata.splits import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
@@ -105,7 +105,7 @@ def test_distances_and_contact_equal_brute_force_from_the_stored_clip(annotated:
     for key in annotated.ids():
         track, points = annotated.clip(key).object, annotated.points(annotated.object_key(key))
         local = articulate(points.points_m, points.part, track.model.hinge, track.hinge_rad)
-        world = place(np.broadcast_to(local, (FRAMES, 1024, 3)), track.rotvec, track.translation_m)
+        world = track.world_from_object @ local
         union = np.zeros(1024, bool)
         for side in SIDES:
             joints = track_joints(annotated.clip(key).hands[side], load_embedded_hands()[side])

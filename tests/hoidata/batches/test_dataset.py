@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from hoidata.batches.dataset import HoiDataset, collate, upright
+from hoidata.batches.dataset import HoiDataset, collate
 from hoidata.clips import SIDES, Clip, ObjectTrack
+from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
@@ -34,6 +35,7 @@ class Clips:
 
     clips: dict[str, Clip]
     sampled: dict[str, SampledPoints] = field(default_factory=dict)
+    contact_threshold_m: float = 0.02
 
     def split_ids(self, split: str) -> list[str]:
         return list(self.clips) if split == "train" else []
@@ -76,7 +78,7 @@ def clips() -> Clips:
 def test_a_sample_goes_back_to_the_world_it_came_from(clips: Clips) -> None:
     for crop in ("start", "random"):
         sample = HoiDataset(clips, "train", 20, crop, seed=1)[0]
-        clip = clips.clip(sample.clip_id).cut(sample.start, sample.start + sample.length)
+        clip = clips.clip(sample.clip_id).take(slice(sample.start, sample.start + sample.length))
         rotation, origin = sample.world_from_model[:3, :3], sample.world_from_model[:3, 3]
         for number, side in enumerate(("left", "right")):
             world = sample.hands[number, :, :3] @ rotation.T + origin
@@ -107,11 +109,21 @@ def test_upright_is_a_rotation_that_turns_gravity_down(gravity: tuple | None) ->
 
 def test_contact_and_distances_are_restricted_to_the_crop_and_to_acting_hands(clips: Clips) -> None:
     sample = HoiDataset(clips, "train").whole("toy/s1/0").crop(5, 10)
-    assert np.flatnonzero(sample.touched).tolist() == list(range(5, 15))
+    assert np.flatnonzero(sample.contact_map).tolist() == list(range(5, 15))
     assert not sample.contact[0].any()
     assert set(sample.distances.side) == {1}
     assert sample.distances.frame.tolist() == list(range(10))
     assert sample.start == 5
+
+
+def test_the_contact_stages_threshold_decides_what_is_touched_whole_and_cropped(clips: Clips) -> None:
+    """Every entry lies 1 cm away: nothing is closer than half of that."""
+    strict = HoiDataset(replace(clips, contact_threshold_m=0.005), "train")
+    assert not strict.whole("toy/s1/0").contact_map.any()
+    assert not strict.whole("toy/s1/0").crop(5, 10).contact_map.any()
+    assert collate([strict.whole("toy/s1/0"), strict.whole("toy/s1/1")]).contact_threshold_m == 0.005
+    with pytest.raises(BadInput, match="one contact threshold"):
+        collate([strict.whole("toy/s1/0"), HoiDataset(clips, "train").whole("toy/s1/1")])
 
 
 def test_random_crops_repeat_with_the_seed_and_reach_the_last_window(clips: Clips) -> None:
@@ -137,7 +149,7 @@ def test_collate_pads_with_zeros_and_masks_what_is_missing(clips: Clips) -> None
     assert not batch.hands.transpose(1, 2)[~batch.frames].any()
     assert not batch.present[:, 0].any()
     assert batch.present[1, 1].tolist() == [frame < 12 and frame != 2 for frame in range(45)]
-    assert torch.equal(batch.touched[1].nonzero()[:, 0], torch.arange(12))
+    assert torch.equal(batch.contact_map[1].nonzero()[:, 0], torch.arange(12))
     clip, side, frame, joint, point = batch.entries.T
     assert torch.equal(torch.bincount(clip), batch.lengths)
     assert torch.equal(point, frame)

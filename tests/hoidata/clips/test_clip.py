@@ -1,4 +1,4 @@
-"""A cut of a clip holds the numbers of its frames, those and no others, whatever the clip has."""
+"""Frames taken from a clip hold the numbers of these frames, those and no others, whatever the clip has."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ START, STOP = 5, 17
 
 @pytest.fixture
 def cuts(clips) -> list[tuple[Clip, Clip]]:
-    return [(clip, clip.cut(START, STOP)) for clip in clips]
+    return [(clip, clip.take(slice(START, STOP))) for clip in clips]
 
 
 def per_frame(clip: Clip) -> dict[str, np.ndarray]:
@@ -71,3 +71,15 @@ def test_contacts_are_those_of_the_frames_counted_from_the_first_of_them(cuts):
     for whole, part in touched:
         expected = {(f - START, v, label) for f, v, label in entries(whole) if START <= f < STOP}
         assert entries(part) == expected
+
+
+def test_frames_may_be_taken_by_number_in_any_order_with_their_contacts(clips):
+    wanted = np.array([STOP, START, START - 1])
+    for whole in clips:
+        taken = whole.take(wanted)
+        for name, array in per_frame(whole).items():
+            np.testing.assert_array_equal(per_frame(taken)[name], array[wanted], err_msg=name)
+        if whole.source_contact is not None:
+            expected = {(new, v, label) for new, old in enumerate(wanted) for f, v, label in entries(whole) if f == old}
+            assert entries(taken) == expected
+            assert taken.source_contact.frame.dtype == whole.source_contact.frame.dtype

@@ -17,7 +17,7 @@ from hoidata.contact import (
     touched_frames,
 )
 from hoidata.errors import BadInput
-from hoidata.objects.model import Hinge, ObjectModel, articulate, place
+from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints
 from tests.builders.clips import MIRROR, clip_of, in_another_world, mirror_image, with_hand
 from tests.builders.objects import sampled
@@ -38,7 +38,7 @@ def scene(request: pytest.FixtureRequest) -> tuple[Clip, Joints, SampledPoints]:
     track = ObjectTrack(model, random.normal(size=(FRAMES, 3)), random.normal(size=(FRAMES, 3)), angle)
     clip = clip_of("toy/s1/1", track)
     around = articulate(points, part, hinge, angle)
-    centre = place(np.broadcast_to(around, (FRAMES, POINTS, 3)), track.rotvec, track.translation_m).mean(axis=1)
+    centre = (track.world_from_object @ around).mean(axis=1)
     joints = {side: centre[:, None] + random.normal(0, 0.07, (FRAMES, 21, 3)) for side in SIDES}
     return clip, joints, sampled(points, part)
 
@@ -128,7 +128,7 @@ def test_a_cut_clip_has_the_entries_of_its_own_frames_only(scene: tuple[Clip, Jo
     clip, joints, points = scene
     index = ProximityIndex(points)
     whole = distance_entries(clip, joints, index)["left"]
-    part = distance_entries(clip.cut(3, 7), {side: joints[side][3:7] for side in SIDES}, index)["left"]
+    part = distance_entries(clip.take(slice(3, 7)), {side: joints[side][3:7] for side in SIDES}, index)["left"]
     expected = whole[(whole["frame"] >= 3) & (whole["frame"] < 7)]
     np.testing.assert_array_equal(part["point"], expected["point"])
     np.testing.assert_array_equal(part["frame"], expected["frame"] - 3)

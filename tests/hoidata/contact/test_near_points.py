@@ -12,7 +12,6 @@ from hoidata.clips import ObjectTrack
 from hoidata.contact import ENTRY, ProximityIndex
 from hoidata.contact.near_points import cell_grids, near_entries
 from hoidata.contact.part_frames import PartMotion, part_motion, part_places
-from hoidata.contact.proximity import joints_in_object, joints_in_part
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import SampledPoints
@@ -43,11 +42,11 @@ def by_part(
     points: SampledPoints, track: ObjectTrack, joints: np.ndarray
 ) -> list[tuple[np.ndarray, KDTree, np.ndarray]]:
     """Per part its rows, a tree of its points, and the joints in its frame."""
-    in_object = joints_in_object(joints, track)
+    in_object = track.world_from_object.inverse() @ joints.astype(np.float64)
     found = []
     for part in np.unique(points.part):
         rows = np.flatnonzero(points.part == part)
-        local = joints_in_part(in_object, int(part), track.model.hinge, track.hinge_rad)
+        local = track.model.object_from_part(int(part), track.hinge_rad).inverse() @ in_object
         found.append((rows, KDTree(points.points_m[rows].astype(np.float64)), local))
     return found
 
@@ -98,9 +97,9 @@ def test_joints_in_the_frames_of_parts_are_those_of_numpy_and_scipy_bit_for_bit(
     hinge_rad = None if track.hinge_rad is None else (scale * track.hinge_rad).astype(np.float32)
     track = replace(track, rotvec=(scale * track.rotvec).astype(np.float32), hinge_rad=hinge_rad)
     found = part_places(joints, part_motion(track, [0, 1]))
-    in_object = joints_in_object(joints, track)
+    in_object = track.world_from_object.inverse() @ joints.astype(np.float64)
     for part in (0, 1):
-        expected = joints_in_part(in_object, part, track.model.hinge, track.hinge_rad)
+        expected = track.model.object_from_part(part, track.hinge_rad).inverse() @ in_object
         np.testing.assert_array_equal(found[part], expected)
 
 

@@ -22,6 +22,7 @@ from hoidata.hands import load_embedded_hands
 
 KILL_AT = "HOIDATA_TEST_KILL_AT"
 LOADED = "HOIDATA_TEST_LOADED"
+DEADLY = "HOIDATA_TEST_DEADLY"  # the name of a sequence that kills whoever converts it
 N_FRAMES = 40
 IS_WORKER = __name__ == "__mp_main__"  # how a spawned process names the program it belongs to
 
@@ -65,6 +66,8 @@ class LoggedGrab(GrabAdapter):
     def load(self, raw, key, hands):
         with open(os.environ[LOADED], "a") as log:
             log.write(f"{key.name}\n")
+        if key.name == os.environ.get(DEADLY):
+            os.kill(os.getpid(), signal.SIGKILL)
         time.sleep(0.01)
         return super().load(raw, key, hands)
 
@@ -142,6 +145,7 @@ def start(order: dict) -> int:
     os.setsid()
     os.dup2(os.open(order["stderr"], os.O_CREAT | os.O_WRONLY | os.O_TRUNC), 2)
     os.environ[LOADED], os.environ[KILL_AT] = order["loaded"], json.dumps(order.get("kill"))
+    os.environ[DEADLY] = order.get("deadly", "")
     calls = die_at(order.get("kill"))
     code = run(order)
     Path(order["counted"]).write_text(str(calls["made"]))

@@ -250,8 +250,8 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
 
 
 def test_an_unknown_adapter_is_answered_with_the_known_ones():
-    assert adapter_names()[:4] == ["h2o", "grab", "arctic", "manipnet"]
-    with pytest.raises(MissingResource, match="h2o, grab, arctic, manipnet"):
+    assert adapter_names()[:5] == ["arctic", "grab", "h2o", "manipnet", "taco"]
+    with pytest.raises(MissingResource, match="arctic, grab, h2o, manipnet, taco"):
         get_adapter("tacos")
 
 

@@ -64,7 +64,7 @@ def test_a_clip_comes_back_in_every_bit(make_clip):
 def test_meshes_and_personal_hands_are_shared_and_one_object_only_once(make_clip):
     clip = full_clip(make_clip)
     right = replace(clip.hands["right"], template_m=np.random.default_rng(0).random((778, 3)))
-    clips = [replace(clip, hands={**clip.hands, "right": right}), clip.cut(1, 3), clip.cut(2, 5)]
+    clips = [replace(clip, hands={**clip.hands, "right": right}), clip.take(slice(1, 3)), clip.take(slice(2, 5))]
     back, kept = there_and_back(clips)
     assert bits(back) == bits(clips)
     assert len(kept) == 3 + 3 + 1  # vertices, faces and parts of two objects; one template

@@ -18,9 +18,11 @@ from types import SimpleNamespace
 
 import pytest
 
+import hoidata
 from hoidata.conversion.convert import convert_dataset
 from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive
+from hoidata.store.store import open_store
 from pipelines.lineage.manifests import scan_files
 
 DRIVER = Path(__file__).with_name("killable.py")
@@ -77,9 +79,9 @@ class Conversions:
         answer = json.loads(self.process.stdout.readline())
         return SimpleNamespace(**answer, loaded=loaded.read_text().split(), said=said.read_text())
 
-    def moment(self, out: Path, at: str, when: float) -> int:
+    def moment(self, out: Path, at: str, when: float, only: str | None = None, **more) -> int:
         """The number of the call to die at, counted in a run like the one that will be killed."""
-        self.run(out, kill={"at": at, "n": -1, "who": "group"})
+        self.run(out, kill={"at": at, "n": -1, "who": "group", "only": only}, **more)
         total = int((self.folder / "counted.txt").read_text())
         return total + 1 + int(when) if when < 0 else int(when * total)
 
@@ -155,13 +157,28 @@ def test_kills_at_random_moments_change_no_byte(conversions, tmp_path, number):
 
 
 @pytest.mark.slow
-def test_a_killed_worker_ends_the_run_with_the_sequences_in_flight_and_what_to_do(conversions, tmp_path):
-    kill = {"at": "rename", "n": 6, "who": "self", "only": "worker"}
-    killed = conversions.kill_and_run_again(tmp_path / "clips", jobs=2, kill=kill)
-    assert killed.status == 1
-    for part in ("grab/s1/mug_lift_0", "SIGKILL", "run it again", f"of {N_SEQUENCES} sequences", "HOIDATA_JOBS=1"):
-        assert part in killed.said
-    assert "Traceback" not in killed.said
+def test_a_worker_killed_once_costs_nothing(conversions, tmp_path):
+    done = conversions.run(tmp_path / "clips", jobs=2, kill={"at": "rename", "n": 10, "who": "self", "only": "worker"})
+    assert (done.status, done.said) == (0, "")
+    assert digests(tmp_path / "clips") == conversions.expected
+    assert len(done.loaded) > N_SEQUENCES
+
+
+@pytest.mark.slow
+def test_a_sequence_that_kills_its_worker_twice_is_left_out_and_stays_out_when_the_run_goes_on(conversions, tmp_path):
+    out, deadly = tmp_path / "clips", "s1/mug_lift_002"
+    assert conversions.run(out, jobs=2, deadly=deadly).loaded.count(deadly) == 2
+    store, whole = open_store(out), open_store(conversions.folder / "undisturbed" / "clips")
+    (row,) = store.quarantine.to_dict("records")
+    assert row["source_key"] == f"grab/{deadly}"
+    assert "SIGKILL" in row["got"]
+    assert store.ids == [clip_id for clip_id in whole.ids if deadly not in clip_id]
+    expected, late = digests(out), {"at": "rename", "n": -1, "who": "group", "only": "parent"}
+    late["n"] = conversions.moment(tmp_path / "counted", "rename", -1, jobs=3, deadly=deadly, only="parent")
+    assert conversions.run(tmp_path / "again" / "clips", 3, deadly=deadly, kill=late).status == -signal.SIGKILL
+    resumed = conversions.run(tmp_path / "again" / "clips", jobs=1, deadly=deadly)
+    assert (resumed.status, resumed.loaded) == (0, [])
+    assert digests(tmp_path / "again" / "clips") == expected
 
 
 @pytest.mark.slow
@@ -267,8 +284,9 @@ def test_nothing_is_taken_up_when_what_decides_the_results_changed(half_done, ha
 
 
 def test_the_code_that_decides_is_that_of_hoidata_and_the_adapters_own_file(tmp_path):
-    from hoidata.conversion.finished import _code_digest
+    from hoidata.conversion.finished import ROOMS, _code_digest
 
+    assert all(Path(hoidata.__file__).with_name(room).exists() for room in ROOMS)
     path = tmp_path / "foreign.py"
     text = "from hoidata.datasets.grab.adapter import GrabAdapter\nclass Foreign(GrabAdapter):\n    pass\n"
 

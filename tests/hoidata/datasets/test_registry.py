@@ -5,10 +5,11 @@ from pathlib import Path
 
 import pytest
 
+from hoidata.dataset_folders import built_in_names
 from hoidata.datasets import adapter_names, get_adapter
 from hoidata.datasets.base import Adapter
 from hoidata.datasets.grab.adapter import GrabAdapter
-from hoidata.datasets.registry import BUILT_IN, FACTS, registered_adapters
+from hoidata.datasets.registry import ENTRY_POINT_GROUP, FACTS, registered_adapters
 from hoidata.errors import BadInput, MissingResource
 
 
@@ -20,7 +21,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
         folder = tmp_path / package / f"{package}-3.1.dist-info"
         folder.mkdir(parents=True)
         (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 3.1\n")
-        (folder / "entry_points.txt").write_text(f"[hoidata.datasets]\n{adapter} = {target}\n")
+        (folder / "entry_points.txt").write_text(f"[{ENTRY_POINT_GROUP}]\n{adapter} = {target}\n")
         monkeypatch.syspath_prepend(str(tmp_path / package))
         importlib.invalidate_caches()
 
@@ -33,7 +34,7 @@ def row(name: str):
 
 def test_an_adapter_of_another_package_is_found_after_the_built_in_ones(install) -> None:
     install("attic", "attic", "hoidata.datasets.grab.adapter:GrabAdapter")
-    assert adapter_names() == [*BUILT_IN, "attic"]
+    assert adapter_names() == [*built_in_names(), "attic"]
     assert get_adapter("attic", margin_frames=4) == GrabAdapter(margin_frames=4)
     assert row("attic").origin == "attic 3.1"
     assert row("grab").origin == "built in"
@@ -42,7 +43,7 @@ def test_an_adapter_of_another_package_is_found_after_the_built_in_ones(install)
 def test_a_package_cannot_take_the_place_of_a_built_in_adapter(install) -> None:
     install("impostor", "grab", "hoidata.datasets.h2o.adapter:H2OAdapter")
     assert isinstance(get_adapter("grab"), GrabAdapter)
-    assert adapter_names() == list(BUILT_IN)
+    assert adapter_names() == built_in_names()
 
 
 def test_a_package_that_cannot_be_imported_is_named_and_hides_no_other(install) -> None:
@@ -68,9 +69,5 @@ def test_settings_are_the_fields_that_are_no_facts() -> None:
         get_adapter("grab", licence="mine")
 
 
-def test_facts_are_those_of_the_protocol() -> None:
-    assert set(FACTS) == {name for name, value in vars(Adapter).items() if isinstance(value, property)}
-
-
 def test_every_built_in_adapter_has_a_margin() -> None:
-    assert all("margin_frames" in row(name).settings for name in BUILT_IN)
+    assert all("margin_frames" in row(name).settings for name in built_in_names())

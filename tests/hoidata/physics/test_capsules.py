@@ -7,6 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_vertices
 from hoidata.objects.model import Hinge, ObjectModel
@@ -150,7 +151,7 @@ def test_a_capsule_in_the_gap_between_two_parts_touches_the_one_it_is_deeper_in(
 def test_a_hinged_object_without_angles_is_refused():
     part = np.repeat(np.array([0, 1], dtype=np.uint8), [4, 4])
     model = ObjectModel("tin", _box().vertices_m, _box().faces, part, Hinge(np.array([0.0, 1, 0]), np.zeros(3)))
-    with pytest.raises(ValueError, match="hinge angles"):
+    with pytest.raises(BadInput, match="a hinge angle for every frame"):
         capsule_contacts(model, _still(), _capsule([0, 0, 0], [0, 0, 0.01], 0.01))
 
 

@@ -1,5 +1,7 @@
 import numpy as np
+import pytest
 
+from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.physics.surface import (
@@ -46,6 +48,14 @@ def test_a_moved_lid_is_met_where_it_is():
     np.testing.assert_allclose(found.distance_m[:, 0], 0.005, atol=1e-9)
     surface = articulate(np.array([[0.05, 0.0, 0.021]]), np.ones(1), model.hinge, angles)
     np.testing.assert_allclose(found.closest_m, surface, atol=1e-9)
+
+
+def test_a_hinged_object_without_its_angles_is_refused():
+    model = ObjectModel(
+        "x", _cube().vertices_m, _cube().faces, np.ones(8, dtype=np.uint8), Hinge(np.array([0, 0, 1.0]), np.zeros(3))
+    )
+    with pytest.raises(BadInput, match="a hinge angle for every frame"):
+        surface_distances(model, None, np.zeros((1, 1, 3)))
 
 
 def test_every_patch_of_a_hand_has_vertices_and_left_mirrors_right():

@@ -84,7 +84,7 @@ def test_hand_on_the_moving_part_is_compared_with_that_part():
     scene = carried(turning=1.5)
     points = np.concatenate([scene.thing.points_m, np.repeat(CUBE[None] + 0.5, 90, axis=0)], axis=1)
     rotmats = np.stack([np.eye(3)[None].repeat(90, axis=0), scene.thing.rotmats[0]])
-    places = np.stack([np.full((90, 3), 0.5), scene.thing.places_m[0]])
+    places = np.stack([np.full((90, 3), 0.5), scene.thing.positions_m[0]])
     part = np.repeat(np.array([1, 0], np.uint8), 8)
     found = time_offset([(scene.joints, usable())], ObjectMotion(points, part, rotmats, places))
     assert found.frames == 0

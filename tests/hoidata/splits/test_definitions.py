@@ -6,9 +6,10 @@ from collections import Counter
 import pandas as pd
 import pytest
 
+from hoidata.dataset_folders import built_in_names, dataset_facts
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.errors import BadInput
-from hoidata.splits import assign_split, choose, definition_names, definitions_for, published
+from hoidata.splits import assign_split, choose, definitions_for, published
 
 H2O = tuple(f"subject{number}" for number in (1, 2, 3, 4))
 # Verb and object pairs of ARCTIC's descriptions (Text2HOI's word lists): any object but for the verbs named here.
@@ -145,19 +146,45 @@ def test_every_verb_of_a_held_out_object_is_also_done_with_a_training_object():
         assert held <= set.union(*objects_of.values()), dataset
 
 
-@pytest.mark.parametrize("name", definition_names())
-def test_every_definition_says_its_source_its_version_and_its_promises(name):
-    found = {dataset: definitions_for(dataset).get(name) for dataset in ("h2o", "grab", "arctic", "manipnet")}
-    assert any(found.values())
-    for definition in filter(None, found.values()):
+@pytest.mark.parametrize("dataset", built_in_names())
+def test_every_definition_says_its_source_its_version_and_its_promises(dataset):
+    found = definitions_for(dataset)
+    assert found
+    for definition in found.values():
         assert definition.version >= 1
         assert len(definition.source) > 40
         if definition.rule.by in ("subject", "object"):
             assert definition.rule.by in definition.promises
             assert definition.rule.validation
             assert definition.rule.test
-        if definition.rule.by in ("sequence", "prefix"):
+        if definition.rule.by in ("sequence", "prefix", "drawn"):
             assert "sequence" in definition.promises
+
+
+def test_a_split_that_several_datasets_have_is_from_the_same_source():
+    for name in ("text2hoi", "unseen-object", "unseen-subject"):
+        found = {
+            (rules[name].version, rules[name].source) for d in built_in_names() if name in (rules := definitions_for(d))
+        }
+        assert len(found) == 1
+
+
+def test_a_dataset_says_its_own_split_and_params_override_it():
+    usual = {"h2o": "text2hoi", "grab": "text2hoi", "arctic": "text2hoi", "manipnet": "rounds", "taco": "drawn"}
+    assert {name: choose(name, None).name for name in built_in_names()} == usual
+    assert choose("grab", "official").name == "official"
+    assert dataset_facts("mydata") is None
+
+
+def test_a_split_with_nothing_said_of_its_source_is_refused(tmp_path, monkeypatch):
+    folder = tmp_path / "kitchen"
+    (folder / "splits").mkdir(parents=True)
+    (folder / "adapter.py").touch()
+    monkeypatch.setenv("HOIDATA_DATASETS", str(folder))
+    for text in ('{"by": "time"}', "[]", "{"):
+        (folder / "splits/ours.json").write_text(text)
+        with pytest.raises(BadInput, match=r"kitchen/splits/ours.json"):
+            definitions_for("kitchen")
 
 
 def test_manipnet_has_the_splits_in_time_and_no_split_by_its_only_subject():
@@ -169,10 +196,9 @@ def test_an_unknown_name_lists_the_splits_of_that_dataset():
         BadInput, match="bimart, bimart-validated, p1, p2, text2hoi, unseen-object, unseen-subject, got"
     ):
         choose("arctic", "rounds")
-    with pytest.raises(BadInput, match="rounds, time, unseen-object, got nothing"):
-        choose("manipnet", None)
-    with pytest.raises(BadInput, match="none for this dataset"):
-        choose("mydata", "text2hoi")
+    for wanted, got in (("text2hoi", "'text2hoi'"), (None, "nothing")):
+        with pytest.raises(BadInput, match=f"none for this dataset, got {got}"):
+            choose("mydata", wanted)
 
 
 def test_a_rule_of_the_users_own_needs_no_name():

@@ -1,5 +1,7 @@
 """Rules put clips into parts, by names or in time; what no part names is left out, never trained on."""
 
+from collections import Counter
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -138,3 +140,20 @@ def test_two_meshes_of_one_name_are_one_object_to_a_split():
     clips = of_objects(("mug#1a2b3c4d", ["table#00000000"]), ("apple", []), ("mug#5e6f7a8b", []))
     split = assign_split(clips, SplitRule(by="object", train="rest", test=("mug",)))
     assert split.tolist() == ["test", "train", "test"]
+
+
+def test_drawn_sequences_keep_together_and_few_change_parts_when_others_come():
+    names = [f"day{number % 3}/{number:03d}" for number in range(40)]
+
+    def drawn(sequences) -> dict[str, str]:
+        rows = [{"clip_id": f"{name}/{cut}", "sequence": name} for name in sequences for cut in (0, 1)]
+        parts = assign_split(pd.DataFrame(rows).set_index("clip_id", drop=False), SplitRule(by="drawn"))
+        assert all(parts[f"{name}/0"] == parts[f"{name}/1"] for name in sequences)
+        return {name: parts[f"{name}/0"] for name in sequences}
+
+    found = drawn(names)
+    assert Counter(found.values()) == {"train": 28, "validation": 6, "test": 6}
+    assert found == drawn(names[::-1])
+    more = drawn([*names, "day4/new"])
+    assert sum(more[name] != found[name] for name in names) <= 2
+    assert set(drawn(names[:3]).values()) == {"train", "validation", "test"}

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips import SIDES, Clip, ObjectTrack
-from hoidata.contact.proximity import joints_in_object
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
 from hoidata.surface.bimart_maps import BEYOND, REACH_M, bimart_map, clip_map, packed_map, unpacked_map
@@ -33,11 +32,17 @@ def placed(track: ObjectTrack, vertices: np.ndarray, valid: np.ndarray | None = 
     """World vertices as the object sees them."""
     frames = np.arange(len(vertices)) if valid is None else np.flatnonzero(valid)
     hinge = None if track.hinge_rad is None else track.hinge_rad[frames]
-    return PlacedHand(joints_in_object(vertices, track)[frames], frames, hinge, np.zeros((0, 3), int), len(vertices))
+    return PlacedHand(
+        (track.world_from_object.inverse() @ vertices.astype(np.float64))[frames],
+        frames,
+        hinge,
+        np.zeros((0, 3), int),
+        len(vertices),
+    )
 
 
 def map_of(track: ObjectTrack, vertices: np.ndarray, points, valid: np.ndarray | None = None) -> np.ndarray:
-    return bimart_map(placed(track, vertices, valid), points, track.model.hinge)
+    return bimart_map(placed(track, vertices, valid), points, track.model)
 
 
 def world_points(track: ObjectTrack, points) -> np.ndarray:
@@ -82,7 +87,7 @@ def test_map_is_the_distance_to_the_nearest_hand_vertex(scene):
         assert np.isfinite(truth).sum() > POINTS
         np.testing.assert_allclose(map_of(clip.object, vertices[side], points), truth, atol=1e-6)
         hand = placed_hand(clip, side, load_embedded_hands())
-        np.testing.assert_allclose(bimart_map(hand, points, clip.object.model.hinge), truth, atol=1e-6)
+        np.testing.assert_allclose(bimart_map(hand, points, clip.object.model), truth, atol=1e-6)
 
 
 @pytest.mark.parametrize("changed", [moved, mirror_image], ids=["another world", "mirror"])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
-from hoidata.objects.model import ObjectModel, articulate, place
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.surface.contact import (
     Penetration,
@@ -41,9 +41,7 @@ def test_distances_equal_libigl_s_to_the_posed_mesh_in_the_world(
     clip = shifted(make_clip(n_frames=5, articulated=articulated), 0.02)
     model, track = clip.object.model, clip.object
     index, hand = SurfaceIndex(model), placed_hand(clip, "right", HANDS)
-    posed = place(
-        articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad), track.rotvec, track.translation_m
-    )
+    posed = track.points_in_world(model.vertices_m, model.part)
     vertices = track_vertices(clip.hands["right"], HANDS.right).astype(np.float64)
     found, touched = signed_distances_m(hand, index, 0.05), touched_vertices(hand, index)
     for frame in range(5):

@@ -97,7 +97,7 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
         clip = stored.clip(clip_id)
         points = sample_points(clip.object.model, POINTS)
         for side in SIDES:
-            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model.hinge)
+            exact = bimart_map(placed_hand(clip, side, hands), points, clip.object.model)
             found = store.bimart_map(clip_id, side)
             assert found.shape == exact.shape
             near = np.isfinite(exact)
@@ -204,12 +204,12 @@ def test_bytes_repeat_and_shards_do_not_change_what_is_read(written, monkeypatch
 def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_up(written, monkeypatch):
     folder, asked = written[0], []
 
-    def backwards(bench, jobs):
+    def backwards(measure, clip_ids, jobs):
         asked.append(jobs)
-        for clip_id in reversed(bench.store.ids):
-            yield clip_id, (bench.measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
+        for clip_id in reversed(clip_ids):
+            yield clip_id, (measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
 
-    monkeypatch.setattr("hoidata.surface.stage._measured", backwards)
+    monkeypatch.setattr("hoidata.surface.stage.in_workers", backwards)
     report = surface_store(folder / "clips", folder / "backwards", jobs=8, **ARGUMENTS)
     for path in (folder / "surface").iterdir():
         assert (folder / "backwards" / path.name).read_bytes() == path.read_bytes()

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from dvc.repo import Repo
 from safetensors.numpy import save_file
 
 from hoidata.errors import BadInput
@@ -13,36 +14,42 @@ from pipelines.lineage.digests import path_digest
 from pipelines.lineage.graph import look_up, read_graph
 from pipelines.lineage.provenance import build_provenance, read_provenance
 from pipelines.lineage.tree import lineage_tree, overall_status, tree_as_json
+from pipelines.stages.code import write_code
 
 GRAPH = """
 stages:
   convert:
     matrix: {dataset: "${datasets}"}
     cmd: python convert.py ${item.dataset}
-    deps: ["manifests/${item.dataset}.json", hoidata/datasets]
+    deps: ["manifests/${item.dataset}.json", "code/convert/${item.dataset}.json"]
     params: [convert]
     outs:
       - data/${item.dataset}:
           persist: true
+"""
+FAMILY = """
+vars: [../../params.yaml]
+stages:
   train:
+    wdir: ../..
     matrix:
       dataset: ${datasets}
       model: [contact, length]
-    cmd: >-
-      python train.py ${item.dataset}
-      ${item.model}
-    deps: ["data/${item.dataset}", models]
+    cmd: python train.py ${item.dataset} ${item.model}
+    deps: ["data/${item.dataset}", "code/train/${item.model}.json"]
     params: ["train.${train.size}.${item.model}"]
     outs: ["checkpoints/${item.dataset}/${item.model}"]
 """
 PARAMS = """
 datasets: [grab, arctic]
+families: []
 convert: {fps: 30}
 train:
   size: demo
   demo: {contact: {lr: 0.1, steps: 5}, length: {lr: 0.2}}
   paper: {contact: {lr: 0.3}, length: {lr: 0.4}}
 """
+TRAIN = "models/text2hoi/dvc.yaml:train@grab-contact"
 FACTS = {"model": "contact", "seed": 0, "clips": {"train": ["grab/s1/a", "grab/s1/b"]}, "synthetic": True}
 
 
@@ -50,21 +57,27 @@ FACTS = {"model": "contact", "seed": 0, "clips": {"train": ["grab/s1/a", "grab/s
 def root(tmp_path: Path) -> Path:
     for name, text in {
         "dvc.yaml": GRAPH,
+        "models/text2hoi/dvc.yaml": FAMILY,
         "params.yaml": PARAMS,
         "manifests/grab.json": "{}",
-        "hoidata/datasets/grab/adapter.py": "pass",
-        "models/text2hoi/contact.py": "pass",
+        "hoidata/datasets/registry.py": "",
+        "hoidata/datasets/grab/adapter.py": "",
+        "models/text2hoi/contact.py": "",
+        "pipelines/stages/convert.py": "import hoidata.datasets.registry",
+        "pipelines/stages/train.py": "from models.text2hoi import contact",
         "data/grab/clips.npz": "clips",
     }.items():
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
+    Repo.init(str(tmp_path), no_scm=True).close()
+    write_code(tmp_path)
     return tmp_path
 
 
 @pytest.fixture
 def checkpoint(root: Path) -> Path:
-    provenance = build_provenance(root, "train@grab-contact", FACTS)
+    provenance = build_provenance(root, TRAIN, FACTS)
     path = root / "checkpoints/grab/contact/model.safetensors"
     path.parent.mkdir(parents=True)
     metadata = {"hoidata": canonical_json({"provenance": provenance})}
@@ -76,16 +89,20 @@ def status_of(root: Path, checkpoint: Path) -> dict[str, str]:
     return {f"{node.kind} {node.name}": node.status for node in lineage_tree(root, checkpoint)[0].walk()}
 
 
-def test_graph_resolves_matrix_and_params(root):
+def test_graph_holds_the_stages_of_all_families_with_their_addresses(root):
     graph = read_graph(root)
-    assert sorted(graph) == sorted(
-        ["convert@grab", "convert@arctic"]
-        + [f"train@{d}-{m}" for d in ("grab", "arctic") for m in ("contact", "length")]
-    )
-    stage = graph["train@grab-contact"]
-    assert stage.command == "python train.py grab contact"
-    assert (stage.code, stage.data, stage.params) == (("models",), ("data/grab",), ("train.demo.contact",))
+    trained = [f"models/text2hoi/dvc.yaml:train@{d}-{m}" for d in ("grab", "arctic") for m in ("contact", "length")]
+    assert sorted(graph) == sorted(["convert@grab", "convert@arctic", *trained])
+    stage = graph[TRAIN]
+    assert (stage.data, stage.params) == (("data/grab",), ("train.demo.contact",))
+    assert stage.code == ("code/train/contact.json",)
     assert graph["convert@grab"].outs == ("data/grab",)
+
+
+def test_a_graph_dvc_cannot_read_is_refused(root):
+    (root / "dvc.yaml").write_text("stages: {raw: {cmd: [}}")
+    with pytest.raises(BadInput, match="stages that DVC can read"):
+        read_graph(root)
 
 
 def test_missing_param_is_refused_with_the_known_ones():
@@ -97,13 +114,13 @@ def test_tree_names_every_stage_param_code_and_manifest_behind_a_checkpoint(root
     found = status_of(root, checkpoint)
     assert set(found.values()) == {"same"}
     assert {
-        "stage train@grab-contact",
+        f"stage {TRAIN}",
         "param train.demo.contact",
-        "code models",
+        "code models/text2hoi/contact.py",
         "data data/grab",
         "stage convert@grab",
         "param convert",
-        "code hoidata/datasets",
+        "code hoidata/datasets/grab/adapter.py",
         "manifest manifests/grab.json",
     } <= set(found)
 
@@ -112,12 +129,12 @@ def test_tree_names_every_stage_param_code_and_manifest_behind_a_checkpoint(root
     ("path", "text", "node"),
     [
         ("manifests/grab.json", "{ }", "manifest manifests/grab.json"),
-        ("hoidata/datasets/grab/adapter.py", "1", "code hoidata/datasets"),
-        ("models/new.py", "1", "code models"),
+        ("hoidata/datasets/grab/adapter.py", "1", "code hoidata/datasets/grab/adapter.py"),
+        ("models/text2hoi/table.csv", "1", "code models/text2hoi/table.csv"),
         ("data/grab/clips.npz", "others", "data data/grab"),
         ("params.yaml", PARAMS.replace("fps: 30", "fps: 60"), "param convert"),
         ("params.yaml", PARAMS.replace("lr: 0.1", "lr: 0.5"), "param train.demo.contact"),
-        ("params.yaml", PARAMS.replace("size: demo", "size: paper"), "stage train@grab-contact"),
+        ("params.yaml", PARAMS.replace("size: demo", "size: paper"), f"stage {TRAIN}"),
     ],
 )
 def test_a_change_of_any_input_is_found(root, checkpoint, path, text, node):
@@ -142,19 +159,20 @@ def test_unrelated_changes_are_not_reported(root, checkpoint):
     (root / "params.yaml").write_text(PARAMS.replace("lr: 0.2", "lr: 0.9"))
     (root / "models" / "__pycache__").mkdir()
     (root / "models" / "__pycache__" / "contact.pyc").write_text("compiled")
+    (root / "models" / "text2hoi" / "length.py").write_text("nobody imports it")
     assert overall_status(lineage_tree(root, checkpoint)[0]) == "same"
 
 
 def test_provenance_depends_on_content_alone(root):
-    first = canonical_json(build_provenance(root, "train@grab-contact", FACTS))
+    first = canonical_json(build_provenance(root, TRAIN, FACTS))
     for path in root.rglob("*.py"):
         path.touch()
-    assert canonical_json(build_provenance(root, "train@grab-contact", FACTS)) == first
+    assert canonical_json(build_provenance(root, TRAIN, FACTS)) == first
 
 
 def test_tree_is_plain_json(root, checkpoint):
     tree = lineage_tree(root, checkpoint)[0]
-    assert json.loads(json.dumps(tree_as_json(tree)))["children"][0]["name"] == "train@grab-contact"
+    assert json.loads(json.dumps(tree_as_json(tree)))["children"][0]["name"] == TRAIN
 
 
 def test_clips_it_was_trained_on_are_carried(root, checkpoint):

@@ -148,7 +148,7 @@ def test_still_shows_the_frame_in_which_most_points_are_touched(project, hands):
     busiest = int(np.argmax(counts))
     still = still_of(annotated, clip_id, hands, "Open a box.")
     assert still.view.frames == 1
-    assert still.view == view_of(annotated.clip(clip_id).cut(busiest, busiest + 1), hands)
+    assert still.view == view_of(annotated.clip(clip_id).take(slice(busiest, busiest + 1)), hands)
 
 
 @pytest.mark.slow

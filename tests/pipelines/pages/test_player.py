@@ -46,7 +46,8 @@ def test_same_motion_gives_the_same_page(hands, page_clip, tmp_path, page):
 def test_three_comes_with_its_licence_notice_and_the_loader():
     script = three_javascript()
     assert "SPDX-License-Identifier: MIT" in script[:200]
-    assert script.rstrip().endswith("THREE.GLTFLoader=GLTFLoader;})();")
+    assert "THREE.GLTFLoader=" in script
+    assert len(script) < 700_000
     assert "</script" not in script
 
 

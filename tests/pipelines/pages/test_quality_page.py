@@ -1,6 +1,6 @@
 """The report's section on quality control: every measure, its limits, and what was left out and why."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pandas as pd
@@ -14,7 +14,7 @@ from pipelines.pages.quality import measures_svg, read_quality
 from pipelines.pages.report import ReportFolders, write_report
 from tests.builders.clips import jumping, with_object
 
-LIMITS = {name: limit._asdict() for name, limit in DEFAULT_LIMITS.items()}
+LIMITS = {name: asdict(limit) for name, limit in DEFAULT_LIMITS.items()}
 
 JUMP = "largest sudden step of a corner of the object: 1.74 m at frame 19, above 0.2 m"
 
@@ -33,7 +33,7 @@ def folders(hands, page_clip, tmp_path):
 
 
 def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
-    text = write_report(tmp_path / "report", "embedded", ["grab"], hands, folders).read_text()
+    text = write_report(tmp_path / "report", "embedded", ["grab"], ["ground-truth"], hands, folders).read_text()
     assert "Of 3 clips 2 are sound, 0 are warned of and kept, 1 are left out of annotation" in text
     assert f"<td>test/s1/1</td><td>{JUMP}</td>" in text
     assert "<td>open box</td><td>warned</td><td>share of edges at a hole" in text

@@ -1,0 +1,61 @@
+"""The conventions of the built-in datasets side by side, made from their ``facts.toml``.
+
+``python -m hoidata.datasets.convention_table > hoidata/datasets/CONVENTIONS.md`` writes the table anew.
+"""
+
+from hoidata.dataset_folders import DatasetFacts, built_in_names, dataset_facts
+from hoidata.errors import BadInput
+
+# What a dataset's facts may state, in the order of the table.
+ROWS = (
+    "unit",
+    "handedness of the world",
+    "meshes",
+    "object rotation",
+    "hand translation",
+    "finger angles",
+    "principal components",
+    "angles beyond pi",
+    "shape",
+    "left shape directions",
+    "left and right",
+    "numbers per hand",
+    "joint order",
+    "finger tips",
+    "parts",
+    "hinge",
+    "camera",
+    "frames",
+    "validity",
+    "labels",
+    "gravity",
+)
+HEAD = """# Conventions of the sources
+
+What each source means by its numbers, from `<dataset>/facts.toml`. Every cell has a test that fails when the adapter
+reads it otherwise: it puts literal numbers through a formula of its own and asserts that the flipped convention is off
+by more than 5 mm (or by a frame, a part, a name, a side). `tests/hoidata/datasets/<dataset>/test_contract.py` names the
+test of each cell. A dash: the source has no such thing.
+
+"""
+
+
+def table() -> str:
+    """CONVENTIONS.md: one row per convention, one column per built-in dataset."""
+    columns = [facts for name in built_in_names() if (facts := dataset_facts(name))]
+    for facts in columns:
+        _refuse_unknown(facts)
+    lines = [("convention", *(facts.title for facts in columns)), ("---",) * (len(columns) + 1)]
+    lines += [(row, *(facts.conventions.get(row, "-") for facts in columns)) for row in ROWS]
+    return HEAD + "".join(f"| {' | '.join(cells)} |\n" for cells in lines).replace("| --- ", "|---").replace(
+        "--- |", "---|"
+    )
+
+
+def _refuse_unknown(facts: DatasetFacts) -> None:
+    if unknown := sorted(facts.conventions.keys() - set(ROWS)):
+        raise BadInput(f"{facts.name}/facts.toml: conventions", f"some of {', '.join(ROWS)}", ", ".join(unknown))
+
+
+if __name__ == "__main__":
+    print(table(), end="")

@@ -1,0 +1,32 @@
+"""Intervals of a recording in which something holds, and steps that stand out from the motion around them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Interval(NamedTuple):
+    """Frames ``start`` to ``stop``, half-open."""
+
+    start: int
+    stop: int
+
+
+def runs(flags: np.ndarray) -> list[Interval]:
+    """Maximal intervals of True in (frame,) booleans."""
+    change = np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))
+    pairs = zip(np.flatnonzero(change == 1), np.flatnonzero(change == -1), strict=True)
+    return [Interval(int(start), int(stop)) for start, stop in pairs]
+
+
+def sudden_steps(step: np.ndarray, notable: float, large: float, ratio: float, neighbours: int = 5) -> np.ndarray:
+    """(step,) booleans: steps above ``large``, or above ``notable`` and ``ratio`` times the motion around them.
+
+    step: (step,) sizes >= 0 in any unit, that of ``notable`` and ``large``. The motion around a step is the median of
+    the ``2 * neighbours + 1`` steps about it, mirrored at the ends: it does not follow a glitch of one or two frames.
+    """
+    if not len(step):
+        return np.zeros(0, dtype=bool)
+    padded = np.pad(step, neighbours, mode="reflect" if len(step) > neighbours else "edge")
+    around = np.median(np.lib.stride_tricks.sliding_window_view(padded, 2 * neighbours + 1), axis=1)
+    return (step > large) | ((step > notable) & (step > ratio * around))

@@ -1,0 +1,66 @@
+"""Can the contacts carry the motion? ManipNet's physical measures of one predicted motion, with what they give for
+no hands at all (the floor). Without known gravity, or where the object is never lifted, there are no values.
+"""
+
+from functools import lru_cache
+
+import numpy as np
+
+from hoidata.metrics.pair import Pair
+from hoidata.physics.realism import VARIANTS, Realism, score
+
+NO_VALUES = np.zeros(0)
+
+
+def realism_si(pair: Pair, every: int) -> np.ndarray:
+    """(scored frame,) 1 where friction forces at the contacts give the object's motion, in SI units."""
+    return _passed(pair, "SI", every)
+
+
+def realism_as_released(pair: Pair, every: int) -> np.ndarray:
+    """(scored frame,) the same with the units of ManipNet's released sources."""
+    return _passed(pair, "as released", every)
+
+
+def floor_si(pair: Pair, every: int) -> np.ndarray:
+    """(lifted frame,) the same in SI units with no hands: 1 only in free fall."""
+    return _floor(pair, "SI", every)
+
+
+def floor_as_released(pair: Pair, every: int) -> np.ndarray:
+    """(lifted frame,) the same as released with no hands."""
+    return _floor(pair, "as released", every)
+
+
+def capsule_depth_mm(pair: Pair, every: int) -> np.ndarray:
+    """(1,) mean depth over the hand capsules that overlap the object, in lifted frames, millimetres; none without."""
+    found = _score(pair, "SI", every)
+    return NO_VALUES if found is None or np.isnan(found.colliding_m) else np.array([1000 * found.colliding_m])
+
+
+def _passed(pair: Pair, variant: str, every: int) -> np.ndarray:
+    found = _score(pair, variant, every)
+    return NO_VALUES if found is None else found.passed.astype(np.float64)
+
+
+def _floor(pair: Pair, variant: str, every: int) -> np.ndarray:
+    scene = pair.scene
+    if scene is None:
+        return NO_VALUES
+    bare = scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
+    return score(bare, VARIANTS[variant], _looked_at(scene.lifted, every)).passed.astype(np.float64)
+
+
+@lru_cache(maxsize=2)
+def _score(pair: Pair, variant: str, every: int) -> Realism | None:
+    scene = pair.scene
+    if scene is None:
+        return None
+    return score(scene, VARIANTS[variant], _looked_at(scene.lifted, every))
+
+
+def _looked_at(lifted: np.ndarray, every: int) -> np.ndarray:
+    """Every n-th lifted frame, as (frame,) bool. Derivatives are taken over all frames before any is left out."""
+    chosen = np.zeros_like(lifted)
+    chosen[np.flatnonzero(lifted)[::every]] = True
+    return chosen

@@ -1,0 +1,88 @@
+"""A predicted clip beside the clip it was made for: what every metric is a function of."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.contact.proximity import ProximityIndex
+from hoidata.hands import HandPair
+from hoidata.objects.surface_index import surface_index
+from hoidata.physics.scene import Scene, clip_scene
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One clip and the joints of its hands.
+
+    joints_m: per side (frame, 21, 3) world, metres. hands: the model of the clip's hand parameters.
+    """
+
+    clip: Clip
+    joints_m: Mapping[Side, np.ndarray]
+    hands: HandPair
+
+    def joints_in_object(self, side: Side, frames: np.ndarray) -> np.ndarray:
+        """(chosen frame, 21, 3) float64 joints of one hand in the object frame, metres."""
+        return (self.clip.object.world_from_object.inverse() @ self.joints_m[side])[frames]
+
+    def hinge_rad(self, frames: np.ndarray) -> np.ndarray | None:
+        """(chosen frame,) hinge angle, None for a rigid object."""
+        return None if self.clip.object.hinge_rad is None else self.clip.object.hinge_rad[frames]
+
+
+@dataclass(frozen=True, eq=False)
+class TrueContact:
+    """The contact map a clip was recorded with, as the contact stage made it.
+
+    index: over the sampled points of the object. touched: (point,) bool, nearer to a joint of an acting hand than
+    ``threshold_m`` (metres) in any frame of the pair.
+    """
+
+    index: ProximityIndex
+    touched: np.ndarray
+    threshold_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """Frame ``i`` of both motions is the same moment; both are in the world of the reference clip.
+
+    sides: the hands that act in the reference clip; the prediction has them wherever the reference has (``frames``).
+    table_m: height of the table the object of the whole reference clip rests on; None where gravity is not known.
+    """
+
+    predicted: Motion
+    reference: Motion
+    sides: tuple[Side, ...]
+    contact: TrueContact
+    table_m: float | None
+
+    def frames(self, side: Side, every: int = 1) -> np.ndarray:
+        """Every n-th of the frames in which the reference has this hand."""
+        return np.flatnonzero(self.reference.clip.hands[side].valid)[::every]
+
+    @cached_property
+    def scene(self) -> Scene | None:
+        """The acting hands of the prediction and its object, on the table of the reference clip.
+
+        None where gravity is not known, where the object encloses no solid, and for less than three frames.
+        """
+        clip = self.predicted.clip
+        if self.table_m is None or clip.n_frames < 3 or not surface_index(clip.object.model).is_solid:
+            return None
+        hands = {side: replace(track, valid=self._present(side)) for side, track in clip.hands.items()}
+        gravity = self.reference.clip.gravity
+        return clip_scene(replace(clip, hands=hands, gravity=gravity), self.predicted.hands, self.table_m)
+
+    def _present(self, side: Side) -> np.ndarray:
+        """(frame,) bool: the hand acts and the reference has it."""
+        valid = self.reference.clip.hands[side].valid
+        return valid if side in self.sides else np.zeros_like(valid)
+
+
+def acting_sides(hand_type: str) -> tuple[Side, ...]:
+    """The sides that "left", "right" or "both" names, left first."""
+    return tuple(side for side in SIDES if hand_type in (side, "both"))

@@ -1,0 +1,164 @@
+"""The one list of metrics: evaluation, the tables on pages and README.md beside this file are made from it.
+
+To add one: a function of (pair, every) that gives the values of one motion as an array, and a row here.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hoidata.metrics import forces, motion, touch
+from hoidata.metrics.pair import Pair
+from hoidata.physics.realism import LARGEST_PENETRATION_M
+from hoidata.physics.scene import LIFTED_M
+
+Direction = Literal["higher", "lower", "nearer the truth"]
+Reduction = Literal["best of a clip's samples", "mean over motions", "mean over frames"]
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What one figure is.
+
+    name: its key in files. title: in words. unit: of the figure; "" for a share or score from 0 to 1.
+    direction: which figures are better; "nearer the truth": than the figure of the recorded clips themselves.
+    measure: the values of one motion, given every how many frames to look at; none where nothing can be said.
+    reduction: how values become one figure. "best of a clip's samples": the mean of each motion's values, the best of
+    each clip, the mean over clips; "mean over motions": the mean of each motion's values, the mean over motions; "mean
+    over frames": of all values of all motions alike.
+    frames: which frames count, in words. every: of these, look at every n-th. samples: motions per clip that are looked
+    at; None: all. thresholds: in words. source: where the definition comes from.
+    floor_of: the metric of which this is what it gives for nothing; no figure of a floor is better than another.
+    """
+
+    name: str
+    title: str
+    unit: str
+    direction: Direction
+    measure: Callable[[Pair, int], np.ndarray]
+    reduction: Reduction
+    frames: str
+    source: str
+    every: int = 1
+    samples: int | None = None
+    thresholds: str = ""
+    floor_of: str = ""
+
+
+class Figure(NamedTuple):
+    """value: the figure. clips, motions, values: how many went into it."""
+
+    value: float
+    clips: int
+    motions: int
+    values: int
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return {"clips": self.clips, "motions": self.motions, "values": self.values}
+
+
+HANDS = "frames in which the reference has the acting hand"
+LIFTED = (
+    f"frames in which the object is more than {1000 * LIFTED_M:g} mm above the table (3rd percentile of the true "
+    "clip's lowest vertex)"
+)
+SCORED = f"{LIFTED}, and no hand capsule {1000 * LARGEST_PENETRATION_M:g} mm or more inside it"
+FORCES = "residual below 0.01, friction 0.35"
+CONTACT = "the contact stage's distance and points (its info.json)"
+MANIPNET = "ManipNet (Zhang et al. 2021), Sec. 8"
+
+METRICS: tuple[Metric, ...] = (
+    Metric(
+        "joint_error_mm", "joint error of the best sample", "mm", "lower", motion.joint_error_mm,
+        "best of a clip's samples", HANDS,
+        "mean distance of 21 joints (MPJPE), best of several samples as in Petrovich et al. 2022 (TEMOS), Sec. 4",
+    ),
+    Metric(
+        "contact_f1", "F1 of the contact map made", "", "higher", touch.contact_f1,
+        "mean over motions", f"{HANDS}, all of them together", "Text2HOI (Cha et al. 2024), Sec. 3.2.2: the map",
+        thresholds=CONTACT,
+    ),
+    Metric(
+        "contact_distance_mm", "distance of joints that touch in the truth", "mm", "nearer the truth",
+        touch.contact_distance_mm, "mean over motions", f"{HANDS} and a joint touches in the true clip",
+        "this project; Text2HOI Sec. 3.5 refines it", every=3, samples=2, thresholds=CONTACT,
+    ),
+    Metric(
+        "penetration_mm", "penetration", "mm", "lower", touch.penetration_mm, "mean over motions", HANDS,
+        "depth of the deepest of 778 vertices inside the exact solid (GrabNet, Taheri et al. 2020, Sec. 5)",
+        every=3, samples=2,
+    ),
+    Metric(
+        "deep_share", f"share of frames deeper than {touch.DEEP_MM:g} mm", "", "lower", touch.deep_share,
+        "mean over motions", HANDS, "this project", every=3, samples=2, thresholds=f"{touch.DEEP_MM:g} mm",
+    ),
+    Metric(
+        "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,
+        f"{MANIPNET} and Appendix A, in SI units", samples=2, thresholds=FORCES,
+    ),
+    Metric(
+        "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", forces.floor_si,
+        "mean over frames", LIFTED, "this project: what the metric gives for nothing", samples=2, thresholds=FORCES,
+        floor_of="realism_si",
+    ),
+    Metric(
+        "realism_released", "physical realism, as released", "", "higher", forces.realism_as_released,
+        "mean over frames", SCORED, f"{MANIPNET} and Appendix A, units of the released sources", samples=2,
+        thresholds=FORCES,
+    ),
+    Metric(
+        "realism_released_floor", "physical realism, as released, without hands", "", "nearer the truth",
+        forces.floor_as_released, "mean over frames", LIFTED, "this project: what the metric gives for nothing",
+        samples=2, thresholds=FORCES, floor_of="realism_released",
+    ),
+    Metric(
+        "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", forces.capsule_depth_mm,
+        "mean over motions", LIFTED, f"{MANIPNET}, penetration depth", samples=2,
+    ),
+    Metric(
+        "smoothness_m_s2", "acceleration of joints in the wrist's frame", "m/s2", "nearer the truth",
+        motion.smoothness, "mean over motions", f"{HANDS}, three in a row", f"{MANIPNET}, smoothness",
+    ),
+    Metric(
+        "jitter_m_s3", "jitter of joints in the world", "m/s3", "nearer the truth", motion.jitter_m_s3,
+        "mean over motions", f"{HANDS}, four in a row", "mean jerk, TransPose (Yi et al. 2021), Sec. 5.2",
+    ),
+)  # fmt: skip
+
+
+def metric(name: str) -> Metric:
+    """The metric of that name. Raises KeyError that lists the names there are."""
+    found = next((item for item in METRICS if item.name == name), None)
+    if found is None:
+        raise KeyError(f"no metric {name!r}; there are: {', '.join(item.name for item in METRICS)}")
+    return found
+
+
+def reduced(metric: Metric, clips: list[list[np.ndarray]]) -> Figure | None:
+    """One figure of the values of every motion, by clip and sample; None where no motion has a value.
+
+    Motions without values are left out, not counted as 0.
+    """
+    motions = [[values for values in samples if len(values)] for samples in clips]
+    motions = [samples for samples in motions if samples]
+    if not motions:
+        return None
+    means = [np.array([values.mean() for values in samples]) for samples in motions]
+    every = np.concatenate([values for samples in motions for values in samples])
+    if metric.reduction == "best of a clip's samples":
+        value = np.mean([found.max() if metric.direction == "higher" else found.min() for found in means])
+    else:
+        value = np.mean(every if metric.reduction == "mean over frames" else np.concatenate(means))
+    return Figure(float(value), len(motions), sum(map(len, means)), len(every))
+
+
+def is_better(metric: Metric, value: float, other: float, truth: float | None) -> bool | None:
+    """Whether ``value`` is better than ``other``; None where the truth is not known or the metric is a floor."""
+    if metric.floor_of:
+        return None
+    if metric.direction == "nearer the truth":
+        return None if truth is None else abs(value - truth) < abs(other - truth)
+    return value > other if metric.direction == "higher" else value < other

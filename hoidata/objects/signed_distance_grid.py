@@ -1,0 +1,169 @@
+"""Signed distances interpolated in grids: made once per surface from exact ones, asked in NumPy or in torch.
+
+Where thousands of points are asked at every step, exact answers would cost seconds. One grid, two ways to read it:
+:class:`SignedDistanceGrid` by itself is NumPy, of one surface, for the grasp search of the embedded corpora;
+:class:`DistanceFields` is torch, of both parts of many objects in one stack, also with the offset to the nearest
+surface point, for losses: gradients flow to the points asked about and never into the grid. They differ beyond the
+grid: the search takes a lower bound, a loss needs a distance that goes on without a jump.
+
+Whoever needs exact answers asks ``hoidata.objects.surface_index``. Its ``distance_grid`` is no such look-up: it only
+decides which triangles need not be looked at, from bounds on what lies between its nodes.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.objects.distance import signed_distance
+from hoidata.objects.model import ObjectModel
+
+MARGIN_M = 0.03
+FAR_M = 10.0
+
+
+@dataclass(frozen=True)
+class SignedDistanceGrid:
+    """axes_m: places of the nodes along x, y and z, evenly spaced. distance_m: (x, y, z) signed, negative inside.
+
+    offset_m: (x, y, z, 3) from each node to the nearest surface point.
+    """
+
+    axes_m: tuple[np.ndarray, np.ndarray, np.ndarray]
+    distance_m: np.ndarray
+    offset_m: np.ndarray
+
+    @classmethod
+    def build(
+        cls, vertices_m: np.ndarray, faces: np.ndarray, axes_m: tuple[np.ndarray, np.ndarray, np.ndarray]
+    ) -> "SignedDistanceGrid":
+        """Exact values of the mesh (vertex, 3), (face, 3) at every node. Raises as ``signed_distance`` does."""
+        nodes = np.stack(np.meshgrid(*axes_m, indexing="ij"), axis=-1)
+        found = signed_distance(vertices_m, faces, nodes.reshape(-1, 3))
+        offset = found.closest_m.reshape(nodes.shape) - nodes
+        return cls(axes_m, found.distance_m.reshape(nodes.shape[:3]), offset)
+
+    def distances_m(self, points_m: np.ndarray, spacing_m: float, margin_m: float) -> np.ndarray:
+        """(...,) interpolated distances of points (..., 3); beyond the grid a lower bound.
+
+        spacing_m: step of the grid, the same along all axes. margin_m: how far the surface keeps from the grid's faces.
+        The order of operations is part of the embedded corpora: their bytes rest on it.
+        """
+        shape = np.array(self.distance_m.shape)
+        low_m = np.array([axis[0] for axis in self.axes_m])
+        cell = (points_m - low_m) / spacing_m
+        clipped = np.clip(cell, 0, shape - 1.000001)
+        beyond = np.sqrt(((cell - clipped) ** 2).sum(-1)) * spacing_m
+        low = clipped.astype(np.int64)
+        x, y, z = np.moveaxis(clipped - low, -1, 0)
+        step_x, step_y = shape[1] * shape[2], shape[2]
+        flat = low[..., 0] * step_x + low[..., 1] * step_y + low[..., 2]
+        values = self.distance_m.reshape(-1)
+        rows = []
+        for offset in (0, step_y, step_x, step_x + step_y):
+            start = values[flat + offset]
+            rows.append(start + z * (values[flat + offset + 1] - start))
+        near = rows[0] + y * (rows[1] - rows[0])
+        far = rows[2] + y * (rows[3] - rows[2])
+        return np.where(beyond > 0, beyond + margin_m, near + x * (far - near))
+
+
+class DistanceFields:
+    """Fields of many objects in one stack; clips name their object by key.
+
+    Distances are negative inside. Beyond the box of a part (its bounds and 3 cm) the distance to the box is added.
+    """
+
+    def __init__(self, objects: Iterable[tuple[str, ObjectModel]], resolution: int = 40) -> None:
+        """objects: (key, model) pairs; resolution: grid points along each axis."""
+        self.resolution = resolution
+        self.row: dict[str, int] = {}
+        values, low, high, axis, origin = [], [], [], [], []
+        for key, model in objects:
+            if key in self.row:
+                continue
+            self.row[key] = len(self.row)
+            for part in range(2):
+                for column, found in zip((values, low, high), _part_values(model, part, resolution), strict=True):
+                    column.append(found)
+            axis.append(np.zeros(3) if model.hinge is None else model.hinge.axis)
+            origin.append(np.zeros(3) if model.hinge is None else model.hinge.origin_m)
+        self.values = torch.from_numpy(np.concatenate(values))
+        self.low, self.high = _tensor(low).reshape(-1, 2, 3), _tensor(high).reshape(-1, 2, 3)
+        self.axis, self.origin = _tensor(axis), _tensor(origin)
+
+    def rows(self, keys: Sequence[str]) -> Tensor:
+        """(clip,) rows of the named objects."""
+        return torch.tensor([self.row[key] for key in keys])
+
+    def to(self, device: torch.device | str) -> "DistanceFields":
+        """Moves the grids; gives itself back."""
+        for name in ("values", "low", "high", "axis", "origin"):
+            setattr(self, name, getattr(self, name).to(device))
+        return self
+
+    def query(self, rows: Tensor, points_m: Tensor, hinge_rad: Tensor) -> tuple[Tensor, Tensor]:
+        """Signed distance (B, F, P) and offset to the nearest surface point (B, F, P, 3), metres, object frame.
+
+        rows (B,), points_m (B, F, P, 3) in the object frame, hinge_rad (B, F).
+        """
+        rows = rows.to(points_m.device)
+        turn = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
+        origin = self.origin[rows][:, None, None]
+        base = self._read(rows, 0, points_m)
+        lid = self._read(rows, 1, (points_m - origin) @ turn + origin)
+        lid = torch.cat((lid[..., :1], lid[..., 1:] @ turn.transpose(-1, -2)), -1)
+        nearest = torch.where(base[..., :1] <= lid[..., :1], base, lid)
+        return nearest[..., 0], nearest[..., 1:]
+
+    def _read(self, rows: Tensor, part: int, points: Tensor) -> Tensor:
+        """(B, F, P, 4) interpolated values of one part at points (B, F, P, 3) of its rest frame."""
+        low, high = self.low[rows, part][:, None, None], self.high[rows, part][:, None, None]
+        inside = torch.minimum(torch.maximum(points, low), high)
+        beyond = points - inside
+        node = (inside - low) / (high - low) * (self.resolution - 1)
+        corner = node.detach().floor().clamp_(0, self.resolution - 2)
+        weight = node - corner
+        steps = torch.tensor([self.resolution**2, self.resolution, 1], device=points.device)
+        first = (corner.long() * steps).sum(-1) + ((rows * 2 + part) * self.resolution**3)[:, None, None]
+        total = _blend(self.values, first, weight, steps)
+        distance = total[..., 0] + (beyond.square().sum(-1) + 1e-12).sqrt() - 1e-6
+        return torch.cat((distance[..., None], total[..., 1:] - beyond), -1)
+
+
+def _blend(values: Tensor, first: Tensor, weight: Tensor, steps: Tensor) -> Tensor:
+    """Trilinear interpolation of rows of ``values`` at the eight corners above index ``first``."""
+    total = values.new_zeros(())
+    for corner in range(8):
+        bits = [(corner >> axis) & 1 for axis in range(3)]
+        share = values.new_ones(())
+        for axis, bit in enumerate(bits):
+            share = share * (weight[..., axis] if bit else 1 - weight[..., axis])
+        shift = sum(int(bit) * int(step) for bit, step in zip(bits, steps, strict=True))
+        total = total + share[..., None] * values[first + shift]
+    return total
+
+
+def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of one part (of a rigid object all, and no second): rows (node, 4) of signed distance and offset, and the box.
+
+    An object without the part is far away from everything.
+    """
+    faces = model.faces[model.face_part == part] if model.is_articulated else model.faces
+    if not len(faces) or (part == 1 and not model.is_articulated):
+        values = np.zeros((resolution**3, 4), np.float32)
+        values[:, 0] = FAR_M
+        return values, np.full(3, -1.0), np.full(3, 1.0)
+    corners = model.vertices_m[faces].reshape(-1, 3)
+    low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
+    x, y, z = (np.linspace(low[axis], high[axis], resolution) for axis in range(3))
+    grid = SignedDistanceGrid.build(model.vertices_m, faces, (x, y, z))
+    values = np.concatenate((grid.distance_m[..., None], grid.offset_m), axis=-1)
+    return values.reshape(-1, 4).astype(np.float32), low, high
+
+
+def _tensor(rows: list[np.ndarray]) -> Tensor:
+    return torch.from_numpy(np.stack(rows).astype(np.float32))

@@ -1,0 +1,91 @@
+"""Frozen settings dataclasses from plain mappings (params.yaml, a checkpoint) and back.
+
+The dataclass is the one place of a setting's name, type and default; a mapping states only what differs.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, Field, asdict, fields, is_dataclass
+from types import UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from hoidata.errors import BadInput
+
+Config = TypeVar("Config")
+NONE = type(None)
+
+
+def build_config(kind: type[Config], values: Mapping[str, Any] | None, where: str) -> Config:
+    """``kind`` with the given values over its defaults; nested dataclasses and tuples are rebuilt.
+
+    where: the section's name for errors. Raises BadInput for a key that ``kind`` does not have, listing those it has,
+    for one without default that is missing, and for a value of another type.
+    """
+    values = _checked_mapping({} if values is None else values, where)
+    known: dict[str, Field] = {item.name: item for item in fields(kind)}  # pyright: ignore[reportArgumentType]
+    refuse_unknown(values, list(known), where)
+    needed = [name for name, item in known.items() if item.default is MISSING and item.default_factory is MISSING]
+    if missing := [name for name in needed if name not in values]:
+        raise BadInput(where, f"a value for {', '.join(missing)}", "none", "give one")
+    hints = get_type_hints(kind)
+    built = {name: _value(hints[name], value, f"{where}.{name}", known[name]) for name, value in values.items()}
+    return kind(**built)
+
+
+def refuse_unknown(values: Mapping[str, Any], known: Sequence[str], where: str) -> None:
+    """Raise BadInput that names the keys that are not known and lists those that are."""
+    if unknown := [str(name) for name in values if name not in known]:
+        raise BadInput(where, f"keys among: {', '.join(known)}", ", ".join(unknown), "correct it")
+
+
+def plain_config(config: Any) -> dict[str, Any]:
+    """The config as dictionaries, lists and numbers, ready for JSON."""
+    return {name: _plain(value) for name, value in asdict(config).items()}
+
+
+def _value(hint: Any, value: Any, where: str, item: Field | None = None) -> Any:
+    origin, choices = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType) and NONE in choices:
+        inner = [choice for choice in choices if choice is not NONE]
+        return value if value is None or len(inner) > 1 else _value(inner[0], value, where)
+    if is_dataclass(hint):
+        return build_config(hint, value, where)  # pyright: ignore[reportArgumentType]
+    if origin is Literal:
+        if value not in choices:
+            raise BadInput(where, f"one of {', '.join(map(str, choices))}", repr(value), "choose one of them")
+        return value
+    if origin is Mapping:
+        return _mapping(choices[1], value, where, item)
+    if isinstance(value, list):
+        return tuple(value)
+    return _number_or_text(hint, value, where) if hint in (int, float, bool, str) else value
+
+
+def _mapping(hint: Any, value: Any, where: str, item: Field | None) -> dict[str, Any]:
+    """Entries over the default ones; entries that are settings have the default's names, and its values left out."""
+    value = _checked_mapping(value, where)
+    default = item.default_factory() if item and item.default_factory is not MISSING else {}
+    if not is_dataclass(hint):
+        return {**default, **value}
+    refuse_unknown(value, list(default), where)
+    given = {name: _checked_mapping(entry, f"{where}.{name}") for name, entry in value.items()}
+    whole = {name: {**asdict(default[name]), **entry} for name, entry in given.items()}
+    return {**default, **{name: _value(hint, entry, f"{where}.{name}") for name, entry in whole.items()}}
+
+
+def _checked_mapping(value: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise BadInput(where, "keys with values", repr(value), "correct it")
+    return value
+
+
+def _number_or_text(hint: type, value: Any, where: str) -> Any:
+    allowed = (int, float) if hint is float else hint
+    if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
+        raise BadInput(where, hint.__name__, repr(value), "correct it")
+    return hint(value)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value

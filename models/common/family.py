@@ -1,0 +1,169 @@
+"""What a model family is: its networks, and the one question it answers: motions for requests."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hoidata.batches.dataset import ClipBatch
+from hoidata.batches.requests import Request
+from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.hands import HandPair
+from hoidata.store.annotated import AnnotatedStore
+from models.common.corpus import Corpus
+from models.common.features import (
+    Hands,
+    Normaliser,
+    hand_rotmats,
+    hand_wrist_m,
+    object_hinge_rad,
+    object_position_m,
+    object_rotmat,
+)
+
+DOWN = np.array([0.0, 0.0, -1.0])
+Figures = dict[str, dict[str, float]]
+Losses = dict[str, Tensor]
+
+
+class Objective(Protocol):
+    """How to train one network. ``needs_entries``: whether batches must carry the distance entries."""
+
+    @property
+    def network(self) -> nn.Module: ...
+
+    @property
+    def needs_entries(self) -> bool: ...
+
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
+        """Named losses of one training batch; "total" is the one to minimise."""
+        ...
+
+    def validation(self, network: nn.Module) -> float:
+        """The loss on held-out clips, always with the same draws; network is in evaluation mode."""
+        ...
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What an objective is made from. network, loss: its configs. trained: the checkpoint of each network it needs."""
+
+    network: Any
+    loss: Any
+    seed: int
+    corpus: Corpus
+    hands: Hands
+    device: torch.device
+    trained: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Network:
+    """One network of a family, trained by one stage.
+
+    name: of its checkpoint folder, unique over all families. config: its frozen dataclass; build: config to module.
+    objective: how it is trained, with the normalisation it is trained in or None. loss: config of the objective.
+    needs: names of the networks that must be trained before. crop: of training clips that are too long.
+    results: what else is found on validation clips and kept in the checkpoint.
+    """
+
+    name: str
+    config: type
+    build: Callable[[Any], nn.Module]
+    objective: Callable[[Setup], tuple[Objective, Normaliser | None]]
+    loss: type | None = None
+    needs: tuple[str, ...] = ()
+    crop: Literal["random", "start"] = "random"
+    results: Callable[[nn.Module, Corpus], dict[str, float]] = lambda network, corpus: {}
+
+
+@dataclass(frozen=True)
+class Sources:
+    """What a family may use to answer. annotated: the dataset; checkpoints: folder with one folder per network.
+
+    hands: the hand model of the dataset's clips. settings: sections of families, by name.
+    """
+
+    annotated: AnnotatedStore
+    checkpoints: Path
+    hands: HandPair
+    device: torch.device
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Sampler(Protocol):
+    """A family that is ready to answer."""
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+        """One motion per request, in their order. A request gives the same motion in whatever company it is asked."""
+        ...
+
+
+@dataclass(frozen=True)
+class Family:
+    """A model family. title: in words, for tables. networks: what it trains itself.
+
+    uses: networks its motions need, of whatever family. load: makes it ready. diagnose: figures from inside its
+    networks on the test clips, by network; {} for most.
+    """
+
+    name: str
+    title: str
+    load: Callable[[Sources], Sampler]
+    networks: tuple[Network, ...] = ()
+    uses: tuple[str, ...] = ()
+    diagnose: Callable[[Sources], Figures] = lambda sources: {}
+
+
+def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: bool) -> Clip:
+    """Features (2, F, 99) and (F, 10) of the model frame as the clip that was asked for.
+
+    A hand that takes no part is invalid in every frame. synthetic: whether the model learnt from generated data.
+    """
+    hands, objects = hands[:, : request.n_frames].cpu().double(), objects[: request.n_frames].cpu().double()
+    rotation, origin = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
+    hinge = object_hinge_rad(objects).float().numpy() if request.object.is_articulated else None
+    return Clip(
+        clip_id=request.motion_id,
+        dataset="generated",
+        subject="generated",
+        sequence=request.clip_id,
+        hands={
+            side: _track(hands[row], bool(request.active_hands[row]), request, row, rotation, origin)
+            for row, side in enumerate(SIDES)
+        },
+        object=ObjectTrack(
+            request.object,
+            rotmat_to_rotvec(rotation @ object_rotmat(objects).numpy()).astype(np.float32),
+            (object_position_m(objects).numpy() @ rotation.T + origin).astype(np.float32),
+            hinge,
+        ),
+        source_frames=np.arange(request.n_frames, dtype=np.int32),
+        gravity=rotation @ DOWN,
+        verb=None,
+        object_words=request.object_words or request.object.name,
+        synthetic=synthetic,
+    )
+
+
+def _track(
+    hand: Tensor, active: bool, request: Request, row: int, rotation: np.ndarray, origin: np.ndarray
+) -> HandTrack:
+    n_frames = len(hand)
+    template = None if request.template_m is None else request.template_m[row]
+    betas = request.betas[row][None].astype(np.float32)
+    if not active:
+        nothing = np.zeros((n_frames, 3), np.float32)
+        return HandTrack(
+            nothing, nothing, np.zeros((n_frames, 45), np.float32), betas, np.zeros(n_frames, bool), template
+        )
+    rotmats = hand_rotmats(hand).numpy()
+    rotmats[:, 0] = rotation @ rotmats[:, 0]
+    turns = rotmat_to_rotvec(rotmats).astype(np.float32)
+    wrist = (hand_wrist_m(hand).numpy() @ rotation.T + origin).astype(np.float32)
+    return HandTrack(wrist, turns[:, 0], turns[:, 1:].reshape(n_frames, 45), betas, np.ones(n_frames, bool), template)

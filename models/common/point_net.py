@@ -1,0 +1,82 @@
+"""PointNet (Qi et al. 2017), as Text2HOI's supplement lays it out (Tables S4 and S5): features of a cloud of points."""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+@dataclass(frozen=True)
+class PointNetConfig:
+    """Sizes; the defaults are the paper's. widths: the three per-point layers, the last is the length of F_obj.
+
+    heads: layers behind the maximum (of the alignment, and of the encoder of z). align: learn a matrix per cloud.
+    """
+
+    widths: tuple[int, int, int] = (64, 128, 1024)
+    heads: tuple[int, int] = (512, 256)
+    align: bool = True
+
+
+def normalised_points(points_m: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (B, N, 3) about their mean, divided by the largest distance from it, and that scale (B, 1), metres."""
+    centred = points_m - points_m.mean(1, keepdim=True)
+    scale = centred.norm(dim=-1).amax(1)
+    return centred / scale[:, None, None], scale[:, None]
+
+
+class PointNet(nn.Module):
+    """Global feature (B, G) and per-point features (B, N, L) of points (B, N, C) (Qi et al. 2017; Tables S4, S5)."""
+
+    def __init__(self, channels: int, config: PointNetConfig) -> None:
+        super().__init__()
+        widths = config.widths
+        self.align = _Alignment(channels, config) if config.align else None
+        self.first = PointLayer(channels, widths[0])
+        self.second = PointLayer(widths[0], widths[1])
+        self.third = PointLayer(widths[1], widths[2], activate=False)
+
+    def forward(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        if self.align is not None:
+            points = points @ self.align(points)
+        local = self.first(points)
+        return self.third(self.second(local)).amax(1), local
+
+
+class PointLayer(nn.Module):
+    """Linear, batch norm over clips and points, ReLU: the paper's Conv1D with kernel 1."""
+
+    def __init__(self, inputs: int, outputs: int, activate: bool = True) -> None:
+        super().__init__()
+        self.linear, self.norm, self.activate = nn.Linear(inputs, outputs), nn.BatchNorm1d(outputs), activate
+
+    def forward(self, x: Tensor) -> Tensor:
+        rows = self.linear(x).flatten(0, -2)
+        # One row has no spread of its own: a dataset of one clip is normalised with the running statistics.
+        rows = self.norm(rows) if len(rows) > 1 else self._with_running_statistics(rows)
+        x = rows.reshape(*x.shape[:-1], -1)
+        return x.relu() if self.activate else x
+
+    def _with_running_statistics(self, rows: Tensor) -> Tensor:
+        norm = self.norm
+        return functional.batch_norm(rows, norm.running_mean, norm.running_var, norm.weight, norm.bias, eps=norm.eps)
+
+
+class _Alignment(nn.Module):
+    """The spatial transformer: a (C, C) matrix per clip that starts as the identity."""
+
+    def __init__(self, channels: int, config: PointNetConfig) -> None:
+        super().__init__()
+        self.channels = channels
+        sizes, heads = (channels, *config.widths), config.heads
+        self.points = nn.Sequential(*[PointLayer(a, b) for a, b in pairwise(sizes)])
+        self.hidden = nn.Sequential(PointLayer(sizes[-1], heads[0]), PointLayer(heads[0], heads[1]))
+        self.matrix = nn.Linear(heads[1], channels * channels)
+        nn.init.zeros_(self.matrix.weight)
+        nn.init.zeros_(self.matrix.bias)
+
+    def forward(self, x: Tensor) -> Tensor:
+        flat = self.matrix(self.hidden(self.points(x).amax(1)))
+        return flat.reshape(-1, self.channels, self.channels) + torch.eye(self.channels, device=x.device)

@@ -1,0 +1,85 @@
+"""All model families: the one table that names them, and where they are. Other packages add theirs by an entry point.
+
+``[project.entry-points."hoidata.families"]  mine = "my_package.family:MINE"``.
+"""
+
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import TYPE_CHECKING, Any
+
+from hoidata.errors import BadInput
+
+# Asking where a family is must not load torch: the stage that digests the code does so each time.
+if TYPE_CHECKING:
+    from models.common.family import Family, Network
+
+ENTRY_POINT_GROUP = "hoidata.families"
+FAMILIES = {
+    "text2hoi": "models.text2hoi.family:TEXT2HOI",
+    "text2hoi-coarse": "models.text2hoi.family:COARSE",
+    "other-prompt": "models.text2hoi.family:OTHER_PROMPT",
+    "nearest-clip": "models.baselines.families:NEAREST_CLIP",
+    "mean-motion": "models.baselines.families:MEAN_MOTION",
+    "mean-pose": "models.baselines.families:MEAN_POSE",
+    "ground-truth": "models.baselines.families:GROUND_TRUTH",
+}
+# Each in a module of its own, so that a change of one trains no other again.
+NETWORKS = {
+    "contact": "models.text2hoi.contact_training:CONTACT",
+    "length": "models.text2hoi.length_training:LENGTH",
+    "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
+    "refiner": "models.text2hoi.refiner_training:REFINER",
+}
+
+
+def family_names() -> list[str]:
+    """Names of all known families, built-in ones first."""
+    return [*FAMILIES, *sorted(point.name for point in _added())]
+
+
+def family_module(name: str) -> str:
+    """The module that defines a family, for a built-in one or another package's."""
+    return _address(name).partition(":")[0]
+
+
+def network_modules(name: str) -> list[str]:
+    """The module that defines a network; for one of another package, those of all families that may hold it."""
+    return [address.partition(":")[0] for address in _addresses_of_network(name)]
+
+
+def load_family(name: str) -> "Family":
+    """A family by name. Raises BadInput that lists the known ones."""
+    return _load(_address(name))
+
+
+def load_network(name: str) -> "Network":
+    """A network by its name, of whatever family. Raises BadInput that lists the known ones."""
+    if name in NETWORKS:
+        return _load(NETWORKS[name])
+    added = [network for address in _addresses_of_network(name) for network in _load(address).networks]
+    found = {network.name: network for network in added}
+    if name not in found:
+        known = ", ".join([*NETWORKS, *sorted(found)])
+        raise BadInput("network", f"one of {known}", name, "correct the name")
+    return found[name]
+
+
+def _load(address: str) -> Any:
+    module, _, attribute = address.partition(":")
+    return getattr(import_module(module), attribute)
+
+
+def _addresses_of_network(name: str) -> list[str]:
+    return [NETWORKS[name]] if name in NETWORKS else sorted(point.value for point in _added())
+
+
+def _address(name: str) -> str:
+    added = {point.name: point.value for point in _added()}
+    if name not in FAMILIES | added:
+        raise BadInput("family", f"one of {', '.join(family_names())}", name, "correct the name")
+    return (added | FAMILIES)[name]
+
+
+def _added() -> list[EntryPoint]:
+    """Entry points of other packages; a built-in name cannot be taken over."""
+    return [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name not in FAMILIES]

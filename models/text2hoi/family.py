@@ -1,0 +1,71 @@
+"""Text2HOI as a family, the same before its refiner, and the same asked with another clip's sentence."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hoidata.batches.dataset import HoiDataset
+from hoidata.batches.requests import Request
+from hoidata.clips.clip import Clip
+from models.common.config import build_config
+from models.common.family import Family, Sources
+from models.text2hoi.diagnostics import diagnose
+from models.text2hoi.networks import NETWORKS
+from models.text2hoi.sampler import SamplingConfig, Text2Hoi
+
+NAMES = tuple(network.name for network in NETWORKS)
+
+
+def _load(sources: Sources) -> Text2Hoi:
+    config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
+    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device)
+
+
+@dataclass(frozen=True)
+class BeforeRefiner:
+    """The motions of Text2HOI as the diffusion network leaves them."""
+
+    model: Text2Hoi
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+        motions = self.model.motions(requests, refined=False)
+        return self.model.clips(requests, motions, refined=False)
+
+
+@dataclass(frozen=True)
+class OtherPrompt:
+    """Text2HOI told another clip's sentence: what is then as good does not come from the words.
+
+    other: features of the sentence to use instead, by clip.
+    """
+
+    model: Text2Hoi
+    other: dict[str, np.ndarray]
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+        return self.model.sample([replace(request, text=self.other[request.clip_id]) for request in requests])
+
+
+def other_prompts(sources: Sources) -> dict[str, np.ndarray]:
+    """For every test clip the first sentence's features of another: other verb and object if there is one such."""
+    test = list(HoiDataset(sources.annotated, "test", crop="start"))
+    draws, chosen = np.random.default_rng(0), {}
+    for sample in test:
+        other = [s for s in test if s.verb != sample.verb and s.object_key != sample.object_key]
+        other = other or [s for s in test if s.sentences[0] != sample.sentences[0]] or [sample]
+        same_hand = [s for s in other if s.hand_type == sample.hand_type] or other
+        chosen[sample.clip_id] = same_hand[int(draws.integers(len(same_hand)))].text[0]
+    return chosen
+
+
+TEXT2HOI = Family("text2hoi", "Text2HOI", _load, networks=NETWORKS, uses=NAMES, diagnose=diagnose)
+COARSE = Family(
+    "text2hoi-coarse", "Text2HOI before its refiner", lambda sources: BeforeRefiner(_load(sources)), uses=NAMES
+)
+OTHER_PROMPT = Family(
+    "other-prompt",
+    "Text2HOI, another clip's prompt",
+    lambda sources: OtherPrompt(_load(sources), other_prompts(sources)),
+    uses=NAMES,
+)

@@ -1,0 +1,41 @@
+"""Training of the length network: what one step and one validation are."""
+
+import torch
+from torch import nn
+
+from hoidata.batches.dataset import ClipBatch, collate
+from models.common.corpus import Corpus, any_form
+from models.common.family import Losses, Network, Objective, Setup
+from models.text2hoi.length import LengthConfig, LengthModel, jittered_frames, length_loss
+
+
+class LengthObjective:
+    """Text2HOI Sec. 4.1, with a likelihood in place of the plain squared error."""
+
+    needs_entries = False
+
+    def __init__(self, network: LengthModel, corpus: Corpus, device: torch.device) -> None:
+        self.network = network
+        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
+        frames = jittered_frames(batch.lengths, generator)
+        mean, log_spread = self.network(any_form(batch, generator), batch.active_hands)
+        return length_loss(mean, log_spread, frames)
+
+    @torch.no_grad()
+    def validation(self, network: nn.Module) -> float:
+        assert isinstance(network, LengthModel)
+        held = self.held_out
+        errors = [
+            (network.expected_frames(held.text[:, form], held.active_hands) - held.lengths).abs()
+            for form in range(held.text.shape[1])
+        ]
+        return float(torch.stack(errors).mean())
+
+
+def _length_objective(setup: Setup) -> tuple[Objective, None]:
+    return LengthObjective(LengthModel(setup.network).to(setup.device), setup.corpus, setup.device), None
+
+
+LENGTH = Network("length", LengthConfig, LengthModel, _length_objective)

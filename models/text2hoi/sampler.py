@@ -1,0 +1,136 @@
+"""Text2HOI's answer to requests: a contact map, a motion of hands and object, and its refinement (Sec. 3).
+
+Everything a motion is drawn from comes from its request's seed, so it is the same in any company.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hoidata.batches.requests import Request, collate_requests
+from hoidata.clips.clip import Clip
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
+from hoidata.hands import HandPair
+from models.common.checkpoints import Checkpoint, load_checkpoint
+from models.common.family import motion_clip
+from models.common.features import Hands
+from models.common.sampling import SamplerConfig, draw_each
+from models.text2hoi.contact import ContactModel
+from models.text2hoi.contact_training import contact_threshold
+from models.text2hoi.diffusion import Condition
+from models.text2hoi.diffusion_training import motion_generator
+from models.text2hoi.length import LengthModel
+from models.text2hoi.networks import NETWORKS
+from models.text2hoi.refiner import RefinerModel, refine
+from models.text2hoi.surface import Surface
+
+AT_ONCE = 256
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """sampler: of the diffusion network. field_resolution: of the distance grids the refiner sees."""
+
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    field_resolution: int = 48
+
+
+@dataclass(frozen=True)
+class Text2HoiMotion:
+    """Features in the model frame: hands (2, F, 99) before and after the refiner, object (F, 10); contact_map (N,)."""
+
+    coarse: Tensor
+    refined: Tensor
+    object: Tensor
+    contact_map: Tensor
+
+
+@dataclass(frozen=True)
+class Text2Hoi:
+    """The four trained networks of one dataset, ready to answer."""
+
+    trained: Mapping[str, Checkpoint]
+    hands: Hands
+    config: SamplingConfig
+    device: torch.device
+
+    @classmethod
+    def load(
+        cls,
+        checkpoints: str | Path,
+        hands: HandPair,
+        config: SamplingConfig | None = None,
+        device: torch.device | str = "cpu",
+    ) -> "Text2Hoi":
+        """From ``checkpoints/<network>``. Raises BadInput for one that is not there."""
+        device = torch.device(device)
+        trained = {
+            network.name: load_checkpoint(Path(checkpoints) / network.name, network, device) for network in NETWORKS
+        }
+        return cls(trained, Hands(hands).to(device), config or SamplingConfig(), device)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """What the diffusion network was trained on."""
+        return self.trained["diffusion"].facts
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+        """Refined motions."""
+        return self.clips(requests, self.motions(requests), refined=True)
+
+    def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:
+        """Motions as clips, after refinement or before it."""
+        return [
+            motion_clip(request, motion.refined if refined else motion.coarse, motion.object, self.facts["synthetic"])
+            for request, motion in zip(requests, motions, strict=True)
+        ]
+
+    @torch.no_grad()
+    def motions(self, requests: Sequence[Request], refined: bool = True) -> list[Text2HoiMotion]:
+        """Every stage of one motion per request; without refinement ``refined`` is ``coarse``."""
+        made: list[Text2HoiMotion] = []
+        models = {request.object.name: request.object for request in requests}.values()
+        surface = Surface.of(self.hands, models, self.config.field_resolution, self.device) if refined else None
+        for start in range(0, len(requests), AT_ONCE):
+            made += self._batch_motions(requests[start : start + AT_ONCE], surface)
+        return made
+
+    def sample_lengths(self, text: Tensor, active_hands: Tensor, generator: torch.Generator) -> list[int]:
+        """Numbers of frames, 8 to 150, for sentences (B, 512) and hand flags (B, 2)."""
+        network = self.trained["length"].network
+        assert isinstance(network, LengthModel)
+        return network.sample(text.to(self.device), active_hands.to(self.device), generator).tolist()
+
+    def _batch_motions(self, requests: Sequence[Request], surface: Surface | None) -> list[Text2HoiMotion]:
+        batch = collate_requests(requests).to(self.device)
+        generators = [torch.Generator().manual_seed(request.seed) for request in requests]
+        contact_maps = self._contact_maps(batch.points_m, batch.text, batch.active_hands, generators)
+        generator = motion_generator(self.trained["diffusion"])
+        condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact_maps)
+        noise = draw_each(HAND_FEATURES, OBJECT_FEATURES, batch.frames.shape[1], generators)
+        coarse, objects = generator.sample(condition, self.config.sampler, noise, generators)
+        refined = coarse
+        if surface is not None:
+            network = self.trained["refiner"].network
+            assert isinstance(network, RefinerModel)
+            refined = refine(network, surface.coarse(batch, coarse, objects, contact_maps, batch.hand_frames))
+        parts = zip(coarse, refined, objects, contact_maps, strict=True)
+        return [
+            Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())
+            for (before, after, thing, contact_map), n in zip(parts, batch.lengths.tolist(), strict=True)
+        ]
+
+    def _contact_maps(
+        self, points_m: Tensor, text: Tensor, active_hands: Tensor, generators: Sequence[torch.Generator]
+    ) -> Tensor:
+        """(B, N) one drawn contact map each, 0 or 1; the likeliest points where none reaches the threshold."""
+        network = self.trained["contact"].network
+        assert isinstance(network, ContactModel)
+        latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1).to(self.device)
+        probability = network.sample(points_m, text, active_hands, latents)[:, 0]
+        limit = torch.tensor(contact_threshold(self.trained["contact"]), device=self.device)
+        return (probability >= torch.minimum(probability.amax(1, keepdim=True), limit)).float()

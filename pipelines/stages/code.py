@@ -1,0 +1,114 @@
+"""Stage code: for every stage the digests of exactly the code it runs, in ``code/``, which the stage depends on.
+
+Always run, so that DVC sees each change: a module that was edited, imported anew, or came with another package.
+What params.yaml sets for one dataset stands there too, so that it concerns that dataset's stages only.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hoidata.dataset_folders import outside_folders
+from hoidata.files.atomic import atomic_folder
+from hoidata.files.digest import canonical_json
+from models.registry import family_module, network_modules
+from pipelines.lineage.closure import Choice, SourceTree
+from pipelines.lineage.graph import read_params
+from pipelines.stages.base import Place, write_json
+
+CODE = Path("code")
+STAGES_OF_DATASETS = ("raw", "convert", "quality", "annotate", "contact", "surface", "split")
+DATASETS = "hoidata.datasets"
+# Modules that read files in the folder of a dataset they are given by name, and which.
+READERS = {
+    "hoidata.dataset_folders": ("facts.toml",),
+    "hoidata.splits.definitions": ("splits/*.json",),
+    "hoidata.splits.published": ("published.json",),
+}
+
+
+# Sections of params.yaml that hold a key per dataset. It may be absent, which DVC does not allow of a parameter.
+SECTIONS_OF_DATASETS = {"convert": ("convert", "adapters"), "split": ("split",)}
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where the code of a stage begins. chosen: by module what it picks by name."""
+
+    module: str
+    chosen: dict[str, list[Choice]] = field(default_factory=dict)
+
+
+def run(place: Place) -> None:
+    """Write one file per stage, and per dataset, network or family where that chooses among modules.
+
+    Manifests the graph depends on and nobody has written are written too: those datasets are absent.
+    """
+    params = read_params(Path())
+    places = [Place(params["profile"], name) for name in params["datasets"]]
+    if not all(path.is_file() for place in places for path in (place.manifest, place.hand_manifest)):
+        from pipelines.stages.adapters import ensure_manifests  # imports adapters, which takes longer than all the rest
+
+        ensure_manifests(params["profile"], params["datasets"])
+    write_code(Path())
+
+
+def write_code(root: Path) -> None:
+    """Write ``code/`` of the project at ``root`` anew."""
+    with atomic_folder(root / CODE) as part:
+        for path, digests in code_today(root).items():
+            write_json(part / Path(path).relative_to(CODE), digests)
+
+
+def code_today(root: Path) -> dict[str, dict[str, str]]:
+    """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``)."""
+    params = read_params(root)
+    tree = SourceTree(root, {f"{DATASETS}.{name}": folder for name, folder in outside_folders().items()})
+    starts = closures(params, tree).items()
+    return {
+        f"{CODE / name}.json": tree.closure([start.module], start.chosen) | _own_settings(params, name)
+        for name, start in starts
+    }
+
+
+def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
+    """Where the code of each file of ``code/`` begins: the one table of what the stages run."""
+    found, every = {}, {}
+    for dataset in params["datasets"]:
+        chosen = _chosen_by_dataset(tree, dataset)
+        found |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
+        every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
+    for network in params["train"]["demo"]:
+        found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
+    for family in params["families"]:
+        found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
+    every |= _families([family_module(family) for family in params["families"]])
+    return found | {stage: _start(stage, every) for stage in ("evaluate", "report")}
+
+
+def _families(modules: list[str]) -> dict[str, list[Choice]]:
+    """Of the table of all families only what is picked here counts: one more row concerns no other family."""
+    return {"models.registry": [Choice(tuple(modules), is_table=True)]}
+
+
+def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
+    return Start(f"pipelines.stages.{stage}", chosen)
+
+
+def _own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
+    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same."""
+    stage, _, dataset = name.partition("/")
+    if stage not in SECTIONS_OF_DATASETS:
+        return {}
+    keys, value = (*SECTIONS_OF_DATASETS[stage], dataset), params
+    for key in keys:
+        value = (value or {}).get(key)
+    return {f"params.yaml {'.'.join(keys)}": canonical_json(value or None)}
+
+
+def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
+    """The dataset's adapter, in its folder or registered by another package, and what is read of its folder."""
+    package = f"{DATASETS}.{name}"
+    modules = tree.modules_below(package) or tree.added("hoidata.adapters", name)
+    read = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
+    return {f"{DATASETS}.registry": [Choice(tuple(modules))], **read}

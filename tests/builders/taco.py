@@ -1,0 +1,89 @@
+"""TACO recordings written as the format notes have them: pickles of torch tensors, OBJ in centimetres."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips.clip import SIDES, HandTrack
+from hoidata.datasets import SequenceKey
+from hoidata.hands import load_embedded_hands, track_joints
+
+HANDS = load_embedded_hands()
+N_FRAMES = 30
+HALF_TOOL_M = np.array([0.035, 0.03, 0.02])
+NAMES = (
+    "(brush, brush, bowl)/20230927_034",
+    "(put in, spoon, bowl)/20230928_001",
+    "(put in, spoon, bowl)/20230928_002",
+)
+KEY = SequenceKey("taco", "20230927", NAMES[0])
+
+
+def dump(path: Path, value: object) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(pickle.dumps(value))
+
+
+def write_box(path: Path, half_m: np.ndarray) -> None:
+    mesh = trimesh.creation.box(2 * half_m * 100)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in mesh.vertices)
+    path.write_text(vertices + "".join(f"f {a} {b} {c}\n" for a, b, c in mesh.faces + 1))
+
+
+def write_recording(root: Path, name: str, seed: int) -> None:
+    """Both hands hold the tool, which is moved and turned above a bowl that stands still; its ids are 012 and 105."""
+    rng = np.random.default_rng(seed)
+    time = np.linspace(0, 1, N_FRAMES)[:, None]
+    turn = Rotation.from_rotvec(rng.normal(0, 0.6, 3) + time * rng.normal(0, 1.2, 3))
+    place = np.array([0.3, -0.2, 1.0]) + time * rng.normal(0, 0.2, 3)
+    tool, target = np.tile(np.eye(4), (2, N_FRAMES, 1, 1))
+    tool[:, :3, :3], tool[:, :3, 3], target[:, :3, 3] = turn.as_matrix(), place, (0.3, -0.2, 0.8)
+    folder = root / "Object_Poses" / name
+    folder.mkdir(parents=True)
+    np.save(folder / "tool_012.npy", tool.astype(np.float32))
+    np.save(folder / "target_105.npy", target.astype(np.float32))
+    for side in SIDES:
+        poses, betas = hand(side, turn, place, rng)
+        dump(root / "Hand_Poses" / name / f"{side}_hand.pkl", poses)
+        dump(root / "Hand_Poses" / name / f"{side}_hand_shape.pkl", {"hand_shape": torch.tensor(betas).float()})
+
+
+def hand(side: str, turn: Rotation, place: np.ndarray, rng: np.random.Generator) -> tuple[dict, np.ndarray]:
+    """The middle of index, middle and ring tip lies on one side of the tool; frame keys count from 00001."""
+    betas, fingers = rng.normal(0, 0.3, 10), HANDS[side].mean_pose + rng.normal(0, 0.05, 45)
+    flat = HandTrack(np.zeros((1, 3)), np.zeros((1, 3)), fingers[None], betas[None], np.ones(1, dtype=bool))
+    tips = track_joints(flat, HANDS[side])[0, [16, 17, 19]].mean(axis=0)
+    wrist = place + turn.apply(HALF_TOOL_M * ((1, 0, 0) if side == "right" else (-1, 0, 0)) - tips)
+    poses = {
+        f"{frame + 1:05d}": {
+            "hand_pose": torch.tensor(np.concatenate((turn.as_rotvec()[frame], fingers))).float(),
+            "hand_trans": torch.tensor(wrist[frame]).float(),
+        }
+        for frame in range(N_FRAMES)
+    }
+    return poses, betas
+
+
+def write_taco(root: Path) -> Path:
+    for seed, name in enumerate(NAMES):
+        write_recording(root, name, seed)
+    write_box(root / "Object_Models" / "012_cm.obj", HALF_TOOL_M)
+    write_box(root / "Object_Models" / "105_cm.obj", np.array([0.08, 0.08, 0.03]))
+    return root
+
+
+def write_two(root: Path) -> Path:
+    """Two recordings that share the target; each tool has a mesh of its own."""
+    for seed, name in enumerate(NAMES[:2]):
+        write_recording(root, name, seed)
+    other = root / "Object_Poses" / NAMES[1]
+    (other / "tool_012.npy").rename(other / "tool_013.npy")
+    for number in ("012", "013"):
+        write_box(root / f"Object_Models/{number}_cm.obj", HALF_TOOL_M)
+    write_box(root / "Object_Models/105_cm.obj", np.array([0.08, 0.08, 0.03]))
+    return root

@@ -1,0 +1,179 @@
+"""Stores against annotated datasets: which clips are compared, how values become figures, what is left out."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hoidata.errors import BadInput
+from hoidata.metrics import registry
+from hoidata.metrics.describe import readme
+from hoidata.metrics.evaluate import evaluate_store, matched
+from hoidata.metrics.registry import METRICS, is_better, metric, reduced
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+
+RIGHT, BOTH = "toy/s3/2", "toy/s3/3"
+
+
+def written(folder: Path, clips) -> Path:
+    write_store(folder, clips, generated_info("predicted"))
+    return folder
+
+
+def named(clip, clip_id, **changes):
+    return replace(clip, clip_id=clip_id, **changes)
+
+
+def test_the_truth_has_no_error_and_all_its_contacts(write_annotated, tmp_path):
+    root, clips = write_annotated()
+    found = evaluate_store(written(tmp_path / "same", clips.values()), root)
+    assert (found["held_out_clips"], found["motions"], found["left_out"]) == (2, 2, [])
+    assert found["figures"]["joint_error_mm"] == 0
+    assert found["figures"]["contact_f1"] == 1
+    assert set(found["counts"]) == set(found["figures"])
+    assert found["counts"]["joint_error_mm"] == {"clips": 2, "motions": 2, "values": 3 * 12}
+    assert set(found["figures"]) <= {item.name for item in METRICS}
+
+
+def test_the_best_sample_of_each_clip_counts_for_joints_and_the_first_two_for_meshes(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    shifts = {RIGHT: (0.02, 0.03, 0.004), BOTH: (0.008, 0.05, 0.06)}
+    predicted = [
+        named(moved(clips[clip_id], (shift, 0, 0)), f"{clip_id}~{number}")
+        for clip_id, row in shifts.items()
+        for number, shift in enumerate(row)
+    ]
+    found = evaluate_store(written(tmp_path / "three", predicted[::-1]), root)
+    assert found["figures"]["joint_error_mm"] == pytest.approx((4 + 8) / 2, abs=1e-3)
+    assert found["motions"] == 6
+    assert found["counts"]["penetration_mm"]["motions"] == 4
+    two = evaluate_store(written(tmp_path / "two", [p for p in predicted if not p.clip_id.endswith("~2")]), root)
+    for name in ("penetration_mm", "contact_distance_mm"):
+        assert found["figures"][name] == two["figures"][name]
+
+
+def test_a_motion_under_another_clips_name_is_measured_against_that_clip(write_annotated, tmp_path):
+    root, clips = write_annotated()
+    swapped = [named(clips[RIGHT], f"{BOTH}~0"), named(clips[BOTH], f"{RIGHT}~0")]
+    found = evaluate_store(written(tmp_path / "swapped", swapped), root)
+    assert found["figures"]["joint_error_mm"] > 50
+    assert found["figures"]["contact_f1"] < 0.7
+
+
+def test_left_and_right_hand_are_not_taken_for_each_other(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    predicted = moved(clips[RIGHT], (0, 0, 0.02), ["right"])
+    found = evaluate_store(written(tmp_path / "right", [predicted]), root)
+    assert found["figures"]["joint_error_mm"] == pytest.approx(20, abs=1e-3)
+    predicted = moved(clips[RIGHT], (0, 0, 0.02), ["left"])
+    found = evaluate_store(written(tmp_path / "left", [predicted]), root)
+    assert found["figures"]["joint_error_mm"] == 0
+
+
+def test_predictions_that_cannot_be_compared_are_listed_with_the_reason(write_annotated, make_clip, tmp_path):
+    root, clips = write_annotated()
+    clip, both = clips[RIGHT], clips[BOTH]
+    short = named(clip.take(slice(0, 9)), f"{RIGHT}~1", source_frames=np.arange(70, 79, dtype=np.int32))
+    handless = replace(both.hands["left"], valid=np.zeros(12, bool))
+    other = make_clip(12, "both", articulated=True)
+    predicted = [
+        named(clip, f"{RIGHT}~0"),
+        short,
+        named(both, f"{BOTH}~0", hands=both.hands | {"left": handless}),
+        named(other, f"{BOTH}~1"),
+        named(clip, "toy/s1/0~0"),
+        named(clip, f"{RIGHT}~x"),
+    ]
+    found = evaluate_store(written(tmp_path / "odd", predicted), root)
+    reasons = {item["clip_id"]: item["reason"] for item in found["left_out"]}
+    assert set(reasons) == {item.clip_id for item in predicted[1:]}
+    assert reasons[f"{RIGHT}~1"].startswith("9 frames, 12 expected")
+    assert "left hand" in reasons[f"{BOTH}~0"]
+    assert "mesh" in reasons[f"{BOTH}~1"]
+    assert found["motions"] == 1
+
+
+def test_a_clip_without_prediction_is_listed(write_annotated, tmp_path):
+    root, clips = write_annotated()
+    found = evaluate_store(written(tmp_path / "one", [clips[RIGHT]]), root)
+    assert found["left_out"] == [{"clip_id": BOTH, "reason": "no prediction of this clip"}]
+    assert found["held_out_clips"] == 2
+
+
+def test_a_store_of_which_nothing_can_be_compared_is_refused(write_annotated, make_clip, tmp_path):
+    root, _ = write_annotated()
+    with pytest.raises(BadInput, match=r"<id>~<k>.*unknown"):
+        evaluate_store(written(tmp_path / "none", [make_clip(12, clip_id="toy/s9/unknown")]), root)
+
+
+@pytest.mark.parametrize("start", [0, 4])
+def test_a_prediction_of_some_frames_is_compared_with_those(write_annotated, tmp_path, start):
+    root, clips = write_annotated()
+    part = clips[RIGHT].take(slice(start, start + 7))
+    found = evaluate_store(written(tmp_path / "part", [part]), root)
+    assert found["figures"]["joint_error_mm"] == 0
+    assert found["figures"]["contact_f1"] == 1
+    assert found["counts"]["joint_error_mm"]["values"] == 7
+
+
+def test_the_threshold_and_points_are_those_of_the_contact_stage(write_annotated, tmp_path):
+    def of(folder, **settings):
+        root, clips = write_annotated(**settings)
+        root = root.rename(tmp_path / folder)
+        return evaluate_store(written(tmp_path / f"same-{folder}", clips.values()), root)
+
+    wide, narrow = of("wide"), of("narrow", threshold_m=0.012, points=100)
+    assert narrow["figures"]["contact_f1"] == 1
+    counts = [found["counts"]["contact_distance_mm"]["values"] for found in (narrow, wide)]
+    assert 0 < counts[0] < counts[1]
+
+
+def test_samples_are_taken_in_the_order_of_their_numbers():
+    ids = ["a~10", "a~2", "b~0", "a", "b~x", "c"]
+    samples, left_out = matched(ids, ["a", "b"])
+    assert samples == {"a": ["a", "a~2", "a~10"], "b": ["b~0"]}
+    assert [item.clip_id for item in left_out] == ["b~x", "c"]
+
+
+def test_values_are_reduced_as_the_record_says():
+    clips = [[np.array([1.0, 3.0]), np.array([5.0, 5.0, 5.0])], [np.array([8.0])], [np.zeros(0)]]
+    best = replace(metric("joint_error_mm"), reduction="best of a clip's samples")
+    assert reduced(best, clips) == ((2 + 8) / 2, 2, 3, 6)
+    assert reduced(replace(best, direction="higher"), clips)[0] == (5 + 8) / 2
+    assert reduced(replace(best, reduction="mean over motions"), clips)[0] == (2 + 5 + 8) / 3
+    assert reduced(replace(best, reduction="mean over frames"), clips)[0] == 27 / 6
+    assert reduced(best, [[np.zeros(0)]]) is None
+
+
+def test_better_is_what_the_record_says():
+    lower, higher = metric("joint_error_mm"), metric("contact_f1")
+    assert is_better(lower, 1, 2, None)
+    assert not is_better(lower, 2, 2, None)
+    assert is_better(higher, 2, 1, None)
+    nearer = metric("jitter_m_s3")
+    assert is_better(nearer, 4, 1, 3)
+    assert not is_better(nearer, 1, 4, 3)
+    assert is_better(nearer, 4, 1, None) is None
+    assert is_better(metric("realism_si_floor"), 1, 0, 0) is None
+
+
+def test_every_metric_is_registered_once_and_floors_have_their_metric():
+    names = [item.name for item in METRICS]
+    assert len(set(names)) == len(names) == len({item.title for item in METRICS})
+    assert {item.floor_of for item in METRICS if item.floor_of} <= set(names)
+    directions = {item.name: item.direction for item in METRICS if item.direction != "lower" and not item.floor_of}
+    assert directions == {
+        "contact_f1": "higher",
+        "realism_si": "higher",
+        "realism_released": "higher",
+        "contact_distance_mm": "nearer the truth",
+        "smoothness_m_s2": "nearer the truth",
+        "jitter_m_s3": "nearer the truth",
+    }
+
+
+def test_the_readme_is_the_one_the_registry_gives():
+    path = Path(registry.__file__).with_name("README.md")
+    assert path.read_text() == readme(), "run: python -m hoidata.metrics.describe > hoidata/metrics/README.md"

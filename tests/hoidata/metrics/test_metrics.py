@@ -1,0 +1,267 @@
+"""Every metric on motions whose figure is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips.clip import FPS, HandTrack, ObjectTrack
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.metrics import forces, motion, touch
+from hoidata.metrics.registry import METRICS
+from hoidata.objects.model import ObjectModel
+from hoidata.physics.mano_capsules import hand_capsules
+
+HALF_M = np.array([0.05, 0.04, 0.03])  # of the box of tests/conftest.py
+
+
+def to_box_m(points):
+    """Signed distance of points (..., 3) from the box's surface in closed form, metres, negative inside."""
+    beyond = np.abs(points) - HALF_M
+    return np.linalg.norm(np.maximum(beyond, 0), axis=-1) + np.minimum(beyond.max(axis=-1), 0)
+
+
+def along_the_face(clip, depth_m):
+    """(frame, 3) world shift that pushes a hand of ``make_clip`` into the box's top face."""
+    return Rotation.from_rotvec(clip.object.rotvec).apply([0, 0, -depth_m])
+
+
+# --- joints
+
+
+def test_joint_error_is_the_length_of_a_known_shift(make_clip, moved, pair_of):
+    clip = make_clip(10)
+    found = motion.joint_error_mm(pair_of(moved(clip, (0.003, 0.004, 0.0)), clip), 1)
+    assert found == pytest.approx(np.full(10, 5.0), abs=1e-3)
+
+
+def test_joint_error_counts_left_and_right_apart(make_clip, moved, pair_of):
+    clip = make_clip(6, "both")
+    found = motion.joint_error_mm(pair_of(moved(clip, (0.0, 0.01, 0.0), ["left"]), clip, "both"), 1)
+    assert found == pytest.approx(np.repeat([10.0, 0.0], 6), abs=1e-3)
+
+
+def test_a_hand_that_was_not_asked_for_changes_no_metric(make_clip, moved, pair_of):
+    clip = make_clip(10)
+    garbage = moved(clip, clip.object.translation_m - clip.hands["left"].wrist_m, ["left"])  # inside the box
+    one, other = pair_of(clip, clip, table_m=-1.0), pair_of(garbage, clip, table_m=-1.0)
+    for metric in METRICS:
+        assert metric.measure(one, metric.every).tolist() == metric.measure(other, metric.every).tolist(), metric.name
+
+
+def test_frames_in_which_the_reference_lost_the_hand_are_not_looked_at(make_clip, moved, pair_of):
+    clip = make_clip(9)
+    valid = np.ones(9, bool)
+    valid[2:5] = False
+    lost = replace(clip, hands=clip.hands | {"right": replace(clip.hands["right"], valid=valid)})
+    pair = pair_of(moved(clip, (0, 0, 0.001)), lost)
+    assert len(motion.joint_error_mm(pair, 1)) == 6
+    assert pair.frames("right", 3).tolist() == [0, 6]
+
+
+def with_joints(pair, joints):
+    """The pair with these right joints (frame, 21, 3) in the prediction, whose hand never turns."""
+    hands = pair.predicted.clip.hands
+    still = replace(hands["right"], global_orient=np.zeros_like(hands["right"].global_orient))
+    clip = replace(pair.predicted.clip, hands=hands | {"right": still})
+    return replace(pair, predicted=replace(pair.predicted, clip=clip, joints_m={"left": joints, "right": joints}))
+
+
+def test_smoothness_is_a_known_acceleration_in_the_wrist_frame(make_clip, pair_of):
+    clip = make_clip(8)
+    time = np.arange(8) / FPS
+    joints = np.zeros((8, 21, 3))
+    joints += (2.0 * time**2)[:, None, None]  # the whole hand accelerates: the wrist frame goes along
+    joints[:, 1:, 0] += 0.5 * 3.0 * time[:, None] ** 2
+    found = motion.smoothness(with_joints(pair_of(clip, clip), joints), 1)
+    assert found == pytest.approx([3.0 * 20 / 21])
+
+
+def test_jitter_is_a_known_jerk_in_the_world(make_clip, pair_of):
+    clip = make_clip(8)
+    time = np.arange(8) / FPS
+    joints = np.zeros((8, 21, 3))
+    joints[..., 1] = (7.0 / 6 * time**3 + 5 * time**2)[:, None]
+    found = motion.jitter_m_s3(with_joints(pair_of(clip, clip), joints), 1)
+    assert found == pytest.approx(np.full(5, 7.0))
+
+
+# --- contact and penetration
+
+
+def test_penetration_is_the_depth_of_the_deepest_vertex_in_a_box(make_clip, moved, pair_of):
+    clip, hands = make_clip(12), load_embedded_hands()
+    deep = moved(clip, along_the_face(clip, 0.012))
+    points = deep.object.world_from_object.inverse() @ track_vertices(deep.hands["right"], hands.right)
+    expected = np.maximum(-to_box_m(points).min(axis=1), 0) * 1000
+    assert expected.min() > 5
+    assert touch.penetration_mm(pair_of(deep, clip), 1) == pytest.approx(expected, abs=1e-3)
+    assert touch.penetration_mm(pair_of(deep, clip), 3) == pytest.approx(expected[::3], abs=1e-3)
+    away = moved(clip, along_the_face(clip, -0.2))
+    assert touch.penetration_mm(pair_of(away, clip), 1).tolist() == [0.0] * 12
+
+
+def test_the_deep_share_counts_frames_below_ten_millimetres(make_clip, moved, pair_of):
+    clip = make_clip(4)
+    shifts = [along_the_face(clip, depth)[frame] for frame, depth in enumerate((0.005, 0.011, 0.02, -0.1))]
+    pair = pair_of(moved(clip, np.array(shifts)), clip)
+    depths = touch.penetration_mm(pair, 1)
+    assert touch.deep_share(pair, 1).tolist() == (depths > 10).astype(float).tolist()
+    assert 0 < touch.deep_share(pair, 1).mean() < 1
+
+
+def test_depth_in_a_sphere_is_radius_less_distance_from_its_middle(make_clip, pair_of):
+    mesh, clip, hands = trimesh.creation.icosphere(4, 0.05), make_clip(3), load_embedded_hands()
+    model = ObjectModel("ball", mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
+    tip = track_vertices(clip.hands["right"], hands.right)[:, 445]
+    clip = replace(
+        clip, object=ObjectTrack(model, clip.object.rotvec, (tip + np.array([0, 0, 0.03])).astype(np.float32))
+    )
+    away = np.linalg.norm(track_vertices(clip.hands["right"], hands.right) - clip.object.translation_m[:, None], axis=2)
+    expected = (0.05 - away.min(axis=1)) * 1000
+    assert touch.penetration_mm(pair_of(clip, clip), 1) == pytest.approx(expected, abs=0.2)
+    assert (expected > 15).all()
+
+
+def test_an_object_without_an_inside_has_no_penetration(make_clip, pair_of):
+    clip = make_clip(3)
+    open_box = replace(clip.object.model, faces=clip.object.model.faces[:1], name="one triangle")
+    clip = replace(clip, object=replace(clip.object, model=open_box))
+    assert len(touch.penetration_mm(pair_of(clip, clip), 1)) == 0
+    assert len(forces.realism_si(pair_of(clip, clip, table_m=-1.0), 1)) == 0
+
+
+def test_contact_distance_is_that_of_joints_that_touch_in_the_truth(make_clip, moved, pair_of):
+    clip = make_clip(6)
+    lifted = moved(clip, along_the_face(clip, -0.05))
+    pair = pair_of(lifted, clip)
+    true, made = (to_box_m(one.joints_in_object("right", np.arange(6))) for one in (pair.reference, pair.predicted))
+    touching = np.abs(true) < 0.02
+    assert 0 < touching.sum() < touching.size
+    assert touch.contact_distance_mm(pair, 1) == pytest.approx(1000 * np.abs(made)[touching], abs=1e-3)
+    assert len(touch.contact_distance_mm(pair_of(clip, lifted), 1)) == 0  # nothing touches in that truth
+
+
+def test_contact_f1_compares_the_points_touched_with_those_of_the_truth(make_clip, moved, pair_of):
+    clip = make_clip(6)
+    pair = pair_of(clip, clip)
+    made = touch.touched_points(pair)
+    assert touch.contact_f1(pair, 1) == [1.0]
+    count, missed = int(made.sum()), np.flatnonzero(~made)
+    other = made.copy()
+    other[np.flatnonzero(made)[: count // 2]] = False
+    other[missed[: 3 * count]] = True
+    true_count, hits = int(other.sum()), count - count // 2
+    pair = replace(pair, contact=replace(pair.contact, touched=other))
+    precision, recall = hits / count, hits / true_count
+    assert touch.contact_f1(pair, 1) == pytest.approx([2 * precision * recall / (precision + recall)])
+    away = pair_of(moved(clip, along_the_face(clip, -0.3)), clip)
+    assert touch.contact_f1(away, 1) == [0.0]
+
+
+def test_contact_is_made_at_the_threshold_of_the_reference(make_clip, pair_of):
+    clip = make_clip(6)
+    narrow, wide = (touch.touched_points(pair_of(clip, clip, threshold_m=reach)) for reach in (0.012, 0.02))
+    assert 0 < narrow.sum() < wide.sum()
+    assert len(touch.contact_distance_mm(pair_of(clip, clip, threshold_m=0.012), 1)) < len(
+        touch.contact_distance_mm(pair_of(clip, clip), 1)
+    )
+
+
+# --- forces
+
+
+BOTTOM_M = 0.05
+
+
+def on_a_hand(make_clip, fall_m_s2=0.0, hand_below_m=0.0):
+    """A plate of 40 x 40 x 10 cm, its middle over a flat hand whose highest capsule reaches 6 mm into it."""
+    mesh, n_frames = trimesh.creation.box((0.4, 0.4, 2 * BOTTOM_M)), 12
+    model = ObjectModel("plate", mesh.vertices, mesh.faces, np.zeros(8, np.uint8))
+    time = np.arange(n_frames) / FPS
+    path = np.zeros((n_frames, 3), np.float32)
+    path[:, 2] = -0.5 * fall_m_s2 * time**2
+    zeros = np.zeros((n_frames, 3), np.float32)
+    orient = np.tile(np.float32([np.pi / 2, 0, 0]), (n_frames, 1))
+    hand = HandTrack(
+        zeros, orient, np.zeros((n_frames, 45), np.float32), np.zeros((1, 10), np.float32), zeros[:, 0] == 0
+    )
+    capsules = hand_capsules(hand, load_embedded_hands().right)
+    top = (np.maximum(capsules.start_m, capsules.end_m)[0, :, 2] + capsules.radius_m).max()
+    middle = (capsules.start_m[0, :4] + capsules.end_m[0, :4]).mean(axis=0) / 2
+    wrist = np.array([-middle[0], -middle[1], 0.006 - BOTTOM_M - top - hand_below_m]) + path
+    clip = make_clip(n_frames)
+    right = replace(hand, wrist_m=wrist.astype(np.float32))
+    left = replace(hand, wrist_m=(wrist - np.array([0, 0, 9])).astype(np.float32))
+    return replace(clip, hands={"left": left, "right": right}, object=ObjectTrack(model, zeros, path))
+
+
+def test_a_plate_at_rest_on_a_hand_is_realistic_and_one_in_the_air_is_not(make_clip, pair_of):
+    held, floating = on_a_hand(make_clip), on_a_hand(make_clip, hand_below_m=0.5)
+    for measure in (forces.realism_si, forces.realism_as_released):
+        assert measure(pair_of(held, floating, table_m=-1.0), 1).tolist() == [1.0] * 12
+        assert measure(pair_of(floating, held, table_m=-1.0), 1).tolist() == [0.0] * 12
+    for floor in (forces.floor_si, forces.floor_as_released):
+        assert floor(pair_of(held, held, table_m=-1.0), 1).tolist() == [0.0] * 12
+
+
+def test_the_floor_is_what_falls_by_itself(make_clip, pair_of):
+    """As released, gravity is ten times too small: an object that falls that slowly needs no hand."""
+    free, slow = on_a_hand(make_clip, 9.81, 0.5), on_a_hand(make_clip, 0.98, 0.5)
+    assert forces.floor_si(pair_of(free, free, table_m=-1.0), 1).all()
+    assert not forces.floor_as_released(pair_of(free, free, table_m=-1.0), 1).any()
+    assert not forces.floor_si(pair_of(slow, slow, table_m=-1.0), 1).any()
+    # Its forward differences have nothing after the last two frames.
+    assert forces.floor_as_released(pair_of(slow, slow, table_m=-1.0), 1)[:-2].all()
+
+
+def test_every_name_in_the_registry_gives_the_figure_it_names(make_clip, pair_of):
+    """Figures that tell all metrics of forces, meshes and derivatives from each other."""
+
+    def figures(pair):
+        found = {metric.name: metric.measure(pair, metric.every) for metric in METRICS}
+        # Without the last two frames, in which forward differences have nothing.
+        inner = {name: values[:-2] if len(values) > 2 else values for name, values in found.items()}
+        return {name: float(values.mean()) for name, values in inner.items() if len(values)}
+
+    held, slow = on_a_hand(make_clip), on_a_hand(make_clip, 0.98, 0.5)
+    carried = figures(pair_of(held, held, table_m=-1.0))
+    alone = {name: value for name, value in figures(pair_of(slow, held, table_m=-1.0)).items() if "realism" in name}
+    assert (carried["realism_si"], carried["realism_released"]) == (1, 1)
+    assert (carried["realism_si_floor"], carried["realism_released_floor"]) == (0, 0)
+    assert alone == {
+        "realism_si": 0,
+        "realism_si_floor": 0,
+        "realism_released": 1,
+        "realism_released_floor": 1,
+    }
+    assert 6 < carried["penetration_mm"] < 15
+    assert carried["deep_share"] in (0, 1)
+    assert carried["capsule_depth_mm"] < 6
+    time = np.arange(12) / FPS
+    joints = np.zeros((12, 21, 3))
+    joints[:, 1:, 0] += 7.0 / 6 * time[:, None] ** 3
+    moving = figures(with_joints(pair_of(held, held), joints))
+    assert moving["jitter_m_s3"] == pytest.approx(7.0 * 20 / 21)
+    assert moving["smoothness_m_s2"] == pytest.approx(7.0 * 20 / 21 * time[1:-1].mean())
+
+
+def test_forces_are_asked_about_above_the_table_of_the_truth_only(make_clip, pair_of):
+    held = on_a_hand(make_clip)
+    assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M), 1)) == 0
+    assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 1)) == 12
+    assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 3)) == 4
+    assert len(forces.realism_si(pair_of(held, held, table_m=None), 1)) == 0
+
+
+def test_capsule_depth_is_how_far_capsules_reach_over_a_plane(make_clip, pair_of):
+    held = on_a_hand(make_clip)
+    capsules = hand_capsules(held.hands["right"], load_embedded_hands().right)
+    depth = np.maximum(capsules.start_m, capsules.end_m)[0, :, 2] + capsules.radius_m + BOTTOM_M
+    expected = 1000 * depth[depth > 0].mean()
+    assert (depth > 0).sum() > 3
+    assert forces.capsule_depth_mm(pair_of(held, held, table_m=-1.0), 1) == pytest.approx([expected], abs=1e-3)
+    floating = on_a_hand(make_clip, hand_below_m=0.5)
+    assert len(forces.capsule_depth_mm(pair_of(floating, held, table_m=-1.0), 1)) == 0

@@ -1,0 +1,80 @@
+"""Settings are typed once: a mapping states what differs, and a wrong one is named with what was expected."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import pytest
+
+from hoidata.errors import BadInput
+from hoidata.settings import build_config, plain_config
+
+
+@dataclass(frozen=True)
+class Bound:
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class Inner:
+    widths: tuple[int, ...] = (1, 2)
+
+
+@dataclass(frozen=True)
+class Example:
+    count: int = 3
+    size_m: float = 0.5
+    deep: bool = False
+    kind: Literal["round", "square"] = "round"
+    inner: Inner = field(default_factory=Inner)
+    bounds: Mapping[str, Bound] = field(default_factory=lambda: {"mass": Bound(0.0, 1.0), "age": Bound(None, 9.0)})
+    free: Mapping[str, Any] = field(default_factory=dict)
+
+
+def built(**values: Any) -> Example:
+    return build_config(Example, values, "params.yaml: example")
+
+
+def test_nothing_said_gives_the_defaults():
+    assert build_config(Example, None, "here") == Example() == built()
+
+
+def test_what_is_said_replaces_the_default_and_nothing_else():
+    example = built(size_m=1, inner={"widths": [4]}, bounds={"mass": {"high": 2}}, free={"a": None})
+    assert (example.size_m, type(example.size_m)) == (1.0, float)
+    assert example.inner == Inner((4,))
+    assert example.bounds == {"mass": Bound(0.0, 2.0), "age": Bound(None, 9.0)}
+    assert (example.count, example.free) == (3, {"a": None})
+
+
+def test_plain_values_build_the_same_again():
+    example = built(bounds={"age": {"low": 1}}, inner={"widths": [7, 8]})
+    assert build_config(Example, plain_config(example), "here") == example
+
+
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"cuont": 1}, "example: expected keys among: count, size_m, deep, kind, inner, bounds, free, got cuont"),
+        ({"inner": {"width": 1}}, "example.inner: expected keys among: widths, got width"),
+        ({"bounds": {"weight": {}}}, "example.bounds: expected keys among: mass, age, got weight"),
+        ({"bounds": {"mass": {"most": 1}}}, "example.bounds.mass: expected keys among: low, high, got most"),
+        ({"bounds": {"mass": {"high": "x"}}}, "example.bounds.mass.high: expected float, got 'x'"),
+        ({"bounds": {"mass": 3}}, "example.bounds.mass: expected keys with values, got 3"),
+        ({"count": 1.5}, "example.count: expected int, got 1.5"),
+        ({"count": True}, "example.count: expected int, got True"),
+        ({"deep": 1}, "example.deep: expected bool, got 1"),
+        ({"kind": "flat"}, "example.kind: expected one of round, square, got 'flat'"),
+        ({"inner": 4}, "example.inner: expected keys with values, got 4"),
+    ],
+)
+def test_a_wrong_value_is_named_with_what_was_expected(values: dict, words: str):
+    with pytest.raises(BadInput) as raised:
+        built(**values)
+    assert words in str(raised.value)
+
+
+def test_a_setting_without_default_has_to_be_given():
+    with pytest.raises(BadInput, match="bound: expected a value for high"):
+        build_config(Bound, {"low": 1}, "bound")

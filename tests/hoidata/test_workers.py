@@ -1,0 +1,68 @@
+"""One function over many items in processes, some of which die. The functions are found by spawned processes here."""
+
+import multiprocessing
+import os
+import signal
+from pathlib import Path
+
+import pytest
+
+from hoidata.errors import BadInput
+from hoidata.workers import WorkerLost, in_workers
+
+
+def squared(item: int) -> int:
+    return item * item
+
+
+def deadly(item: int) -> int:
+    if item == 3:
+        os.kill(os.getpid(), signal.SIGSEGV)
+    return squared(item)
+
+
+def deadly_once(path: Path) -> str:
+    """Ends its process the first time it is asked for a path."""
+    if not path.exists():
+        path.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return path.name
+
+
+def broken(item: int) -> int:
+    return 1 // (item - 3)
+
+
+@pytest.mark.slow
+def test_an_item_that_kills_every_process_is_given_up_and_all_others_are_done():
+    found = dict(in_workers(deadly, range(6), 2, on_lost=lambda error: f"{error.item}: {error.cause}"))
+    assert found == {0: 0, 1: 1, 2: 4, 3: "3: signal SIGSEGV", 4: 16, 5: 25}
+    done = []
+    with pytest.raises(WorkerLost, match=r"3: expected.*SIGSEGV"):
+        done.extend(item for item, _ in in_workers(deadly, range(6), 2))
+    assert not multiprocessing.active_children()
+
+
+@pytest.mark.slow
+def test_processes_that_die_once_each_cost_nothing(tmp_path):
+    paths = [tmp_path / str(number) for number in range(3)]
+    assert dict(in_workers(deadly_once, paths, 2)) == {path: path.name for path in paths}
+
+
+@pytest.mark.slow
+def test_what_the_function_raises_names_the_item_and_ends_the_workers():
+    with pytest.raises(RuntimeError, match=r"3: Traceback(?s:.)*ZeroDivisionError"):
+        list(in_workers(broken, range(6), 2))
+    assert not multiprocessing.active_children()
+
+
+def test_one_job_works_here():
+    assert list(in_workers(squared, range(3), 1)) == [(0, 0), (1, 1), (2, 4)]
+
+
+def test_a_lost_worker_is_a_bad_input_in_every_process():
+    import pickle
+
+    error = pickle.loads(pickle.dumps(WorkerLost("grab/s1/1", "signal SIGSEGV")))
+    assert isinstance(error, BadInput)
+    assert (error.where, error.cause) == ("grab/s1/1", "signal SIGSEGV")

@@ -1,0 +1,202 @@
+"""Families answer requests with clips: every rival gives what its name says, whatever company a request is in."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.clips.clip import SIDES, Clip
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.store import open_store
+from models.common.family import Sources, motion_clip
+from models.common.predicting import PredictionConfig, requests_for, sample_family
+from models.registry import family_names, load_family, load_network
+from models.text2hoi.diagnostics import mean_map_by_position
+from models.text2hoi.family import other_prompts
+from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
+from models.text2hoi.thresholds import best_threshold, f1_score, mean_f1
+from tests.models.toy import FAST
+
+HANDS = load_embedded_hands()
+
+
+@pytest.fixture(scope="module")
+def sources(annotated: AnnotatedStore, trained: Path) -> Sources:
+    return Sources(annotated, trained, HANDS, torch.device("cpu"), FAST)
+
+
+def samples_of(annotated: AnnotatedStore, split: str) -> list[ClipSample]:
+    return list(HoiDataset(annotated, split, crop="start"))
+
+
+def joints_of(clip: Clip) -> np.ndarray:
+    """(side and frame, 21, 3) of the hands that are there."""
+    return np.concatenate([track_joints(clip.hands[side], HANDS[side])[clip.hands[side].valid] for side in SIDES])
+
+
+def answer(sources: Sources, family: str, sample: ClipSample, count: int = 1) -> list[Clip]:
+    return load_family(family).load(sources).sample(requests_for(sample, PredictionConfig(samples=count)))
+
+
+def test_every_family_of_the_registry_knows_its_own_name_and_no_two_share_a_network() -> None:
+    families = [load_family(name) for name in family_names()]
+    assert [family.name for family in families] == family_names()
+    networks = [network.name for family in families for network in family.networks]
+    assert len(set(networks)) == len(networks)
+    assert all(load_network(name).name == name for family in families for name in family.uses)
+    with pytest.raises(BadInput, match="text2hoi"):
+        load_family("juggler")
+
+
+def test_features_of_a_recorded_clip_give_it_back(annotated: AnnotatedStore) -> None:
+    for sample in samples_of(annotated, "train"):
+        recorded = annotated.clip(sample.clip_id)
+        request = requests_for(sample, PredictionConfig())[0]
+        made = motion_clip(request, torch.from_numpy(sample.hands), torch.from_numpy(sample.object), True)
+        np.testing.assert_allclose(made.object.translation_m, recorded.object.translation_m, atol=1e-5)
+        np.testing.assert_allclose(made.object.rotvec, recorded.object.rotvec, atol=1e-4)
+        if recorded.object.is_articulated:
+            np.testing.assert_allclose(made.object.hinge_rad, recorded.object.hinge_rad, atol=1e-6)
+        for row, side in enumerate(SIDES):
+            assert made.hands[side].valid.all() == bool(sample.active_hands[row])
+            if sample.active_hands[row]:
+                expected = track_joints(recorded.hands[side], HANDS[side])
+                np.testing.assert_allclose(track_joints(made.hands[side], HANDS[side]), expected, atol=2e-5)
+
+
+def test_ground_truth_is_the_recorded_clip(sources: Sources) -> None:
+    for sample in samples_of(sources.annotated, "test"):
+        (made,) = answer(sources, "ground-truth", sample)
+        recorded = sources.annotated.clip(sample.clip_id)
+        np.testing.assert_array_equal(made.object.translation_m, recorded.object.translation_m)
+        np.testing.assert_array_equal(made.hands["left"].wrist_m, recorded.hands["left"].wrist_m)
+        assert made.clip_id == f"{sample.clip_id}~0"
+
+
+def test_the_mean_pose_stands_still_at_the_mean_of_the_training_wrists(sources: Sources) -> None:
+    train, sample = samples_of(sources.annotated, "train"), samples_of(sources.annotated, "test")[1]
+    (made,) = answer(sources, "mean-pose", sample)
+    assert np.ptp(made.object.translation_m, axis=0).max() == 0
+    wrists = np.concatenate([clip.hands[1, :, :3] for clip in train if clip.active_hands[1]])
+    moved = wrists.astype(np.float64).mean(axis=0) @ sample.world_from_model[:3, :3].T + sample.world_from_model[:3, 3]
+    assert sample.active_hands.tolist() == [False, True]
+    np.testing.assert_allclose(made.hands["right"].wrist_m[0], moved, atol=1e-6)
+
+
+def test_the_mean_motion_moves_as_the_training_clips_do(sources: Sources) -> None:
+    train, sample = samples_of(sources.annotated, "train"), samples_of(sources.annotated, "test")[0]
+    (made,) = answer(sources, "mean-motion", sample)
+    rotation = sample.world_from_model[:3, :3]
+    gone = (made.object.translation_m[-1] - made.object.translation_m[0]) @ rotation
+    true = np.mean([clip.object[-1, :3] - clip.object[0, :3] for clip in train], axis=0)
+    np.testing.assert_allclose(gone, true, atol=0.02)
+    assert np.linalg.norm(true) > 0.05
+
+
+def test_the_nearest_clip_to_a_training_sentence_is_that_clip_and_the_next_is_another(sources: Sources) -> None:
+    sample = samples_of(sources.annotated, "train")[1]
+    first, second = answer(sources, "nearest-clip", sample, count=2)
+    recorded = sources.annotated.clip(sample.clip_id)
+    np.testing.assert_allclose(joints_of(first), track_joints(recorded.hands["right"], HANDS["right"]), atol=2e-5)
+    assert abs(first.object.translation_m - second.object.translation_m).max() > 0.01
+
+
+def test_another_prompt_is_never_the_own_one(sources: Sources) -> None:
+    test = {sample.clip_id: sample for sample in samples_of(sources.annotated, "test")}
+    for clip_id, features in other_prompts(sources).items():
+        assert not np.allclose(features, test[clip_id].text[0])
+        others = [other for key, other in test.items() if key != clip_id]
+        assert any(np.array_equal(features, other.text[0]) for other in others)
+
+
+def test_a_motion_is_the_same_alone_and_in_company_and_differs_with_its_seed(sources: Sources) -> None:
+    family = load_family("text2hoi").load(sources)
+    short, long = samples_of(sources.annotated, "test")
+    asked = requests_for(short, PredictionConfig(samples=2))
+    together = family.sample([*asked, *requests_for(long, PredictionConfig(samples=1))])
+    (alone,) = family.sample(asked[:1])
+    np.testing.assert_allclose(joints_of(alone), joints_of(together[0]), atol=1e-4)
+    assert abs(joints_of(together[0]) - joints_of(together[1])).max() > 1e-3
+
+
+def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources) -> None:
+    model = load_family("text2hoi").load(sources)
+    assert isinstance(model, Text2Hoi)
+    sample = samples_of(sources.annotated, "test")[0]
+    request = requests_for(sample, PredictionConfig(samples=1))[0]
+    other = replace(request, text=np.roll(request.text, 7))
+    assert abs(joints_of(model.sample([request])[0]) - joints_of(model.sample([other])[0])).max() > 1e-5
+    hands = torch.from_numpy(sample.hands)
+    before, after = hands.clone(), hands.clone()
+    after[..., 0] += 0.5
+    motion = Text2HoiMotion(before, after, torch.from_numpy(sample.object), torch.zeros(1024))
+    shift = sample.world_from_model[:3, :3] @ [0.5, 0, 0]
+    coarse, refined = (model.clips([request], [motion], refined=kind)[0] for kind in (False, True))
+    np.testing.assert_allclose(
+        joints_of(refined) - joints_of(coarse), np.broadcast_to(shift, joints_of(coarse).shape), atol=1e-5
+    )
+    plain = load_family("text2hoi-coarse").load(sources).sample([request])[0]
+    unrefined = model.clips([request], model.motions([request], refined=False), refined=False)[0]
+    np.testing.assert_array_equal(joints_of(plain), joints_of(unrefined))
+
+
+def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
+    annotated_root: Path, trained: Path, tmp_path: Path
+) -> None:
+    family, params = load_family("text2hoi"), {"samples": 2, "seed": 1}
+    for out in (tmp_path / "a", tmp_path / "b"):
+        counts = sample_family(family, annotated_root, trained, out, params, HANDS, settings=FAST)
+        assert counts["clips"] == 4
+    store = open_store(tmp_path / "a" / "clips", HANDS)
+    assert store.ids == ["toy/s3/5~0", "toy/s3/5~1", "toy/s3/6~0", "toy/s3/6~1"]
+    assert store.clip("toy/s3/6~1").n_frames == 33
+    figures = json.loads((tmp_path / "a" / "diagnostics.json").read_text())
+    assert {"f1", "f1_mean_map", "f1_mean_map_by_index", "f1_mean_map_by_position"} <= set(figures["contact"])
+    # Training lengths 24, 32, 28 with mean 28; test lengths 24 and 33.
+    assert figures["length"]["mae_mean_length_frames"] == pytest.approx(4.5)
+    assert figures["contact"]["f1_margin"] == pytest.approx(
+        figures["contact"]["f1"] - figures["contact"]["f1_mean_map"], abs=2e-6
+    )
+    for path in sorted((tmp_path / "a").rglob("*")):
+        if path.is_file():
+            assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes(), path
+
+
+def test_a_family_that_cannot_answer_says_why(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
+    counts = sample_family(load_family("text2hoi"), annotated_root, tmp_path, tmp_path / "a", {}, HANDS)
+    assert counts == {"clips": 0}
+    note = json.loads((tmp_path / "a" / "empty.json").read_text())
+    assert note == {"reason": "not trained: contact, length, diffusion, refiner"}
+    with pytest.raises(BadInput, match="samples"):
+        sample_family(load_family("text2hoi"), annotated_root, trained, tmp_path / "a", {"sample": 3}, HANDS)
+
+
+def test_f1_is_the_harmonic_mean_of_precision_and_recall() -> None:
+    predicted, true = np.array([1, 1, 1, 1, 0], bool), np.array([1, 1, 0, 1, 1], bool)
+    precision, recall = 3 / 4, 3 / 4
+    assert f1_score(predicted, true) == pytest.approx(2 * precision * recall / (precision + recall))
+    assert f1_score(np.array([1, 0, 0], bool), np.array([1, 1, 1], bool)) == pytest.approx(2 * 1 * (1 / 3) / (4 / 3))
+    nothing = np.zeros(5, bool)
+    assert f1_score(nothing, nothing) == 1
+    assert f1_score(predicted, nothing) == 0
+
+
+def test_the_best_threshold_separates_the_maps() -> None:
+    probabilities = np.array([[0.1, 0.4, 0.62, 0.9], [0.2, 0.3, 0.7, 0.8]])
+    true = np.array([[0, 0, 1, 1], [0, 0, 1, 1]], bool)
+    best = best_threshold(probabilities, true)
+    assert best == pytest.approx(0.45)
+    assert mean_f1(probabilities, true, best) == 1
+    assert mean_f1(probabilities, true, 0.65) == pytest.approx((2 / 3 + 1) / 2)
+
+
+def test_the_mean_map_by_position_reads_the_nearest_training_points() -> None:
+    cloud = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    found = mean_map_by_position(np.array([[0.9, 0, 0], [0.1, 0, 0]]), [cloud, cloud], np.array([[1, 0], [1, 1]]))
+    np.testing.assert_allclose(found, [0.5, 1.0])

@@ -1,0 +1,44 @@
+"""Smoke tests on a GPU: every network trains a step there, and a motion is sampled. Skipped by name without one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from hoidata.hands import load_embedded_hands
+from hoidata.metrics.evaluate import evaluate_store
+from models.common.predicting import sample_family
+from models.registry import load_family
+from tests.models.toy import FAST, PARAMS, train
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU: torch.cuda.is_available() is False"),
+]
+
+
+@pytest.fixture(scope="module")
+def on_gpu(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One short training of each network on the GPU."""
+    out = tmp_path_factory.mktemp("gpu")
+    for name in PARAMS:
+        train(name, annotated_root, out, device="cuda")
+    return out
+
+
+def test_every_network_trains_on_the_gpu_and_its_weights_are_finite(on_gpu: Path) -> None:
+    for name in PARAMS:
+        weights = load_file(on_gpu / name / "model.safetensors")
+        assert weights
+        assert all(torch.isfinite(weight).all() for weight in weights.values())
+
+
+def test_motions_are_sampled_and_measured_on_the_gpu(annotated_root: Path, on_gpu: Path, tmp_path: Path) -> None:
+    family, hands = load_family("text2hoi"), load_embedded_hands()
+    sample_family(
+        family, annotated_root, on_gpu, tmp_path / "motions", {"samples": 2}, hands, settings=FAST, device="cuda"
+    )
+    figures = evaluate_store(tmp_path / "motions" / "clips", annotated_root, hands)["figures"]
+    assert all(np.isfinite(value) for value in figures.values())

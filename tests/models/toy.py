@@ -1,0 +1,33 @@
+"""The smallest networks that still have every part, trained on the toy dataset in seconds."""
+
+from pathlib import Path
+
+from models.common.training import train_network
+from models.registry import load_network
+
+POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
+TRANSFORMER = {
+    "width": 32, "layers": 1, "heads": 2, "feed_forward": 64, "dropout": 0.1, "norm_first": True, "frames_per_token": 5,
+}  # fmt: skip
+BUDGET = {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "ema_decay": 0.5}
+PARAMS = {
+    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
+    "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
+    "diffusion": {"network": {"transformer": TRANSFORMER, "contact_input": "moments"}, "training": BUDGET},
+    "refiner": {
+        "network": {"transformer": TRANSFORMER, "contact_map": False},
+        "training": BUDGET,
+        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
+    },
+}
+
+
+def train(name: str, root: Path, out: Path, device: str = "cpu") -> Path:
+    network = load_network(name)
+    needed = {load_network(other): out / other for other in network.needs}
+    provenance = lambda facts: {"model": facts["model"]}  # noqa: E731
+    return train_network(network, root, out / name, PARAMS[name], needed=needed, provenance=provenance, device=device)
+
+
+# Sections of families with which sampling takes a moment.
+FAST = {"text2hoi": {"sampler": {"steps": 2}, "field_resolution": 16}}

@@ -1,0 +1,46 @@
+"""`hoidata up` in a copy of the project, for the tests that need it running."""
+
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+START_S = 180
+STOP_S = 60
+
+
+@contextmanager
+def hoidata_up(project: Path, tools: SimpleNamespace) -> Iterator[SimpleNamespace]:
+    """Gives ``url``, ``settings`` (variables for `prefect`), ``log`` and ``process`` once a run can be started."""
+    url = f"http://127.0.0.1:{free_port()}/api"
+    settings = {"PREFECT_API_URL": url}
+    log = project.parent / "up.log"
+    with log.open("w") as stream:
+        up = subprocess.Popen(
+            ["hoidata", "up"], cwd=project, env=tools.environment(**settings), stdout=stream, stderr=stream
+        )
+    try:
+        wait_until(lambda: "ready: run `prefect deployment run annotate-arctic`" in log.read_text(), START_S, up, log)
+        yield SimpleNamespace(url=url, settings=settings, log=log, project=project, process=up)
+    finally:
+        up.send_signal(signal.SIGTERM)
+        up.wait(STOP_S)
+
+
+def wait_until(holds, seconds: float, process: subprocess.Popen, log: Path) -> None:
+    """Wait while ``process`` lives."""
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert process.poll() is None, log.read_text()
+        assert time.monotonic() < deadline, log.read_text()
+        time.sleep(0.5)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]

@@ -1,0 +1,112 @@
+"""The graph as DVC resolves it: what it depends on is there, and the code it names is what runs."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hoidata.datasets.registry import adapter_names
+from pipelines.lineage.graph import Stage, read_graph, read_params
+from pipelines.stages.__main__ import STAGES
+from pipelines.stages.code import code_today
+
+PROJECT = Path(__file__).parents[2]
+# What a module that imports others by name calls; what it picks must be told in pipelines/stages/code.py.
+IMPORTERS = {"import_module", "__import__", "spec_from_file_location"}
+NEVER_OF_A_STAGE = (
+    "hoidata/conformance/",
+    "hoidata/store_check/",
+    "hoidata/hand_builder/",
+    "pipelines/lineage/tree.py",
+)
+# Prints the files of our packages that a stage's module and everything it reaches have loaded.
+LOADED = """
+import json, sys
+from importlib import import_module
+for name in json.loads(sys.argv[1]):
+    import_module(name)
+files = {getattr(module, "__file__", None) for module in list(sys.modules.values())}
+print(json.dumps(sorted(filter(None, files))))
+"""
+
+
+@pytest.fixture(scope="module")
+def graph() -> dict[str, Stage]:
+    return read_graph(PROJECT)
+
+
+@pytest.fixture(scope="module")
+def code() -> dict[str, dict[str, str]]:
+    return code_today(PROJECT)
+
+
+def test_every_dependency_is_made_by_a_stage_or_committed(graph, code):
+    made = {out for stage in graph.values() for out in stage.outs}
+    parents = {parent.as_posix() for out in made for parent in Path(out).parents}
+    for stage in graph.values():
+        assert [path for path in stage.code if path not in code] == []
+        assert [path for path in stage.data if path not in made | parents and not (PROJECT / path).exists()] == []
+
+
+def test_every_stage_depends_on_the_code_of_its_own_module(graph, code):
+    for stage in graph.values():
+        if stage.name != "code":
+            (file,) = stage.code
+            assert f"pipelines/stages/{file.split('/')[1].removesuffix('.json')}.py" in code[file]
+
+
+def test_no_module_of_a_stage_imports_by_name_but_the_one_the_closures_are_told_of(code):
+    found = set()
+    for file in {file for digests in code.values() for file in digests if file.endswith(".py")}:
+        nodes = ast.walk(ast.parse((PROJECT / file).read_bytes()))
+        if {getattr(node, "attr", getattr(node, "id", "")) for node in nodes} & IMPORTERS:
+            found.add(file)
+    assert found == {"hoidata/datasets/registry.py"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["convert/manipnet", "train/refiner", "report"])
+def test_importing_a_closure_loads_no_file_outside_of_it(code, name):
+    files = [path for path in code[f"code/{name}.json"] if path.endswith(".py")]
+    modules = [path.removesuffix(".py").removesuffix("/__init__").replace("/", ".") for path in files]
+    command = [sys.executable, "-c", LOADED, json.dumps(modules)]
+    result = subprocess.run(command, cwd=PROJECT, capture_output=True, text=True, check=True)
+    loaded = {Path(path) for path in json.loads(result.stdout)}
+    ours = {path.relative_to(PROJECT).as_posix() for path in loaded if path.is_relative_to(PROJECT)}
+    ours = {path for path in ours if path.split("/")[0] in ("hoidata", "models", "pipelines")}
+    assert ours - {"models/registry.py"} == set(files)  # a table: what it picks counts, it does not
+
+
+def test_rooms_that_change_no_result_are_in_no_stage(code):
+    files = {file for digests in code.values() for file in digests}
+    assert [file for file in files if file.startswith(NEVER_OF_A_STAGE)] == []
+
+
+def test_a_dataset_without_settings_of_its_own_needs_no_line_in_the_params(tmp_path):
+    (tmp_path / "params.yaml").write_text("{datasets: [taco], families: [], train: {demo: {}}}")
+    assert code_today(tmp_path)["code/convert/taco.json"] == {"params.yaml convert.adapters.taco": "null"}
+
+
+def test_every_dataset_of_the_params_has_an_adapter():
+    assert set(read_params(PROJECT)["datasets"]) <= set(adapter_names())
+
+
+def test_every_section_of_the_params_belongs_to_a_stage():
+    sections = {name for name, value in read_params(PROJECT).items() if isinstance(value, dict)}
+    assert sections <= set(STAGES)
+
+
+def test_every_stage_names_its_own_profile_so_that_profiles_never_share_outputs(graph):
+    for stage in graph.values():
+        assert all("embedded" in out.split("/") for out in stage.outs if out != "code")
+
+
+def test_the_graph_names_no_dataset_and_no_raw_data():
+    text = (PROJECT / "dvc.yaml").read_text()
+    assert len(text.splitlines()) <= 220
+    stages = str(yaml.safe_load(text)["stages"])
+    assert [name for name in (*adapter_names(), ".hoidata") if name in stages] == []

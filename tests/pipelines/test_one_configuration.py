@@ -1,0 +1,116 @@
+"""One threshold, one copy of each default: what the contact stage is told reaches labels, masks, losses and pages."""
+
+import ast
+import shutil
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from hoidata.batches.dataset import HoiDataset, collate
+from hoidata.contact.settings import ContactSettings
+from hoidata.settings import plain_config
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from models.common import losses
+from pipelines.commands.settings import SECTIONS, settings_class
+from pipelines.pages.report import touch_words
+from pipelines.stages import annotate, contact, quality, split
+from pipelines.stages.base import Place
+
+PROJECT = Path(__file__).parents[2]
+PLACE = Place("embedded", "grab")
+RULE = {"by": "subject", "train": "rest", "validation": ["s9"], "test": ["s10"]}
+# Named for the user although the library's default is the same: readers look for it here.
+SHOWN_ON_PURPOSE = {"annotate.encoder"}
+# Constants that are as large as a contact threshold and mean something else.
+OTHER_LENGTHS = {
+    "LONGEST_EDGE_M", "STAND_RADIUS_M", "LARGEST_DISTANCE_M", "REACH_M", "HANDS_BELOW", "TOUCH_M",
+}  # fmt: skip
+
+
+def annotated_at(folder: Path, threshold_m: float, make_clip, monkeypatch) -> AnnotatedStore:
+    """Three clips through the stages with ``contact.threshold_m`` set and nothing else said."""
+    folder.mkdir()
+    shutil.copytree(PROJECT / "manifests" / "embedded", folder / "manifests" / "embedded")
+    params = {"contact": {"threshold_m": threshold_m, "points": 256}, "annotate": {"encoder": "hash"}}
+    (folder / "params.yaml").write_text(yaml.safe_dump({**params, "split": {"grab": RULE}}))
+    monkeypatch.chdir(folder)
+    subjects = ("s1", "s9", "s10")
+    clips = [
+        make_clip(30, seed=seed, clip_id=f"grab/{name}/box_lift_1", subject=name) for seed, name in enumerate(subjects)
+    ]
+    write_store(PLACE.clips, clips, generated_info("grab"))
+    for stage in (quality, contact, annotate, split):
+        stage.run(PLACE)
+    return load_annotated(folder / PLACE.data)
+
+
+@pytest.fixture
+def wide_and_narrow(tmp_path, make_clip, monkeypatch) -> tuple[AnnotatedStore, AnnotatedStore]:
+    wide = annotated_at(tmp_path / "wide", 0.02, make_clip, monkeypatch)
+    return wide, annotated_at(tmp_path / "narrow", 0.01, make_clip, monkeypatch)
+
+
+def test_the_contact_threshold_changes_labels_hand_types_masks_and_words_alike(wide_and_narrow):
+    wide, narrow = wide_and_narrow
+    key = wide.ids("train")[0]
+    assert 0 < narrow.contact(key).sum() < wide.contact(key).sum()
+    assert narrow.distances(key).distance_m.max() < 0.01 < wide.distances(key).distance_m.max()
+    assert (wide.hand_evidence(key).threshold_m, narrow.hand_evidence(key).threshold_m) == (0.02, 0.01)
+    assert (touch_words(wide), touch_words(narrow)) == ("within 2 cm of a joint", "within 1 cm of a joint")
+    samples = [next(iter(HoiDataset(store, "train"))) for store in (wide, narrow)]
+    assert [sample.contact_threshold_m for sample in samples] == [0.02, 0.01]
+    np.testing.assert_array_equal(samples[1].contact_map, narrow.contact(key).astype(bool))
+    assert samples[1].contact_map.sum() < samples[0].contact_map.sum()
+
+
+def test_the_losses_of_a_batch_use_the_threshold_it_was_made_with(wide_and_narrow):
+    batches = [collate(list(HoiDataset(store, "train"))) for store in wide_and_narrow]
+    apart = torch.tensor([0.005, 0.015, -0.015, 0.025])
+    touching = [losses.touching_joints(apart, batch.contact_threshold_m).tolist() for batch in batches]
+    assert touching == [[True, True, True, False], [True, False, False, False]]
+
+
+def test_params_repeat_no_default_of_the_library():
+    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    repeated = set()
+    for section in SECTIONS:
+        defaults = plain_config(settings_class(section)())
+        said = params[section] or {}
+        same = {f"{section}.{name}" for name, value in said.items() if value is not None and value == defaults[name]}
+        repeated |= same
+    assert repeated == SHOWN_ON_PURPOSE
+
+
+def test_threshold_and_points_are_written_down_once_in_the_product():
+    """Of all constants and default values in the code, one states the threshold and one the number of points."""
+    homes: dict[float, list[str]] = {0.02: [], 1024: []}
+    for room in ("hoidata", "models", "pipelines"):
+        for path in sorted((PROJECT / room).rglob("*.py")):
+            for name, value in constants(ast.parse(path.read_text(encoding="utf-8"))):
+                if value in homes and ("threshold" in name.lower() or "point" in name.lower() or name.isupper()):
+                    homes[value].append(name)
+    assert [name for name in homes[0.02] if name not in OTHER_LENGTHS] == ["CONTACT_THRESHOLD_M"]
+    assert homes[1024].count("POINT_COUNT") == 1
+    assert {item.name: item.default for item in fields(ContactSettings)} == {"points": 1024, "threshold_m": 0.02}
+
+
+def constants(tree: ast.Module) -> list[tuple[str, float]]:
+    """(name, number) of every plain assignment, annotated field and default value of an argument."""
+    found: list[tuple[ast.expr | ast.arg, ast.expr | None]] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Assign):
+            found += [(target, node.value) for target in node.targets]
+        elif isinstance(node, ast.AnnAssign):
+            found.append((node.target, node.value))
+        elif isinstance(node, ast.arguments):
+            positional = [*node.posonlyargs, *node.args]
+            found += list(zip(positional[len(positional) - len(node.defaults) :], node.defaults, strict=True))
+            found += list(zip(node.kwonlyargs, node.kw_defaults, strict=True))
+    names = ((getattr(target, "id", None) or getattr(target, "arg", ""), value) for target, value in found)
+    return [(name, value.value) for name, value in names if isinstance(value, ast.Constant) and name]

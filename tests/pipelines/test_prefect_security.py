@@ -1,0 +1,353 @@
+"""What a web page or another user of this machine gets from the server of `hoidata up`: nothing run, nothing read."""
+
+import base64
+import http.client
+import json
+import os
+import queue
+import shutil
+import subprocess
+import tempfile
+import threading
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import SimpleNamespace
+from urllib.parse import urlsplit
+
+import psutil
+import pytest
+
+from hoidata.errors import BadInput, MissingResource
+from pipelines.prefect_key import is_loopback, read_key, write_key
+from pipelines.prefect_names import key_for
+from pipelines.prefect_server import api_url, wait_until_healthy
+from tests.pipelines.prefect_up import hoidata_up, wait_until
+
+FOREIGN = "http://evil.example"
+SOCKETS = (
+    "events/in",
+    "events/out",
+    "logs/out",
+    "task_runs/subscriptions/scheduled",
+    "work_pools/local/workers/connect",
+)
+FLOWS = """
+from pathlib import Path
+from prefect import flow
+
+@flow(name="annotate-arctic")
+def annotate_arctic():
+    (Path(__file__).parents[1] / "flow-ran").touch()
+
+@flow(name="full-graph")
+def full_graph(): ...
+"""
+
+
+def mode(path: Path) -> int:
+    return path.stat().st_mode & 0o777
+
+
+def test_every_start_makes_a_key_for_the_owner_alone(tmp_path):
+    key_file = tmp_path / ".prefect" / "api-key"
+    key_file.parent.mkdir(mode=0o755)
+    key_file.write_text("an old key that others could read")
+    keys = {write_key(key_file), write_key(key_file)}
+    assert (mode(key_file), mode(key_file.parent)) == (0o600, 0o700)
+    assert len(keys) == 2
+    assert read_key(key_file) in keys
+    assert min(map(len, keys)) >= 40
+    assert [item.name for item in key_file.parent.iterdir()] == ["api-key"]
+
+
+@pytest.mark.parametrize("wide", [0o640, 0o604, 0o620, 0o602])
+def test_a_key_that_others_could_read_or_write_is_refused(tmp_path, wide):
+    key_file = tmp_path / "api-key"
+    write_key(key_file)
+    key_file.chmod(wide)
+    with pytest.raises(PermissionError, match="`hoidata up` makes a new one"):
+        read_key(key_file)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can try as another user")
+def test_another_user_cannot_read_the_key():
+    with tempfile.TemporaryDirectory() as name:
+        project, nobody = Path(name), 65534
+        project.chmod(0o755)
+        (project / "open").touch()
+        key_file = project / ".prefect" / "api-key"
+        write_key(key_file)
+        assert subprocess.run(["cat", project / "open"], user=nobody).returncode == 0
+        assert subprocess.run(["cat", key_file], user=nobody, capture_output=True).returncode != 0
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "http://0.0.0.0:4200/api",
+        "http://[::]:4200/api",
+        "http://192.168.1.5:4200/api",
+        "http://localhost:4200/api",
+        "http://127.0.0.1.evil.example:4200/api",
+        "http://127.0.0.1:4200@evil.example/api",
+        "https://127.0.0.1:4200/api",
+        "http://127.0.0.1:99999/api",
+        "http://127.0.0.1/api",
+        "http://127.0.0.1:4200",
+    ],
+)
+def test_a_server_is_only_started_on_a_loopback_address(url, monkeypatch):
+    monkeypatch.setenv("PREFECT_API_URL", url)
+    with pytest.raises(BadInput, match="PREFECT_API_URL: expected a loopback address"):
+        api_url()
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "[::1]"])
+def test_loopback_addresses_are_taken(host, monkeypatch):
+    monkeypatch.setenv("PREFECT_API_URL", f"http://{host}:4321/api/")
+    assert api_url() == f"http://{host}:4321/api"
+    assert is_loopback(api_url())
+
+
+def test_the_key_goes_to_no_other_machine_and_not_over_the_users_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PREFECT_API_AUTH_STRING", raising=False)
+    here = "http://127.0.0.1:4200/api"
+    assert key_for(here) is None
+    key = write_key()
+    assert key_for(here).env == {"PREFECT_API_AUTH_STRING": key}
+    assert key_for("https://api.prefect.cloud/api") is None
+    assert key_for(None) is None
+    monkeypatch.setenv("PREFECT_API_AUTH_STRING", "mine:own")
+    assert key_for(here) is None
+
+
+def test_a_stranger_at_the_port_is_not_taken_for_our_server(monkeypatch):
+    """He would be sent the key, and the worker would run what he says."""
+    monkeypatch.setattr("pipelines.prefect_server.START_TIMEOUT_S", 2)
+    ours = subprocess.Popen(["sleep", "60"])
+    try:
+        with served(b"true") as (url, _), pytest.raises(MissingResource, match="did not answer"):
+            wait_until_healthy(f"{url}api", ours)
+    finally:
+        ours.kill()
+        ours.wait()
+
+
+@pytest.fixture(scope="module")
+def up(tmp_path_factory, project_tools):
+    """The real server and worker, with a flow that only leaves a file; ``post`` and ``get`` use the project's key."""
+    folder = tmp_path_factory.mktemp("security")
+    project = project_tools.copy_project(folder / "project")
+    (project / "pipelines" / "flows.py").write_text(FLOWS)
+    with hoidata_up(project, project_tools) as running:
+        running.marker = folder / "command-ran"
+        running.key = read_key(project / ".prefect" / "api-key")
+        deployments = json.loads(with_key(running, "POST", "/deployments/filter", "{}").body)
+        [running.deployment] = [found["id"] for found in deployments if found["name"] == "annotate-arctic"]
+        running.attack = json.dumps({"job_variables": {"command": f"touch {running.marker}"}})
+        yield running
+
+
+def ask(up, method: str, path: str, body: str | None = None, **headers: str) -> SimpleNamespace:
+    """One request to the API, without the key unless ``headers`` bring it; "_" in a header's name stands for "-"."""
+    connection = http.client.HTTPConnection(urlsplit(up.url).netloc, timeout=30)
+    connection.request(method, f"/api{path}", body, {name.replace("_", "-"): text for name, text in headers.items()})
+    with connection.getresponse() as response:
+        answer = SimpleNamespace(status=response.status, body=response.read().decode(), headers=response.headers)
+    connection.close()
+    return answer
+
+
+def basic(key: str) -> dict[str, str]:
+    return {"Authorization": "Basic " + base64.b64encode(key.encode()).decode()}
+
+
+def csrf(up) -> dict[str, str]:
+    """A CSRF token, as those get one who have the key."""
+    token = json.loads(ask(up, "GET", "/csrf-token?client=tests", **basic(up.key)).body)["token"]
+    return {"Prefect_Csrf_Token": token, "Prefect_Csrf_Client": "tests"}
+
+
+def with_key(up, method: str, path: str, body: str | None = None) -> SimpleNamespace:
+    """A request as Prefect's own client makes it."""
+    return ask(up, method, path, body, **basic(up.key), **csrf(up), Content_Type="application/json")
+
+
+def assert_nothing_came_of_it(up) -> None:
+    """No run but those asked for by name stands on the server, and no command of theirs was run."""
+    assert json.loads(with_key(up, "POST", "/flow_runs/filter", "{}").body) == []
+    assert not up.marker.exists()
+
+
+def attack_path(up) -> str:
+    return f"/deployments/{up.deployment}/create_flow_run"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["application/json", "text/plain", "application/x-www-form-urlencoded", None])
+def test_what_a_browser_would_send_from_a_page_is_refused(up, kind):
+    headers = {"Origin": FOREIGN, **({"Content_Type": kind} if kind else {})}
+    refused = ask(up, "POST", attack_path(up), up.attack, **headers)
+    assert refused.status in (401, 403)
+    assert "Access-Control-Allow-Origin" not in refused.headers
+    assert_nothing_came_of_it(up)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("origin", [FOREIGN, "null", "http://127.0.0.1:9", "http://localhost:4200"])
+def test_preflight_grants_no_other_origin(up, origin):
+    asked = {"Access_Control_Request_Method": "POST", "Access_Control_Request_Headers": "authorization,content-type"}
+    refused = ask(up, "OPTIONS", attack_path(up), Origin=origin, **asked)
+    assert refused.status == 400
+    assert "Access-Control-Allow-Origin" not in refused.headers
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("host", ["evil.example", "evil.example/api/health", "localhost"])
+def test_a_rebound_name_gets_nothing_without_the_key(up, host):
+    assert ask(up, "GET", "/csrf-token?client=page", Host=host).status == 401
+    assert ask(up, "POST", attack_path(up), up.attack, Host=host, Content_Type="application/json").status == 403
+    assert_nothing_came_of_it(up)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", [None, "hoidata:guess", ""])
+def test_only_the_health_check_answers_without_the_key(up, key):
+    """Every path and method of the API, with a valid CSRF token, so that the key alone decides."""
+    paths = json.loads(with_key(up, "GET", "/openapi.json").body)["paths"]
+    wrong = csrf(up) | (basic(key) if key is not None else {})
+    asked = [(method.upper(), path) for path, methods in paths.items() for method in methods]
+    assert len(asked) > 150
+    answered = {path for method, path in asked if ask(up, method, path, "{}", **wrong).status != 401}
+    assert answered == {"/health", "/ready"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", SOCKETS)
+@pytest.mark.parametrize("hello", ["auth with a guess", "no auth", "no subprotocol"])
+def test_sockets_close_without_the_key(up, path, hello):
+    from websockets.exceptions import ConnectionClosed, InvalidStatus
+    from websockets.sync.client import connect
+
+    protocols = None if hello == "no subprotocol" else ["prefect"]
+    words = {"type": "auth", "token": "guess"} if hello == "auth with a guess" else {"type": "hello"}
+    url = up.url.replace("http:", "ws:")
+
+    def hear() -> str | bytes:
+        with connect(f"{url}/{path}", origin=FOREIGN, subprotocols=protocols) as socket:
+            socket.send(json.dumps(words))
+            return socket.recv(timeout=10)
+
+    with pytest.raises((ConnectionClosed, InvalidStatus)):
+        hear()
+
+
+@pytest.mark.slow
+def test_state_on_the_disk_is_for_the_owner_alone(up):
+    state = up.project / ".prefect"
+    assert mode(state) == 0o700
+    assert {mode(item) for item in state.iterdir() if item.is_file() and not item.name.startswith(".")} == {0o600}
+    assert up.key not in up.log.read_text()
+    assert ".prefect/api-key" in up.log.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", ["http", "file"])
+def test_a_hostile_page_in_chromium_runs_nothing_and_reads_nothing(up, where, tmp_path):
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium on PATH: the page was not opened")
+    page = tmp_path / "page.html"
+    with served(b"") as (report, posted):
+        page.write_bytes(hostile_page(up, report))
+        with served(page.read_bytes()) as (site, _):
+            address = site if where == "http" else page.as_uri()
+            results = report_of(chromium, address, tmp_path, posted)
+    assert results.pop("server reached") == "opaque"
+    assert set(results.values()) <= {"blocked", "opaque", "closed", "form sent"}, results
+    assert_nothing_came_of_it(up)
+
+
+def hostile_page(up, report: str) -> bytes:
+    """A page that tries every way from a browser to the API, and tells the address ``report`` what came of each.
+
+    It knows the API's address and the deployment, but not the key.
+    """
+    given = {"API": up.url, "DEPLOYMENT": up.deployment, "ATTACK": up.attack, "SOCKETS": SOCKETS, "REPORT": report}
+    constants = "".join(f"const {name} = {json.dumps(value)};" for name, value in given.items())
+    return Path(__file__).with_name("hostile_page.html").read_text().replace("/* given */", constants).encode()
+
+
+@contextmanager
+def served(page: bytes):
+    """A site that answers every GET with ``page``; gives its address, and the bodies of POSTs as they come."""
+    posted = queue.Queue()
+
+    class Site(BaseHTTPRequestHandler):
+        def do_GET(self):
+            self.send_response(200)
+            self.send_header("Content-Type", "text/html")
+            self.end_headers()
+            self.wfile.write(page)
+
+        def do_POST(self):
+            posted.put(self.rfile.read(int(self.headers["Content-Length"])))
+            self.send_response(204)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Site)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}/", posted
+    finally:
+        server.shutdown()
+        server.server_close()
+
+
+def report_of(chromium: str, url: str, folder: Path, posted: queue.Queue) -> dict[str, str]:
+    """What the page at ``url`` posts in headless Chromium, whose own (new) guard of the local network is off."""
+    switches = [
+        "--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--no-first-run",
+        "--disable-features=LocalNetworkAccessChecks", f"--user-data-dir={folder / 'profile'}",
+    ]  # fmt: skip
+    process = subprocess.Popen([chromium, *switches, url], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        return json.loads(posted.get(timeout=60))
+    finally:
+        process.terminate()
+        process.wait(30)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["command", "env", "env.PATH", "working_dir", "stream_output", "image"])
+def test_the_pool_takes_no_variable_from_a_run_even_with_the_key(up, name):
+    asked = json.dumps({"job_variables": {name: f"touch {up.marker}"}})
+    refused = with_key(up, "POST", attack_path(up), asked)
+    assert refused.status == 422
+    assert f"'{name}' was unexpected" in refused.body
+    assert_nothing_came_of_it(up)
+
+
+@pytest.mark.slow
+def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_tools):
+    """After the tests above: the worker that runs this flow has had time for every run they could have started."""
+    asked = project_tools.run(up.project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
+    assert asked.returncode == 0, asked.stdout + asked.stderr
+    wait_until((up.project / "flow-ran").exists, 120, up.process, up.log)
+    [run] = json.loads(with_key(up, "POST", "/flow_runs/filter", "{}").body)
+    assert run["job_variables"] in (None, {})
+    assert not up.marker.exists()
+
+
+@pytest.mark.slow
+def test_the_worker_ends_with_its_server(up):
+    """Last of all. Otherwise the next one to take the port could tell it what to run."""
+    children = {child.cmdline()[3]: child for child in psutil.Process(up.process.pid).children()}
+    children["server"].kill()
+    assert up.process.wait(60) != 0
+    assert not children["worker"].is_running()
