@@ -154,11 +154,20 @@ def test_still_shows_the_frame_in_which_most_points_are_touched(project, hands):
 @pytest.mark.slow
 def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, hands, tmp_path):
     assert can_be_shown(project)
-    page = write_report(tmp_path / "report", "embedded", ["h2o", "grab"], hands, ReportFolders.of("embedded", tmp_path))
+    page = write_report(
+        tmp_path / "report",
+        "embedded",
+        ["h2o", "grab"],
+        ["ground-truth"],
+        hands,
+        ReportFolders.of("embedded", tmp_path),
+    )
     assert 'href="grab.html"' in page.read_text()
     assert "<h1>GRAB" in (tmp_path / "report" / "grab.html").read_text()
     (project / "splits" / "splits.parquet").unlink()
-    page = write_report(tmp_path / "less", "embedded", ["grab"], hands, ReportFolders.of("embedded", tmp_path))
+    page = write_report(
+        tmp_path / "less", "embedded", ["grab"], ["ground-truth"], hands, ReportFolders.of("embedded", tmp_path)
+    )
     assert "grab.html" not in page.read_text()
 
 
