@@ -7,6 +7,7 @@ from typing import Any
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import Clip
 from hoidata.clips.quarantine import Quarantined
+from hoidata.contact.settings import ContactSettings
 from hoidata.contact.stage import contact_store
 from hoidata.quality.stage import quality_store
 from hoidata.splits import split_store
@@ -27,13 +28,15 @@ def write_annotated(
     dataset: str = "toy",
     rule: dict[str, Any] | None = None,
     threshold_m: float = 0.02,
+    points: int = 1024,
     quality: bool = False,
 ) -> Path:
     """clips, annotation (the encoder without weights), contact and splits below ``root``; quality where asked for."""
+    contact = ContactSettings(points=points, threshold_m=threshold_m)
     write_clips(root / "clips", clips, dataset)
     if quality:
         quality_store(root / "clips", root / "quality", progress=False)
-    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=threshold_m)
-    contact_store(root / "clips", root / "contact", threshold_m=threshold_m)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", contact=contact)
+    contact_store(root / "clips", root / "contact", contact)
     split_store(root / "clips", root / "annotation", root / "splits", rule or BY_SUBJECT)
     return root

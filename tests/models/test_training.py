@@ -24,6 +24,7 @@ from models.text2hoi.generation import GeneratedMotion, generate
 from tests.models.toy import PARAMS, train
 
 
+@pytest.mark.slow
 def test_training_twice_gives_the_same_bytes(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
     for name in PARAMS:
         again = train(name, annotated_root, tmp_path)
@@ -58,7 +59,7 @@ def test_the_log_has_training_and_validation_losses(trained: Path) -> None:
     header, *rows = (trained / "diffusion" / "log.csv").read_text().splitlines()
     expected = "step,validation,train_total,train_simple,train_distance_map,train_relative_orientation"
     assert header == expected
-    assert [row.split(",")[0] for row in rows] == ["2", "4"]
+    assert [row.split(",")[0] for row in rows] == ["1", "2"]
 
 
 def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:

@@ -95,15 +95,6 @@ def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
     np.testing.assert_allclose(near[expected <= 0.02], expected[expected <= 0.02], atol=1e-14)
 
 
-def test_distances_equal_brute_force() -> None:
-    model = model_of(MESHES["bumpy torus"])
-    places = queries(model.vertices_m, 400, seed=1)
-    expected = brute_distance(model.vertices_m[model.faces], places)
-    for grid_from in (AT_ONCE, NEVER):
-        found = SurfaceIndex(model, grid_from).distance_m(places[None], None)[0]
-        np.testing.assert_allclose(found, expected, atol=1e-14)
-
-
 def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
     """On a coarse lattice triangles collapse to segments, coincide, cross, and places lie on them."""
     rng = np.random.default_rng(3)

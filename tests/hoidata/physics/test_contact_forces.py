@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.objects.mesh import mass_properties
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import (
     GRAVITY_M_S2,
     RESIDUAL_LIMIT,
@@ -16,6 +16,7 @@ from hoidata.physics.contact_forces import (
 )
 from hoidata.physics.surface import body_motion
 from hoidata.synthetic.shapes import sharp_box
+from tests.builders.objects import box_model, two_parts
 
 DOWN = np.array([0.0, 0.0, -1.0])
 SIZE = (0.1, 0.06, 0.2)
@@ -106,11 +107,11 @@ def test_accelerations_need_three_frames():
 
 
 def _two_boxes() -> ObjectModel:
-    base, lid = sharp_box((0.1, 0.1, 0.04)).moved((0.05, 0, -0.02)), sharp_box((0.1, 0.1, 0.02)).moved((0.05, 0, 0.01))
-    vertices = np.concatenate([base.vertices_m, lid.vertices_m])
-    faces = np.concatenate([base.faces, lid.faces + 8])
-    part = np.repeat(np.array([0, 1], dtype=np.uint8), 8)
-    return ObjectModel("boxes", vertices, faces, part, Hinge(np.array([0.0, 1.0, 0.0]), np.zeros(3)))
+    base, lid = (
+        box_model((0.1, 0.1, 0.04), middle_m=(0.05, 0, -0.02)),
+        box_model((0.1, 0.1, 0.02), middle_m=(0.05, 0, 0.01)),
+    )
+    return two_parts(base, lid, (0, 1, 0))
 
 
 def test_a_hinged_object_weighs_its_parts_by_volume_and_moves_its_centre_with_the_lid():
