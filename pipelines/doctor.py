@@ -103,7 +103,7 @@ def _hand(profile: str) -> Finding:
 
 
 def _encoder() -> Finding:
-    from hoidata.annotation import load_encoder
+    from hoidata.annotation.encoders import load_encoder
     from hoidata.annotation.settings import AnnotationSettings
 
     name = load_settings(AnnotationSettings, "annotate").encoder

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.annotation import load_encoder
+from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.hand_choice import Method
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.errors import BadInput, MissingResource

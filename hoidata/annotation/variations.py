@@ -5,17 +5,17 @@ reading it gives back its hand by rule, its verb and its object among the words 
 """
 
 import csv
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from itertools import product
 from typing import Literal
 
-from hoidata.annotation.grammar import Grammar, NounPhrase, VerbForms, default_grammar
+from hoidata.annotation.grammar import NounPhrase, VerbForms, default_grammar
 from hoidata.annotation.hand_choice import select_hand
 from hoidata.annotation.prompts import Lexicon
+from hoidata.annotation.sentences import as_sentence
 from hoidata.clips import HandType
 
 Manner = Literal["slowly", "quickly"]
@@ -38,14 +38,6 @@ class WordTable:
 
 
 @dataclass(frozen=True)
-class Variations:
-    """sentences: distinct and in a fixed order; dropped: how many did not read back, by what was lost."""
-
-    sentences: tuple[str, ...]
-    dropped: Mapping[str, int]
-
-
-@dataclass(frozen=True)
 class _Object:
     """An object in a sentence: words with determiner and preposition, and whether it is plural."""
 
@@ -64,30 +56,19 @@ class SentenceMaker:
     verbs, objects: base forms. A synonym that is itself a verb of the dataset, or stands for two of them, is not used.
     """
 
-    def __init__(self, verbs: Iterable[str], objects: Iterable[str], grammar: Grammar | None = None) -> None:
-        self._grammar = grammar or default_grammar()
+    def __init__(self, verbs: Iterable[str], objects: Iterable[str]) -> None:
+        self._grammar = default_grammar()
         self._table = word_table()
         self._verbs = sorted(set(verbs))
         self._objects = sorted(set(objects))
         self._lexicon = self._make_lexicon()
 
-    def variations(self, verb: str, object_words: str, hand: HandType, manner: Manner | None = None) -> Variations:
-        """Every sentence for one interaction that reads back, the paper's four among them.
-
-        manner: adds the adverb in two places; only for a clip whose speed was measured.
-        """
-        made = self.unguarded(verb, object_words, hand, manner)
-        losses = {sentence: self.lost(sentence, verb, object_words, hand) for sentence in made}
-        kept = tuple(sentence for sentence, loss in losses.items() if loss is None)
-        return Variations(kept, Counter(loss for loss in losses.values() if loss))
-
     def unguarded(self, verb: str, object_words: str, hand: HandType, manner: Manner | None = None) -> tuple[str, ...]:
-        """Every distinct sentence the frames make, before the guard."""
-        return tuple(dict.fromkeys(self._sentences(verb, object_words, hand, manner)))
+        """Every distinct sentence the frames make, before the guard; the paper's four are among them.
 
-    def reads_back(self, sentence: str, verb: str, object_words: str, hand: HandType) -> bool:
-        """Hand by rule alone, verb and object among the dataset's words."""
-        return self.lost(sentence, verb, object_words, hand) is None
+        manner: adds the adverb in two positions; only for a clip whose speed was measured.
+        """
+        return tuple(dict.fromkeys(self._sentences(verb, object_words, hand, manner)))
 
     def lost(self, sentence: str, verb: str, object_words: str, hand: HandType) -> Loss | None:
         """What reading the sentence does not give back, the first of hand, verb and object; None when all are there."""
@@ -122,10 +103,10 @@ class SentenceMaker:
         things = list(self._determined(verb, noun))
         for forms, thing, hands in product(self.synonyms(verb), things, HAND_PHRASES[hand]):
             for sentence in _frames(forms, thing, hands, hand == "both"):
-                yield _sentence(sentence)
+                yield as_sentence(sentence)
                 if manner:
-                    yield _sentence(f"{manner}, {sentence}")
-                    yield _sentence(f"{sentence} {manner}")
+                    yield as_sentence(f"{manner}, {sentence}")
+                    yield as_sentence(f"{sentence} {manner}")
 
     def _determined(self, verb: str, noun: str) -> Iterator[_Object]:
         """The object plain and in its natural phrase, with "a", "the" and "this"; with and without its preposition."""
@@ -181,7 +162,3 @@ def manner_of(speed: float, quantiles: tuple[float, float]) -> Manner | None:
     """The adverb a measured speed deserves: below the lower or above the upper of two quantiles of its dataset."""
     slow, quick = quantiles
     return "slowly" if speed < slow else "quickly" if speed > quick else None
-
-
-def _sentence(words: str) -> str:
-    return words[0].upper() + words[1:] + "."

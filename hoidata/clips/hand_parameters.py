@@ -1,9 +1,9 @@
-"""Hand parameters of any source to the one convention of ``HandTrack``, and back.
+"""Hand parameters of any source to the one convention of ``HandTrack``.
 
 MANO's ``transl`` places the hand so that its wrist joint lies at ``J0 + transl``, where J0 is the wrist of the shaped
 rest mesh (about 10 cm from the model's origin); the hand turns about J0. Other sources give the wrist itself. Once a
 hand is known by its wrist position, a change of frame is the plain ``R' = A R``, ``wrist' = A wrist + b``.
-Finger angles are added and subtracted as they are: angles beyond pi survive.
+Finger angles are added as they are: angles beyond pi survive.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -90,13 +90,6 @@ class FrameChange:
             return rotvec
         return rotmat_to_rotvec(self.rotation @ rotvec_to_rotmat(np.asarray(rotvec, dtype=np.float64)))
 
-    def inverse(self) -> "FrameChange":
-        if self.rotation is None:
-            return self
-        back = np.swapaxes(self.rotation, -1, -2)
-        shift = None if self.translation_m is None else -(back @ self.translation_m[..., None])[..., 0]
-        return FrameChange(back, shift)
-
 
 SAME_FRAME = FrameChange()
 
@@ -118,25 +111,6 @@ def to_track(
         valid=valid,
         template_m=source.template_m,
     )
-
-
-def from_track(
-    track: HandTrack, convention: HandConvention, model: HandModel, change: FrameChange = SAME_FRAME
-) -> SourceHand:
-    """A track in a source's convention, float64. change: the source's frame from the world.
-
-    With fewer components than 45 the fingers are the closest ones (least squares) the components can express.
-    """
-    wrist = change.points(track.wrist_m.astype(np.float64))
-    if convention.translation == "transl":
-        wrist = wrist - model.wrist_offset_m(track.betas, track.template_m)
-    fingers = track.hand_pose.astype(np.float64)
-    if convention.fingers == "mean-relative":
-        fingers = fingers - model.mean_pose
-    if convention.components:
-        fingers = fingers @ np.linalg.pinv(model.components[: convention.components])
-    orient = change.rotvecs(track.global_orient.astype(np.float64))
-    return SourceHand(wrist, orient, fingers, track.betas, track.valid, track.template_m)
 
 
 def absolute_fingers(fingers: np.ndarray, convention: HandConvention, model: HandModel) -> np.ndarray:

@@ -46,9 +46,12 @@ def check_adapter(
         finding("the adapter can be sent to another process", _picklable(adapter)),
         finding("the raw folder holds every part the adapter declares", _parts(adapter, root)),
     ]
-    keys, opened = _located(adapter, root)
+    with opened_files(root) as opened:
+        keys = list(adapter.sequences(root))
     findings.append(finding("sequences are sorted, unique and named as they should be", _keys(adapter, keys)))
-    findings.append(finding("sequences are found by name: no file is opened", [f"{path} is opened" for path in opened]))
+    findings.append(
+        finding("sequences are found by name: no file is opened", [f"{path} is opened" for path in sorted(opened)])
+    )
     if not keys:
         return [*findings, finding("at least one sequence gives a clip", ["there is no sequence"])]
     hands = hands_for(adapter.hand_convention, hands)
@@ -134,12 +137,6 @@ def _parts(adapter: Adapter, root: Path) -> list[str]:
     return [f"no {part.what} ({', '.join(part.patterns)}); it comes from {part.where}" for part in absent]
 
 
-def _located(adapter: Adapter, root: Path) -> tuple[list[SequenceKey], list[str]]:
-    with opened_files(root) as opened:
-        keys = adapter.sequences(root)
-    return list(keys), sorted(opened)
-
-
 def _keys(adapter: Adapter, keys: list[SequenceKey]) -> list[str]:
     problems = []
     if keys != sorted(keys):
@@ -189,12 +186,10 @@ def _spread(keys: list[Any]) -> list[Any]:
 def _loading_findings(loaded: list[Loaded], refused: list[Loaded]) -> list[Finding]:
     reasons = [f"{item.key}: {item.problem or 'everything in it is left out'}" for item in refused]
     crashes = [f"{item.key}: {item.problem}" for item in refused if item.crashed]
-    rules = [
-        finding("at least one sequence gives a clip", [] if loaded else reasons),
-        finding("what cannot be used raises BadInput, nothing else", crashes),
-    ]
     rule = "files are read through the RawTree only"
     behind = [f"{item.key}: {path} is opened behind its back" for item in loaded for path in item.unrecorded]
-    if not loaded:
-        return [*rules, skipped(rule, "nothing was loaded")]
-    return [*rules, finding(rule, behind)]
+    return [
+        finding("at least one sequence gives a clip", [] if loaded else reasons),
+        finding("what cannot be used raises BadInput, nothing else", crashes),
+        finding(rule, behind) if loaded else skipped(rule, "nothing was loaded"),
+    ]

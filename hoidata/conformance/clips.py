@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable
 from itertools import chain
-from typing import Literal
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from hoidata.conformance.report import Finding, finding
 from hoidata.datasets.base import Adapter, Quarantined
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
+from hoidata.quality.meshes import volume_m3
 
 VERB = re.compile(r"[a-z]+( [a-z]+)*")
 NOUN = re.compile(r"[A-Z]?[a-z]+([ '-][A-Z]?[a-z]+)*")  # a proper name may be among them: Stanford bunny
@@ -27,27 +27,26 @@ ClipRule = Callable[[Adapter, Clip], list[str]]
 def clip_findings(adapter: Adapter, loaded: list[Loaded]) -> list[Finding]:
     """The rules over all results of some sequences."""
     clips = list(chain.from_iterable(item.clips for item in loaded))
+
+    def per_clip(rule: str, check: ClipRule) -> Finding:
+        outcome = "warn" if check is _mirrored else "fail"
+        return finding(rule, [f"{clip.clip_id}: {text}" for clip in clips for text in check(adapter, clip)], outcome)
+
     return [
         finding("results are clips or left-out stretches", _kinds(loaded)),
         finding("ids come from the sequence's key and are unique", _ids(loaded)),
-        _per_clip("clips say where they come from", _origin, adapter, clips),
+        per_clip("clips say where they come from", _origin),
         finding("clips name the files they were made from", _sources(loaded)),
         finding("files that are read belong to a declared part", _undeclared(adapter, loaded)),
-        _per_clip("clips are valid: shapes, finite numbers, possible sizes", _validity, adapter, clips),
-        _per_clip("frames are 1/30 s apart by the source's own clock", _clock, adapter, clips),
-        _per_clip("words are words: a lower-case verb or None, and a noun", _words, adapter, clips),
-        _per_clip("gravity is as declared, or None with a note", _gravity, adapter, clips),
-        _per_clip("the way back to the source is a similarity", _way_back, adapter, clips),
-        _per_clip("hands are from parameters, or fitted with a stated error", _hands_from, adapter, clips),
-        _per_clip("object meshes are not turned inside out (mirrored)", _mirrored, adapter, clips, "warn"),
+        per_clip("clips are valid: shapes, finite numbers, possible sizes", _validity),
+        per_clip("frames are 1/30 s apart by the source's own clock", _clock),
+        per_clip("words are words: a lower-case verb or None, and a noun", _words),
+        per_clip("gravity is as declared, or None with a note", _gravity),
+        per_clip("the way back to the source is a similarity", _way_back),
+        per_clip("hands are from parameters, or fitted with a stated error", _hands_from),
+        per_clip("object meshes are not turned inside out (mirrored)", _mirrored),
         finding("both hands are there", _both_hands(clips), "warn"),
     ]
-
-
-def _per_clip(
-    rule: str, check: ClipRule, adapter: Adapter, clips: list[Clip], outcome: Literal["fail", "warn"] = "fail"
-) -> Finding:
-    return finding(rule, [f"{clip.clip_id}: {text}" for clip in clips for text in check(adapter, clip)], outcome)
 
 
 def _kinds(loaded: list[Loaded]) -> list[str]:
@@ -168,10 +167,8 @@ def _mirrored(adapter: Adapter, clip: Clip) -> list[str]:
 
 
 def _is_inside_out(model: ObjectModel) -> bool:
-    """The volume by the divergence theorem is below minus 1 % of the bounding box: open meshes give vague volumes."""
-    corners = (model.vertices_m - model.vertices_m.mean(axis=0))[model.faces]
-    volume = np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    return bool(volume < -0.01 * np.ptp(model.vertices_m, axis=0).prod())
+    """The volume is below minus 1 % of the bounding box: open meshes give vague volumes."""
+    return bool(volume_m3(model.vertices_m, model.faces) < -0.01 * np.ptp(model.vertices_m, axis=0).prod())
 
 
 def _both_hands(clips: list[Clip]) -> list[str]:
@@ -179,9 +176,7 @@ def _both_hands(clips: list[Clip]) -> list[str]:
     for side in SIDES:
         if not any(clip.hands[side].valid.any() for clip in clips if side in clip.hands):
             problems.append(f"the {side} hand is valid in no frame")
-    empty = [clip.clip_id for clip in clips if _valid_share(clip) < FEWEST_VALID]
-    return problems + [f"{name}: no hand is valid in most frames" for name in empty]
-
-
-def _valid_share(clip: Clip) -> float:
-    return float(np.any([track.valid for track in clip.hands.values()], axis=0).mean())
+    for clip in clips:
+        if np.any([track.valid for track in clip.hands.values()], axis=0).mean() < FEWEST_VALID:
+            problems.append(f"{clip.clip_id}: no hand is valid in most frames")
+    return problems

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -106,15 +107,12 @@ def opened_files(root: Path) -> Iterator[set[str]]:
 
 
 _opened: list[str] | None = None
-_is_hooked = False
 
 
+@cache
 def _install_hook() -> None:
     """Audit hooks stay until the process ends: there is one, and it does nothing outside of ``opened_files``."""
-    global _is_hooked
-    if not _is_hooked:
-        sys.addaudithook(_note_open)
-        _is_hooked = True
+    sys.addaudithook(_note_open)
 
 
 def _note_open(event: str, arguments: tuple) -> None:

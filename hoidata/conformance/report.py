@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-Outcome = Literal["pass", "warn", "fail", "skip"]
 SHOWN = 3
 
 
@@ -16,14 +15,14 @@ class Finding:
     """
 
     rule: str
-    outcome: Outcome
+    outcome: Literal["pass", "warn", "fail", "skip"]
     detail: str = ""
 
 
-def finding(rule: str, problems: Sequence[str], outcome: Literal["fail", "warn"] = "fail", note: str = "") -> Finding:
-    """Passed with ``note`` when there are no problems, else ``outcome`` with the first of them."""
+def finding(rule: str, problems: Sequence[str], outcome: Literal["fail", "warn"] = "fail") -> Finding:
+    """Passed when there are no problems, else ``outcome`` with the first of them."""
     if not problems:
-        return Finding(rule, "pass", note)
+        return Finding(rule, "pass")
     rest = len(problems) - SHOWN
     return Finding(rule, outcome, "; ".join(problems[:SHOWN]) + (f"; and {rest} more" if rest > 0 else ""))
 

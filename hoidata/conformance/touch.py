@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.conformance.report import Finding, finding, skipped
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.hands import HandPair, track_joints
+from hoidata.hands import HandModel, HandPair, track_joints
 from hoidata.objects.distance import closest_points
 
 MOST_CLIPS, MOST_FRAMES = 12, 24
@@ -48,8 +48,18 @@ def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
         return [skipped("hands hold objects", f"the clips cannot be measured: {error!r}")]
     return [
         finding("hands are 0.15 to 0.25 m long", _hand_lengths(some, hands), "warn"),
-        finding("wrists are within 0.3 m of the object when it is nearest", _wrists(touches), "warn"),
-        finding("a fingertip comes within 2 cm of the object in most clips", _tips(touches), "warn"),
+        _near(
+            "wrists are within 0.3 m of the object when it is nearest",
+            [touch.wrist_m for touch in touches],
+            WRIST_M,
+            "unit, frame or translation?",
+        ),
+        _near(
+            "a fingertip comes within 2 cm of the object in most clips",
+            [touch.nearest_tip_m for touch in touches],
+            TOUCH_M,
+            "mean pose, frame or parts?",
+        ),
         _bending(some, hands),
         _other_readings(some, touches, hands),
         _turning(some, touches),
@@ -107,20 +117,12 @@ def _hand_length_m(clip: Clip, side: Side, hands: HandPair) -> float | None:
     return float(np.linalg.norm(np.diff(joints[list(MIDDLE_FINGER)], axis=0), axis=1).sum())
 
 
-def _wrists(touches: list[_Touch]) -> list[str]:
-    nearest = [_nanmin(touch.wrist_m) for touch in touches]
-    near = np.mean([value <= WRIST_M for value in nearest])
-    if near >= MOST:
-        return []
-    return [f"only in {near:.0%} of clips; typically {np.median(nearest):.2g} m: unit, frame or translation?"]
-
-
-def _tips(touches: list[_Touch]) -> list[str]:
-    nearest = [_nanmin(touch.nearest_tip_m) for touch in touches]
-    near = np.mean([value <= TOUCH_M for value in nearest])
-    if near >= MOST:
-        return []
-    return [f"only in {near:.0%} of clips; typically {np.median(nearest) * 100:.2g} cm: mean pose, frame or parts?"]
+def _near(rule: str, distances_m: list[np.ndarray], limit_m: float, question: str) -> Finding:
+    """Whether the smallest distance of most clips is within the limit."""
+    nearest = [distance[np.isfinite(distance)].min(initial=np.inf) for distance in distances_m]
+    share = np.mean([value <= limit_m for value in nearest])
+    text = f"only in {share:.0%} of clips; typically {np.median(nearest) * 100:.2g} cm: {question}"
+    return finding(rule, [] if share >= MOST else [text], "warn")
 
 
 def _bending(clips: list[Clip], hands: HandPair) -> Finding:
@@ -206,11 +208,6 @@ def _angle_rad(rotation: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip((np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
-def _nanmin(values: np.ndarray) -> float:
-    good = values[np.isfinite(values)]
-    return float(good.min()) if len(good) else np.inf
-
-
 def _nanmin_hands(values: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(values), values, np.inf).min(axis=0)
 
@@ -224,24 +221,18 @@ def _transposed(clip: Clip, hands: HandPair) -> Clip:
 
 
 def _with_mean(sign: int) -> Reading:
-    def read(clip: Clip, hands: HandPair) -> Clip:
-        moved = {
-            side: replace(track, hand_pose=track.hand_pose + sign * hands[side].mean_pose)
-            for side, track in clip.hands.items()
-        }
-        return replace(clip, hands=moved)
-
-    return read
+    return _each_hand(lambda track, model: {"hand_pose": track.hand_pose + sign * model.mean_pose})
 
 
 def _with_wrist(sign: int) -> Reading:
+    return _each_hand(
+        lambda track, model: {"wrist_m": track.wrist_m + sign * model.wrist_offset_m(track.betas, track.template_m)}
+    )
+
+
+def _each_hand(change: Callable[[HandTrack, HandModel], dict[str, np.ndarray]]) -> Reading:
     def read(clip: Clip, hands: HandPair) -> Clip:
-        moved = {
-            side: replace(
-                track, wrist_m=track.wrist_m + sign * hands[side].wrist_offset_m(track.betas, track.template_m)
-            )
-            for side, track in clip.hands.items()
-        }
+        moved = {side: replace(track, **change(track, hands[side])) for side, track in clip.hands.items()}
         return replace(clip, hands=moved)
 
     return read

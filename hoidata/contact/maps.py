@@ -26,37 +26,13 @@ def distance_entries(
     return {side: index.entries(joints_m[side], clip.hands[side].valid, clip.object, threshold_m) for side in SIDES}
 
 
-def touched_frames(entries: np.ndarray, point_count: int, threshold_m: float | None = None) -> np.ndarray:
-    """(point,) uint16: in how many frames a joint of this hand is closer than ``threshold_m`` to the point.
-
-    None takes every entry, that is the threshold they were found with.
-    """
-    near = entries if threshold_m is None else entries[entries["distance_m"].astype(np.float64) < threshold_m]
-    frame_count = int(near["frame"].max(initial=-1)) + 1
-    return frame_contact(near, frame_count, point_count).sum(axis=0, dtype=np.uint16)
-
-
-def contact_map(entries: np.ndarray, point_count: int, threshold_m: float | None = None) -> np.ndarray:
-    """(point,) uint8: 1 where a joint of this hand is closer than ``threshold_m`` in any frame, Text2HOI's map."""
-    return (touched_frames(entries, point_count, threshold_m) > 0).astype(np.uint8)
-
-
-def contact_maps(
-    entries: Mapping[Side, np.ndarray], point_count: int, threshold_m: float | None = None
-) -> dict[Side, np.ndarray]:
-    """Per hand its clip-level binary map (point,) uint8. A hand with an entry acts, so the union needs no hand type."""
-    return {side: contact_map(entries[side], point_count, threshold_m) for side in SIDES}
-
-
-def frame_contact(entries: np.ndarray, frame_count: int, point_count: int) -> np.ndarray:
-    """(frame, point) bool: the per-frame contact map of one hand at the threshold the entries were found with."""
-    touched = np.zeros((frame_count, point_count), dtype=bool)
+def touched_frames(entries: np.ndarray, point_count: int) -> np.ndarray:
+    """(point,) uint16: in how many frames a joint of this hand is as close to the point as entries are."""
+    touched = np.zeros((int(entries["frame"].max(initial=-1)) + 1, point_count), dtype=bool)
     touched[entries["frame"], entries["point"]] = True
-    return touched
+    return touched.sum(axis=0, dtype=np.uint16)
 
 
-def dense_distances(entries: np.ndarray, frame_count: int, point_count: int, joint_count: int = 21) -> np.ndarray:
-    """(frame, point, joint) float32 distance map of one hand, metres; infinite where there is no entry."""
-    dense = np.full((frame_count, point_count, joint_count), np.inf, dtype=np.float32)
-    dense[entries["frame"], entries["point"], entries["joint"]] = entries["distance_m"]
-    return dense
+def contact_maps(entries: Mapping[Side, np.ndarray], point_count: int) -> dict[Side, np.ndarray]:
+    """Per hand Text2HOI's map (point,) uint8. A hand with an entry acts, so the union needs no hand type."""
+    return {side: (touched_frames(entries[side], point_count) > 0).astype(np.uint8) for side in SIDES}

@@ -55,23 +55,10 @@ def _halved(points_m: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
     return _halved(points_m, order[:middle]) + _halved(points_m, order[middle:])
 
 
-@njit(cache=True)
-def nearest_of_each(places_m, boxes):  # pragma: no cover (compiled)
-    """(frame, joint) distance to the nearest point. places_m: (part, frame, joint, 3) joints in each part's frame."""
-    n_frames, n_joints = places_m.shape[1:3]
-    nearest = np.empty((n_frames, n_joints))
-    box = np.zeros(n_joints, np.int64)
-    for frame in range(n_frames):
-        for joint in range(n_joints):
-            square, box[joint] = _nearest(places_m[:, frame, joint], boxes, np.inf, box[joint])
-            nearest[frame, joint] = np.sqrt(square)
-    return nearest
-
-
 def closest_of_joints(
     joints_m: np.ndarray, motion: PartMotion, boxes: PointBoxes, grids: CellGrids, reach_m: float
 ) -> np.ndarray:
-    """(frame,) the smallest ``nearest_of_each`` of a frame's joints; the same bits, but most joints are passed over.
+    """(frame,) distance of the nearest point to the nearest of a frame's joints; most joints are passed over.
 
     joints_m: (frame, joint, 3) world joints, metres. grids: built for ``reach_m`` over the points of ``boxes``.
     """

@@ -44,23 +44,9 @@ def part_motion(track: ObjectTrack, parts: Sequence[int]) -> PartMotion:
     )
 
 
-def part_places(joints_m: np.ndarray, motion: PartMotion) -> np.ndarray:
-    """(part, frame, joint, 3) float64: world joints ``(frame, joint, 3)`` in the frame of each part, metres."""
-    places = np.empty((len(motion.moves), *joints_m.shape))
-    _all_places(_numbers(joints_m), motion, places)
-    return places
-
-
 def _numbers(values: np.ndarray) -> np.ndarray:
     """A copy in the one type and layout the compiled code is made for."""
     return np.array(values, dtype=np.float64, order="C")
-
-
-@njit(cache=True)
-def _all_places(joints_m, motion, places):  # pragma: no cover (compiled)
-    turns = np.empty((2, 3, 3))
-    for frame in range(len(joints_m)):
-        places_of_frame(joints_m[frame], motion, frame, turns, places[:, frame])
 
 
 @njit(cache=True)

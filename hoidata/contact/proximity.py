@@ -8,8 +8,8 @@ import numpy as np
 
 from hoidata.clips import ObjectTrack
 from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entries
-from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, nearest_of_each, point_boxes
-from hoidata.contact.part_frames import part_motion, part_places
+from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, point_boxes
+from hoidata.contact.part_frames import part_motion
 from hoidata.errors import BadInput
 from hoidata.objects.sampling import SampledPoints
 
@@ -27,12 +27,8 @@ class ProximityIndex:
         self._grids: dict[float, CellGrids] = {}
         self._point_boxes: PointBoxes | None = None
 
-    def nearest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
-        """(frame, joint) distance from world joints ``(frame, joint, 3)`` to the nearest sampled point, metres."""
-        return nearest_of_each(self._places(joints_m, track), self._boxes())
-
     def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
-        """(frame,) the smallest of ``nearest_m`` of each frame: most joints need not be looked at closely for it."""
+        """(frame,) distance from the nearest of the world joints ``(frame, joint, 3)`` to the nearest point, metres."""
         if not self.parts:
             return np.full(len(joints_m), np.inf)
         motion, reach = part_motion(track, self.parts), CONTACT_THRESHOLD_M
@@ -65,7 +61,3 @@ class ProximityIndex:
         if self._point_boxes is None:
             self._point_boxes = point_boxes(self._points_m.astype(np.float64), self._members)
         return self._point_boxes
-
-    def _places(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
-        """(part, frame, joint, 3) float64 joints in the frame of each part."""
-        return part_places(joints_m, part_motion(track, self.parts))

@@ -3,7 +3,6 @@
 The folder it writes is described in ``hoidata.store.annotated``.
 """
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -61,8 +60,11 @@ def contact_store(
         _write_points(partial, sampled, points)
         writer = _Writer(partial, points)
         indices = {name: ProximityIndex(cloud) for name, cloud in sampled.items()}
-        for clip_id, entries in clip_entries(store, indices, settings.threshold_m):
-            writer.add(clip_id, entries)
+        for clip_id in store.ids:
+            clip = store.clip(clip_id)
+            joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
+            index = indices[clip.object.model.name]
+            writer.add(clip_id, distance_entries(clip, joints, index, settings.threshold_m))
         counts = writer.finish() | {"objects": len(sampled)}
         info = {"threshold_m": settings.threshold_m, "points": points, "counts": counts}
         (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
@@ -72,16 +74,6 @@ def contact_store(
 def sample_objects(store: Store, points: int) -> dict[str, SampledPoints]:
     """Sampled points of every object of a store, by name, in the store's order."""
     return {name: sample_points(store.object_model(name), points) for name in store.objects["object"]}
-
-
-def clip_entries(
-    store: Store, indices: dict[str, ProximityIndex], threshold_m: float
-) -> Iterator[tuple[str, dict[Side, np.ndarray]]]:
-    """Every clip's id and distance entries per hand, one clip in memory at a time."""
-    for clip_id in store.ids:
-        clip = store.clip(clip_id)
-        joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
-        yield clip_id, distance_entries(clip, joints, indices[clip.object.model.name], threshold_m)
 
 
 def _write_points(folder: Path, sampled: dict[str, SampledPoints], points: int) -> None:

@@ -12,7 +12,6 @@ import math
 import pickletools
 import re
 import struct
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,9 +19,10 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.lib import format as npy
 
 from hoidata.errors import BadInput
+from hoidata.files.npy_header import read_npy_header
+from hoidata.files.numpy_files import open_archive
 from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
 
 MOST_MEMBERS = 256
@@ -62,7 +62,7 @@ class StoredArray:
         """
         count, length = self.shape[::-1] if self.by_columns else self.shape
         step = max(1, _PIECE_BYTES // max(1, length * self.dtype.itemsize))
-        with _readable(self.path), self._open() as stream:
+        with self._open() as stream:
             for first in range(0, count, step):
                 rows = min(step, count - first)
                 data = _exactly(stream, rows * length * self.dtype.itemsize)
@@ -73,14 +73,14 @@ class StoredArray:
         if isinstance(self.data, bytes):
             yield io.BytesIO(self.data)
             return
-        with zipfile.ZipFile(self.path) as archive, archive.open(f"{self.member}.npy") as stream:
+        with open_archive(self.path) as archive, archive.open(f"{self.member}.npy") as stream:
             _skip(stream, self.data.start)
             yield _BytesOfText(stream, self.data.length) if self.data.is_text else stream
 
 
 def npz_members(path: str | Path) -> set[str]:
     """The names of an archive's members. Raises BadInput when it is no archive, or has more than 256."""
-    with _readable(path), zipfile.ZipFile(path) as archive:
+    with open_archive(path) as archive:
         names = {name.removesuffix(".npy") for name in archive.namelist()}
     if len(names) > MOST_MEMBERS:
         raise BadInput(path, f"at most {MOST_MEMBERS} members", str(len(names)))
@@ -95,12 +95,14 @@ def locate_arrays(path: str | Path, member: str) -> dict[str, StoredArray]:
     where = f"{path}: {member}"
     if member not in npz_members(path):
         raise BadInput(path, f"a member {member!r}", "a file without it")
-    with _readable(path), zipfile.ZipFile(path) as archive:
+    with open_archive(path) as archive:
         if archive.getinfo(f"{member}.npy").file_size > MOST_MEMBER_BYTES:
             raise BadInput(where, f"at most {MOST_MEMBER_BYTES} bytes when unpacked", "more")
         with archive.open(f"{member}.npy") as stream:
             counted = _Counted(stream)
-            _check_header(counted, where)
+            header = read_npy_header(counted, where)
+            if header.shape != () or not header.dtype.hasobject:
+                raise BadInput(where, "a pickled dict of arrays", f"an array of shape {header.shape}, {header.dtype}")
             rest, places = _without_long_strings(counted, where)
     content = _dict_of(where, restricted_load(rest, _allowed(places), where=where))
     found = {str(name): _stored(f"{where}.{name}", Path(path), member, value) for name, value in content.items()}
@@ -166,25 +168,6 @@ class _Counted:
         self.given += size
         if self.given > _REST_BYTES:
             raise ValueError(f"more than {_REST_BYTES} bytes beside its arrays")
-
-
-@contextmanager
-def _readable(path: str | Path) -> Iterator[None]:
-    """Turns whatever a damaged archive raises into a BadInput that names it."""
-    try:
-        yield
-    except BadInput:
-        raise
-    except Exception as error:  # OSError, BadZipFile, zlib.error and the like have no common base
-        raise BadInput(path, "a whole .npz file", f"{type(error).__name__}: {error}") from None
-
-
-def _check_header(stream: Any, where: str) -> None:
-    version = npy.read_magic(stream)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    if shape != () or not dtype.hasobject:
-        raise BadInput(where, "a pickled dict of arrays", f"an array of shape {shape} and type {dtype}")
 
 
 def _without_long_strings(stream: _Counted, where: str) -> tuple[bytes, list[_Place]]:

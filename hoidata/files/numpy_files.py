@@ -34,7 +34,7 @@ def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -
 
     BadInput if a named member is absent, on more than 256 members, or on more than 1 GiB when unpacked.
     """
-    with _archive(path) as archive:
+    with open_archive(path) as archive:
         chosen = _chosen_members(path, archive, members)
         return {name: _item(_read_member(path, archive, info, True)) for name, info in chosen.items()}
 
@@ -44,14 +44,15 @@ def load_npz_arrays(path: str | Path) -> dict[str, np.ndarray]:
 
     BadInput on Python objects, and where it unpacks to more than 1 GiB and more than its own size.
     """
-    with _archive(path) as archive:
+    with open_archive(path) as archive:
         infos = archive.infolist()
         _check_size(path, infos, max(_MAX_BYTES, Path(path).stat().st_size))
         return {info.filename.removesuffix(".npy"): _read_member(path, archive, info, False) for info in infos}
 
 
 @contextmanager
-def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
+def open_archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
+    """The archive ``path``; whatever a damaged one raises becomes a BadInput that names it."""
     try:
         with zipfile.ZipFile(path) as archive:
             yield archive

@@ -32,11 +32,6 @@ class RigidTransform:
         """From axis-angles (..., 3), radians, and positions (..., 3) of the origin of b in a, metres."""
         return cls(rotvec_to_rotmat(rotvec), translation_m)
 
-    @classmethod
-    def from_matrix(cls, matrix: Array) -> "RigidTransform":
-        """From homogeneous matrices (..., 4, 4); the last row is not looked at."""
-        return cls(matrix[..., :3, :3], matrix[..., :3, 3])
-
     @property
     def translation(self) -> Any:
         """(..., 3) where the origin of b lies in a, metres."""

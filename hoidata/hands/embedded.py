@@ -1,9 +1,10 @@
 """The hand that comes with hoidata: MANO's layout on a CC0 mesh, so that everything runs without a licensed file.
 
-``build_embedded.py`` made ``assets/embedded_hand.npz`` (right hand) once. Pose correctives and the left hand are
+``hoidata.hand_builder`` made ``assets/embedded_hand.npz`` (right hand) once. Pose correctives and the left hand are
 rebuilt here with elementwise arithmetic only (no BLAS), so that every machine gets the same bits and the same digest.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -12,7 +13,6 @@ import numpy as np
 from hoidata.hands.model import N_POSE_FEATURES, N_ROTATIONS, N_VERTICES, PARENTS, HandModel, HandPair, checked_model
 
 ASSET = Path(__file__).with_name("assets") / "embedded_hand.npz"
-_REMEDY = "reinstall hoidata"
 _MIRROR = np.array([-1.0, 1.0, 1.0])
 _DORSAL_M, _PALMAR_M, _BULGE_M = 1.5e-3, -1.0e-3, -1.0e-3
 
@@ -24,12 +24,6 @@ def load_embedded_hands() -> HandPair:
     return HandPair(left=mirrored(right), right=right)
 
 
-def provenance() -> str:
-    """Where the embedded mesh comes from, its licence, and what made it."""
-    with np.load(ASSET, allow_pickle=False) as asset:
-        return str(asset["provenance"])
-
-
 def _read_right() -> HandModel:
     with np.load(ASSET, allow_pickle=False) as asset:
         stored = {key: asset[key] for key in asset.files if key != "provenance"}
@@ -37,7 +31,7 @@ def _read_right() -> HandModel:
     weights = _dense_weights(stored["weight_joint"], stored["weight_value"].astype(np.float64))
     return checked_model(
         str(ASSET),
-        _REMEDY,
+        "reinstall hoidata",
         side="right",
         name="embedded",
         template_m=template,
@@ -108,18 +102,13 @@ def mirrored(model: HandModel) -> HandModel:
     pose_sign = _MIRROR[:, None, None, None] * rotation_sign
     pose = model.pose_directions.reshape(N_VERTICES, 3, N_ROTATIONS - 1, 3, 3) * pose_sign
     axis_sign = np.tile([1.0, -1.0, -1.0], N_ROTATIONS - 1)
-    return checked_model(
-        f"mirror of {model.name}",
-        _REMEDY,
+    return replace(
+        model,
         side="left" if model.side == "right" else "right",
-        name=model.name,
         template_m=model.template_m * _MIRROR,
         shape_directions=model.shape_directions * _MIRROR[:, None],
         pose_directions=pose.reshape(N_VERTICES, 3, N_POSE_FEATURES),
-        joint_regressor=model.joint_regressor,
-        skin_weights=model.skin_weights,
-        parents=model.parents,
-        faces=model.faces[:, ::-1],
+        faces=np.ascontiguousarray(model.faces[:, ::-1]),
         mean_pose=model.mean_pose * axis_sign,
         components=model.components * axis_sign,
     )

@@ -41,6 +41,18 @@ _ALLOW = {
     ("scipy.sparse.csc", "csc_matrix"): _Csc,
     ("scipy.sparse._csc", "csc_matrix"): _Csc,
 }
+# Our fields, and MANO's names for them.
+_KEYS = {
+    "template_m": "v_template",
+    "shape_directions": "shapedirs",
+    "pose_directions": "posedirs",
+    "joint_regressor": "J_regressor",
+    "skin_weights": "weights",
+    "parents": "kintree_table",
+    "faces": "f",
+    "mean_pose": "hands_mean",
+    "components": "hands_components",
+}
 
 
 def load_mano_hands(folder: str | Path) -> HandPair:
@@ -74,21 +86,10 @@ def _find(folder: Path, name: str) -> Path:
 
 
 def _fields(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
-    names = {
-        "template_m": "v_template",
-        "shape_directions": "shapedirs",
-        "pose_directions": "posedirs",
-        "joint_regressor": "J_regressor",
-        "skin_weights": "weights",
-        "parents": "kintree_table",
-        "faces": "f",
-        "mean_pose": "hands_mean",
-        "components": "hands_components",
-    }
-    absent = sorted(key for key in names.values() if key not in content)
+    absent = sorted(key for key in _KEYS.values() if key not in content)
     if absent:
-        raise BadInput(path, f"the keys {sorted(names.values())}", f"a dict without {absent}", _REMEDY)
-    values = {field: _dense(f"{path}: {key}", content[key]) for field, key in names.items()}
+        raise BadInput(path, f"the keys {sorted(_KEYS.values())}", f"a dict without {absent}", _REMEDY)
+    values = {field: _dense(f"{path}: {key}", content[key]) for field, key in _KEYS.items()}
     values["shape_directions"] = values["shape_directions"][..., :N_SHAPE]
     values["parents"] = _parents(values["parents"])
     return values
@@ -147,17 +148,10 @@ def write_mano_pickle(model: HandModel, path: str | Path) -> None:
 
     For tests of the user-file path and for tools that read MANO; never write a real MANO hand with it to share it.
     """
-    content = {
-        "v_template": model.template_m,
-        "shapedirs": model.shape_directions,
-        "posedirs": model.pose_directions,
-        "J_regressor": model.joint_regressor,
+    content = {key: getattr(model, field) for field, key in _KEYS.items()} | {
         "J": model.joint_regressor @ model.template_m,
-        "weights": model.skin_weights,
         "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_ROTATIONS)], dtype=np.int64),
         "f": model.faces.astype(np.uint32),
-        "hands_mean": model.mean_pose,
-        "hands_components": model.components,
         "hands_coeffs": np.zeros((1, len(model.mean_pose))),
         "bs_style": "lbs",
         "bs_type": "lrotmin",

@@ -12,7 +12,7 @@ import numpy as np
 from hoidata.clips.clip import Side
 from hoidata.metrics.pair import Motion, Pair
 from hoidata.objects.surface_index import surface_index
-from hoidata.surface.contact import PlacedHand, penetration, placed_hand
+from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
 
 DEEP_MM = 10.0
 
@@ -64,7 +64,7 @@ def _deepest_m(pair: Pair, every: int) -> np.ndarray:
     for side in pair.sides if index.is_solid else ():
         frames = pair.frames(side, every)
         hand = _at(placed_hand(clip, side, pair.predicted.hands), frames)
-        each.append(penetration(hand, index).deepest_m[frames])
+        each.append(deepest_m(hand, index)[frames])
     return np.concatenate(each)
 
 

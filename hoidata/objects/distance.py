@@ -4,7 +4,7 @@ Exact nearest-triangle search is libigl's. The sign is the angle-weighted pseudo
 where the surface is closed, and the winding number's (Jacobson et al. 2013) where it has holes.
 """
 
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import igl
 import numpy as np
@@ -14,40 +14,29 @@ from hoidata.errors import BadInput
 CHUNK_POINTS = 1 << 17
 
 
-@dataclass(frozen=True)
-class ClosestPoints:
-    """distance_m: (point,) >= 0; closest_m: (point, 3) on the surface; face: (point,) index of its triangle."""
+class ClosestPoints(NamedTuple):
+    """distance_m: (point,) >= 0; closest_m: (point, 3) on the surface."""
 
     distance_m: np.ndarray
     closest_m: np.ndarray
-    face: np.ndarray
 
 
-@dataclass(frozen=True)
-class SignedDistance:
-    """distance_m: (point,) negative inside; closest_m: (point, 3); face: (point,); normal: (point, 3) unit, outward.
+class SignedDistance(NamedTuple):
+    """distance_m: (point,) negative inside; closest_m: (point, 3); normal: (point, 3) unit, outward.
 
     ``normal`` belongs to the closest point: the triangle's there, whatever the side the query came from.
-    ``closed`` says whether the surface has no hole, so that "inside" is exact.
     """
 
     distance_m: np.ndarray
     closest_m: np.ndarray
-    face: np.ndarray
     normal: np.ndarray
-    closed: bool
 
 
-@dataclass(frozen=True)
-class MergedSurface:
-    """Coinciding vertices merged, collapsed triangles left out; ``kept`` maps back to the caller's face indices.
-
-    vertices_m: (vertex, 3) float64; faces: (face, 3) int64.
-    """
+class MergedSurface(NamedTuple):
+    """Vertices merged, collapsed triangles left out. vertices_m: (vertex, 3) float64; faces: (face, 3) int64."""
 
     vertices_m: np.ndarray
     faces: np.ndarray
-    kept: np.ndarray
 
 
 def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> ClosestPoints:
@@ -56,11 +45,9 @@ def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarr
     Raises BadInput for a mesh without triangles of positive area or with numbers that are not finite.
     """
     surface = merged_surface(vertices_m, faces)
-    parts = [
-        igl.point_mesh_squared_distance(chunk, surface.vertices_m, surface.faces)[:3] for chunk in _chunks(points_m)
-    ]
-    square, face, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
-    return ClosestPoints(np.sqrt(square), closest.reshape(-1, 3), surface.kept[face])
+    parts = [igl.point_mesh_squared_distance(chunk, *surface)[::2] for chunk in _chunks(points_m)]
+    square, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return ClosestPoints(np.sqrt(square), closest.reshape(-1, 3))
 
 
 def signed_distance(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> SignedDistance:
@@ -73,13 +60,13 @@ def signed_distance(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndar
     surface = merged_surface(vertices_m, faces)
     closed = is_closed(surface.faces)
     if _is_inside_out(surface, closed):
-        surface = replace(surface, faces=np.ascontiguousarray(surface.faces[:, ::-1]))
+        surface = surface._replace(faces=np.ascontiguousarray(surface.faces[:, ::-1]))
     kinds = igl.SignedDistanceType
     kind = kinds.SIGNED_DISTANCE_TYPE_PSEUDONORMAL if closed else kinds.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
-    parts = [igl.signed_distance(chunk, surface.vertices_m, surface.faces, kind)[:3] for chunk in _chunks(points_m)]
+    parts = [igl.signed_distance(chunk, *surface, kind)[:3] for chunk in _chunks(points_m)]
     distance, face, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
     normals = face_normals(surface.vertices_m, surface.faces)
-    return SignedDistance(distance, closest.reshape(-1, 3), surface.kept[face], normals[face], closed)
+    return SignedDistance(distance, closest.reshape(-1, 3), normals[face])
 
 
 def face_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -98,12 +85,12 @@ def merged_surface(vertices_m: np.ndarray, faces: np.ndarray) -> MergedSurface:
     unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
     merged = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)].reshape(-1, 3)
     a, b, c = merged.T
-    kept = np.flatnonzero((a != b) & (b != c) & (c != a))
+    kept = merged[(a != b) & (b != c) & (c != a)]
     if not len(kept):
         raise BadInput(
             "object mesh", "at least one triangle", f"{len(merged)} faces, none with area", "repair the mesh"
         )
-    return MergedSurface(unique, np.ascontiguousarray(merged[kept]), kept)
+    return MergedSurface(unique, kept)
 
 
 def is_closed(faces: np.ndarray) -> bool:
@@ -119,9 +106,13 @@ def _is_inside_out(surface: MergedSurface, closed: bool) -> bool:
     """Negative volume: more than rounding of it (two opposite shells enclose nothing), or where the surface is open
     and its volume vague, more than 1 % of the bounding box.
     """
-    corners = (surface.vertices_m - surface.vertices_m.mean(axis=0))[surface.faces]
-    volume = np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
-    return bool(volume < -(1e-6 if closed else 0.01) * np.ptp(surface.vertices_m, axis=0).prod())
+    return bool(volume_m3(*surface) < -(1e-6 if closed else 0.01) * np.ptp(surface.vertices_m, axis=0).prod())
+
+
+def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
+    """Volume a closed surface encloses by the divergence theorem; negative when it is turned inside out."""
+    corners = (vertices_m - vertices_m.mean(axis=0))[faces]
+    return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 
 
 def _chunks(points_m: np.ndarray) -> list[np.ndarray]:

@@ -11,11 +11,12 @@ _POINTS_PER_BUCKET = 128
 _ROUNDING = np.float32(1 - 1e-5)  # a bound from box corners is rounded otherwise than a distance
 
 
-def farthest_rows(points: np.ndarray, count: int) -> np.ndarray:
-    """(count,) rows of (point, 3) float32: the first, then always the one farthest from all chosen so far.
+def farthest_points(points_m: np.ndarray, count: int) -> np.ndarray:
+    """(count,) rows of ``points_m (point, 3)``: the first, then always the point farthest from all chosen so far.
 
-    Among equals the lowest row; rows repeat only when points coincide.
+    Squared distances in float32; among equals the lowest row. Rows repeat only when points coincide.
     """
+    points = np.ascontiguousarray(points_m, dtype=np.float32)
     order, first = _buckets(points)
     x, y, z = np.ascontiguousarray(points[order].T, np.float32)
     low = np.minimum.reduceat(points[order], first[:-1], axis=0)

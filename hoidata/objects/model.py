@@ -44,6 +44,15 @@ class ObjectModel:
         """(face,) part of each face: the moving part when at least two of its vertices move."""
         return (self.part[self.faces].sum(axis=1) >= 2).astype(np.uint8)
 
+    @property
+    def parts(self) -> list[int]:
+        """The parts that have faces; of a rigid object one, which all its faces belong to."""
+        return [int(part) for part in np.unique(self.face_part)] if self.is_articulated else [0]
+
+    def faces_of(self, part: int) -> np.ndarray:
+        """(face, 3) those of one part."""
+        return self.faces[self.face_part == part] if self.is_articulated else self.faces
+
     def object_from_part(self, part: int, hinge_rad: np.ndarray | None) -> RigidTransform:
         """Where a part lies in the object frame, seen from its rest position (hinge angle 0), in which its mesh is.
 

@@ -5,7 +5,7 @@ states is allocated before the file is known to be long enough for it.
 """
 
 from collections.abc import Iterator
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -34,29 +34,13 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
-class _Rows(Protocol):
-    """The rows of a file, in order."""
-
-    def lengths(self, element: _Element) -> list[int]:
-        """How many numbers each property of the next row has."""
-        ...
-
-    def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
-        """Up to ``most`` rows, read as if each had these lengths: per property the stated lengths and (row, number)."""
-        ...
-
-    def advance(self, rows: int) -> None:
-        """Go past the first rows of the last block."""
-        ...
-
-
 def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (vertex, 3) float64 and triangles (face, 3) int64; polygons become fans.
 
     Vertices are as stored and in order. Raises ValueError when it is no PLY file, ends early or lacks either.
     """
     order, elements, start = _read_header(data)
-    rows: _Rows = _BinaryRows(data, start, order) if order else _TextRows(data[start:])
+    rows = _BinaryRows(data, start, order) if order else _TextRows(data[start:])
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     for element in elements[: _last_needed(elements) + 1]:
@@ -106,7 +90,7 @@ def _last_needed(elements: list[_Element]) -> int:
     return max(names.index("vertex"), names.index("face") if "face" in names else 0)
 
 
-def _read_rows(rows: _Rows, element: _Element) -> Iterator[list[np.ndarray]]:
+def _read_rows(rows: "_BinaryRows | _TextRows", element: _Element) -> Iterator[list[np.ndarray]]:
     """The rows of an element in blocks of equal list lengths, (row, number) for each property."""
     left = chunk = element.count
     while left and element.properties:
@@ -125,11 +109,14 @@ def _read_rows(rows: _Rows, element: _Element) -> Iterator[list[np.ndarray]]:
 
 
 class _BinaryRows:
+    """The rows of a file, in order."""
+
     def __init__(self, data: bytes, start: int, order: str) -> None:
         self.data, self.offset, self.order = data, start, order
         self.row_bytes = 0
 
     def lengths(self, element: _Element) -> list[int]:
+        """How many numbers each property of the next row has."""
         offset, found = self.offset, []
         for item in element.properties:
             length = 1
@@ -146,6 +133,7 @@ class _BinaryRows:
         return found
 
     def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
+        """Up to ``most`` rows, read as if each had these lengths: per property the stated lengths and (row, number)."""
         fields = []
         for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
             if item.count_kind is not None:
@@ -166,6 +154,8 @@ class _BinaryRows:
 
 
 class _TextRows:
+    """As ``_BinaryRows``, of a text file."""
+
     def __init__(self, text: bytes) -> None:
         self.words = text.split()
         self.offset = self.width = 0

@@ -11,7 +11,7 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.objects.distance import face_normals
-from hoidata.objects.farthest import farthest_rows
+from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import ObjectModel
 
 POINT_COUNT = 1024
@@ -54,14 +54,6 @@ def sample_points(model: ObjectModel, count: int = POINT_COUNT) -> SampledPoints
     if _vertices_are_dense(model, corners, count):
         return _from_vertices(model, count)
     return _from_surface(model, corners, count)
-
-
-def farthest_points(points_m: np.ndarray, count: int) -> np.ndarray:
-    """(count,) indices of ``points_m (point, 3)``: the first, then always the point farthest from all chosen so far.
-
-    Squared distances in float32; among equals the lowest index. Repeats indices only when points coincide.
-    """
-    return farthest_rows(np.ascontiguousarray(points_m, dtype=np.float32), count)
 
 
 def _vertices_are_dense(model: ObjectModel, corners: np.ndarray, count: int) -> bool:

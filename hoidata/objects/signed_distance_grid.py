@@ -152,7 +152,7 @@ def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.nda
 
     An object without the part is far away from everything.
     """
-    faces = model.faces[model.face_part == part] if model.is_articulated else model.faces
+    faces = model.faces_of(part)
     if not len(faces) or (part == 1 and not model.is_articulated):
         values = np.zeros((resolution**3, 4), np.float32)
         values[:, 0] = FAR_M

@@ -11,7 +11,7 @@ import igl
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from hoidata.objects.distance import is_closed, merged_surface
+from hoidata.objects.distance import is_closed, merged_surface, volume_m3
 
 LARGEST_PATCH = 0.01
 LEAST_SHARE = 1e-3  # of the convex hull: less is enclosed by two opposite sheets
@@ -60,12 +60,6 @@ def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
         repairs.append("triangles turned outward")
         found = np.ascontiguousarray(found[:, ::-1])
     return Solid(vertices, found, ", ".join(repairs), patched)
-
-
-def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
-    """Volume a closed surface encloses by the divergence theorem; negative when it is turned inside out."""
-    corners = (vertices_m - vertices_m.mean(axis=0))[faces]
-    return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 
 
 def encloses(vertices_m: np.ndarray, faces: np.ndarray) -> bool:

@@ -51,7 +51,7 @@ class SurfaceIndex:
 
     def __init__(self, model: ObjectModel, grid_from: int = GRID_PAYS_FROM) -> None:
         self.model = model
-        faces = {part: _faces_of(model, part) for part in _parts(model)}
+        faces = {part: model.faces_of(part) for part in model.parts}
         self.solids = {part: solid_of(model.vertices_m, own) for part, own in faces.items()}
         self.solid_note = _note(model, self.solids)
         self._surfaces: dict[int, _Surface] = {}
@@ -109,11 +109,6 @@ class SurfaceIndex:
         return depth
 
     @property
-    def has_grids(self) -> bool:
-        """Every part has been asked about so often that it has its grid."""
-        return all(surface.has_grid for surface in self._surfaces.values())
-
-    @property
     def is_solid(self) -> bool:
         """Some part encloses a solid, so that depths can be asked for."""
         return bool(self._closed)
@@ -147,14 +142,6 @@ class _Surface:
         if not self.has_grid and self._asked > self._grid_from:
             self._grid = distance_grid(self.tree, self.closed)
         return self._grid
-
-
-def _parts(model: ObjectModel) -> list[int]:
-    return [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
-
-
-def _faces_of(model: ObjectModel, part: int) -> np.ndarray:
-    return model.faces[model.face_part == part] if model.is_articulated else model.faces
 
 
 def _note(model: ObjectModel, solids: dict[int, Solid | NoSolid]) -> str | None:

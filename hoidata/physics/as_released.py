@@ -36,7 +36,6 @@ class AsReleased:
     limit: float = 0.01
     tolerance_m: float = 0.0
     reference: Literal["centre of mass", "origin"] = "centre of mass"
-    name: ClassVar[str] = "as released"
     at_centre: ClassVar[bool] = True
 
     def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray:
@@ -44,8 +43,7 @@ class AsReleased:
         centre = scene.motion.centre_m if self.reference == "centre of mass" else scene.poses.translation_m
         edges = friction_edges(contacts.normal, self.friction)
         arms = (contacts.point_m - centre[contacts.frame]) * UNITS_PER_METRE
-        kept = np.ones(edges.shape[:2], dtype=bool)
-        columns, offsets = force_columns(contacts.frame, arms, edges, kept, scene.n_frames)
+        columns, offsets = force_columns(contacts.frame, arms, edges, scene.n_frames)
         return np.square(wrench_residuals(columns, offsets, self.wrench(scene, centre), MOST_STEPS)).mean(axis=1)
 
     def wrench(self, scene: Scene, centre_m: np.ndarray) -> np.ndarray:

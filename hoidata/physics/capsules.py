@@ -56,7 +56,7 @@ class CapsuleContacts(NamedTuple):
 
     frame, capsule: (contact,) int. part: (contact,) touched part. depth_m: (contact,) radius less signed distance of
     the deepest axis point. point_m: (contact, 3) nearest surface point to it. normal: (contact, 3) unit, out of the
-    object, the gradient of the signed distance there. along: (contact,) where on the axis the deepest point is, 0 to 1.
+    object, the gradient of the signed distance there.
     """
 
     frame: np.ndarray
@@ -65,7 +65,6 @@ class CapsuleContacts(NamedTuple):
     depth_m: np.ndarray
     point_m: np.ndarray
     normal: np.ndarray
-    along: np.ndarray
 
 
 def joined(hands: list[Capsules]) -> Capsules:
@@ -84,17 +83,13 @@ def capsule_contacts(
     """
     found = [
         _part_contacts(model, part, poses.world_from_part(model, part), capsules, tolerance_m, at_centre)
-        for part in _parts(model)
+        for part in model.parts
     ]
     every = CapsuleContacts(*(np.concatenate(column) for column in zip(*found, strict=True)))
     order = np.lexsort((-every.depth_m, every.capsule, every.frame))
     frame, capsule = every.frame[order], every.capsule[order]
     first = np.r_[True, (np.diff(frame) != 0) | (np.diff(capsule) != 0)] if len(order) else np.zeros(0, dtype=bool)
     return CapsuleContacts(*(column[order][first] for column in every))
-
-
-def _parts(model: ObjectModel) -> list[int]:
-    return [int(part) for part in np.unique(model.face_part)] if model.is_articulated else [0]
 
 
 def _part_contacts(
@@ -105,7 +100,7 @@ def _part_contacts(
     tolerance_m: float,
     at_centre: bool,
 ) -> CapsuleContacts:
-    faces = model.faces[model.face_part == part] if model.is_articulated else model.faces
+    faces = model.faces_of(part)
     start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
     frame, capsule = _candidates(model.vertices_m[np.unique(faces)], start, end, capsules.radius_m + tolerance_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
@@ -121,7 +116,7 @@ def _part_contacts(
     point = (world_from_part[frame] @ point[hit][:, None])[:, 0]
     normal = world_from_part[frame].turn(normal[hit][:, None])[:, 0]
     depth = (radius - distance)[hit]
-    return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal, along[hit])
+    return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal)
 
 
 def _candidates(

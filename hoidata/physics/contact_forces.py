@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 
 FRICTION = 0.35
 GRAVITY_M_S2 = 9.81
-MASS_KG = 1.0
 RESIDUAL_LIMIT = 0.01
 _NNLS_ITERATIONS = 300
 
@@ -39,8 +38,8 @@ def angular_velocity(rotmats: np.ndarray, fps: float) -> np.ndarray:
     return step * (fps / np.maximum(after - before, 1))[:, None]
 
 
-def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray, mass_kg: float = MASS_KG) -> np.ndarray:
-    """(frame, 6): force in N and torque in N m about the centre of mass that the contacts together must apply.
+def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray) -> np.ndarray:
+    """(frame, 6): force in N and torque in N m about the centre of mass that the contacts of 1 kg must apply.
 
     gravity: (3,) unit vector, the direction things fall. Derivatives are central differences over frames.
     """
@@ -51,9 +50,9 @@ def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray, mass_kg
     acceleration[1:-1] = (centre[2:] - 2 * centre[1:-1] + centre[:-2]) * fps**2
     acceleration[0], acceleration[-1] = acceleration[1], acceleration[-2]
     spin = angular_velocity(motion.rotmats, fps)
-    momentum = mass_kg * np.einsum("fij,fj->fi", motion.inertia_kg_m2, spin)
+    momentum = np.einsum("fij,fj->fi", motion.inertia_kg_m2, spin)
     torque = np.gradient(momentum, 1 / fps, axis=0)
-    return np.concatenate([mass_kg * (acceleration - GRAVITY_M_S2 * gravity), torque], axis=1)
+    return np.concatenate([acceleration - GRAVITY_M_S2 * gravity, torque], axis=1)
 
 
 def cone_edges(normals: np.ndarray, friction: float = FRICTION) -> np.ndarray:
@@ -75,18 +74,14 @@ def wrench_columns(
     return np.concatenate([edges, torques], axis=2).reshape(-1, 6).T
 
 
-def wrench_residual(columns: np.ndarray, wrench: np.ndarray) -> float:
-    """Norm of the part of ``wrench (6,)`` that no non-negative combination of ``columns (6, n)`` produces."""
-    if columns.shape[1] == 0:
-        return float(np.linalg.norm(wrench))
-    try:
-        return float(nnls(columns, wrench, maxiter=_NNLS_ITERATIONS)[1])
-    except RuntimeError:  # no convergence: counted as infeasible, never as feasible
-        return float("inf")
-
-
 def force_residual(
     points_m: np.ndarray, normals: np.ndarray, centre_m: np.ndarray, wrench: np.ndarray, friction: float = FRICTION
 ) -> float:
     """Residual in N and N m of contacts at ``points_m (contact, 3)`` against the required ``wrench (6,)``."""
-    return wrench_residual(wrench_columns(points_m, normals, centre_m, friction), wrench)
+    if not len(points_m):
+        return float(np.linalg.norm(wrench))
+    try:
+        columns = wrench_columns(points_m, normals, centre_m, friction)
+        return float(nnls(columns, wrench, maxiter=_NNLS_ITERATIONS)[1])
+    except RuntimeError:  # no convergence: counted as infeasible, never as feasible
+        return float("inf")

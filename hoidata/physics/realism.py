@@ -1,28 +1,16 @@
 """Physical realism, penetration and smoothness of hand-object motion, as ManipNet (Zhang et al. 2021, Sec. 8) measures.
 
-The one entry point is ``measure``, for MANO-layout hands of a clip (19 capsules fitted to the skin, 30 fps)::
-
-    measure(clip_scene(clip, hands), clip_motions(clip, hands))
-
-and for ManipNet's own hands (its 19 capsules and 17 joints, 120 Hz; ``hoidata.datasets.manipnet.source_hands``)::
-
-    source = read_source_hands(raw, "cyl_med3")
-    measure(source.scene, source.motions)
-
 Scored are lifted frames in which no capsule is 1.5 cm or more inside the object.
 """
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import ClassVar, NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.clips.clip import SIDES, Clip
-from hoidata.hands import HandPair, track_joints
 from hoidata.physics.as_released import AsReleased
-from hoidata.physics.capsules import CapsuleContacts, capsule_contacts
-from hoidata.physics.mano_capsules import world_rotmats
+from hoidata.physics.capsules import capsule_contacts
 from hoidata.physics.scene import Scene
 from hoidata.physics.standard_units import StandardUnits
 
@@ -30,16 +18,8 @@ LARGEST_PENETRATION_M = 0.015
 SMOOTHNESS_FPS = 60.0
 
 
-class Variant(Protocol):
-    """A way to score frames: ``StandardUnits`` or ``AsReleased``."""
-
-    at_centre: ClassVar[bool]
-
-    @property
-    def limit(self) -> float: ...
-    @property
-    def tolerance_m(self) -> float: ...
-    def residuals(self, scene: Scene, contacts: CapsuleContacts) -> np.ndarray: ...
+# A way to score frames.
+Variant = StandardUnits | AsReleased
 
 
 class Realism(NamedTuple):
@@ -95,58 +75,7 @@ class HandMotion(NamedTuple):
     wrist_rotmats: np.ndarray
 
 
-class Measures(NamedTuple):
-    """Of one recording.
-
-    shares: by variant, of ``scored`` frames those whose motion the contacts can give (Appendix A); NaN when none is
-    scored. floors: the same with no hands at all, what a variant gives for nothing: 0 in SI units but for free fall.
-    penetration_m: mean depth over capsules that overlap the object, in frames looked at; NaN without any.
-    smoothness_m_s2: by hand, mean acceleration of its joints in the wrist's frame; only hands that have three frames.
-    """
-
-    shares: dict[str, float]
-    floors: dict[str, float]
-    scored: int
-    penetration_m: float
-    smoothness_m_s2: dict[str, float]
-
-
 VARIANTS: Mapping[str, Variant] = MappingProxyType({"SI": StandardUnits(), "as released": AsReleased()})
-
-
-def measure(
-    scene: Scene,
-    motions: Mapping[str, HandMotion],
-    variants: Mapping[str, Variant] = VARIANTS,
-    frames: np.ndarray | None = None,
-) -> Measures:
-    """All of ManipNet's physical measures of one recording, of any hands that are capsules and joints.
-
-    scene: ``clip_scene`` or ``SourceRecording.scene``; motions: ``clip_motions`` or ``SourceRecording.motions``.
-    frames: as in ``score``. The capsules of a MANO-layout hand follow its skin to a few millimetres:
-    ``StandardUnits(tolerance_m=0.002)`` counts a capsule that near as touching.
-    """
-    results = {name: score(scene, variant, frames) for name, variant in variants.items()}
-    bare = scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
-    floors = {name: score(bare, variant, frames).share for name, variant in variants.items()}
-    first = next(iter(results.values()), None) or score(scene, StandardUnits(), frames)
-    smooth = {
-        side: smoothness_m_s2(motion.joints_m, motion.wrist_rotmats, scene.fps)
-        for side, motion in motions.items()
-        if has_acceleration(motion.joints_m, scene.fps)
-    }
-    shares = {name: result.share for name, result in results.items()}
-    return Measures(shares, floors, len(first.frames), first.colliding_m, smooth)
-
-
-def clip_motions(clip: Clip, hands: HandPair) -> dict[str, HandMotion]:
-    """Both hands of a clip: its 16 joints and 5 tips."""
-    motions = {}
-    for side in SIDES:
-        track = clip.hands[side]
-        joints = np.where(track.valid[:, None, None], track_joints(track, hands[side]).astype(np.float64), np.nan)
-        motions[side] = HandMotion(joints, world_rotmats(track)[:, 0])
-    return motions
 
 
 def smoothness_m_s2(joints_m: np.ndarray, wrist_rotmats: np.ndarray, fps: float) -> float:

@@ -10,7 +10,7 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
-from hoidata.physics.contact_forces import GRAVITY_M_S2, MASS_KG, BodyMotion, required_wrench
+from hoidata.physics.contact_forces import GRAVITY_M_S2, BodyMotion, required_wrench
 from hoidata.physics.mano_capsules import hand_capsules
 from hoidata.physics.surface import body_motion
 
@@ -73,7 +73,7 @@ class Scene:
     @property
     def held(self) -> np.ndarray:
         """(frame,) bool: lifted, and not falling: the force it needs is more than 5 % of its weight."""
-        return self.lifted & (np.linalg.norm(self.wrench[:, :3], axis=1) > _FALLING * MASS_KG * GRAVITY_M_S2)
+        return self.lifted & (np.linalg.norm(self.wrench[:, :3], axis=1) > _FALLING * GRAVITY_M_S2)
 
     def with_capsules(self, capsules: Capsules) -> "Scene":
         """The same object under other hands."""

@@ -11,13 +11,12 @@ import numpy as np
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import HandModel
 from hoidata.objects.distance import signed_distance
-from hoidata.objects.mesh import MassProperties, mass_properties
+from hoidata.objects.mesh import mass_properties
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import BodyMotion
 
 REACH_M = 0.03
 CONTACT_TOLERANCE_M = 0.002
-N_PATCHES = 21
 
 
 class SurfaceDistances(NamedTuple):
@@ -44,10 +43,9 @@ def surface_distances(
     """Signed distances of ``points_m (frame, point, 3)``, object frame, to the object at each frame's hinge angle."""
     shape = points_m.shape[:2]
     best = SurfaceDistances(np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros((*shape, 3)))
-    for part in np.unique(model.face_part) if model.is_articulated else [None]:
-        faces = model.faces if part is None else model.faces[model.face_part == part]
-        object_from_part = model.object_from_part(int(part or 0), hinge_rad)
-        _merge_nearer(best, _part_distances(model, faces, object_from_part, points_m, reach_m))
+    for part in model.parts:
+        object_from_part = model.object_from_part(part, hinge_rad)
+        _merge_nearer(best, _part_distances(model, model.faces_of(part), object_from_part, points_m, reach_m))
     return best
 
 
@@ -92,29 +90,16 @@ def hand_patches(model: HandModel) -> np.ndarray:
     return np.where(joint == 0, 15 + region, joint - 1)
 
 
-def patch_contacts(
-    distances: SurfaceDistances, patches: np.ndarray, frame: int, tolerance_m: float = CONTACT_TOLERANCE_M
-) -> Contacts:
-    """At most one contact per patch: its deepest vertex, where that is nearer than the tolerance.
+def patch_contacts(distances: SurfaceDistances, patches: np.ndarray, frame: int) -> Contacts:
+    """At most one contact per patch: its deepest vertex, where that is nearer than 2 mm.
 
     The contact point is the closest surface point. patches: (point,) as from :func:`hand_patches`, any numbering.
     """
     order = np.argsort(distances.distance_m[frame], kind="stable")
-    order = order[distances.distance_m[frame][order] < tolerance_m]
+    order = order[distances.distance_m[frame][order] < CONTACT_TOLERANCE_M]
     first = np.unique(patches[order], return_index=True)[1]
     chosen = order[first]
     return Contacts(distances.closest_m[frame][chosen], distances.normal[frame][chosen])
-
-
-def part_mass_properties(model: ObjectModel) -> list[tuple[float, MassProperties]]:
-    """(share of the mass, properties for 1 kg) of each part, even density over the whole object."""
-    parts = [mass_properties(model.vertices_m, model.faces[model.face_part == part]) for part in _parts(model)]
-    total = sum(part.volume_m3 for part in parts)
-    return [(part.volume_m3 / total, part) for part in parts]
-
-
-def _parts(model: ObjectModel) -> np.ndarray:
-    return np.unique(model.face_part) if model.is_articulated else np.zeros(1, dtype=np.uint8)
 
 
 def body_motion(
@@ -122,16 +107,17 @@ def body_motion(
 ) -> BodyMotion:
     """Centre of mass and inertia of 1 kg in the world at each frame; a hinged object is one body at its angle."""
     n_frames = len(rotmats)
-    shares = part_mass_properties(model)
-    centres, inertias = [], []
-    for index, (_, part) in enumerate(shares):
+    parts = [mass_properties(model.vertices_m, model.faces_of(part)) for part in model.parts]
+    total = sum(part.volume_m3 for part in parts)
+    shares, centres, inertias = [part.volume_m3 / total for part in parts], [], []
+    for index, part in enumerate(parts):
         object_from_part = model.object_from_part(index, hinge_rad)
         turn = np.broadcast_to(object_from_part.rotation, (n_frames, 3, 3))
         centres.append((object_from_part @ np.broadcast_to(part.centre_m, (n_frames, 1, 3)))[:, 0])
         inertias.append(turn @ part.inertia_kg_m2 @ turn.transpose(0, 2, 1))
-    centre = sum(share * c for (share, _), c in zip(shares, centres, strict=True))
+    centre = sum(share * c for share, c in zip(shares, centres, strict=True))
     inertia = np.zeros((n_frames, 3, 3))
-    for (share, _), part_centre, part_inertia in zip(shares, centres, inertias, strict=True):
+    for share, part_centre, part_inertia in zip(shares, centres, inertias, strict=True):
         away = part_centre - centre
         square = (away**2).sum(-1)[:, None, None] * np.eye(3)
         inertia += share * (part_inertia + square - away[:, :, None] * away[:, None, :])

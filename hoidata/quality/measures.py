@@ -136,23 +136,19 @@ def _jumps(clip: Clip, joints: Joints, corners: np.ndarray, thresholds: Threshol
 
 def _frozen(clip: Clip, joints: Joints, corners: np.ndarray) -> dict[str, float]:
     always = np.ones(clip.n_frames, bool)
-    same: Joints = {
-        side: motion.equal_steps(_hand_numbers(clip.hands[side]), clip.hands[side].valid) for side in joints
-    }
-    moves: Joints = {
-        side: motion.steps_m(positions, clip.hands[side].valid) > STILL_M for side, positions in joints.items()
-    }
+    valid = {side: clip.hands[side].valid for side in joints}
+    same = {side: motion.equal_steps(_hand_numbers(clip.hands[side]), valid[side]) for side in joints}
+    moves = {side: motion.steps_m(positions, valid[side]) > STILL_M for side, positions in joints.items()}
     thing_moves = motion.steps_m(corners, always) > STILL_M
-    alone = [same[side] & (thing_moves | _any(moves, but=side, like=thing_moves)) for side in joints]
+    alone = []
+    for side in joints:
+        others_move = [flags for other, flags in moves.items() if other != side]
+        alone.append(same[side] & np.any([thing_moves, *others_move], axis=0))
     things = [motion.equal_steps(_object_numbers(track), always) for track in (clip.object, *clip.other_objects)]
     return {
         "frozen_hand_frames": float(max(map(motion.longest_frozen, alone), default=0)),
         "frozen_all_frames": float(motion.longest_frozen(np.all([*same.values(), *things], axis=0))),
     }
-
-
-def _any(moves: Joints, but: Side, like: np.ndarray) -> np.ndarray:
-    return np.any([np.zeros_like(like), *(flags for side, flags in moves.items() if side != but)], axis=0)
 
 
 def _hand_numbers(track: HandTrack) -> np.ndarray:

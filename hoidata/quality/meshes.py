@@ -47,7 +47,7 @@ def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
     kept = merged[(a != b) & (b != c) & (c != a)]
     return SurfaceFacts(
         open_edge_share=_open_edge_share(kept),
-        volume_m3=_volume(unique, kept),
+        volume_m3=volume_m3(unique, kept),
         hull_m3=_hull_volume(unique[np.unique(kept)]),
         shells=_shells(kept),
         degenerate_share=float(_is_degenerate(unique[merged]).mean()),
@@ -77,8 +77,8 @@ def _open_edge_share(faces: np.ndarray) -> float:
     return float(np.maximum(unmatched, 0).sum() / len(edges))
 
 
-def _volume(vertices_m: np.ndarray, faces: np.ndarray) -> float:
-    """Divergence theorem: signed tetrahedra between the triangles and the centre of the vertices."""
+def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
+    """Enclosed volume by the divergence theorem: signed tetrahedra between the triangles and the vertices' centre."""
     corners = (vertices_m - vertices_m.mean(axis=0))[faces]
     return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
 

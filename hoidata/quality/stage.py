@@ -110,9 +110,8 @@ def _measured(
     measure = functools.partial(_measure, store, facts, thresholds)
     frames = sum(store.sequences["n_frames"].tolist())
     jobs = min(jobs, 1 + frames // FRAMES_PER_JOB)
-    rows: dict[str, dict[str, Any]] = {}
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        rows |= bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality")
+        rows = dict(bar.track(in_workers(measure, store.ids, jobs), len(store), description="quality"))
     return [rows[clip_id] for clip_id in store.ids]
 
 

@@ -45,13 +45,6 @@ class ObjectMotion(NamedTuple):
     positions_m: np.ndarray
 
 
-class Pairs(NamedTuple):
-    """What one hand adds. object_m_s: (sample, 3); hand_m_s: (lag, sample, 3), the joint's velocity at each lag."""
-
-    object_m_s: np.ndarray
-    hand_m_s: np.ndarray
-
-
 def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], thing: ObjectMotion) -> TimeOffset:
     """The lag in -10 to 10 frames at which the hands' velocities agree best with the object's.
 
@@ -60,20 +53,20 @@ def time_offset(hands: Sequence[tuple[np.ndarray, np.ndarray]], thing: ObjectMot
     nothing. At lag ``L``: ``sum u(t) . v(t + L) / sqrt(sum |u(t)|^2 sum |v(t + L)|^2)``, v of the joint, u of the point
     of the object (or of its part) that lies where the joint is at t; central differences.
     """
-    pairs = [near_pairs(joints, usable, thing) for joints, usable in hands]
-    samples = sum(len(pair.object_m_s) for pair in pairs)
+    pairs = [_near_pairs(joints, usable, thing) for joints, usable in hands]
+    samples = sum(len(object_m_s) for object_m_s, _ in pairs)
     if samples < FEWEST_SAMPLES:
         return TimeOffset(float("nan"), float("nan"), samples)
-    moved = np.concatenate([pair.object_m_s for pair in pairs])
-    hand = np.concatenate([pair.hand_m_s for pair in pairs], axis=1)
+    moved = np.concatenate([object_m_s for object_m_s, _ in pairs])
+    hand = np.concatenate([hand_m_s for _, hand_m_s in pairs], axis=1)
     energy = np.sqrt((moved**2).sum() * (hand**2).sum(axis=(1, 2)))
     score = (hand * moved).sum(axis=(1, 2)) / np.maximum(energy, 1e-12)
     best = int(score.argmax())
     return TimeOffset(float(best - LARGEST_LAG), float(score[best]), samples)
 
 
-def near_pairs(joints_m: np.ndarray, usable: np.ndarray, thing: ObjectMotion) -> Pairs:
-    """Velocities of the nearest joint, and of the object there, in the frames in which it is near a moving object."""
+def _near_pairs(joints_m: np.ndarray, usable: np.ndarray, thing: ObjectMotion) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities (sample, 3) of the object and (lag, sample, 3) of the joint near it, where a moving object is near."""
     n_frames, margin = len(joints_m), LARGEST_LAG + 1
     # Every lag sees the same frames, so that none wins by leaving out those that disagree.
     whole = [frame for frame in range(margin, n_frames - margin) if usable[frame - margin : frame + margin + 1].all()]
@@ -83,7 +76,7 @@ def near_pairs(joints_m: np.ndarray, usable: np.ndarray, thing: ObjectMotion) ->
     frame, joint = frame[moving], joint[moving]
     then = frame[None] + np.arange(-LARGEST_LAG, LARGEST_LAG + 1)[:, None]
     hand_m_s = (joints_m[then + 1, joint] - joints_m[then - 1, joint]) * (FPS / 2)
-    return Pairs(object_m_s[moving], hand_m_s)
+    return object_m_s[moving], hand_m_s
 
 
 def _nearest(

@@ -51,7 +51,7 @@ def split_store(
     chosen, named = choose(dataset, wanted), definitions_for(dataset)
     rows = store.sequences.loc[used]
     digests = {clip_id: motion_digest(store.clip(clip_id, motion_only=True)) for clip_id in used}
-    parts = {definition: _assign(rows, definition) for definition in (*named.values(), chosen)}
+    parts = {definition: assign_split(rows, definition.rule).to_dict() for definition in (*named.values(), chosen)}
     leaks = {definition: _leaks(store, parts[definition], definition, digests) for definition in parts}
     _refuse_leaks(chosen, leaks[chosen])
     records = {name: _record(store, parts[item], item, leaks[item]) for name, item in named.items()}
@@ -92,10 +92,6 @@ def _annotated_clips(store: Store, annotation: Path) -> tuple[pd.DataFrame, list
         raise BadInput(annotation, f"the {len(store)} clips of {store.folder}", got, "run the stage 'annotate' again")
     named = set(pd.read_parquet(annotation / "text.parquet", columns=["clip_id"])["clip_id"])
     return hand_types, [clip_id for clip_id in store.ids if clip_id in named]
-
-
-def _assign(rows: pd.DataFrame, definition: Definition) -> Assignment:
-    return dict(assign_split(rows, definition.rule).items())  # type: ignore[arg-type]
 
 
 def _leaks(store: Store, parts: Assignment, definition: Definition, digests: Mapping[str, str]) -> Leaks:

@@ -144,13 +144,9 @@ class AnnotatedStore:
         """Imperative, passive, subject and gerund form."""
         return tuple(self._sentences[clip_id]["sentence"])
 
-    def text_features(self, clip_id: str) -> np.ndarray:
+    def text_embedding(self, clip_id: str) -> np.ndarray:
         """(4, 512) float32 features of the four sentences, of the encoder ``encoder_identity``."""
         return self._features[self._sentences[clip_id]["text_row"].to_numpy()]
-
-    def text_embedding(self, clip_id: str) -> np.ndarray:
-        """The same as :meth:`text_features`."""
-        return self.text_features(clip_id)
 
     def variations(self, clip_id: str) -> tuple[str, ...]:
         """Further sentences that say the same, as many as the stage was asked for; by default none."""

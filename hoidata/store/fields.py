@@ -116,20 +116,13 @@ FRAMES = StoreFile(
         *_hand("right"),
         *_object("object", "frame", "the manipulated object"),
         *_object("other", "other object x frame", "the further objects, one after another"),
-        _rotvec(
-            "camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)", since=(1, 1)
-        ),
+        _rotvec("camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)",
+                since=(1, 1)),
         _point("camera_position_m", "camera row", "where the camera is", since=(1, 1)),
-        Field(
-            "camera_images",
-            "int32",
-            "number of the image in the source",
-            ("camera row",),
-            ("camera row",),
-            since=(1, 1),
-        ),
+        Field("camera_images", "int32", "number of the image in the source", ("camera row",), ("camera row",),
+              since=(1, 1)),
     ),
-)
+)  # fmt: skip
 
 BODY = StoreFile(
     "arrays/body-*.npz",

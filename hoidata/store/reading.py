@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.store.mapped import map_npz
@@ -22,10 +23,8 @@ def clip_rows(sequences: pd.DataFrame) -> dict[str, dict[str, Any]]:
     Added: ``frames``, the rows of its shard; ``hands``, per side the rows of its betas and its template; ``facts``, the
     fields of ``Clip`` that stand in the row as they are. gravity (3,) and source_from_world (4, 4) become arrays.
     """
-    columns = {str(name): _plain_column(column) for name, column in sequences.items()}
     rows = {}
-    for values in zip(*columns.values(), strict=True):
-        row = dict(zip(columns, values, strict=True))
+    for row in pa.Table.from_pandas(sequences, preserve_index=False).to_pylist():
         row["frames"] = slice(row["first_row"], row["first_row"] + row["n_frames"])
         row["hands"] = {side: _hand_rows(row, side) for side in SIDES}
         row["facts"] = {name: row[name] for name in (*_FACTS, *_FURTHER_FACTS)}
@@ -38,18 +37,6 @@ def clip_rows(sequences: pd.DataFrame) -> dict[str, dict[str, Any]]:
 def _hand_rows(row: dict[str, Any], side: Side) -> tuple[slice, str | None]:
     first = row[f"{side}_betas_row"]
     return slice(first, first + row[f"{side}_betas_count"]), row[f"{side}_template"]
-
-
-def _plain_column(column: pd.Series) -> list[Any]:
-    """Python values; a missing one (pandas has three kinds) is None."""
-    values = column.tolist()
-    if column.dtype.kind in "biu":
-        return values
-    return [value.tolist() if isinstance(value, np.ndarray) else _plain(value) for value in values]
-
-
-def _plain(value: Any) -> Any:
-    return None if value is None or value is pd.NA or value != value else value
 
 
 @dataclass(frozen=True)

@@ -48,10 +48,10 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.store.fields import SCHEMA_VERSION, SEQUENCES, TABLES
+from hoidata.store.fields import SCHEMA_VERSION, TABLES
 from hoidata.store.mapped import map_npz
 from hoidata.store.reading import FrameShard, clip_rows
-from hoidata.store.versions import checked_version, filled_info, filled_table
+from hoidata.store.versions import checked_version, filled_info, filled_sequences
 from hoidata.store.writing import write_store
 
 __all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"]
@@ -76,7 +76,7 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
         remedy = "open it with the hands it was converted with"
         raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
     sequences, objects, files, quarantine = (_read_table(folder / file.path) for file in TABLES.values())
-    sequences = filled_table(SEQUENCES, sequences, version).set_index("clip_id", drop=False).rename_axis(None)
+    sequences = filled_sequences(sequences, version).set_index("clip_id", drop=False).rename_axis(None)
     return Store(folder, filled_info(info, version), sequences, objects, files, quarantine, hands)
 
 

@@ -6,13 +6,12 @@ from typing import Any
 import pandas as pd
 
 from hoidata.errors import BadInput
-from hoidata.store.fields import SCHEMA_VERSION, StoreFile, Version, parse_version
+from hoidata.store.fields import SCHEMA_VERSION, Version, parse_version
 
 CURRENT = parse_version(SCHEMA_VERSION)
 
 # What a clip of a store before 1.1 has in the columns 1.1 added.
 _COLUMNS_1_1: dict[str, Any] = {
-    "gravity_note": "",
     "hands_from": "parameters",
     "fit_error_m": None,
     "camera_name": None,
@@ -23,7 +22,7 @@ _COLUMNS_1_1: dict[str, Any] = {
     "source_contact_row": -1,
     "source_contact_count": 0,
 }
-_NO_GRAVITY = "not recorded: converted with schema 1.0"
+_NOT_RECORDED = "not recorded: converted with schema 1.0"
 
 
 def checked_version(folder: str | Path, text: Any) -> Version:
@@ -44,16 +43,12 @@ def checked_version(folder: str | Path, text: Any) -> Version:
     return version
 
 
-def filled_table(file: StoreFile, table: pd.DataFrame, version: Version) -> pd.DataFrame:
-    """The table with the columns that later minor versions added."""
+def filled_sequences(table: pd.DataFrame, version: Version) -> pd.DataFrame:
+    """The table of clips with the columns that later minor versions added."""
     if version >= (1, 1):
         return table
-    added = {field.name: _COLUMNS_1_1[field.name] for field in file.fields if field.since > version}
-    columns = {name: [value] * len(table) for name, value in added.items()}
-    filled = table.assign(**columns)
-    if "gravity_note" in added:
-        unknown = [value is None for value in table["gravity"]]
-        filled["gravity_note"] = [_NO_GRAVITY if missing else "" for missing in unknown]
+    filled = table.assign(**{name: [value] * len(table) for name, value in _COLUMNS_1_1.items()})
+    filled["gravity_note"] = [_NOT_RECORDED if value is None else "" for value in table["gravity"]]
     return filled
 
 
@@ -62,7 +57,6 @@ def filled_info(info: dict[str, Any], version: Version) -> dict[str, Any]:
     if version >= (1, 1):
         return info
     rest = {key: value for key, value in info.items() if key not in ("frame_notes", "hand_notes")}
-    note = "not recorded: converted with schema 1.0"
     added = {
         "dataset_version": "not recorded",
         "synthetic": False,
@@ -74,8 +68,8 @@ def filled_info(info: dict[str, Any], version: Version) -> dict[str, Any]:
             "handedness": "right",
             "up_axis": None,
             "gravity": "unknown",
-            "note": info.get("frame_notes", note),
+            "note": info.get("frame_notes", _NOT_RECORDED),
         },
-        "hand_convention": {"left_shape": "unknown", "note": info.get("hand_notes", note)},
+        "hand_convention": {"left_shape": "unknown", "note": info.get("hand_notes", _NOT_RECORDED)},
     }
     return added | rest

@@ -2,9 +2,9 @@
 
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,8 +32,7 @@ Arrays = dict[str, np.ndarray]
 _STEP = 1 << 20  # rows whose finiteness is looked at in one go
 
 
-@dataclass(frozen=True)
-class _Range:
+class _Range(NamedTuple):
     """Rows of a member that belong to a clip: from the number in ``column``, as many as ``count`` (of the clip's row).
 
     A column that may be -1 says that the clip has none.
@@ -45,19 +44,15 @@ class _Range:
     count: Callable[[dict[str, Any]], int]
 
 
-def _frames(row: dict[str, Any]) -> int:
-    return row["n_frames"]
-
-
 _RANGES = (
-    _Range(FRAMES, "source_frames", "first_row", _frames),
-    _Range(FRAMES, "left_betas", "left_betas_row", lambda row: row["left_betas_count"]),
-    _Range(FRAMES, "right_betas", "right_betas_row", lambda row: row["right_betas_count"]),
+    _Range(FRAMES, "source_frames", "first_row", itemgetter("n_frames")),
+    _Range(FRAMES, "left_betas", "left_betas_row", itemgetter("left_betas_count")),
+    _Range(FRAMES, "right_betas", "right_betas_row", itemgetter("right_betas_count")),
     _Range(FRAMES, "other_rotvec", "other_row", lambda row: row["n_frames"] * len(row["other_objects"])),
-    _Range(FRAMES, "camera_rotvec", "camera_row", _frames),
-    _Range(BODY, "transl_m", "body_row", _frames),
-    _Range(BODY, "expression", "expression_row", _frames),
-    _Range(SOURCE_CONTACT, "frame", "source_contact_row", lambda row: row["source_contact_count"]),
+    _Range(FRAMES, "camera_rotvec", "camera_row", itemgetter("n_frames")),
+    _Range(BODY, "transl_m", "body_row", itemgetter("n_frames")),
+    _Range(BODY, "expression", "expression_row", itemgetter("n_frames")),
+    _Range(SOURCE_CONTACT, "frame", "source_contact_row", itemgetter("source_contact_count")),
 )
 
 
@@ -139,18 +134,14 @@ def _equal_lengths(path: str, fields: Iterable[Field], arrays: Arrays) -> Iterat
             yield BadInput(f"{path}: {field.name}", expected, f"{len(arrays[field.name])}", REMEDY)
 
 
-def shard_problems(
-    file: StoreFile, shards: dict[int, Arrays], tables: dict[str, Columns], version: Version
-) -> Iterator[BadInput]:
+def shard_problems(file: StoreFile, shards: dict[int, Arrays], sequences: Columns) -> Iterator[BadInput]:
     """Rows that point outside, overlap, or leave some of a shard to nobody; and rows that say otherwise than arrays."""
-    columns = tables["sequences"]
-    rows = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
     for number, arrays in shards.items():
-        clips = [row for row in rows if row["shard"] == number]
+        clips = [row for row in _rows(sequences) if row["shard"] == number]
         found = [
             problem
             for kind in _RANGES
-            if kind.file is file and kind.column in columns
+            if kind.file is file and kind.column in sequences
             for problem in _range_problems(kind, number, clips, len(arrays[kind.member]))
         ]
         yield from found
@@ -193,35 +184,29 @@ def _frame_problems(clips: list[dict[str, Any]], arrays: Arrays) -> Iterator[Bad
             yield BadInput(where, "0 for a rigid object", "other angles", REMEDY)
 
 
-@dataclass(frozen=True)
-class MeshesAndTemplates:
-    """objects.npz and templates.npz of a store, against the rows that name their members."""
+def mesh_problems(folder: Path, objects: Columns) -> Iterator[BadInput]:
+    """objects.npz against the rows that name its members."""
+    fields = {f"{name}/{field.name}": field for name in objects["object"] for field in OBJECT_ARRAYS.fields}
+    arrays, found = _read_members(folder, OBJECT_ARRAYS.path, fields)
+    yield from found
+    if arrays is not None:
+        for row in _rows(objects):
+            yield from _mesh_problems(row, arrays)
 
-    folder: Path
-    tables: dict[str, Columns]
 
-    def problems(self) -> Iterator[BadInput]:
-        objects = self.tables["objects"]
-        names = objects["object"]
-        fields = {f"{name}/{field.name}": field for name in names for field in OBJECT_ARRAYS.fields}
-        arrays, found = _read_members(self.folder, OBJECT_ARRAYS.path, fields)
-        yield from found
-        if arrays is not None:
-            for values in zip(*objects.values(), strict=True):
-                yield from _mesh_problems(dict(zip(objects, values, strict=True)), arrays)
-        yield from self._template_problems()
+def template_problems(folder: Path, sequences: Columns) -> Iterator[BadInput]:
+    """templates.npz against the rows that name its members."""
+    names = {name for side in SIDES for name in sequences[f"{side}_template"] if name is not None}
+    arrays, found = _read_members(folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)})
+    yield from found
+    for name, template_m in (arrays or {}).items():
+        if template_key(template_m) != name:
+            where = f"{TEMPLATES.path}: {name}"
+            yield BadInput(where, "a name that is the start of its SHA-256", template_key(template_m), REMEDY)
 
-    def _template_problems(self) -> Iterator[BadInput]:
-        sequences = self.tables["sequences"]
-        names = {name for side in SIDES for name in sequences[f"{side}_template"] if name is not None}
-        arrays, found = _read_members(
-            self.folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)}
-        )
-        yield from found
-        for name, template_m in (arrays or {}).items():
-            if template_key(template_m) != name:
-                where = f"{TEMPLATES.path}: {name}"
-                yield BadInput(where, "a name that is the start of its SHA-256", template_key(template_m), REMEDY)
+
+def _rows(columns: Columns) -> list[dict[str, Any]]:
+    return [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)]
 
 
 def _mesh_problems(row: dict[str, Any], arrays: Arrays) -> Iterator[BadInput]:

@@ -6,11 +6,11 @@ from typing import Any
 
 from hoidata.clips.validation import check_clip
 from hoidata.errors import BadInput, MissingResource
-from hoidata.store.fields import BODY, FRAMES, INFO, SOURCE_CONTACT, STORE_FILES, TABLES, StoreFile, Version
+from hoidata.store.fields import BODY, FRAMES, INFO, SOURCE_CONTACT, STORE_FILES, TABLES, Version
 from hoidata.store.info import info_problems
 from hoidata.store.store import open_store, read_info
 from hoidata.store.versions import CURRENT, checked_version
-from hoidata.store_check.arrays import MeshesAndTemplates, read_shards, shard_problems
+from hoidata.store_check.arrays import mesh_problems, read_shards, shard_problems, template_problems
 from hoidata.store_check.tables import REMEDY, Columns, is_whole, read_columns, reference_problems, table_problems
 
 
@@ -76,12 +76,8 @@ def expected_files(sequences: Columns, version: Version) -> set[str]:
     for file in STORE_FILES:
         if file.since <= version:
             numbers = with_rows.get(file.path)
-            paths |= {file.path} if numbers is None else {shard_path(file, number) for number in numbers}
+            paths |= {file.path} if numbers is None else {file.path.replace("*", f"{number:05d}") for number in numbers}
     return paths
-
-
-def shard_path(file: StoreFile, number: int) -> str:
-    return file.path.replace("*", f"{number:05d}")
 
 
 def _shards_where(sequences: Columns, column: str, above: int) -> set[int]:
@@ -105,8 +101,9 @@ def _array_problems(folder: Path, tables: dict[str, Columns], version: Version) 
         if file.since <= version:
             shards, found = read_shards(folder, file, paths, version)
             yield from found
-            yield from shard_problems(file, shards, tables, version)
-    yield from MeshesAndTemplates(folder, tables).problems()
+            yield from shard_problems(file, shards, tables["sequences"])
+    yield from mesh_problems(folder, tables["objects"])
+    yield from template_problems(folder, tables["sequences"])
 
 
 def _clip_problems(folder: Path) -> Iterator[BadInput]:

@@ -2,6 +2,7 @@
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -49,8 +50,8 @@ def table_problems(name: str, file: StoreFile, columns: Columns) -> Iterator[Bad
     for field in file.fields:
         if field.name in columns:
             yield from _value_problems(file, field, columns[field.name])
-    if is_whole(file, columns):
-        yield from _OWN_RULES.get(name, _no_rules)(columns)
+    if name in _OWN_RULES and is_whole(file, columns):
+        yield from _OWN_RULES[name](columns)
 
 
 def is_whole(file: StoreFile, columns: Columns) -> bool:
@@ -89,18 +90,13 @@ def _each(where: str, values: list[Any], is_right: Callable[[Any], bool], expect
 
 
 def _unique(where: str, values: list[Any]) -> Iterator[BadInput]:
-    known: set[Any] = set()
-    twice = [value for value in values if value in known or known.add(value)]
+    twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
         yield BadInput(where, "each value once", f"{twice[0]!r} more than once", REMEDY)
 
 
 def _is_unit(vector: list[float] | None) -> bool:
     return vector is None or abs(math.hypot(*vector) - 1) <= UNIT_TOLERANCE
-
-
-def _no_rules(columns: Columns) -> Iterator[BadInput]:
-    yield from ()
 
 
 def _sequence_rules(columns: Columns) -> Iterator[BadInput]:

@@ -37,11 +37,6 @@ def bimart_map(hand: PlacedHand, points: SampledPoints, model: ObjectModel) -> n
     return hand.over_clip(nearest, np.inf)
 
 
-def clip_map(distances_m: np.ndarray) -> np.ndarray:
-    """(point,) how close the hand ever comes to each point: the smallest value of a map ``(frame, point)``."""
-    return distances_m.min(axis=0, initial=np.inf)
-
-
 def packed_map(distances_m: np.ndarray) -> np.ndarray:
     """uint8 of the same shape: steps of 0.8 mm, rounded; 255 beyond 20 cm."""
     near = distances_m <= REACH_M

@@ -1,4 +1,4 @@
-"""Hands of a clip against the exact surface of its object: touched vertices, signed distances, penetration.
+"""Hands of a clip against the exact surface of its object: touched vertices, penetration.
 
 Everything is asked in the object frame, so no answer depends on the world a clip is in. Arrays have a row for every
 frame of the clip; frames in which the hand is not valid are not looked at.
@@ -11,10 +11,8 @@ import numpy as np
 from hoidata.clips.clip import Clip, Side
 from hoidata.hands import HandPair, track_vertices
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.surface.solid_overlap import SolidOverlap
 
 TOUCH_M = 0.005
-REACH_M = 0.02
 
 
 @dataclass(frozen=True)
@@ -51,46 +49,9 @@ def touched_vertices(hand: PlacedHand, index: SurfaceIndex, threshold_m: float =
     return hand.over_clip(index.within(hand.vertices_m, hand.hinge_rad, threshold_m), False)
 
 
-def signed_distances_m(hand: PlacedHand, index: SurfaceIndex, most_m: float = REACH_M) -> np.ndarray:
-    """(frame, 778) float64 distance of each vertex to the surface, metres, negative inside the solid at any depth.
-
-    Infinite beyond ``most_m`` outside, NaN in frames without the hand. Raises BadInput for an object without an inside.
-    """
-    depth = index.depth_m(hand.vertices_m, hand.hinge_rad)
-    distance = index.distance_m(hand.vertices_m, hand.hinge_rad, most_m)
-    return hand.over_clip(np.where(depth > 0, -depth, distance), np.nan)
-
-
-@dataclass(frozen=True)
-class Penetration:
-    """How one hand enters the object.
-
-    depth_m: (frame, 778) float64 metres inside the solid, 0 outside, NaN in frames without the hand.
-    volume_m3: (frame,) volume that hand and object both fill (``hoidata.surface.solid_overlap``), NaN likewise; None
-    where it was not asked for.
-    """
-
-    depth_m: np.ndarray
-    volume_m3: np.ndarray | None
-
-    @property
-    def deepest_m(self) -> np.ndarray:
-        """(frame,) depth of the deepest vertex, 0 where none is inside, NaN in frames without the hand."""
-        return self.depth_m.max(axis=1)
-
-    def share(self, more_than_m: float = 0.0) -> float:
-        """Of the frames with the hand, those in which a vertex is deeper than that; NaN without such frames."""
-        deepest = self.deepest_m[np.isfinite(self.deepest_m)]
-        return float((deepest > more_than_m).mean()) if len(deepest) else float("nan")
-
-
-def penetration(hand: PlacedHand, index: SurfaceIndex, overlap: SolidOverlap | None = None) -> Penetration:
-    """Depth of every vertex, and the common volume where ``overlap`` (of the same index) is given.
+def deepest_m(hand: PlacedHand, index: SurfaceIndex) -> np.ndarray:
+    """(frame,) metres the deepest vertex is inside the solid, 0 where none is, NaN in frames without the hand.
 
     Raises BadInput for an object without an inside; ``index.solid_note`` says what was repaired or left out.
     """
-    depth = hand.over_clip(index.depth_m(hand.vertices_m, hand.hinge_rad), np.nan)
-    if overlap is None:
-        return Penetration(depth, None)
-    volume = overlap.volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad)
-    return Penetration(depth, hand.over_clip(volume, np.nan))
+    return hand.over_clip(index.depth_m(hand.vertices_m, hand.hinge_rad).max(axis=1), np.nan)

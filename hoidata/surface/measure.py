@@ -14,7 +14,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.surface.bimart_maps import bimart_map, packed_map
-from hoidata.surface.contact import TOUCH_M, PlacedHand, penetration, placed_hand, touched_vertices
+from hoidata.surface.contact import TOUCH_M, PlacedHand, deepest_m, placed_hand, touched_vertices
 from hoidata.surface.solid_overlap import SolidOverlap
 from hoidata.surface.store import SideSurface
 
@@ -83,7 +83,7 @@ def measure_hand(
     with watch("contact"):
         touched = touched_vertices(hand, index, touch_m)
     with watch("depth"):
-        depth = penetration(hand, index).deepest_m if shape.solid else np.full(clip.n_frames, np.nan)
+        depth = deepest_m(hand, index) if shape.solid else np.full(clip.n_frames, np.nan)
     with watch("volume"):
         volume = _deepest_volume_m3(hand, depth, shape.overlap)
     with watch("joints"):

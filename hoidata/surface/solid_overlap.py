@@ -13,7 +13,7 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.objects.line_crossings import Intervals, common_length_m, intervals_inside
-from hoidata.objects.solid import Solid, patched_holes, volume_m3
+from hoidata.objects.solid import Solid, patched_holes
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.objects.triangle_tree import triangle_tree
 
@@ -51,11 +51,6 @@ class SolidOverlap:
             for frame, own in zip(near, positions, strict=True):
                 volume[frame] += common_length_m(np.ascontiguousarray(own), closed, lines) * self.cell_m**2
         return volume
-
-
-def hand_volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
-    """Volume of one hand (vertex, 3) closed at the wrist, by the divergence theorem."""
-    return volume_m3(*patched_holes(vertices_m, faces))
 
 
 def _lines_through(name: str, solid: Solid, cell_m: float) -> Intervals:

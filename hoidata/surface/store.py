@@ -39,7 +39,7 @@ from hoidata.files.tables import write_table
 from hoidata.hands.model import N_VERTICES
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.mapped import map_npz
-from hoidata.surface.bimart_maps import BEYOND, REACH_M, STEP_M, clip_map, unpacked_map
+from hoidata.surface.bimart_maps import BEYOND, REACH_M, STEP_M, unpacked_map
 
 VERSION = 1
 FRAMES_PER_SHARD = 1 << 15
@@ -261,10 +261,6 @@ class SurfaceStore:
         start, first, stop = (int(row[f"{side}_map_{name}"]) for name in ("row", "first", "stop"))
         packed[first:stop] = self._shard(int(row["shard"]))[f"{side}_map"][start : start + stop - first]
         return packed
-
-    def clip_map(self, clip_id: str, side: Side) -> np.ndarray:
-        """(point,) float32: how close the hand ever comes to each point; infinite beyond the reach."""
-        return clip_map(self.bimart_map(clip_id, side))
 
     def is_solid(self, clip_id: str) -> bool:
         """Whether anything can be inside the clip's object."""

@@ -12,23 +12,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.synthetic.shapes import (
-    Solid,
-    cylinder,
-    revolved,
-    rounded_box,
-    sharp_box,
-    sphere,
-    torus,
-    united,
-)
+from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 
 ARCTIC_AXIS = np.array([0.0, 0.0, -1.0])
-# Hinge across, at the far side: canonical x away from the person, y up, z to the right.
-# How an object stands: x-y-z Euler angles in degrees from the mesh as filed. A hinge "behind" lies across, at the far
-# side; one that is "upright" or absent needs no turn.
+# How an object with its hinge across, at the far side, stands (canonical x away from the person, y up, z to the right):
+# x-y-z Euler angles in degrees from the mesh as filed. An upright hinge, or none, needs no turn.
 HINGE_BEHIND = (90.0, 0.0, 90.0)
-AS_FILED = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -44,28 +33,12 @@ class ObjectSpec:
     base: Callable[[], Solid]
     lid: Callable[[], Solid] | None = None
     stand_m: float = 0.0
-    standing_deg: tuple[float, float, float] = AS_FILED
+    standing_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def upright_from_object(self) -> np.ndarray:
         """(3, 3) turns the mesh as filed to the upright frame."""
         return Rotation.from_euler("xyz", self.standing_deg, degrees=True).as_matrix()
-
-
-def build_model(spec: ObjectSpec) -> ObjectModel:
-    """The canonical ObjectModel, metres; base vertices first, then those of the part the hinge moves."""
-    base = spec.base()
-    vertices, faces, part = [base.vertices_m], [base.faces], [np.zeros(len(base.vertices_m), dtype=np.uint8)]
-    hinge = None
-    if spec.lid is not None:
-        lid = spec.lid()
-        vertices.append(lid.vertices_m)
-        faces.append(lid.faces + len(base.vertices_m))
-        part.append(np.ones(len(lid.vertices_m), dtype=np.uint8))
-        hinge = Hinge(ARCTIC_AXIS, np.zeros(3))
-    # Files keep float32-exact millimetres, so the truth and what a reader finds are the same numbers.
-    filed = np.concatenate(vertices) @ spec.upright_from_object
-    return ObjectModel(spec.name, np.round(filed, 7), np.concatenate(faces), np.concatenate(part), hinge)
 
 
 def _box_at(size, offset, radius_m=0.004, spacing_m=0.012) -> Callable[[], Solid]:
@@ -93,98 +66,62 @@ def _mug() -> Solid:
     # A hook handle, open below and wide enough for four fingers.
     grip = rounded_box((0.022, 0.022, 0.085)).moved((0.079, 0, 0.05))
     arm = rounded_box((0.05, 0.018, 0.014)).moved((0.056, 0, 0.0853))
-    return united(revolved([(float(r), float(z)) for r, z in cup]), united(grip, arm))
+    return united(revolved(cup), united(grip, arm))
 
 
 def _wineglass() -> Solid:
-    profile = [
+    return revolved([
         (0, 0), (0.036, 0), (0.037, 0.004), (0.012, 0.012), (0.009, 0.03), (0.009, 0.075), (0.022, 0.09),
         (0.034, 0.11), (0.037, 0.135), (0.034, 0.17), (0.032, 0.172), (0.029, 0.17), (0.028, 0.155), (0, 0.155),
-    ]  # fmt: skip
-    return revolved([(float(r), float(z)) for r, z in profile])
+    ])  # fmt: skip
 
 
 def _teapot() -> Solid:
-    body = revolved(
-        [
-            (0, 0),
-            (0.045, 0),
-            (0.06, 0.02),
-            (0.064, 0.05),
-            (0.052, 0.085),
-            (0.03, 0.1),
-            (0.012, 0.104),
-            (0.012, 0.12),
-            (0, 0.122),
-        ]
-    )
+    body = revolved([
+        (0, 0), (0.045, 0), (0.06, 0.02), (0.064, 0.05), (0.052, 0.085), (0.03, 0.1), (0.012, 0.104), (0.012, 0.12),
+        (0, 0.122),
+    ])  # fmt: skip
     # A side handle, as on a kyusu: a thick bar to the right.
-    bar = cylinder(0.017, 0.13).rotated(Rotation.from_euler("y", 70, degrees=True).as_matrix()).moved((0.108, 0, 0.075))
-    spout = cylinder(0.011, 0.06).rotated(Rotation.from_euler("y", -50, degrees=True).as_matrix())
+    bar = cylinder(0.017, 0.13).rotated(_tilted(70)).moved((0.108, 0, 0.075))
+    spout = cylinder(0.011, 0.06).rotated(_tilted(-50))
     return united(body, bar, spout.moved((-0.073, 0, 0.07)))
 
 
+def _tilted(degrees: float) -> np.ndarray:
+    """(3, 3) turn from upright to the person's right."""
+    return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
+
+
 def _hammer() -> Solid:
-    handle = cylinder(0.0165, 0.2).rotated(Rotation.from_euler("y", 90, degrees=True).as_matrix())
+    handle = cylinder(0.0165, 0.2).rotated(_tilted(90))
     head = rounded_box((0.034, 0.09, 0.036), 0.003).moved((-0.105, 0, 0))
     return united(handle, head).moved((0, 0, 0.02))
 
 
 def _lightbulb() -> Solid:
-    profile = [(0, 0), (0.012, 0), (0.014, 0.004), (0.014, 0.028), (0.022, 0.045), (0.031, 0.065), (0.0335, 0.082),
-               (0.031, 0.098), (0.022, 0.11), (0.01, 0.1155), (0, 0.1165)]  # fmt: skip
-    return revolved([(float(r), float(z)) for r, z in profile])
-
-
-def _apple() -> Solid:
-    return Solid(*sphere(0.038)).moved((0, 0, 0.038))
+    return revolved([
+        (0, 0), (0.012, 0), (0.014, 0.004), (0.014, 0.028), (0.022, 0.045), (0.031, 0.065), (0.0335, 0.082),
+        (0.031, 0.098), (0.022, 0.11), (0.01, 0.1155), (0, 0.1165),
+    ])  # fmt: skip
 
 
 def _flashlight() -> Solid:
-    profile = [
-        (0, 0),
-        (0.017, 0),
-        (0.019, 0.003),
-        (0.019, 0.12),
-        (0.03, 0.145),
-        (0.03, 0.168),
-        (0.028, 0.17),
-        (0, 0.17),
-    ]
-    upright = revolved([(float(r), float(z)) for r, z in profile])
-    return (
-        upright.moved((0, 0, -0.085))
-        .rotated(Rotation.from_euler("y", 90, degrees=True).as_matrix())
-        .moved((0, 0, 0.03))
-    )
+    upright = revolved([
+        (0, 0), (0.017, 0), (0.019, 0.003), (0.019, 0.12), (0.03, 0.145), (0.03, 0.168), (0.028, 0.17), (0, 0.17),
+    ])  # fmt: skip
+    return upright.moved((0, 0, -0.085)).rotated(_tilted(90)).moved((0, 0, 0.03))
 
 
 def _bowl() -> Solid:
-    profile = [
-        (0, 0),
-        (0.035, 0),
-        (0.05, 0.012),
-        (0.068, 0.045),
-        (0.072, 0.065),
-        (0.069, 0.067),
-        (0.062, 0.06),
-        (0, 0.042),
-    ]
-    return revolved([(float(r), float(z)) for r, z in profile])
+    return revolved([
+        (0, 0), (0.035, 0), (0.05, 0.012), (0.068, 0.045), (0.072, 0.065), (0.069, 0.067), (0.062, 0.06), (0, 0.042),
+    ])  # fmt: skip
 
 
 def _cone_cup() -> Solid:
-    profile = [
-        (0, 0),
-        (0.028, 0),
-        (0.03, 0.003),
-        (0.038, 0.105),
-        (0.04, 0.106),
-        (0.04, 0.116),
-        (0.037, 0.12),
-        (0, 0.12),
-    ]
-    return revolved([(float(r), float(z)) for r, z in profile])
+    return revolved([
+        (0, 0), (0.028, 0), (0.03, 0.003), (0.038, 0.105), (0.04, 0.106), (0.04, 0.116), (0.037, 0.12), (0, 0.12),
+    ])  # fmt: skip
 
 
 def _spray() -> Solid:
@@ -194,16 +131,9 @@ def _spray() -> Solid:
 
 
 def _ketchup_bottle() -> Solid:
-    profile = [
-        (0, -0.15),
-        (0.027, -0.15),
-        (0.03, -0.147),
-        (0.033, -0.06),
-        (0.026, -0.012),
-        (0.022, -0.0005),
-        (0, -0.0005),
-    ]
-    return revolved([(float(r), float(z)) for r, z in profile]).moved((0, -0.024, 0))
+    return revolved([
+        (0, -0.15), (0.027, -0.15), (0.03, -0.147), (0.033, -0.06), (0.026, -0.012), (0.022, -0.0005), (0, -0.0005),
+    ]).moved((0, -0.024, 0))  # fmt: skip
 
 
 def _mixer_base() -> Solid:
@@ -231,7 +161,7 @@ GRAB_OBJECTS = (
     ObjectSpec("cylinderlarge", "large cylinder", lambda: cylinder(0.042, 0.14).moved((0, 0, 0.07))),
     ObjectSpec("cylindermedium", "medium cylinder", lambda: cylinder(0.03, 0.1).moved((0, 0, 0.05))),
     ObjectSpec("toruslarge", "large torus", lambda: torus(0.06, 0.02).moved((0, 0, 0.02)), stand_m=0.06),
-    ObjectSpec("apple", "apple", _apple),
+    ObjectSpec("apple", "apple", lambda: sphere(0.038).moved((0, 0, 0.038))),
     ObjectSpec("mug", "mug", _mug),
     ObjectSpec("wineglass", "wine glass", _wineglass),
     ObjectSpec("waterbottle", "water bottle", _bottle(0.034, 0.16, 0.014, 0.016, 0.21)),
@@ -264,7 +194,6 @@ ARCTIC_OBJECTS = (
         "microwave", "microwave",
         _box_at((0.2, 0.13, 0.13), (0.1, 0.0655, 0.065), 0.003, 0.013),
         _box_at((0.2, 0.018, 0.13), (0.1, -0.0095, 0.065), 0.003, 0.013),
-        0.0, AS_FILED,
     ),
     ObjectSpec(
         "ketchup", "ketchup",
@@ -296,5 +225,17 @@ def object_spec(dataset: str, name: str) -> ObjectSpec:
 
 @lru_cache(maxsize=64)
 def object_model(dataset: str, name: str) -> ObjectModel:
-    """The mesh of a catalogue object, made once per process."""
-    return build_model(object_spec(dataset, name))
+    """A catalogue object in metres, made once per process: base vertices first, then those the hinge moves."""
+    spec = object_spec(dataset, name)
+    base = spec.base()
+    vertices, faces, part = [base.vertices_m], [base.faces], [np.zeros(len(base.vertices_m), dtype=np.uint8)]
+    hinge = None
+    if spec.lid is not None:
+        lid = spec.lid()
+        vertices.append(lid.vertices_m)
+        faces.append(lid.faces + len(base.vertices_m))
+        part.append(np.ones(len(lid.vertices_m), dtype=np.uint8))
+        hinge = Hinge(ARCTIC_AXIS, np.zeros(3))
+    # Files keep float32-exact millimetres, so the truth and what a reader finds are the same numbers.
+    filed = np.concatenate(vertices) @ spec.upright_from_object
+    return ObjectModel(spec.name, np.round(filed, 7), np.concatenate(faces), np.concatenate(part), hinge)

@@ -1,19 +1,18 @@
 """The figures of an embedded corpus: are its held frames physically possible, and would wrong ones be noticed?"""
 
-import argparse
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 from rich.table import Table
 
 from hoidata.hands import load_embedded_hands
 from hoidata.physics.contact_forces import RESIDUAL_LIMIT
-from hoidata.synthetic.generate import generate_sequences, worker_pool
+from hoidata.synthetic.generate import generate_sequences
 from hoidata.synthetic.plan import DATASET_IDS, Size
 from hoidata.synthetic.soundness import measure, residuals_without_contact
 from hoidata.synthetic.truth import TruthSequence
+from hoidata.workers import in_workers
 
 SHIFT_M = 0.010
 _DIRECTIONS_SEED = 7
@@ -37,12 +36,11 @@ def sequence_figures(truth: TruthSequence) -> SequenceFigures:
     """Figures of one sequence and of its two controls: hands moved by 10 mm, and no hands."""
     pair = load_embedded_hands()
     sound = measure(truth, pair)
-    shifted = measure(truth, pair, _shift(truth))
-    without = residuals_without_contact(truth)
+    residuals = (sound.residual, measure(truth, pair, _shift(truth)).residual, residuals_without_contact(truth))
+    feasible, shifted, without = (int((residual < RESIDUAL_LIMIT).sum()) for residual in residuals)
     return SequenceFigures(
-        truth.dataset, len(sound.residual), int((sound.residual < RESIDUAL_LIMIT).sum()),
-        int((shifted.residual < RESIDUAL_LIMIT).sum()), int((without < RESIDUAL_LIMIT).sum()),
-        float(sound.distance_m.max(initial=0)), float(sound.penetration_m.max()), len(truth.clip_frames), truth.verb,
+        truth.dataset, len(sound.residual), feasible, shifted, without, float(sound.distance_m.max(initial=0)),
+        float(sound.penetration_m.max()), len(truth.clip_frames), truth.verb,
     )  # fmt: skip
 
 
@@ -63,9 +61,8 @@ def explained_by_verb(verbs: list[str], lengths: list[int]) -> float:
 
 def check_sequences(sequences: list[TruthSequence], jobs: int = 1) -> pd.DataFrame:
     """One row per dataset: shares of held frames that pass, extremes in mm, controls, and what the verb explains."""
-    with worker_pool(jobs) as run:
-        figures: list[SequenceFigures] = list(run(sequence_figures, sequences))
-    datasets = dict.fromkeys(one.dataset for one in figures)
+    figures: list[SequenceFigures] = [found for _, found in in_workers(sequence_figures, sequences, jobs)]
+    datasets = dict.fromkeys(truth.dataset for truth in sequences)
     return pd.DataFrame([_row(dataset, [one for one in figures if one.dataset == dataset]) for dataset in datasets])
 
 
@@ -100,16 +97,3 @@ def as_text(figures: pd.DataFrame) -> Table:
     for name in figures.columns[1:]:
         table.add_row(name, *(f"{value:.4g}" if isinstance(value, float) else str(value) for value in figures[name]))
     return table
-
-
-def main(arguments: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--size", choices=["full", "small"], default="full")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--jobs", type=int, default=2)
-    chosen = parser.parse_args(arguments)
-    Console().print(as_text(check_corpus(chosen.size, chosen.seed, chosen.jobs)))
-
-
-if __name__ == "__main__":
-    main()

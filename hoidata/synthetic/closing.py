@@ -3,7 +3,7 @@
 Everything is written for the right hand; for a left hand the caller mirrors the field in x and mirrors the result.
 """
 
-from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,10 +21,10 @@ from hoidata.synthetic.hand_capsules import (
 PRESS_M = 0.0008
 _LARGEST_STEPS = 70
 _MARCH_START_M = 0.25
+_NORMAL_NOISE = 0.1
 
 
-@dataclass(frozen=True)
-class Placement:
+class Placement(NamedTuple):
     """Where candidate hands approach an object; one row per candidate, upright object frame, metres and radians.
 
     rotmats: (row, 3, 3) object-from-hand, its y axis the approach normal. target_m: (row, 3) surface point.
@@ -40,22 +40,12 @@ class Placement:
     hand: np.ndarray
 
     def take(self, rows: np.ndarray) -> "Placement":
-        return Placement(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Placement(*(array[rows] for array in self))
 
     def for_hands(self, n_hands: int) -> "Placement":
         """Every placement with every hand shape: rows placement-major."""
         rows = np.repeat(np.arange(len(self.hand)), n_hands)
-        return replace(self.take(rows), hand=np.tile(np.arange(n_hands), len(self.hand)))
-
-
-@dataclass(frozen=True)
-class ClosedHands:
-    """Candidate grasps: wrist_m (row, 3), rotmats (row, 3, 3), flexion_rad (row, 5, 3), spread_rad (row, 5)."""
-
-    wrist_m: np.ndarray
-    rotmats: np.ndarray
-    flexion_rad: np.ndarray
-    spread_rad: np.ndarray
+        return self.take(rows)._replace(hand=np.tile(np.arange(n_hands), len(self.hand)))
 
 
 def march_to_surface(field: Field, direction: np.ndarray, through_m: np.ndarray) -> np.ndarray:
@@ -67,18 +57,13 @@ def march_to_surface(field: Field, direction: np.ndarray, through_m: np.ndarray)
 
 
 def draw_placements(
-    field: Field,
-    direction: np.ndarray,
-    through_m: np.ndarray,
-    blend: tuple[float, float],
-    rng: np.random.Generator,
-    normal_noise: float,
+    field: Field, direction: np.ndarray, through_m: np.ndarray, blend: tuple[float, float], rng: np.random.Generator
 ) -> Placement:
     """Random placements coming from each ``direction (row, 3)``; rows that miss the object are left out."""
     surface = march_to_surface(field, direction, through_m)
     direction, surface = (array[field(surface) < 0.003] for array in (direction, surface))
     count = len(surface)
-    normal = gradient(field, surface) + normal_noise * rng.normal(size=(count, 3))
+    normal = gradient(field, surface) + _NORMAL_NOISE * rng.normal(size=(count, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     share = rng.uniform(*blend, size=count)
     power = share < 0.5
@@ -117,8 +102,11 @@ def put_over(field: Field, hands: CapsuleHands, placement: Placement) -> np.ndar
     return wrist - slid[:, None] * normal
 
 
-def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> ClosedHands:
-    """Curl all fingers step by step; a segment that presses the surface stops itself and the joints before it."""
+def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> tuple[np.ndarray, np.ndarray]:
+    """Curl all fingers step by step; a segment that presses the surface stops itself and the joints before it.
+
+    Gives wrist_m (row, 3) and flexion_rad (row, 5, 3).
+    """
     wrist = put_over(field, hands, placement)
     flexion = np.broadcast_to(OPEN_RAD, (len(wrist), N_FINGERS, 3)).copy()
     stopped = np.zeros(flexion.shape, dtype=bool)
@@ -134,7 +122,7 @@ def close_fingers(field: Field, hands: CapsuleHands, placement: Placement) -> Cl
         nearest = np.where(moves, clearance + PRESS_M, np.inf).min(-1, keepdims=True)
         step = np.clip(0.9 * nearest / 0.10, 0.006, 0.10)
         flexion = np.minimum(np.where(free, flexion + step * CURL_RATIO, flexion), LIMITS_RAD)
-    return ClosedHands(wrist, placement.rotmats, flexion, placement.spread_rad)
+    return wrist, flexion
 
 
 def _finger_clearance(

@@ -1,26 +1,27 @@
 """Writing a whole embedded corpus in the raw format of one dataset."""
 
-from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn
 
 from hoidata.errors import HoidataError
 from hoidata.files import atomic_folder
 from hoidata.hands import load_embedded_hands
-from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of, worker_pool
+from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.plan import DATASET_IDS, Size
 from hoidata.synthetic.truth import TruthSequence
 from hoidata.synthetic.write_arctic import write_arctic_meta, write_arctic_sequence
 from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
-from hoidata.synthetic.write_h2o import write_h2o_lists, write_h2o_objects, write_h2o_sequence
+from hoidata.synthetic.write_h2o import write_h2o_objects_and_lists, write_h2o_sequence
+from hoidata.workers import in_workers
 
-
-class _WriteTask(NamedTuple):
-    dataset: str
-    root: Path
-    members: list[TruthSequence]
+# Per dataset, who writes what all sequences share, and who writes one raw sequence.
+_WRITERS = {
+    "h2o": (write_h2o_objects_and_lists, write_h2o_sequence),
+    "grab": (write_grab_meshes, write_grab_sequence),
+    "arctic": (write_arctic_meta, write_arctic_sequence),
+}
 
 
 def write_corpus(
@@ -34,59 +35,30 @@ def write_corpus(
     if dataset not in DATASET_IDS:
         raise HoidataError(f"no embedded corpus named {dataset!r}; there are {', '.join(DATASET_IDS)}")
     tasks = tasks_of(dataset, seed, size)
-    with _progress() as progress, worker_pool(min(jobs, len(tasks))) as run, atomic_folder(root) as partial:
-        made = _shown(progress, f"{dataset}: making", len(tasks), run(make_action, tasks))
-        ordered = sorted((pair for pairs in made for pair in pairs), key=lambda pair: pair[0])
-        sequences = place_in_raw_sequences(dataset, [truth for _, truth in ordered])
-        write_shared_files(dataset, sequences, partial)
-        writing = [_WriteTask(dataset, partial, members) for members in _by_raw_sequence(sequences)]
-        list(_shown(progress, f"{dataset}: writing", len(writing), run(_write_task, writing)))
+    columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns) as progress, atomic_folder(root) as partial_root:
+        making = progress.track(in_workers(make_action, tasks, jobs), len(tasks), description=f"{dataset}: making")
+        sequences = place_in_raw_sequences(dataset, [pair for _, pairs in making for pair in pairs])
+        write_shared_files(dataset, partial_root, sequences)
+        groups = by_raw_sequence(sequences)
+        writing = in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
+        list(progress.track(writing, len(groups), description=f"{dataset}: writing"))
     return sequences
 
 
-def write_raw(dataset: str, sequences: list[TruthSequence], root: str | Path) -> None:
-    """Write given truth below ``root``, an existing or new folder, as the dataset's own files."""
-    Path(root).mkdir(parents=True, exist_ok=True)
-    write_shared_files(dataset, sequences, Path(root))
-    for members in _by_raw_sequence(sequences):
-        _write_task(_WriteTask(dataset, Path(root), members))
-
-
-def write_shared_files(dataset: str, sequences: list[TruthSequence], root: Path) -> None:
+def write_shared_files(dataset: str, root: Path, sequences: list[TruthSequence]) -> None:
     """Everything that does not belong to one sequence: meshes, subjects, splits."""
-    if dataset == "h2o":
-        write_h2o_objects(root)
-        write_h2o_lists(root, sequences)
-    elif dataset == "grab":
-        write_grab_meshes(root, sequences)
-    else:
-        write_arctic_meta(root, sequences)
+    _WRITERS[dataset][0](root, sequences)
 
 
-def _by_raw_sequence(sequences: list[TruthSequence]) -> list[list[TruthSequence]]:
+def write_raw_sequence(dataset: str, root: Path, members: list[TruthSequence]) -> None:
+    """The files of one raw sequence, which holds ``members`` in their order."""
+    _WRITERS[dataset][1](root, members, load_embedded_hands())
+
+
+def by_raw_sequence(sequences: list[TruthSequence]) -> list[list[TruthSequence]]:
+    """The actions of each raw sequence, in time order."""
     groups: dict[str, list[TruthSequence]] = {}
     for truth in sequences:
         groups.setdefault(truth.source_key, []).append(truth)
     return [sorted(members, key=lambda truth: truth.raw_start) for members in groups.values()]
-
-
-def _write_task(task: _WriteTask) -> None:
-    pair = load_embedded_hands()
-    if task.dataset == "grab":
-        write_grab_sequence(task.root, task.members[0], pair)
-    else:
-        write: Callable[..., None] = write_h2o_sequence if task.dataset == "h2o" else write_arctic_sequence
-        write(task.root, task.members, pair)
-
-
-def _progress() -> Progress:
-    return Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn()
-    )
-
-
-def _shown(progress: Progress, title: str, total: int, results: Iterator[Any]) -> Iterator[Any]:
-    task = progress.add_task(title, total=total)
-    for result in results:
-        progress.advance(task)
-        yield result

@@ -7,12 +7,13 @@ counts in the end is the hand's mesh against the object's mesh.
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from scipy.optimize import nnls
 
-from hoidata.clips.clip import Side
+from hoidata.clips.clip import HandType, Side
 from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.hands.tracks import kinematics_of
@@ -20,8 +21,8 @@ from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import wrench_columns
 from hoidata.physics.surface import body_motion, hand_patches, patch_contacts, surface_distances
 from hoidata.synthetic.catalogue import ObjectSpec
-from hoidata.synthetic.closing import ClosedHands, Placement, close_fingers, draw_placements
-from hoidata.synthetic.field import Field, MirroredField, MovedField, NearestField, gradient, grid_field
+from hoidata.synthetic.closing import Placement, close_fingers, draw_placements
+from hoidata.synthetic.field import Field, gradient, grid_field, mirrored
 from hoidata.synthetic.hand_capsules import OPEN_RAD, CapsuleHands, capsule_points, hand_pose_rotvec
 
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -64,7 +65,7 @@ class Hold:
     angles_rad: tuple[float, ...] = ()
 
     @property
-    def hand(self) -> str:
+    def hand(self) -> HandType:
         return "both" if len(self.reaches) == 2 else self.reaches[0][0]
 
 
@@ -113,11 +114,11 @@ class Scene:
         if not self.model.is_articulated:
             return [grid_field(standing, self.model.faces)]
         base, lid = (grid_field(standing, self.model.faces[self.model.face_part == part]) for part in (0, 1))
-        return [base, MovedField(lid, self.turn, np.zeros(3))]
+        return [base, lambda points_m: lid(points_m @ self.turn)]
 
-    @cached_property
-    def field(self) -> Field:
-        return self.part_fields[0] if len(self.part_fields) == 1 else NearestField(tuple(self.part_fields))
+    def field(self, points_m: np.ndarray) -> np.ndarray:
+        """Signed distance of the whole object."""
+        return np.minimum.reduce([field(points_m) for field in self.part_fields])
 
     @cached_property
     def bottom_m(self) -> float:
@@ -129,38 +130,36 @@ class Scene:
         return (self.part_vertices[0].min(0) + self.part_vertices[0].max(0))[:2] / 2
 
 
-@dataclass(frozen=True)
-class Candidates:
-    """Closed candidate hands of one side, in the right-hand world of the search (mirrored for a left hand)."""
+class Candidates(NamedTuple):
+    """Closed candidate hands of one side, in the right-hand world of the search (mirrored for a left hand).
+
+    hands: a shape per row. wrist_m: (row, 3). flexion_rad: (row, 5, 3).
+    """
 
     side: Side
-    reach: Reach
     placement: Placement
-    closed: ClosedHands
     hands: CapsuleHands
+    wrist_m: np.ndarray
+    flexion_rad: np.ndarray
 
     def take(self, rows: np.ndarray) -> "Candidates":
-        closed = self.closed
-        return Candidates(
-            self.side, self.reach, self.placement.take(rows),
-            ClosedHands(closed.wrist_m[rows], closed.rotmats[rows], closed.flexion_rad[rows], closed.spread_rad[rows]),
-            self.hands.take(rows),
-        )  # fmt: skip
+        placement, hands = self.placement.take(rows), self.hands.take(rows)
+        return Candidates(self.side, placement, hands, self.wrist_m[rows], self.flexion_rad[rows])
 
-    @cached_property
-    def points(self) -> np.ndarray:
-        """(row, 21, 4, 3) capsule points in the search's right-hand world."""
-        closed = self.closed
-        return capsule_points(self.hands, closed.rotmats, closed.wrist_m, closed.flexion_rad, closed.spread_rad)
+    def points(self, flexion_rad: np.ndarray) -> np.ndarray:
+        """(row, 21, 4, 3) capsule points, with fingers curled by ``flexion_rad (row, 5, 3)``."""
+        return capsule_points(self.hands, self.placement.rotmats, self.wrist_m, flexion_rad, self.placement.spread_rad)
+
+    @property
+    def open_rad(self) -> np.ndarray:
+        return np.broadcast_to(OPEN_RAD, self.flexion_rad.shape)
 
 
 def _mirrored(side: Side, field: Field) -> Field:
-    return MirroredField(field) if side == "left" else field
+    return mirrored(field) if side == "left" else field
 
 
-def draw_candidates(
-    scene: Scene, side: Side, reach: Reach, hands: CapsuleHands, count: int, rng: np.random.Generator
-) -> Placement:
+def draw_candidates(scene: Scene, side: Side, reach: Reach, count: int, rng: np.random.Generator) -> Placement:
     """Placements of one hand that a person standing at -y could take and that keep clear of table and stand."""
     sign = MIRROR if side == "left" else np.ones(3)
     field = _mirrored(side, scene.part_fields[reach.part or 0] if reach.part is not None else scene.field)
@@ -168,32 +167,28 @@ def draw_candidates(
     low, high = vertices.min(0), vertices.max(0)
     middle = (low + high) / 2 if reach.through_m is None else np.asarray(reach.through_m)
     extent = (high - low) if reach.through_m is None else np.full(3, 0.02)
-    direction = np.asarray(reach.direction) / np.linalg.norm(reach.direction) + reach.width * rng.normal(
-        size=(count, 3)
-    )
+    direction = np.asarray(reach.direction) / np.linalg.norm(reach.direction)
+    direction = direction + reach.width * rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     through = middle + 0.2 * extent * rng.normal(size=(count, 3))
-    placement = draw_placements(field, direction * sign, through * sign, reach.blend, rng, 0.1)
+    placement = draw_placements(field, direction * sign, through * sign, reach.blend, rng)
     forearm = placement.rotmats[:, :, 0]
     return placement.take(np.flatnonzero(forearm @ _ELBOW > 0.1))
 
 
-def close_candidates(scene: Scene, side: Side, reach: Reach, placement: Placement, hands: CapsuleHands) -> Candidates:
+def close_candidates(scene: Scene, side: Side, placement: Placement, hands: CapsuleHands) -> Candidates:
     """Close the fingers of every placement with its hand shape."""
     rows = hands.take(placement.hand)
-    closed = close_fingers(_mirrored(side, scene.field), rows, placement)
-    return Candidates(side, reach, placement, closed, rows)
+    return Candidates(side, placement, rows, *close_fingers(_mirrored(side, scene.field), rows, placement))
 
 
 def clear_of_table(scene: Scene, candidates: Candidates) -> np.ndarray:
     """(row,) bool: open and closed, the hand stays above the table and off the stand."""
-    closed = candidates.closed
-    opened = np.broadcast_to(OPEN_RAD, closed.flexion_rad.shape)
-    before = capsule_points(candidates.hands, closed.rotmats, closed.wrist_m, opened, closed.spread_rad)
-    clear = np.ones(len(closed.wrist_m), dtype=bool)
+    clear = np.ones(len(candidates.wrist_m), dtype=bool)
     foot = scene.foot_m * (MIRROR[:2] if candidates.side == "left" else 1.0)
-    for points in (before, candidates.points):
-        radii = candidates.hands.radii[:, :, None]
+    radii = candidates.hands.radii[:, :, None]
+    for flexion in (candidates.open_rad, candidates.flexion_rad):
+        points = candidates.points(flexion)
         clear &= (points[..., 2] - radii > scene.bottom_m - scene.spec.stand_m - 0.004).all((1, 2))
         beside = np.linalg.norm(points[..., :2] - foot, axis=-1) - radii > STAND_RADIUS_M
         clear &= (beside | (points[..., 2] - radii > scene.bottom_m - 0.004)).all((1, 2))
@@ -203,10 +198,11 @@ def clear_of_table(scene: Scene, candidates: Candidates) -> np.ndarray:
 def capsule_contacts(scene: Scene, candidates: Candidates) -> list[tuple[np.ndarray, np.ndarray]]:
     """Per row, contact points and outward normals (contact, 3) in the upright world, at most one per capsule."""
     field = _mirrored(candidates.side, scene.field)
-    distance = field(candidates.points)
+    points = candidates.points(candidates.flexion_rad)
+    distance = field(points)
     nearest = distance.argmin(-1)
     clearance = np.take_along_axis(distance, nearest[..., None], -1)[..., 0]
-    point = np.take_along_axis(candidates.points, nearest[..., None, None], -2)[..., 0, :]
+    point = np.take_along_axis(points, nearest[..., None, None], -2)[..., 0, :]
     touching = clearance - candidates.hands.radii < _CAPSULE_CONTACT_M
     sign = MIRROR if candidates.side == "left" else np.ones(3)
     normal = gradient(field, point)
@@ -238,12 +234,12 @@ def closes_force(points_m: np.ndarray, normals: np.ndarray, centre_m: np.ndarray
 def hand_gap_m(candidates: list[Candidates]) -> np.ndarray:
     """(row,) smallest distance between the two hands' capsules; infinite for one hand."""
     if len(candidates) == 1:
-        return np.full(len(candidates[0].closed.wrist_m), np.inf)
-    clouds = []
+        return np.full(len(candidates[0].wrist_m), np.inf)
+    clouds, radii = [], []
     for one in candidates:
-        sign = MIRROR if one.side == "left" else np.ones(3)
-        clouds.append((one.points * sign).reshape(len(one.points), -1, 3))
-    radii = [np.repeat(one.hands.radii / 1.25, one.points.shape[2], axis=1) for one in candidates]
+        points = one.points(one.flexion_rad) * (MIRROR if one.side == "left" else np.ones(3))
+        clouds.append(points.reshape(len(points), -1, 3))
+        radii.append(np.repeat(one.hands.radii / 1.25, points.shape[2], axis=1))
     distance = np.linalg.norm(clouds[0][:, :, None] - clouds[1][:, None], axis=-1)
     return (distance - radii[0][:, :, None] - radii[1][:, None]).min((1, 2))
 
@@ -273,16 +269,14 @@ class PosedHands:
 
 def posed_hands(candidates: Candidates, betas: np.ndarray) -> PosedHands:
     """Back from the right-hand world of the search to the hand's own side; betas (hand, 10) per hand shape."""
-    closed, rows = candidates.closed, candidates.placement.hand
-    pose = hand_pose_rotvec(candidates.hands, closed.flexion_rad, closed.spread_rad)
-    opened = hand_pose_rotvec(candidates.hands, np.broadcast_to(OPEN_RAD, closed.flexion_rad.shape), closed.spread_rad)
+    rotmats, spread, rows = candidates.placement.rotmats, candidates.placement.spread_rad, candidates.placement.hand
+    pose = hand_pose_rotvec(candidates.hands, candidates.flexion_rad, spread)
+    opened = hand_pose_rotvec(candidates.hands, candidates.open_rad, spread)
     if candidates.side == "right":
-        return PosedHands("right", closed.wrist_m, closed.rotmats, pose, opened, betas[rows])
+        return PosedHands("right", candidates.wrist_m, rotmats, pose, opened, betas[rows])
     mirror = np.diag(MIRROR)
-    flip = lambda rotvec: mirror_rotvec_x(rotvec.reshape(-1, 15, 3)).reshape(-1, 45)  # noqa: E731
-    return PosedHands(
-        "left", closed.wrist_m * MIRROR, mirror @ closed.rotmats @ mirror, flip(pose), flip(opened), betas[rows]
-    )
+    pose, opened = (mirror_rotvec_x(one.reshape(-1, 15, 3)).reshape(-1, 45) for one in (pose, opened))
+    return PosedHands("left", candidates.wrist_m * MIRROR, mirror @ rotmats @ mirror, pose, opened, betas[rows])
 
 
 def verify(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair) -> np.ndarray:

@@ -4,7 +4,7 @@ Right hand, frame of MANO's rest pose turned about the wrist: fingers along -x, 
 Fingers in MANO's order: index, middle, pinky, ring, thumb. Finger segments are capsules 0-14, palm regions 15-20.
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ OPEN_RAD = np.array([[-0.15, 0.0, 0.0]] * 4 + [[-0.35, 0.0, 0.0]])
 CURL_RATIO = np.array([[1.0, 1.15, 0.75]] * 4 + [[0.8, 0.6, 0.9]])
 
 
-@dataclass(frozen=True)
-class CapsuleHands:
+class CapsuleHands(NamedTuple):
     """Rest shapes of several hands, wrist at the origin, metres.
 
     joints: (hand, 16, 3). tips: (hand, 5, 3) centres of the fingertip balls. radii: (hand, 21).
@@ -36,9 +35,7 @@ class CapsuleHands:
     swing_axis: np.ndarray
 
     def take(self, rows: np.ndarray) -> "CapsuleHands":
-        return CapsuleHands(
-            self.joints[rows], self.tips[rows], self.radii[rows], self.flex_axis[rows], self.swing_axis[rows]
-        )
+        return CapsuleHands(*(array[rows] for array in self))
 
 
 def capsule_hands(model: HandModel, betas: np.ndarray) -> CapsuleHands:

@@ -40,11 +40,10 @@ def write_ply(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
 
 def npy_bytes(value: Any) -> bytes:
     """An .npy file: plain arrays and scalars plainly, a dict as the 0-d object array NumPy 1 made of it."""
+    stream = io.BytesIO()
     if not isinstance(value, dict):
-        stream = io.BytesIO()
         np.lib.format.write_array(stream, np.asanyarray(value), allow_pickle=False)
         return stream.getvalue()
-    stream = io.BytesIO()
     np.lib.format.write_array_header_1_0(stream, {"descr": "|O", "fortran_order": False, "shape": ()})
     boxed = np.empty((), dtype=object)
     boxed[()] = value

@@ -1,7 +1,5 @@
 """Choosing the few grasps a (verb, object) pair uses: searched with an average hand, closed again for every subject."""
 
-from typing import NamedTuple
-
 import numpy as np
 
 from hoidata.errors import HoidataError
@@ -35,14 +33,13 @@ _ENOUGH_ROUNDS = 4
 _TRIED_PER_ROUND = 6
 
 
-class GraspPool(NamedTuple):
-    """grips[subject][choice]: a tuple with one grip per hand; GRASPS_PER_PAIR are used, the others are reserves."""
+def search_pool(
+    scene: Scene, hold: Hold, pair: HandPair, betas: np.ndarray, rng: np.random.Generator
+) -> list[list[tuple[Grip, ...]]]:
+    """Grasps of ``hold`` for subjects with ``betas (subject, 10)``. Raises HoidataError where a subject has none.
 
-    grips: list[list[tuple[Grip, ...]]]
-
-
-def search_pool(scene: Scene, hold: Hold, pair: HandPair, betas: np.ndarray, rng: np.random.Generator) -> GraspPool:
-    """Grasps of ``hold`` for subjects with ``betas (subject, 10)``. Raises HoidataError where a subject has none."""
+    Per subject its choices, each with one grip per hand; GRASPS_PER_PAIR are used, the others are reserves.
+    """
     average = capsule_hands(pair.right, np.zeros((1, 10)))
     own = capsule_hands(pair.right, betas)
     table: list[list[tuple[Grip, ...]]] = [[] for _ in betas]
@@ -62,7 +59,7 @@ def search_pool(scene: Scene, hold: Hold, pair: HandPair, betas: np.ndarray, rng
     missing = [index for index, grips in enumerate(table) if not grips]
     if missing:
         raise HoidataError(f"{scene.spec.name}: no {hold.hand} grasp found for subjects {missing} of {len(table)}")
-    return GraspPool(table)
+    return table
 
 
 def _enough(works: np.ndarray, round_number: int) -> bool:
@@ -75,9 +72,9 @@ def _promising(scene: Scene, hold: Hold, hands: CapsuleHands, rng: np.random.Gen
     """Placements (one per hand) whose capsule hands hold the object; rows of the hands belong together."""
     sides = []
     for side, reach in hold.reaches:
-        placement = draw_candidates(scene, side, reach, hands, 3 * _ROUND, rng)
+        placement = draw_candidates(scene, side, reach, 3 * _ROUND, rng)
         placement = placement.take(np.arange(min(_ROUND, len(placement.hand))))
-        closed = close_candidates(scene, side, reach, placement, hands)
+        closed = close_candidates(scene, side, placement, hands)
         sides.append(closed.take(np.flatnonzero(clear_of_table(scene, closed))))
     count = min(len(side.placement.hand) for side in sides)
     if count == 0:
@@ -88,7 +85,8 @@ def _promising(scene: Scene, hold: Hold, hands: CapsuleHands, rng: np.random.Gen
 
 
 def _holds(scene: Scene, sides: list[Candidates]) -> np.ndarray:
-    centre = (scene.upright @ _centre(scene)).astype(np.float64)
+    hinge = np.full(1, scene.hinge_rad) if scene.model.is_articulated else None
+    centre = scene.upright @ body_motion(scene.model, np.eye(3)[None], np.zeros((1, 3)), hinge).centre_m[0]
     contacts = [capsule_contacts(scene, side) for side in sides]
     apart = hand_gap_m(sides) > SMALLEST_HAND_GAP_M
     held = np.zeros(len(apart), dtype=bool)
@@ -99,17 +97,12 @@ def _holds(scene: Scene, sides: list[Candidates]) -> np.ndarray:
     return held
 
 
-def _centre(scene: Scene) -> np.ndarray:
-    hinge = np.full(1, scene.hinge_rad) if scene.model.is_articulated else None
-    return body_motion(scene.model, np.eye(3)[None], np.zeros((1, 3)), hinge).centre_m[0]
-
-
 def _for_subjects(scene: Scene, hold: Hold, placements, own: CapsuleHands, betas: np.ndarray, pair: HandPair):
     """For each placement: (subject,) scores and grips, closed again with every subject's hand."""
     n_subjects = len(betas)
     sides = [
-        close_candidates(scene, side, reach, placement.for_hands(n_subjects), own)
-        for (side, reach), placement in zip(hold.reaches, placements, strict=True)
+        close_candidates(scene, side, placement.for_hands(n_subjects), own)
+        for (side, _), placement in zip(hold.reaches, placements, strict=True)
     ]
     posed = [posed_hands(side, betas) for side in sides]
     score = verify(scene, hold, posed, pair)

@@ -1,11 +1,10 @@
 """From a grasp and a path to a whole action: approach, close, carry, open, retreat."""
 
 from dataclasses import dataclass
-from typing import get_args
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, HandTrack, HandType, ObjectTrack, Side
+from hoidata.clips.clip import FPS, SIDES, HandTrack, ObjectTrack, Side
 from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel, articulate
@@ -93,14 +92,10 @@ def make_sequence(
     contact = (round(timing.contact_start * fps / FPS), round(timing.contact_stop * fps / FPS) + 1)
     return TruthSequence(
         dataset=dataset, subject=person.subject, source_key=source_key, raw_start=0, source_fps=fps, verb=action.verb,
-        object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=_hand_type(hand), hands=hands,
+        object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=hand, hands=hands,
         object=track, clip=_clip_span(dataset, action, timing, contact), contact=contact,
         held=_lowest_point(track) > spec.stand_m + HELD_ABOVE_M, stand_m=spec.stand_m,
     )  # fmt: skip
-
-
-def _hand_type(hand: str) -> HandType:
-    return next(kind for kind in get_args(HandType) if kind == hand)
 
 
 def _clip_span(dataset: str, action: Action, timing: Timing, contact: tuple[int, int]) -> tuple[int, int]:

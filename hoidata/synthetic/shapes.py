@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import igl.copyleft.cgal as cgal
 import numpy as np
+from numpy.typing import ArrayLike
 
 _WELD_DIGITS = 6
-Profile = list[tuple[float, float]]
 
 
 class Solid(NamedTuple):
@@ -70,7 +70,7 @@ def _compact(vertices: np.ndarray, faces: np.ndarray) -> Solid:
     return Solid(vertices[used], renumbered.reshape(-1, 3).astype(np.int64))
 
 
-def revolved(profile: Profile, sections: int = 40, spacing_m: float = 0.012) -> Solid:
+def revolved(profile: ArrayLike, sections: int = 40, spacing_m: float = 0.012) -> Solid:
     """The solid swept by a profile of (radius, height) points about the z axis, from the axis below to the axis above.
 
     The first and last points lie on the axis. Segments longer than ``spacing_m`` are cut.
@@ -126,7 +126,7 @@ def sphere(radius_m: float, sections: int = 40) -> Solid:
     angle = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 1)
     profile = np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle)], axis=1)
     profile[[0, -1], 0] = 0.0
-    return revolved([(float(r), float(z)) for r, z in profile], sections, spacing_m=1.0)
+    return revolved(profile, sections, spacing_m=1.0)
 
 
 def cylinder(radius_m: float, height_m: float, edge_m: float = 0.003, sections: int = 40) -> Solid:
@@ -136,14 +136,6 @@ def cylinder(radius_m: float, height_m: float, edge_m: float = 0.003, sections: 
     rim = [(radius_m - edge_m + edge_m * np.sin(a), half - edge_m + edge_m * np.cos(a)) for a in turn]
     below = [(r, -z) for r, z in rim]
     return revolved([(0.0, -half), *below, *reversed(rim), (0.0, half)], sections)
-
-
-def pyramid(base_m: float, height_m: float) -> Solid:
-    """An upright pyramid over a square, about half its height: 5 vertices, 6 triangles."""
-    b, h = base_m / 2, height_m / 2
-    vertices = np.array([[-b, -b, -h], [b, -b, -h], [b, b, -h], [-b, b, -h], [0, 0, h]], dtype=np.float64)
-    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], dtype=np.int64)
-    return Solid(vertices, faces)
 
 
 def united(*solids: Solid) -> Solid:

@@ -68,10 +68,6 @@ class TruthSequence:
         frames = np.arange(self.n_frames)
         return self.take(frames[(frames + self.raw_start) % self.stride == 0])
 
-    def clip_truth(self) -> "TruthSequence":
-        """The labelled interval alone, at 30 fps: what an adapter must find."""
-        return self.take(self.clip_frames)
-
     def take(self, frames: np.ndarray) -> "TruthSequence":
         """Only the given own frames; ``clip`` and ``contact`` then span what is left of them."""
         return replace(

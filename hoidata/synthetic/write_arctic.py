@@ -5,6 +5,7 @@ of the "add" kind; parts.json says 0 for the top, the part that moves, and 1 for
 """
 
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -45,11 +46,10 @@ def write_arctic_meta(root: Path, sequences: list[TruthSequence]) -> None:
 
 def _part_parameters(name: str, vertices: np.ndarray) -> dict[str, list]:
     low, high = vertices.min(0), vertices.max(0)
-    box = [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     points = vertices[np.linspace(0, len(vertices) - 1, 16).astype(int)].tolist()
     return {
         f"mocap_{name}": points[:4],
-        f"bbox_{name}": [[float(x) for x in row] for row in box],
+        f"bbox_{name}": list(product(*zip(low.tolist(), high.tolist(), strict=True))),
         f"keypoints_{name}": points,
     }
 

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from hoidata.clips.clip import SIDES, HandTrack, Side
-from hoidata.hands import HandPair, track_vertices
+from hoidata.hands import HandPair, load_embedded_hands, track_vertices
 from hoidata.synthetic.catalogue import GRAB_OBJECTS, object_model
 from hoidata.synthetic.object_files import write_npz, write_ply
 from hoidata.synthetic.shapes import sharp_box
@@ -37,16 +37,11 @@ def write_grab_meshes(root: Path, sequences: list[TruthSequence]) -> None:
         write_ply(root / _MESHES / f"{spec.name}.ply", model.vertices_m, model.faces)
     table = sharp_box(_TABLE_M).moved((0, 0, -_TABLE_M[2] / 2))
     write_ply(root / _MESHES / "table.ply", table.vertices_m, table.faces)
+    hands = load_embedded_hands()
     people = {truth.subject: truth for truth in sequences}
     for truth in people.values():
         for side in SIDES:
-            write_ply(root / _template_path(truth.subject, side), _template(truth.hands[side]), _hand_faces(side))
-
-
-def _hand_faces(side: Side) -> np.ndarray:
-    from hoidata.hands import load_embedded_hands
-
-    return load_embedded_hands()[side].faces
+            write_ply(root / _template_path(truth.subject, side), _template(truth.hands[side]), hands[side].faces)
 
 
 def _template(track: HandTrack) -> np.ndarray:
@@ -63,13 +58,14 @@ def _template_path(subject: str, side: Side) -> str:
     return f"tools/subject_meshes/{_gender(subject)}/{subject}_{side[0]}hand.ply"
 
 
-def write_grab_sequence(root: Path, truth: TruthSequence, pair: HandPair) -> None:
-    """grab/<subject>/<object>_<intent>_<n>.npz."""
+def write_grab_sequence(root: Path, members: list[TruthSequence], pair: HandPair) -> None:
+    """grab/<subject>/<object>_<intent>_<n>.npz; a recording of GRAB is one action."""
+    (truth,) = members
     body = {
         "params": _body(truth.n_frames),
         "vtemp": f"tools/subject_meshes/{_gender(truth.subject)}/{truth.subject}.ply",
     }
-    members: dict[str, Any] = {
+    arrays: dict[str, Any] = {
         "gender": _gender(truth.subject),
         "sbj_id": truth.subject,
         "obj_name": truth.object_name,
@@ -80,17 +76,17 @@ def write_grab_sequence(root: Path, truth: TruthSequence, pair: HandPair) -> Non
         "body": body,
     }
     for side in SIDES:
-        members[f"{side[0]}hand"] = {
+        arrays[f"{side[0]}hand"] = {
             "params": _hand_parameters(truth.hands[side], pair, side),
             "vtemp": _template_path(truth.subject, side),
         }
-    members["object"] = {"params": _object_parameters(truth), "object_mesh": f"{_MESHES}/{truth.object_name}.ply"}
-    members["table"] = {"params": _table_parameters(truth), "table_mesh": f"{_MESHES}/table.ply"}
-    members["contact"] = {
+    arrays["object"] = {"params": _object_parameters(truth), "object_mesh": f"{_MESHES}/{truth.object_name}.ply"}
+    arrays["table"] = {"params": _table_parameters(truth), "table_mesh": f"{_MESHES}/table.ply"}
+    arrays["contact"] = {
         "object": _object_contact(truth, pair),
         "body": np.zeros((truth.n_frames, _BODY_VERTICES), dtype=np.int8),
     }
-    write_npz(root / "grab" / f"{truth.source_key}.npz", members)
+    write_npz(root / "grab" / f"{truth.source_key}.npz", arrays)
 
 
 def _body(n_frames: int) -> dict[str, np.ndarray]:
@@ -130,12 +126,11 @@ def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
     start, stop = truth.contact
     labels = np.zeros(len(truth.object.model.vertices_m), dtype=np.int8)
     nearest = np.full(len(labels), np.inf)
-    track = truth.object.model.vertices_m
     one = truth.take(np.array([(start + stop) // 2]))
     for side in truth.acting_sides:
         vertices = track_vertices(one.hands[side], pair[side]).astype(np.float64)
         local = (one.object.world_from_object.inverse() @ vertices)[0]
-        distance, index = KDTree(local).query(track)
+        distance, index = KDTree(local).query(truth.object.model.vertices_m)
         joint = pair[side].skin_weights.argmax(1)[index]
         ids = np.where(joint == 0, _HAND_ID[side], _FINGER_ID[side] + joint - 1)
         # A coarse mesh may have no vertex under the fingers: its nearest one is marked all the same.

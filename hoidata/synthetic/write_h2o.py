@@ -4,6 +4,7 @@ Formats: raw-formats.md section 1. MANO translations are of the "add" kind: wris
 turn about J0 stays, so in the camera frame ``t' = A (J0 + t) + b - J0``.
 """
 
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -11,25 +12,39 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.hands import HandPair, track_joints
+from hoidata.hands.joint_orders import OPENPOSE
 from hoidata.synthetic.actions import H2O_ACTION_IDS, H2O_OBJECT_IDS, H2O_VERB_IDS
 from hoidata.synthetic.catalogue import H2O_OBJECTS, object_model
 from hoidata.synthetic.generate import GAP_FRAMES
 from hoidata.synthetic.object_files import obj_text, write_text
 from hoidata.synthetic.truth import TruthSequence
 
-# hand_pose files list the joints finger by finger, thumb first.
-_KEYPOINTS = [0, 13, 14, 15, 20, 1, 2, 3, 16, 4, 5, 6, 17, 10, 11, 12, 19, 7, 8, 9, 18]
 _EDGES = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)]
 _INTRINSICS = (636.6593, 636.2520, 635.2839, 366.8740, 1280.0, 720.0)
 _ABSENT_MANO, _ABSENT_POINTS = np.zeros(62), np.zeros(64)
 _SPLITS = {"subject1": "train", "subject2": "val", "subject3": "test"}
 
 
-def write_h2o_objects(root: Path) -> None:
-    """object/<name>/<name>.obj, metres."""
+def write_h2o_objects_and_lists(root: Path, sequences: list[TruthSequence]) -> None:
+    """object/<name>/<name>.obj, metres, and label_split/action_*.txt: labelled runs of each split.
+
+    The test list carries no labels, as in the original.
+    """
     for spec in H2O_OBJECTS:
         model = object_model("h2o", spec.name)
         write_text(root / "object" / spec.name / f"{spec.name}.obj", obj_text(model.vertices_m, model.faces))
+    last = {truth.source_key: 0 for truth in sequences}
+    for truth in sequences:
+        last[truth.source_key] = max(last[truth.source_key], truth.raw_start + truth.n_frames + GAP_FRAMES - 1)
+    for split in ("train", "val", "test"):
+        own = [truth for truth in sequences if _SPLITS[truth.subject] == split]
+        header = "id path action_label start_act end_act start_frame end_frame"
+        lines = [header if split != "test" else header.replace(" action_label", "")]
+        for number, truth in enumerate(own, 1):
+            label = "" if split == "test" else f" {H2O_ACTION_IDS[truth.verb, truth.object_name]}"
+            start, stop = truth.raw_start + truth.clip[0], truth.raw_start + truth.clip[1] - 1
+            lines.append(f"{number} {truth.source_key}{label} {start} {stop} 0 {last[truth.source_key]}")
+        write_text(root / "label_split" / f"action_{split}.txt", "\n".join(lines) + "\n")
 
 
 def write_h2o_sequence(root: Path, members: list[TruthSequence], pair: HandPair) -> None:
@@ -47,22 +62,6 @@ def write_h2o_sequence(root: Path, members: list[TruthSequence], pair: HandPair)
         for frame, line in enumerate(lines):
             with open(f"{folder}/{name}/{frame:06d}.txt", "w", encoding="ascii") as stream:
                 stream.write(line)
-
-
-def write_h2o_lists(root: Path, sequences: list[TruthSequence]) -> None:
-    """label_split/action_*.txt: labelled runs of each split; the test list carries no labels, as in the original."""
-    last = {truth.source_key: 0 for truth in sequences}
-    for truth in sequences:
-        last[truth.source_key] = max(last[truth.source_key], truth.raw_start + truth.n_frames + GAP_FRAMES - 1)
-    for split in ("train", "val", "test"):
-        own = [truth for truth in sequences if _SPLITS[truth.subject] == split]
-        header = "id path action_label start_act end_act start_frame end_frame"
-        lines = [header if split != "test" else header.replace(" action_label", "")]
-        for number, truth in enumerate(own, 1):
-            label = "" if split == "test" else f" {H2O_ACTION_IDS[truth.verb, truth.object_name]}"
-            start, stop = truth.raw_start + truth.clip[0], truth.raw_start + truth.clip[1] - 1
-            lines.append(f"{number} {truth.source_key}{label} {start} {stop} 0 {last[truth.source_key]}")
-        write_text(root / "label_split" / f"action_{split}.txt", "\n".join(lines) + "\n")
 
 
 def _line(numbers: np.ndarray) -> str:
@@ -126,7 +125,7 @@ def _hand_blocks(
     orient = (Rotation.from_matrix(turn) * Rotation.from_rotvec(track.global_orient)).as_rotvec()
     flag = np.ones((n_frames, 1))
     mano = np.concatenate([flag, translation, orient, track.hand_pose, np.repeat(track.betas, n_frames, 0)], axis=1)
-    joints = track_joints(track, pair[side])[:, _KEYPOINTS].astype(np.float64)
+    joints = track_joints(track, pair[side])[:, OPENPOSE].astype(np.float64)
     seen = (joints - eye[:, None]) @ turn.transpose(0, 2, 1)
     return mano, np.concatenate([flag, seen.reshape(n_frames, 63)], axis=1)
 
@@ -138,9 +137,7 @@ def _object_rows(truth: TruthSequence, turn: np.ndarray, eye: np.ndarray) -> tup
     pose[:, :3, :3] = turn @ Rotation.from_rotvec(track.rotvec).as_matrix()
     pose[:, :3, 3] = np.einsum("fij,fj->fi", turn, track.translation_m - eye)
     low, high = track.model.vertices_m.min(0), track.model.vertices_m.max(0)
-    corners = np.array(
-        [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
-    )
+    corners = np.array(list(product(*zip(low, high, strict=True))))
     edges = np.array([(corners[a] + corners[b]) / 2 for a, b in _EDGES])
     points = np.concatenate([[(low + high) / 2], corners, edges])
     seen = points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3]

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hoidata.annotation import TextEncoder, refuse_other_encoder
+from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request

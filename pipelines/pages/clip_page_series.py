@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
-from hoidata.contact import HandEvidence
 from hoidata.contact.maps import LONGEST_CLIP
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.surface_index import surface_index
 from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.hand_evidence import HandEvidence
 from hoidata.surface.contact import TOUCH_M
 from hoidata.surface.measure import ObjectShape, encloses_solid, measure_hand
 from hoidata.surface.store import SideSurface, SurfaceStore

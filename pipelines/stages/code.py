@@ -11,7 +11,7 @@ from typing import Any
 from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from models.registry import family_module, network_modules
+from models.registry import NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.lineage.graph import read_params
 from pipelines.stages.base import Place, write_json
@@ -78,9 +78,9 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         chosen = _chosen_by_dataset(tree, dataset)
         found |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
         every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
-    for network in params["train"]["demo"]:
+    for network in dict.fromkeys([*NETWORKS, *params["train"][params["train"]["size"]]]):
         found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
-    for family in params["families"]:
+    for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
     every |= _families([family_module(family) for family in params["families"]])
     return found | {stage: _start(stage, every) for stage in ("evaluate", "report")}

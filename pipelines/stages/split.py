@@ -16,6 +16,6 @@ def run(place: Place) -> None:
 
 def split(place: Place, wanted: Any) -> None:
     """Clips and words to parts and statistics. wanted: a split's name, or a rule (``hoidata.splits.SplitRule``)."""
-    from hoidata.splits import split_store
+    from hoidata.splits.stage import split_store
 
     print_counts(place, split_store(place.clips, place.annotation, place.splits, wanted))

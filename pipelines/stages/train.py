@@ -7,7 +7,7 @@ from hoidata.files.atomic import atomic_folder
 from models.common.device import chosen_device
 from models.common.family import Network
 from models.registry import load_network
-from pipelines.lineage.graph import look_up, producers, read_graph, read_params
+from pipelines.lineage.graph import producers, read_graph, read_params
 from pipelines.lineage.provenance import build_provenance
 from pipelines.stages.base import Place, StageParams, empty_reason, load_hands, load_params, write_empty
 
@@ -21,9 +21,8 @@ class TrainParams(StageParams):
     paper: dict[str, dict[str, Any]]
 
     def of(self, network: str) -> dict[str, Any]:
-        """The network's section in the chosen size, with the seed."""
-        sections = getattr(self, self.size)
-        return {**look_up(sections, network), "seed": self.seed}
+        """The network's section in the chosen size, with the seed; a network without one keeps its defaults."""
+        return {**getattr(self, self.size).get(network, {}), "seed": self.seed}
 
 
 def run(place: Place) -> None:

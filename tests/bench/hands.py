@@ -19,10 +19,11 @@ import pandas as pd
 
 from hoidata.annotation.derived import derive_verb
 from hoidata.clips import SIDES, Clip, HandType, Side
-from hoidata.contact import HandEvidence, ProximityIndex, acting_hands
-from hoidata.contact.hands import acting_hands_at_surface
+from hoidata.contact.hands import acting_hands
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.stage import sample_objects
 from hoidata.objects.surface_index import surface_index
+from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.store import Store, open_store
 from hoidata.synthetic.actions import ACTIONS
 from tests.bench.harness import show
@@ -66,9 +67,19 @@ def measure(store: Store, threshold_m: float) -> list[Measured]:
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         points = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        surface = acting_hands_at_surface(clip, joints, surface_index(clip.object.model), threshold_m)
+        surface = _at_surface(clip, joints, threshold_m)
         measured.append(Measured(clip, points, surface))
     return measured
+
+
+def _at_surface(clip: Clip, joints_m: dict[Side, np.ndarray], threshold_m: float) -> HandEvidence:
+    """The same test against the object's exact surface in the place of sampled points of it."""
+    index, distance = surface_index(clip.object.model), {}
+    for side in SIDES:
+        positions = clip.object.world_from_object.inverse() @ joints_m[side].astype(np.float64)
+        nearest = index.distance_m(positions, clip.object.hinge_rad).min(axis=1, initial=np.inf)
+        distance[side] = np.where(clip.hands[side].valid, nearest, np.inf)
+    return HandEvidence(None, distance, threshold_m).at_threshold(threshold_m)
 
 
 def known_hand(clip: Clip) -> HandType:

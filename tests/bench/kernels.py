@@ -23,13 +23,13 @@ import torch
 import trimesh
 
 from hoidata.clips import HandTrack, ObjectTrack
-from hoidata.contact import ProximityIndex
-from hoidata.contact.proximity import CONTACT_THRESHOLD_M
+from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_joints, track_rotmats, write_mano_pickle
 from hoidata.hands.fast_joints import fast_track_joints
+from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
-from hoidata.objects.sampling import SampledPoints, farthest_points, sample_points
+from hoidata.objects.sampling import SampledPoints, sample_points
 from tests.bench.harness import Times, medians, show
 
 RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21

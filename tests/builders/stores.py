@@ -10,7 +10,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.contact.settings import ContactSettings
 from hoidata.contact.stage import contact_store
 from hoidata.quality.stage import quality_store
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 

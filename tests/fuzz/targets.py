@@ -174,7 +174,7 @@ def _numpy_files() -> list[Target]:
     objects = npy_mutation(PICKLE)
     reading = [numpy_files._read, *functions_of(npy_header)]
     members = [numpy_files.load_npz_objects, numpy_files._chosen_members, numpy_files._check_size]
-    members += [numpy_files._read_member, numpy_files._archive, numpy_files._item]
+    members += [numpy_files._read_member, numpy_files.open_archive, numpy_files._item]
     return [
         Target(
             "npy",
@@ -204,7 +204,7 @@ def _numpy_files() -> list[Target]:
             "npz-pieces",
             lambda: [*seeds.npz_object_files(), *seeds.near_pieces()],
             on_disk("a.npz", _pieces),
-            [item for item in functions_of(array_pieces) if item.__name__ != "_readable"],
+            functions_of(array_pieces),
             zip_words,
             zip_mutation(objects),
         ),

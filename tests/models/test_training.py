@@ -10,7 +10,7 @@ import torch
 import trimesh
 from safetensors import safe_open
 
-from hoidata.annotation import load_encoder
+from hoidata.annotation.encoders import load_encoder
 from hoidata.batches.dataset import HoiDataset
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints

@@ -39,14 +39,7 @@ TINY = {
         "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
     },
 }
-TINY_EVALUATION = {
-    "contact_samples": 2,
-    "samples": 2,
-    "refined": 1,
-    "sampler_steps": 2,
-    "frame_stride": 30,
-    "field_resolution": 16,
-}
+TINY_SAMPLE = {"samples": 2, "text2hoi": {"sampler": {"steps": 2}, "field_resolution": 16}}
 
 
 def copy_project(folder: Path) -> Path:
@@ -70,7 +63,7 @@ def make_small(folder: Path) -> None:
     params = yaml.safe_load((folder / "params.yaml").read_text())
     params["annotate"]["encoder"] = "hash"
     params["train"]["demo"] = TINY
-    params["evaluate"] |= TINY_EVALUATION
+    params["sample"] |= TINY_SAMPLE
     write_params(folder, params)
 
 

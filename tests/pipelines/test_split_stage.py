@@ -9,7 +9,7 @@ import yaml
 
 from hoidata.annotation.stage import annotate_store
 from hoidata.errors import BadInput
-from hoidata.splits import choose
+from hoidata.splits.definitions import choose
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.lineage.graph import producers, read_graph

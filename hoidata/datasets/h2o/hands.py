@@ -10,7 +10,7 @@ from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHan
 from hoidata.datasets.h2o.files import SequenceFrames
 from hoidata.hands import HandPair, track_joints
 from hoidata.hands.fitting import fit_hands, fit_shape
-from hoidata.hands.joint_orders import to_mano_order
+from hoidata.hands.joint_orders import openpose_to_mano_order
 
 PARAMETERS = HandConvention(
     translation="transl",
@@ -115,6 +115,6 @@ def _known(points: np.ndarray) -> np.ndarray:
 def _world_joints(frames: SequenceFrames, side: Side) -> np.ndarray:
     """(frame, 21, 3) in hoidata's order and the world, metres; NaN where the flag is 0."""
     block = frames.hands[:, :_KEYPOINTS] if side == "left" else frames.hands[:, _KEYPOINTS:]
-    seen = to_mano_order(block[:, 1:].reshape(-1, 21, 3), "openpose")
+    seen = openpose_to_mano_order(block[:, 1:].reshape(-1, 21, 3))
     world = seen @ frames.camera[:, :3, :3].transpose(0, 2, 1) + frames.camera[:, None, :3, 3]
     return np.where(block[:, :1, None] != 0, world, np.nan)

@@ -12,8 +12,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hoidata.annotation import clip_weights, load_encoder
+from hoidata.annotation import clip_weights
 from hoidata.annotation.clip_weights import is_reachable, parse_weights_name, tagged_weights
+from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput, MissingResource
 
 SENTENCES = ["Lift a box with the left hand.", "Pour milk with both hands.", "A mug is grabbed by the right hand."]

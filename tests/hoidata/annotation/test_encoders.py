@@ -9,8 +9,13 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from hoidata.annotation import load_encoder, refuse_other_encoder
-from hoidata.annotation.encoders import CachedEncoder, HashEncoder, UniversalSentenceEncoder
+from hoidata.annotation.encoders import (
+    CachedEncoder,
+    HashEncoder,
+    UniversalSentenceEncoder,
+    load_encoder,
+    refuse_other_encoder,
+)
 from hoidata.errors import BadInput, MissingResource
 
 SENTENCES = ["Lift a box with the left hand.", "Pour milk with both hands.", "A mug is grabbed by the right hand."]

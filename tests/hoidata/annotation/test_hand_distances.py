@@ -10,15 +10,14 @@ import pytest
 from hoidata.annotation.hand_distances import hand_types_at
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip, Side
-from hoidata.contact import ProximityIndex, acting_hands
-from hoidata.contact.hands import acting_hands_at_surface
+from hoidata.contact.hands import acting_hands
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz, write_npz
 from hoidata.objects.sampling import sample_points
-from hoidata.objects.surface_index import surface_index
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.hand_evidence import HandDistances, HandEvidence
-from tests.builders.clips import clip_of, flat_hand, still_object, with_object
+from tests.builders.clips import clip_of, flat_hand, still_object
 from tests.builders.objects import box_model
 from tests.builders.stores import write_annotated
 
@@ -132,47 +131,3 @@ def test_no_length_is_no_threshold(root: Path) -> None:
     for wrong in (0.0, -0.02, float("nan")):
         with pytest.raises(BadInput, match="metres above 0"):
             hand_types_at(root / "annotation", wrong)
-
-
-def test_at_the_surface_a_hand_is_as_near_as_the_box_is_and_never_farther_than_its_points() -> None:
-    """The wrist is the lowest of the joints above the box's top; points lie on that surface, so none is nearer."""
-    turned = clip("toy/s3/3", HEIGHTS_M["toy/s3/3"], 7)
-    model = turned.object.model
-    joints: dict[Side, np.ndarray] = {side: wrist_and_far_joints(turned, side) for side in SIDES}
-    exact = acting_hands_at_surface(turned, joints, surface_index(model), 0.02)
-    sampled = acting_hands(turned, joints, ProximityIndex(sample_points(model)), 0.02)
-    for side in SIDES:
-        valid = turned.hands[side].valid
-        height = turned.hands[side].wrist_m[valid, 2].astype(np.float64) - 0.1
-        np.testing.assert_allclose(exact.distance_m[side][valid], height, atol=1e-7)
-        assert np.isinf(exact.distance_m[side][~valid]).all()
-        assert (exact.distance_m[side] <= sampled.distance_m[side] + 1e-9).all()
-    assert exact.hand_type == "right"
-
-
-def wrist_and_far_joints(clip: Clip, side: Side) -> np.ndarray:
-    joints = np.full((clip.n_frames, 21, 3), 3.0)
-    joints[:, 0] = clip.hands[side].wrist_m
-    return joints
-
-
-def test_the_surface_test_follows_the_objects_motion() -> None:
-    still = clip("toy/s2/2", HEIGHTS_M["toy/s2/2"], 6)
-    joints: dict[Side, np.ndarray] = {side: wrist_and_far_joints(still, side) for side in SIDES}
-    shift = np.linspace(0, 0.3, 6, dtype=np.float32)[:, None] * np.array([1, 0, 0], np.float32)
-    moved = with_object(still, translation_m=shift)
-    carried: dict[Side, np.ndarray] = {side: joints[side] + shift[:, None] for side in SIDES}
-    index = surface_index(still.object.model)
-    for side in SIDES:
-        np.testing.assert_allclose(
-            acting_hands_at_surface(moved, carried, index).distance_m[side],
-            acting_hands_at_surface(still, joints, index).distance_m[side],
-            atol=1e-7,
-        )
-    far, all_of_it = (acting_hands_at_surface(still, joints, index, 0.026, most_m=most) for most in (0.03, np.inf))
-    assert far.hand_type == all_of_it.hand_type == "right"
-    for side in SIDES:
-        whole = all_of_it.distance_m[side]
-        np.testing.assert_array_equal(far.distance_m[side], np.where(whole > 0.03, np.inf, whole))
-    with pytest.raises(BadInput, match="at least the threshold"):
-        acting_hands_at_surface(still, joints, index, 0.02, most_m=0.01)

@@ -12,7 +12,6 @@ from hoidata.annotation.grammar import (
     DETERMINERS,
     Grammar,
     default_grammar,
-    extend_grammar,
     mass_nouns,
     regular_forms,
 )
@@ -188,20 +187,3 @@ MASS = {row["base"] for row in table_rows("object") if row["number"] == "mass"}
 def test_a_sentence_without_an_object_is_refused(words: str) -> None:
     with pytest.raises(BadInput, match="object of a sentence"):
         four_sentences("lift", words, "left")
-
-
-def test_a_users_table_adds_words_and_wins(tmp_path) -> None:
-    header = "kind,base,gerund,past_participle,third_singular,noun_phrase,number\n"
-    path = tmp_path / "words.csv"
-    path.write_text(header + "object,sand,,,,sand,mass\nobject,mug,,,,a cup,singular\n", encoding="utf-8")
-    grammar = extend_grammar(default_grammar(), path)
-    assert four_sentences("lift", "sand", "left", grammar)[1] == "Sand is lifted by the left hand."
-    assert four_sentences("lift", "mug", "left", grammar)[0] == "Lift a cup with the left hand."
-
-
-@pytest.mark.parametrize("row", ["noun,sand,,,,sand,mass", "object,sand,,,,sand,some", "verb,sand,,,,,"])
-def test_a_broken_row_of_a_users_table_is_named(tmp_path, row: str) -> None:
-    path = tmp_path / "words.csv"
-    path.write_text("kind,base,gerund,past_participle,third_singular,noun_phrase,number\n" + row + "\n")
-    with pytest.raises(BadInput, match=r"words\.csv line 2"):
-        extend_grammar(default_grammar(), path)

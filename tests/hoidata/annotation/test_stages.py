@@ -13,7 +13,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.objects.sampling import sample_points
-from hoidata.splits import split_store
+from hoidata.splits.stage import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from tests.builders.clips import clip_of, flat_hand, still_object
 from tests.builders.objects import box_model, notebook
@@ -89,7 +89,7 @@ def test_every_clip_with_words_has_its_part(annotated: AnnotatedStore) -> None:
 def test_features_are_those_of_the_sentences(annotated: AnnotatedStore) -> None:
     encoder = load_encoder("hash")
     for key in annotated.ids():
-        np.testing.assert_array_equal(annotated.text_features(key), encoder.encode(annotated.sentences(key)))
+        np.testing.assert_array_equal(annotated.text_embedding(key), encoder.encode(annotated.sentences(key)))
     assert annotated.encoder_identity == encoder.identity
 
 

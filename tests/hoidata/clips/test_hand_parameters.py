@@ -11,7 +11,6 @@ from hoidata.clips.hand_parameters import (
     HandConvention,
     SourceHand,
     absolute_fingers,
-    from_track,
     hands_for,
     to_track,
     with_corrected_left,
@@ -143,14 +142,8 @@ class TestFingers:
         convention = replace(PLAIN, fingers=fingers)
         track = to_track(source, convention, model)
         assert track.hand_pose[:, 23].min() > 6
-        np.testing.assert_allclose(from_track(track, convention, model).fingers, source.fingers, atol=1e-6)
-
-    def test_a_pose_outside_the_components_becomes_the_nearest_one_they_express(self, model):
-        convention = replace(PLAIN, components=6)
-        track = to_track(source_hand(), PLAIN, model)
-        back = from_track(track, convention, model).fingers
-        expected, *_ = np.linalg.lstsq(model.components[:6].T, track.hand_pose.astype(np.float64).T, rcond=None)
-        np.testing.assert_allclose(back, expected.T, atol=1e-9)
+        mean = model.mean_pose if fingers == "mean-relative" else 0
+        np.testing.assert_allclose(track.hand_pose - mean, source.fingers, atol=1e-6)
 
     @pytest.mark.parametrize(("components", "columns"), [(0, 44), (24, 45), (45, 24), (6, 1)])
     def test_another_number_of_columns_is_refused(self, model, components, columns):
@@ -177,50 +170,9 @@ class TestFrame:
             np.testing.assert_allclose(joints_of(model, after, frame), expected, atol=3e-6)
         np.testing.assert_array_equal(before.hand_pose, after.hand_pose)
 
-    def test_transl_in_the_new_frame_is_taken_about_the_rest_wrist(self, model):
-        source, change = source_hand(), frame_change(1)
-        there = from_track(to_track(source, PLAIN, model, change), PLAIN, model)
-        rotation, shift = change.rotation[0], change.translation_m[0]
-        wrist = wrist_of(model, source.betas[0])
-        expected = (wrist + source.translation_m) @ rotation.T + shift - wrist
-        np.testing.assert_allclose(there.translation_m, expected, atol=2e-6)
-        turned_alone = source.translation_m @ rotation.T + shift
-        assert np.linalg.norm(there.translation_m - turned_alone, axis=1).min() > 0.02
-
-    @pytest.mark.parametrize("rows", [1, N_FRAMES])
-    def test_the_inverse_takes_points_and_turns_back(self, rows):
-        change, points = frame_change(rows), np.random.default_rng(1).normal(size=(N_FRAMES, 3))
-        np.testing.assert_allclose(change.inverse().points(change.points(points)), points, atol=1e-12)
-        back = change.inverse().rotvecs(change.rotvecs(points))
-        close = Rotation.from_rotvec(back) * Rotation.from_rotvec(points).inv()
-        assert close.magnitude().max() < 1e-9
-
     def test_a_turn_without_a_shift_leaves_the_origin(self):
         change = FrameChange(frame_change(1).rotation)
         np.testing.assert_array_equal(change.points(np.zeros((2, 3))), np.zeros((2, 3)))
-        points = np.random.default_rng(1).normal(size=(2, 3))
-        np.testing.assert_allclose(change.inverse().points(change.points(points)), points, atol=1e-12)
-
-
-@pytest.mark.parametrize("translation", ["transl", "wrist"])
-@pytest.mark.parametrize("fingers", ["absolute", "mean-relative"])
-@pytest.mark.parametrize("components", [0, 1, 24, 45])
-@pytest.mark.parametrize("betas", ["sequence", "frame", "mesh"])
-@pytest.mark.parametrize("rows", [0, 1, N_FRAMES])
-def test_there_and_back_gives_the_source_again(model, translation, fingers, components, betas, rows):
-    shape = {"sequence": "betas per sequence", "frame": "betas per frame", "mesh": "personal mesh"}[betas]
-    convention = HandConvention(translation, fingers, shape, "as released", components)
-    mesh = personal_mesh(model) if betas == "mesh" else None
-    source = source_hand(11, components or 45, "frame" if betas == "frame" else "sequence", mesh)
-    change = frame_change(rows) if rows else FrameChange()
-    back = from_track(to_track(source, convention, model, change), convention, model, change.inverse())
-    np.testing.assert_allclose(back.translation_m, source.translation_m, atol=3e-6)
-    np.testing.assert_allclose(back.fingers, source.fingers, atol=3e-6)
-    np.testing.assert_array_equal(back.betas, source.betas)
-    turned = Rotation.from_rotvec(back.global_orient) * Rotation.from_rotvec(source.global_orient).inv()
-    assert turned.magnitude().max() < 3e-6
-    if mesh is not None:
-        np.testing.assert_array_equal(back.template_m, mesh)
 
 
 class TestValidFrames:
@@ -290,6 +242,4 @@ class TestLeftShape:
             expected = wrist_of(left, source.betas[0]) + source.translation_m
             np.testing.assert_allclose(track.wrist_m, expected, atol=1e-6)
             joints[flag] = joints_of(left, track, 0)
-            back = from_track(track, PLAIN, left)
-            np.testing.assert_allclose(back.translation_m, source.translation_m, atol=1e-6)
         assert np.linalg.norm(joints["corrected"] - joints["as released"], axis=1).max() > 0.005

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.contact import ProximityIndex, acting_hands
+from hoidata.contact.hands import acting_hands
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import get_adapter
 from hoidata.files import load_npy, load_npz_objects
@@ -41,7 +42,8 @@ def pairs(corpus):
     truths, store = corpus
     clips = [store.clip(clip_id) for clip_id in store.ids]
     assert {(clip.sequence, int(clip.source_frames[0])) for clip in clips} == set(truths)
-    return [(clip, truths[clip.sequence, int(clip.source_frames[0])].clip_truth()) for clip in clips]
+    found = [truths[clip.sequence, int(clip.source_frames[0])] for clip in clips]
+    return [(clip, truth.take(truth.clip_frames)) for clip, truth in zip(clips, found, strict=True)]
 
 
 @pytest.mark.slow

@@ -138,8 +138,8 @@ def _array_of_shape(shape: str, data: int) -> bytes:
 
 BROKEN = {
     "no pickle": (_header() + b"nothing at all", "pickle"),
-    "an empty member": (b"", ".npz"),
-    "no header": (b"\x80\x03}.", ".npz"),
+    "an empty member": (b"", "NumPy file"),
+    "no header": (b"\x80\x03}.", "NumPy file"),
     "a pickle cut short": (_header() + pickle.dumps(np.zeros((100, 100)), 3)[:5000], ".npz"),
     "plain numbers": (_header("<i8", (4,)) + bytes(32), "dict of arrays"),
     "a list in the place of the dict": (_header() + b"\x80\x03]q\x00.", "dict of arrays"),

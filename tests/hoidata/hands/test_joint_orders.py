@@ -1,10 +1,10 @@
-"""Joint orders and fingertip vertices against the lists their libraries publish."""
+"""Joint orders against the lists their libraries publish, and the fingertip vertices of the embedded hand."""
 
 import numpy as np
 import pytest
 
 from hoidata.hands import JOINT_NAMES, TIP_VERTICES, load_embedded_hands
-from hoidata.hands.joint_orders import OPENPOSE, TIP_SETS, from_mano_order, to_mano_order
+from hoidata.hands.joint_orders import OPENPOSE, openpose_to_mano_order
 
 # smplx and MANO: wrist, index, middle, pinky, ring, thumb, three joints each; then the tips in the same order.
 MANO = [
@@ -34,32 +34,14 @@ def test_our_own_order_is_manos_with_the_tips_at_the_end():
 
 def test_openpose_order_goes_finger_by_finger_from_the_thumb():
     assert [MANO[place] for place in OPENPOSE] == OPENPOSE_NAMES
-    np.testing.assert_array_equal(to_mano_order(numbered(OPENPOSE_NAMES), "openpose"), numbered(MANO))
-    np.testing.assert_array_equal(from_mano_order(numbered(MANO), "openpose"), numbered(OPENPOSE_NAMES))
-    for change in (to_mano_order, from_mano_order):
-        np.testing.assert_array_equal(change(numbered(MANO), "mano"), numbered(MANO))
+    np.testing.assert_array_equal(openpose_to_mano_order(numbered(OPENPOSE_NAMES)), numbered(MANO))
 
 
-def test_tip_vertices_are_those_the_libraries_take():
-    # thumb, index, middle, ring, pinky as each library lists them; ours follow index, middle, pinky, ring, thumb.
-    published = {
-        "smplx": (744, 320, 443, 554, 671),
-        "manopth right": (745, 317, 444, 556, 673),
-        "manopth left": (745, 317, 445, 556, 673),
-        "text2hoi": (745, 317, 445, 556, 673),
-    }
-    for name, (thumb, index, middle, ring, pinky) in published.items():
-        assert TIP_SETS[name] == (index, middle, pinky, ring, thumb)
-    assert set(TIP_SETS) == set(published)
-    assert TIP_SETS["text2hoi"] == TIP_VERTICES
-
-
-@pytest.mark.parametrize("name", TIP_SETS)
 @pytest.mark.parametrize("side", ["left", "right"])
-def test_every_tip_set_lies_at_the_ends_of_its_fingers(name, side):
+def test_every_tip_lies_at_the_end_of_its_finger(side):
     model = load_embedded_hands()[side]
     joints = model.joint_regressor @ model.template_m
-    for vertex, last_joint in zip(TIP_SETS[name], (3, 6, 9, 12, 15), strict=True):
+    for vertex, last_joint in zip(TIP_VERTICES, (3, 6, 9, 12, 15), strict=True):
         away = np.linalg.norm(joints - model.template_m[vertex], axis=1)
         assert away.argmin() == last_joint
         assert 0.005 < away.min() < 0.04

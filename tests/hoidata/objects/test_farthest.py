@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hoidata.objects.farthest import farthest_rows
+from hoidata.objects.farthest import farthest_points
 
 
 def plain_loop(points: np.ndarray, count: int) -> list[int]:
@@ -34,7 +34,7 @@ def test_rows_are_those_of_the_plain_loop(seed: int, n_points: int, kind: str) -
         points = np.concatenate((points, points))
     points = points.astype(np.float32)
     count = min(len(points), 300)
-    assert farthest_rows(points, count).tolist() == plain_loop(points, count)
+    assert farthest_points(points, count).tolist() == plain_loop(points, count)
 
 
 @pytest.mark.parametrize("n_points", [4000, 32768])
@@ -43,10 +43,10 @@ def test_rows_of_dense_surfaces_are_those_of_the_plain_loop(n_points: int) -> No
     ring = 0.05 + 0.02 * np.cos(angle[1])
     points = np.column_stack((ring * np.cos(angle[0]), ring * np.sin(angle[0]), 0.02 * np.sin(angle[1])))
     points = points.astype(np.float32)
-    assert farthest_rows(points, 1024).tolist() == plain_loop(points, 1024)
+    assert farthest_points(points, 1024).tolist() == plain_loop(points, 1024)
 
 
 def test_more_rows_than_distinct_points_repeat_the_first() -> None:
     points = np.zeros((70, 3), np.float32)
     points[50:] = 1
-    assert farthest_rows(points, 5).tolist() == [0, 50, 0, 0, 0]
+    assert farthest_points(points, 5).tolist() == [0, 50, 0, 0, 0]

@@ -9,9 +9,10 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
+from hoidata.objects.distance import volume_m3
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.solid import NoSolid, Solid, patched_holes, solid_of, volume_m3
+from hoidata.objects.solid import NoSolid, Solid, patched_holes, solid_of
 from hoidata.objects.surface_index import SurfaceIndex
 from tests.builders.objects import model_of
 

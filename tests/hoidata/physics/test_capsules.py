@@ -46,7 +46,6 @@ def test_a_capsule_that_dips_into_the_top_touches_there_with_the_depth_of_its_lo
     assert found.depth_m == pytest.approx([0.004], abs=1e-6)
     np.testing.assert_allclose(found.point_m, [[0.02, 0, 0.03]], atol=1e-9)
     np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-9)
-    assert found.along == pytest.approx([1.0])
 
 
 def test_an_axis_inside_the_object_still_has_its_normal_outwards():

@@ -5,7 +5,6 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import articulate
 from hoidata.physics.surface import (
-    N_PATCHES,
     hand_patches,
     patch_contacts,
     penetration_depth_m,
@@ -52,7 +51,7 @@ def test_a_hinged_object_without_its_angles_is_refused():
 def test_every_patch_of_a_hand_has_vertices_and_left_mirrors_right():
     pair = load_embedded_hands()
     right, left = hand_patches(pair.right), hand_patches(pair.left)
-    assert set(right) == set(range(N_PATCHES))
+    assert set(right) == set(range(21))
     np.testing.assert_array_equal(left, right)
 
 

@@ -9,7 +9,9 @@ import pytest
 from hoidata.dataset_folders import built_in_names, dataset_facts
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.errors import BadInput
-from hoidata.splits import assign_split, choose, definitions_for, published
+from hoidata.splits.definitions import choose, definitions_for
+from hoidata.splits.published import published
+from hoidata.splits.rules import assign_split
 
 H2O = tuple(f"subject{number}" for number in (1, 2, 3, 4))
 # Verb and object pairs of ARCTIC's descriptions (Text2HOI's word lists): any object but for the verbs named here.

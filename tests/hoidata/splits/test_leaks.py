@@ -3,7 +3,7 @@
 import pandas as pd
 import pytest
 
-from hoidata.splits import PROMISES, find_leaks
+from hoidata.splits.leaks import PROMISES, find_leaks
 
 FILES = ["raw/a.npz", "raw/b.npz", "mesh/box.ply", "raw/sub/c.npz"]
 

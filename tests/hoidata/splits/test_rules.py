@@ -9,7 +9,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from hoidata.errors import BadInput
-from hoidata.splits import SplitRule, assign_split
+from hoidata.splits.rules import SplitRule, assign_split
 
 COLUMNS = ["clip_id", "subject", "sequence", "first_source_frame", "last_source_frame", "object", "other_objects"]
 

@@ -10,8 +10,7 @@ import pytest
 
 from hoidata.clips import SourceContact, SourceFile
 from hoidata.errors import BadInput
-from hoidata.splits import split_store
-from hoidata.splits.stage import motion_digest
+from hoidata.splits.stage import motion_digest, split_store
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 

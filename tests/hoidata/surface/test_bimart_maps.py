@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips import SIDES, Clip, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
-from hoidata.surface.bimart_maps import BEYOND, REACH_M, bimart_map, clip_map, packed_map, unpacked_map
+from hoidata.surface.bimart_maps import BEYOND, REACH_M, bimart_map, packed_map, unpacked_map
 from hoidata.surface.contact import PlacedHand, placed_hand
 from tests.builders.clips import MIRROR, in_another_world, mirror_image, with_object
 
@@ -110,14 +110,7 @@ def test_frames_without_the_hand_are_beyond_and_do_not_count(scene):
     part = map_of(clip.object, vertices["right"], points, valid)
     np.testing.assert_array_equal(part[valid], whole[valid])
     assert np.isinf(part[~valid]).all()
-    np.testing.assert_array_equal(clip_map(part), whole[valid].min(axis=0))
     assert np.isinf(map_of(clip.object, vertices["right"], points, np.zeros(clip.n_frames, bool))).all()
-
-
-def test_clip_map_is_the_nearest_the_hand_ever_comes():
-    distances = np.array([[0.01, np.inf, 0.2], [0.03, np.inf, 0.1]], np.float32)
-    np.testing.assert_array_equal(clip_map(distances), np.array([0.01, np.inf, 0.1], np.float32))
-    assert np.isinf(clip_map(np.zeros((0, 3), np.float32))).all()
 
 
 def test_a_hand_too_far_away_gives_nothing_and_one_within_reach_is_seen(make_clip):

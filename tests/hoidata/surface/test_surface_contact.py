@@ -12,18 +12,23 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.surface.contact import (
-    Penetration,
-    PlacedHand,
-    penetration,
-    placed_hand,
-    signed_distances_m,
-    touched_vertices,
-)
+from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand, touched_vertices
 from hoidata.surface.solid_overlap import SolidOverlap
 from tests.builders.clips import in_another_world, mirror_image, with_hand, with_object
 
 HANDS = load_embedded_hands()
+
+
+def signed_distances_m(hand: PlacedHand, index: SurfaceIndex, most_m: float) -> np.ndarray:
+    """(frame, 778) distance of each vertex, negative inside at any depth, infinite beyond ``most_m`` outside."""
+    depth = index.depth_m(hand.vertices_m, hand.hinge_rad)
+    distance = index.distance_m(hand.vertices_m, hand.hinge_rad, most_m)
+    return hand.over_clip(np.where(depth > 0, -depth, distance), np.nan)
+
+
+def shared_m3(hand: PlacedHand, overlap: SolidOverlap) -> np.ndarray:
+    """(frame,) volume that hand and object both fill, NaN without the hand."""
+    return hand.over_clip(overlap.volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad), np.nan)
 
 
 def shifted(clip: Clip, way_m: float) -> Clip:
@@ -71,17 +76,12 @@ def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip
     valid = np.array([False, True, True, False, True, True])
     clip = with_hand(clip, valid=valid)
     index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
-    touched, found = touched_vertices(hand, index), penetration(hand, index, SolidOverlap(index, 0.002))
+    touched, overlap = touched_vertices(hand, index), SolidOverlap(index, 0.002)
     np.testing.assert_array_equal(touched.any(axis=1), valid)
-    np.testing.assert_array_equal(np.isfinite(found.deepest_m), valid)
-    assert found.volume_m3 is not None
-    np.testing.assert_array_equal(np.isfinite(found.volume_m3), valid)
-    shares = Penetration(np.array([[0.0, 0.0], [0.01, 0.002], [np.nan, np.nan], [0.02, 0.0]]), None)
-    assert (shares.share(), shares.share(more_than_m=0.01)) == pytest.approx((2 / 3, 1 / 3))
+    np.testing.assert_array_equal(np.isfinite(deepest_m(hand, index)), valid)
+    np.testing.assert_array_equal(np.isfinite(shared_m3(hand, overlap)), valid)
     gone = with_hand(clip, valid=np.zeros(6, bool))
-    nothing = penetration(placed_hand(gone, "right", HANDS), index, SolidOverlap(index, 0.002))
-    assert np.isnan(nothing.share())
-    assert np.isnan(nothing.deepest_m).all()
+    assert np.isnan(deepest_m(placed_hand(gone, "right", HANDS), index)).all()
 
 
 def test_the_angle_of_a_hinge_is_that_of_its_own_frame_where_others_lack_the_hand(
@@ -97,9 +97,7 @@ def test_the_angle_of_a_hinge_is_that_of_its_own_frame_where_others_lack_the_han
     np.testing.assert_array_equal(
         signed_distances_m(part, index, 1.0)[valid], signed_distances_m(whole, index, 1.0)[valid]
     )
-    volumes = [penetration(hand, index, overlap).volume_m3 for hand in (part, whole)]
-    assert volumes[0] is not None
-    assert volumes[1] is not None
+    volumes = [shared_m3(hand, overlap) for hand in (part, whole)]
     np.testing.assert_array_equal(volumes[0][valid], volumes[1][valid])
 
 
@@ -108,16 +106,13 @@ def test_deeper_hands_share_more_volume_and_a_far_hand_none(make_clip: Callable[
     index = SurfaceIndex(clip.object.model)
     overlap, volumes, depths = SolidOverlap(index), [], []
     for way_m in (0.0, 0.01, 0.02, 0.04):
-        found = penetration(placed_hand(shifted(clip, way_m), "right", HANDS), index, overlap)
-        assert found.volume_m3 is not None
-        volumes.append(found.volume_m3.mean())
-        depths.append(found.deepest_m.mean())
+        hand = placed_hand(shifted(clip, way_m), "right", HANDS)
+        volumes.append(shared_m3(hand, overlap).mean())
+        depths.append(deepest_m(hand, index).mean())
     assert (np.diff(volumes[1:]) > 0).all()
     assert (np.diff(depths[1:]) > 0).all()
-    far = penetration(placed_hand(clip, "left", HANDS), index, overlap)
-    assert far.volume_m3 is not None
-    assert not far.volume_m3.any()
-    assert not far.depth_m.any()
+    assert not shared_m3(placed_hand(clip, "left", HANDS), overlap).any()
+    assert not deepest_m(placed_hand(clip, "left", HANDS), index).any()
 
 
 @pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
@@ -134,7 +129,7 @@ def test_nothing_changes_when_the_world_moves(make_clip: Callable[..., Clip], ar
         np.testing.assert_array_equal(touched_vertices(one, index)[clear], touched_vertices(two, index)[clear])
         both = np.isfinite(first) & np.isfinite(second)
         np.testing.assert_allclose(second[both], first[both], atol=3e-6)
-        volumes = [penetration(hand, index, overlap).volume_m3 for hand in (one, two)]
+        volumes = [shared_m3(hand, overlap) for hand in (one, two)]
         np.testing.assert_allclose(volumes[1], volumes[0], atol=2e-8)
 
 
@@ -150,7 +145,7 @@ def test_the_mirrored_clip_has_the_other_hand_s_contacts(make_clip: Callable[...
         np.testing.assert_allclose(second[both], first[both], atol=3e-6)
         clear = np.abs(np.abs(first) - 0.005) > 3e-6
         np.testing.assert_array_equal(touched_vertices(one, index)[clear], touched_vertices(two, other)[clear])
-        volumes = [penetration(*asked).volume_m3 for asked in ((one, index, overlaps[0]), (two, other, overlaps[1]))]
+        volumes = [shared_m3(hand, overlap) for hand, overlap in zip((one, two), overlaps, strict=True)]
         np.testing.assert_allclose(volumes[1], volumes[0], atol=2e-8)
 
 
@@ -162,5 +157,5 @@ def test_an_open_object_has_touched_vertices_but_no_penetration(make_clip: Calla
     assert isinstance(hand, PlacedHand)
     assert touched_vertices(hand, index, 1.0).all()
     with pytest.raises(BadInput, match="it is open"):
-        penetration(hand, index)
+        deepest_m(hand, index)
     assert index.solid_note == "sheet has no inside: it is open"

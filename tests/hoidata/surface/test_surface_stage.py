@@ -17,7 +17,7 @@ from hoidata.objects.sampling import sample_points
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.store.store import open_store
 from hoidata.surface.bimart_maps import bimart_map
-from hoidata.surface.contact import penetration, placed_hand
+from hoidata.surface.contact import deepest_m, placed_hand
 from hoidata.surface.measure import ObjectShape, measure_hand
 from hoidata.surface.solid_overlap import SolidOverlap
 from hoidata.surface.stage import surface_store
@@ -106,7 +106,6 @@ def test_map_is_bimarts_rounded_to_steps_and_only_frames_within_reach_are_stored
             assert [row[f"{side}_map_first"], row[f"{side}_map_stop"]] == kept
             np.testing.assert_array_equal(np.isfinite(found), near)
             assert np.abs(found[near] - exact[near]).max(initial=0) <= 0.0004 + 1e-6
-            np.testing.assert_array_equal(store.clip_map(clip_id, side), found.min(axis=0))
     row = store.clips.loc["test/s1/through"]
     assert 0 < row["right_map_first"] < row["right_map_stop"] == 20
     assert row["left_map_stop"] == 0
@@ -164,13 +163,13 @@ def test_volume_is_that_of_the_deepest_frame_at_the_angle_of_that_frame(make_cli
     right = clip.hands["right"]
     shape = ObjectShape(model, sample_points(model, POINTS))
     found = measure_hand(clip, "right", track_joints(right, hands["right"]), hands, shape)
-    every = penetration(placed_hand(clip, "right", hands), shape.index, SolidOverlap(shape.index))
-    np.testing.assert_array_equal(found.depth_m, every.deepest_m)
-    assert every.volume_m3 is not None
+    hand = placed_hand(clip, "right", hands)
+    volume = hand.over_clip(SolidOverlap(shape.index).volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad), np.nan)
+    np.testing.assert_array_equal(found.depth_m, deepest_m(hand, shape.index))
     deepest = int(np.nanargmax(found.depth_m))
     assert deepest > 2  # not the first in which the hand is there
-    assert every.volume_m3[deepest] > 1e-7
-    assert found.deepest_volume_m3 == pytest.approx(every.volume_m3[deepest], rel=1e-12)
+    assert volume[deepest] > 1e-7
+    assert found.deepest_volume_m3 == pytest.approx(volume[deepest], rel=1e-12)
 
 
 def test_bits_of_touched_vertices_lie_as_the_layout_says(written):

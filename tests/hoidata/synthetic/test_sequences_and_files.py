@@ -13,7 +13,7 @@ from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints
 from hoidata.objects.mesh import load_mesh
 from hoidata.synthetic.check import sequence_figures
-from hoidata.synthetic.corpus import write_raw
+from hoidata.synthetic.corpus import write_raw_sequence, write_shared_files
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.grasps import closes_force
 from hoidata.synthetic.soundness import measure
@@ -25,8 +25,7 @@ ONE_ACTION = {"h2o": 0, "grab": 1, "arctic": 1}
 
 def _one(dataset: str) -> TruthSequence:
     task = next(task for task in tasks_of(dataset, 3, "small") if task.action == ONE_ACTION[dataset])
-    made = make_action(task._replace(entries=task.entries[:1]))
-    return place_in_raw_sequences(dataset, [truth for _, truth in made])[0]
+    return place_in_raw_sequences(dataset, make_action(task._replace(entries=task.entries[:1])))[0]
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,8 @@ def truths() -> dict[str, TruthSequence]:
 def root(truths, tmp_path_factory):
     folder = tmp_path_factory.mktemp("raw")
     for dataset, truth in truths.items():
-        write_raw(dataset, [truth], folder / dataset)
+        write_shared_files(dataset, folder / dataset, [truth])
+        write_raw_sequence(dataset, folder / dataset, [truth])
     return folder
 
 
@@ -216,4 +216,4 @@ def test_grab_clips_are_every_fourth_frame_of_the_contact(truths):
     assert (np.diff(frames) == 4).all()
     assert truth.contact[0] <= frames[0] < truth.contact[0] + 4
     assert truth.contact[1] - 4 <= frames[-1] < truth.contact[1]
-    assert truth.clip_truth().n_frames == len(frames)
+    assert truth.take(truth.clip_frames).n_frames == len(frames)

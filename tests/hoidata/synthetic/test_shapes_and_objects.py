@@ -8,7 +8,7 @@ from hoidata.objects.distance import signed_distance
 from hoidata.objects.mesh import mass_properties
 from hoidata.splits import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
-from hoidata.synthetic.field import MirroredField, gradient, grid_field
+from hoidata.synthetic.field import gradient, grid_field, mirrored
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 
 ALL = [(dataset, spec.name) for dataset, specs in OBJECTS.items() for spec in specs]
@@ -123,9 +123,9 @@ def test_far_from_the_grid_the_field_never_promises_more_room_than_there_is():
 
 def test_a_mirrored_field_is_the_field_of_the_mirrored_object():
     model = object_model("grab", "mug")
-    mirrored = grid_field(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1])
+    turned_round = grid_field(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1])
     points = np.random.default_rng(1).uniform(-0.08, 0.1, (600, 3))
-    seen, wanted = MirroredField(grid_field(model.vertices_m, model.faces))(points), mirrored(points)
+    seen, wanted = mirrored(grid_field(model.vertices_m, model.faces))(points), turned_round(points)
     near = wanted < 0.025
     assert near.sum() > 40
     assert np.abs(seen - wanted)[near].max() < 0.003

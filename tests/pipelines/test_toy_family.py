@@ -1,0 +1,60 @@
+"""A model family is a folder and a row: one that learns is added to a copy of the project, and everything serves it."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from pipelines.lineage.provenance import read_checkpoint_metadata
+
+pytestmark = pytest.mark.slow
+FOLDER = Path(__file__).with_name("toy_family")
+
+
+def add_line(path: Path, before: str, line: str) -> None:
+    """Type one line in front of the first one that starts with ``before``."""
+    lines = path.read_text().splitlines(keepends=True)
+    at = next(number for number, text in enumerate(lines) if text.startswith(before))
+    path.write_text("".join([*lines[:at], line + "\n", *lines[at:]]))
+
+
+def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(project: Path, project_tools) -> None:
+    project_tools.set_present(project, {"grab"})
+    # Only so that the test is quick: Text2HOI's own stages would run as well.
+    (project / "models" / "text2hoi" / "dvc.yaml").unlink()
+    params = project / "params.yaml"
+    params.write_text(
+        "".join(
+            "families:\n" if line.startswith("families:") else line
+            for line in params.read_text().splitlines(keepends=True)
+            if line.strip() not in ("- text2hoi", "- text2hoi-coarse", "- other-prompt")
+        )
+    )
+    shutil.copytree(FOLDER, project / "models" / "toy", ignore=shutil.ignore_patterns("__pycache__"))
+    (project / "models" / "toy" / "__init__.py").touch()
+    typed = (
+        (project / "models" / "registry.py", '    "nearest-clip"', '    "toy": "models.toy.family:TOY",'),
+        (project / "models" / "registry.py", '    "contact"', '    "toy": "models.toy.family:NETWORK",'),
+        (params, "- nearest-clip", "- toy"),
+    )
+    for path, before, line in typed:
+        add_line(path, before, line)
+    print(f"lines typed outside the folder: {len(typed)}")
+    assert len(typed) <= 3
+
+    result = project_tools.run(project, "dvc", "repro", PYTHONPATH=str(project))
+    assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+
+    metadata = read_checkpoint_metadata(project / "checkpoints/embedded/grab/toy/model.safetensors")
+    assert metadata["provenance"]["datasets"] == {"grab": 4}
+    figures = json.loads((project / "metrics/embedded/grab/toy.json").read_text())
+    assert figures["motions"] == 2 * figures["held_out_clips"] > 0
+    assert 0 < figures["figures"]["joint_error_mm"] < 1000
+    page = (project / "report/embedded/index.html").read_text()
+    assert "toy" in page
+
+    again = project_tools.run(project, "dvc", "repro", PYTHONPATH=str(project))
+    assert "Running stage 'models/toy" not in again.stdout
+    lineage = project_tools.run(project, "hoidata", "lineage", "checkpoints/embedded/grab/toy", PYTHONPATH=str(project))
+    assert lineage.returncode == 0, lineage.stdout + lineage.stderr
