@@ -9,7 +9,7 @@ import pytest
 from hoidata.clips import Clip
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.quality.measures import ObjectFacts, clip_row, object_row
+from hoidata.quality.measures import ObjectFacts, clip_row, object_motion, object_row
 from hoidata.quality.thresholds import (
     CLIP_MEASURES,
     DEFAULT_LIMITS,
@@ -288,3 +288,13 @@ def test_limit_of_an_unknown_measure_is_refused():
         Thresholds(limits={name: limit for name, limit in DEFAULT_LIMITS.items() if name != "size_m"})
     with pytest.raises(BadInput, match="penetration_every"):
         Thresholds(penetration_every=0)
+
+
+def test_each_parts_pose_carries_its_points_through_the_world(make_clip):
+    track = make_clip(6, articulated=True).object
+    facts = ObjectFacts.of(track.model)
+    found, moved = object_motion(track, facts), facts.part == 1
+    assert 0 < moved.sum() < len(moved)
+    for part, rows in enumerate((~moved, moved)):
+        placed = facts.points_m[rows] @ found.rotmats[part].transpose(0, 2, 1) + found.positions_m[part][:, None]
+        np.testing.assert_allclose(placed, found.points_m[:, rows], atol=1e-9)
