@@ -20,7 +20,8 @@ from models.common.checkpoints import load_checkpoint, save_checkpoint
 from models.common.corpus import batches
 from models.common.training import TrainingConfig, learning_rate_factor, train_network
 from models.registry import load_network
-from models.text2hoi.generation import GeneratedMotion, generate
+from models.text2hoi.generation import GeneratedMotion, _started_at_origin, generate
+from models.text2hoi.sampler import Text2HoiMotion
 from tests.models.toy import PARAMS, train
 
 
@@ -129,6 +130,16 @@ def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(tra
         assert np.isfinite(track_joints(track, load_embedded_hands()[side])).all()
     assert made.contact.shape == (1024,)
     assert len(made.clip.source_frames) == made.evidence["frames"] >= 8
+
+
+def test_a_motion_that_is_moved_to_the_origin_keeps_its_hands_at_the_object() -> None:
+    draws = torch.Generator().manual_seed(0)
+    parts = [torch.randn(shape, generator=draws) for shape in ((2, 4, 99), (2, 4, 99), (4, 10), (9,))]
+    given, found = Text2HoiMotion(*parts), _started_at_origin(Text2HoiMotion(*parts))
+    assert not found.object[0, :3].any()
+    for name in ("coarse", "refined"):
+        before, after = (getattr(own, name)[..., :3] - own.object[:, :3] for own in (given, found))
+        torch.testing.assert_close(after, before)
 
 
 def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import mirror_rotvec_x
@@ -99,6 +100,14 @@ def test_left_model_mirrors_the_right_one(pair):
     assert np.abs(left.shape_directions[:, 0] - right.shape_directions[:, 0]).sum() > 1
     rebuilt = pose_correctives(right.template_m, right.faces, right.skin_weights)
     np.testing.assert_array_equal(rebuilt, right.pose_directions)
+
+
+def test_the_back_of_a_bent_knuckle_rises(pair):
+    model, normals = pair.right, vertex_normals(pair.right.template_m, pair.right.faces)
+    bent = np.tile(Rotation.from_rotvec([0, 0, 0.5]).as_matrix() - np.eye(3), (15, 1, 1)).ravel()
+    risen_m = ((model.pose_directions @ bent) * normals).sum(axis=1)[normals[:, 1] > 0.9]
+    assert risen_m.max() > 0.0003
+    assert risen_m.min() >= 0
 
 
 def test_size_follows_the_first_beta_by_a_centimetre_of_hand_length(pair):

@@ -18,10 +18,12 @@ HANDS = load_embedded_hands()
 
 
 def with_shared_tips(model: HandModel) -> HandModel:
-    """Tips that follow several joints, as in MANO; those of the embedded hand follow one each."""
-    weights = model.skin_weights.copy()
-    weights[list(TIP_VERTICES)] = np.random.default_rng(8).dirichlet(np.full(16, 0.3), 5)
-    return replace(model, skin_weights=weights)
+    """Tips that follow several joints and move with every pose, as in MANO; the embedded hand's are simpler."""
+    rng, tips = np.random.default_rng(8), list(TIP_VERTICES)
+    weights, pose = model.skin_weights.copy(), model.pose_directions.copy()
+    weights[tips] = rng.dirichlet(np.full(16, 0.3), 5)
+    pose[tips] += rng.normal(0, 1e-3, pose[tips].shape)
+    return replace(model, skin_weights=weights, pose_directions=pose)
 
 
 def layer_joints_m(track: HandTrack, model: HandModel) -> np.ndarray:
