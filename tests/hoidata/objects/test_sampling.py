@@ -120,3 +120,22 @@ def grid(columns: int, rows: int, longest_edge_m: float) -> ObjectModel:
 )
 def test_vertices_serve_from_1024_of_them_and_up_to_edges_of_2_cm(columns, rows, longest_edge_m, method) -> None:
     assert sample_points(grid(columns, rows, longest_edge_m)).method == method
+
+
+def test_vertices_at_the_seam_of_two_parts_take_a_face_of_their_own() -> None:
+    sphere = trimesh.creation.icosphere(4, radius=0.05)
+    part = (sphere.vertices[:, 2] > 0).astype(np.uint8)
+    model = ObjectModel("split", np.array(sphere.vertices), np.array(sphere.faces), part)
+    points = sample_points(model)
+    np.testing.assert_array_equal(points.part, points.points_m[:, 2] > 0)
+    np.testing.assert_array_equal(model.face_part[points.face], points.part)
+
+
+def test_parts_that_lie_on_each_other_keep_their_own_normals() -> None:
+    sphere = trimesh.creation.icosphere(4, radius=0.05)
+    lining = ObjectModel(
+        "in", np.array(sphere.vertices), sphere.faces[:, ::-1], np.zeros(len(sphere.vertices), np.uint8)
+    )
+    points = sample_points(two_parts(model_of(sphere), lining, (1, 0, 0)))
+    outwards = np.where(points.part == 1, -1, 1)[:, None] * points.points_m / 0.05
+    np.testing.assert_allclose(points.normals, outwards, atol=0.01)
