@@ -1,44 +1,31 @@
-"""Every count of the papers and of the datasets that needs no data, beside the code that must agree with it.
+"""Counts of the papers and of the datasets that needs no data, beside the code that must agree with it.
 
 Numbers are typed from the papers (section or table named) and from what the datasets' makers publish. How many clips a
 paper counts (Text2HOI: 660, 1,335 and 4,597) can only be checked on the licensed files.
 """
 
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 
-from hoidata.annotation.grammar import default_grammar
-from hoidata.annotation.sentences import FORMS, HAND_PHRASES, four_sentences
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.clips import HandTrack
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.contact.settings import ContactSettings
-from hoidata.datasets.grab.words import INTENTS, OBJECTS
+from hoidata.datasets.grab.words import OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.objects.sampling import sample_points
 from hoidata.splits.definitions import definitions_for
 from hoidata.splits.published import published
 from models.common.sampling import alphas_cumprod
 from models.common.transformer import Encoder, TransformerConfig
-from models.text2hoi.contact import ContactConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
-from models.text2hoi.length import LengthConfig
-from pipelines.lineage.graph import read_params
 
-PROJECT = Path(__file__).parents[1]
 H2O_OBJECTS = {"book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino"}
 H2O_VERBS = ("grab", "place", "open", "close", "pour", "take out", "put in", "apply", "read", "spray", "squeeze")
 ARCTIC_OBJECTS = {"box", "capsulemachine", "espressomachine", "ketchup", "laptop", "microwave", "mixer", "notebook",
                   "phone", "scissors", "waffleiron"}  # fmt: skip
-ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
-GRAB_VERBS = {"hand over", "browse", "brush", "call", "chop", "clean", "cook", "drink", "eat", "fly", "inspect", "lift",
-              "open", "pass", "peel", "play", "pour", "screw", "see", "set", "shake", "squeeze", "stamp", "staple",
-              "switch on", "take a picture with", "toast", "use", "wear"}  # fmt: skip
 
 
 class TestH2O:
@@ -50,14 +37,6 @@ class TestH2O:
         assert len(set(ACTIONS)) == 37
         assert {noun for _, noun in ACTIONS[1:]} == H2O_OBJECTS
         assert list(dict.fromkeys(verb for verb, _ in ACTIONS[1:])) == list(H2O_VERBS)
-
-    @pytest.mark.parametrize(
-        ("label", "action"),
-        [(1, "grab book"), (16, "place cappuccino"), (19, "open chips"), (23, "pour milk"), (27, "take out cappuccino"),
-         (30, "put in cappuccino"), (32, "apply spray"), (34, "read espresso"), (36, "squeeze lotion")],
-    )  # fmt: skip
-    def test_action_labels_mean_what_the_list_says(self, label, action):
-        assert " ".join(ACTIONS[label]) == action
 
     def test_184_sequences_with_eight_gaps_of_the_full_grid(self):
         grid = {
@@ -91,11 +70,6 @@ class TestGrab:
         assert Counter(words.split()[1] for words in sized) == dict.fromkeys(
             ("cube", "cylinder", "pyramid", "sphere", "torus"), 3
         )
-
-    def test_29_intents_with_three_renamed(self):
-        assert set(INTENTS.values()) == GRAB_VERBS
-        assert len(INTENTS) == 29
-        assert {key for key, verb in INTENTS.items() if key != verb} == {"offhand", "switchON", "takepicture"}
 
     def test_the_official_split_leaves_41_objects_for_training(self):
         rule = definitions_for("grab")["official"].rule
@@ -144,25 +118,6 @@ class TestBimArt:
 
 
 class TestText2Hoi:
-    def test_four_sentences_per_text(self):
-        """Supplement 6: 272, 1,104 and 644 distinct sentences, which are four forms of 68, 276 and 161 texts."""
-        assert len(FORMS) == len(set(four_sentences("place", "book", "both"))) == 4
-        assert (68 * len(FORMS), 276 * len(FORMS), 161 * len(FORMS)) == (272, 1104, 644)
-
-    def test_h2os_68_texts_fit_into_its_actions_and_three_hand_types(self):
-        texts = {four_sentences(*action, hand) for action in ACTIONS[1:] for hand in HAND_PHRASES}
-        assert len(texts) == 36 * 3
-        assert len(texts) >= 68
-
-    def test_every_verb_of_the_three_datasets_has_its_forms_in_the_table(self):
-        """Supplement 6: 11, 29 and 11 action labels; "take picture" reads "take a picture with" here."""
-        assert (len(set(H2O_VERBS)), len(GRAB_VERBS), len(set(ARCTIC_VERBS))) == (11, 29, 11)
-        assert {*H2O_VERBS, *GRAB_VERBS, *ARCTIC_VERBS} - set(default_grammar().verbs) == set()
-
-    def test_an_object_is_1024_points(self, make_clip):
-        """Supplement, section 12: N = 1,024 points by farthest point sampling."""
-        assert sample_points(make_clip().object.model).points_m.shape == (1024, 3)
-
     def test_a_hand_has_778_vertices_and_21_joints(self):
         """Supplement, Table S3: V = 778, J = 21."""
         hand = load_embedded_hands().right
@@ -177,7 +132,6 @@ class TestText2Hoi:
     def test_contact_and_distances_end_at_2_centimetres(self):
         """Sections 3.2 and 3.3 name the threshold tau; its value is that of the authors' code."""
         assert ContactSettings() == ContactSettings(points=1024, threshold_m=0.02)
-        assert read_params(PROJECT)["contact"] == {}
 
     def test_noise_has_1000_steps(self):
         """Section 4.1: T = 1,000, cosine schedule (Nichol and Dhariwal 2021)."""
@@ -200,8 +154,8 @@ class TestText2Hoi:
         """Section 3.2: one condition, then three agents of 150 frames."""
         small = TransformerConfig(width=16, layers=1, heads=2, feed_forward=16)
         model = DiffusionModel(DiffusionConfig(transformer=small)).eval()
-        attention_mask: list[tuple[int, ...]] = []
-        model.encoder.register_forward_pre_hook(lambda _, inputs: attention_mask.append(tuple(inputs[0].shape)))
+        shapes: list[tuple[int, ...]] = []
+        model.encoder.register_forward_pre_hook(lambda _, inputs: shapes.append(tuple(inputs[0].shape)))
         condition = Condition(
             text=torch.ones(1, 512),
             object=torch.zeros(1, 1024),
@@ -213,12 +167,5 @@ class TestText2Hoi:
         )
         with torch.no_grad():
             hands, objects = model(torch.zeros(1, 2, 150, 99), torch.zeros(1, 150, 10), torch.zeros(1), condition)
-        assert attention_mask == [(1, 451, 16)]
+        assert shapes == [(1, 451, 16)]
         assert (hands.shape, objects.shape) == ((1, 2, 150, 99), (1, 150, 10))
-
-    def test_contact_and_length_networks_have_the_papers_sizes(self):
-        """Supplement, Tables S4 to S6: z of 64, F_obj of 1,024, text of 512, decoder 512-256-128."""
-        contact = ContactConfig()
-        assert (contact.latent, contact.text, contact.decoder_widths) == (64, 512, (512, 256, 128))
-        assert contact.point_net.widths == (64, 128, 1024)
-        assert LengthConfig().text == 512

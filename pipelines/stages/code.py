@@ -78,7 +78,8 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         chosen = _chosen_by_dataset(tree, dataset)
         found |= {f"{stage}/{dataset}": _start(stage, chosen) for stage in STAGES_OF_DATASETS}
         every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
-    for network in dict.fromkeys([*NETWORKS, *params["train"][params["train"]["size"]]]):
+    sizes = [section for section in params["train"].values() if isinstance(section, dict)]
+    for network in dict.fromkeys([*NETWORKS, *(name for section in sizes for name in section)]):
         found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))

@@ -6,7 +6,7 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from tests.bench import adapters, kernels, physics, realism, scale, store, surface, text, whole
+from tests.bench import adapters, kernels, physics, realism, scale, store, surface, text
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -17,7 +17,6 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
-    "whole": whole.main,
 }
 
 

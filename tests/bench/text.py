@@ -24,14 +24,10 @@ from hoidata.annotation.sentences import four_sentences
 from hoidata.datasets.grab.words import INTENTS, OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from tests.bench.harness import Times, medians, show
+from tests.builders.words import ARCTIC_OBJECTS, ARCTIC_VERBS
 
 RUNS, SAMPLE, CLIP_SAMPLE = 7, 400, 16
 GOAL_S = 60
-ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
-ARCTIC_OBJECTS = (
-    "box", "capsule machine", "espresso machine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
-    "scissors", "waffle iron",
-)  # fmt: skip
 VOCABULARIES = (
     (sorted({verb for verb, _ in ACTIONS[1:]}), sorted({noun for _, noun in ACTIONS[1:]})),
     (list(INTENTS.values()), list(OBJECTS.values())),

@@ -3,14 +3,9 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from hoidata.annotation.stage import annotate_store
 from hoidata.clips import Clip
-from hoidata.contact.stage import contact_store
-from hoidata.splits.stage import split_store
-from hoidata.store.info import generated_info
-from hoidata.store.store import write_store
+from tests.builders.stores import write_annotated
 
-RULE = {"by": "subject", "train": ["s1"], "validation": ["s2"], "test": ["s3"]}
 PLANS = (("s1", "right"), ("s2", "left"), ("s3", "right"), ("s3", "both"))
 
 
@@ -22,8 +17,5 @@ def write_annotated_dataset(
         make_clip(12, hand, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject)
         for seed, (subject, hand) in enumerate(PLANS)
     ]
-    write_store(root / "clips", clips, generated_info("toy"))
-    annotate_store(root / "clips", root / "annotation", encoder="hash")
-    contact_store(root / "clips", root / "contact", points=points, threshold_m=threshold_m)
-    split_store(root / "clips", root / "annotation", root / "splits", RULE)
+    write_annotated(root, clips, threshold_m=threshold_m, points=points)
     return root, {clip.clip_id: clip for clip in clips if clip.subject == "s3"}

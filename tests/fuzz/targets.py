@@ -175,7 +175,7 @@ def _numpy_files() -> list[Target]:
     objects = npy_mutation(PICKLE)
     reading = [numpy_files._read, *functions_of(npy_header)]
     members = [numpy_files.load_npz_objects, numpy_files._chosen_members, numpy_files._check_size]
-    members += [numpy_files._read_member, numpy_files._archive, numpy_files._item]
+    members += [numpy_files._read_member, numpy_files.open_archive, numpy_files._item]
     return [
         Target(
             "npy",

@@ -141,6 +141,10 @@ def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources
     np.testing.assert_allclose(
         joints_of(refined) - joints_of(coarse), np.broadcast_to(shift, joints_of(coarse).shape), atol=1e-5
     )
+    (made,) = model.motions([request])
+    assert (made.refined != made.coarse).any()
+    answered = [*model.sample([request]), *model.clips([request], [made], refined=True)]
+    np.testing.assert_array_equal(*map(joints_of, answered))
     plain = load_family("text2hoi-coarse").load(sources).sample([request])[0]
     unrefined = model.clips([request], model.motions([request], refined=False), refined=False)[0]
     np.testing.assert_array_equal(joints_of(plain), joints_of(unrefined))

@@ -20,10 +20,12 @@ from models.common.checkpoints import load_checkpoint, save_checkpoint
 from models.common.corpus import batches
 from models.common.training import TrainingConfig, learning_rate_factor, train_network
 from models.registry import load_network
-from models.text2hoi.generation import GeneratedMotion, generate
+from models.text2hoi.generation import GeneratedMotion, _started_at_origin, generate
+from models.text2hoi.sampler import Text2HoiMotion
 from tests.models.toy import PARAMS, train
 
 
+@pytest.mark.slow
 def test_training_twice_gives_the_same_bytes(annotated_root: Path, trained: Path, tmp_path: Path) -> None:
     for name in PARAMS:
         again = train(name, annotated_root, tmp_path)
@@ -58,7 +60,7 @@ def test_the_log_has_training_and_validation_losses(trained: Path) -> None:
     header, *rows = (trained / "diffusion" / "log.csv").read_text().splitlines()
     expected = "step,validation,train_total,train_simple,train_distance_map,train_relative_orientation"
     assert header == expected
-    assert [row.split(",")[0] for row in rows] == ["2", "4"]
+    assert [row.split(",")[0] for row in rows] == ["1", "2"]
 
 
 def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -> None:
@@ -128,6 +130,16 @@ def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(tra
         assert np.isfinite(track_joints(track, load_embedded_hands()[side])).all()
     assert made.contact.shape == (1024,)
     assert len(made.clip.source_frames) == made.evidence["frames"] >= 8
+
+
+def test_a_motion_that_is_moved_to_the_origin_keeps_its_hands_at_the_object() -> None:
+    draws = torch.Generator().manual_seed(0)
+    parts = [torch.randn(shape, generator=draws) for shape in ((2, 4, 99), (2, 4, 99), (4, 10), (9,))]
+    given, found = Text2HoiMotion(*parts), _started_at_origin(Text2HoiMotion(*parts))
+    assert not found.object[0, :3].any()
+    for name in ("coarse", "refined"):
+        before, after = (getattr(own, name)[..., :3] - own.object[:, :3] for own in (given, found))
+        torch.testing.assert_close(after, before)
 
 
 def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:

@@ -9,7 +9,7 @@ POINT_NET = {"widths": [16, 32, 64], "heads": [32, 16], "align": False}
 TRANSFORMER = {
     "width": 32, "layers": 1, "heads": 2, "feed_forward": 64, "dropout": 0.1, "norm_first": True, "frames_per_token": 5,
 }  # fmt: skip
-BUDGET = {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "ema_decay": 0.5}
+BUDGET = {"steps": 2, "batch": 2, "learning_rate": 0.001, "validate_every": 1, "ema_decay": 0.5}
 PARAMS = {
     "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
     "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},

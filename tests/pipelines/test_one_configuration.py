@@ -65,8 +65,8 @@ def test_the_contact_threshold_changes_labels_hand_types_masks_and_words_alike(w
     assert (touch_words(wide), touch_words(narrow)) == ("within 2 cm of a joint", "within 1 cm of a joint")
     samples = [next(iter(HoiDataset(store, "train"))) for store in (wide, narrow)]
     assert [sample.contact_threshold_m for sample in samples] == [0.02, 0.01]
-    np.testing.assert_array_equal(samples[1].touched, narrow.contact(key).astype(bool))
-    assert samples[1].touched.sum() < samples[0].touched.sum()
+    np.testing.assert_array_equal(samples[1].contact_map, narrow.contact(key).astype(bool))
+    assert samples[1].contact_map.sum() < samples[0].contact_map.sum()
 
 
 def test_the_losses_of_a_batch_use_the_threshold_it_was_made_with(wide_and_narrow):

@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 PROJECT = Path(__file__).parents[2]
-MAY_LEAVE = ("raw.json", "metrics/")  # digests and figures
+MAY_LEAVE = ("raw.json", "metrics/", "code")  # digests and figures
 
 
 def outputs(project: Path) -> dict[str, dict]:

@@ -28,6 +28,8 @@ def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(project: Pa
     (project / "models" / "text2hoi" / "dvc.yaml").unlink()
     shutil.copytree(FOLDER, project / "models" / "toy", ignore=shutil.ignore_patterns("__pycache__"))
     (project / "models" / "toy" / "__init__.py").touch()
+    # Under its own name DVC would take the file for one of this project's.
+    (project / "models" / "toy" / "stages.yaml").rename(project / "models" / "toy" / "dvc.yaml")
     typed = (
         (project / "models" / "registry.py", '    "nearest-clip"', '    "toy": "models.toy.family:TOY",'),
         (project / "models" / "registry.py", '    "contact"', '    "toy": "models.toy.family:NETWORK",'),

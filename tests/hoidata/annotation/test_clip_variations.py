@@ -19,17 +19,13 @@ from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, four_sentences
 from hoidata.annotation.stage import annotate_store
 from hoidata.annotation.variations import SentenceMaker
-from hoidata.clips import Clip, HandTrack, ObjectTrack
-from hoidata.contact.stage import contact_store
-from hoidata.errors import BadInput
-from hoidata.objects.model import ObjectModel
-from hoidata.splits.stage import split_store
+from hoidata.clips import Clip, HandTrack, Side
 from hoidata.store.annotated import load_annotated
-from hoidata.store.info import generated_info
-from hoidata.store.store import write_store
+from tests.builders.clips import clip_of, flat_hand, still_object
+from tests.builders.objects import box_model
+from tests.builders.stores import write_annotated
 
 FRAMES = 12
-RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
 WORDS = [("lift", "box", "left"), ("open", "laptop", "both"), ("take out", "milk", "right"), (None, "teapot", "both")]
 
 
@@ -142,40 +138,21 @@ def test_hand_speed_is_the_mean_over_valid_tenths_of_a_second() -> None:
     assert hand_speed_m_s({"left": moving}, {"left": ~everywhere}) is None
 
 
-def hand(wrist_m: np.ndarray) -> HandTrack:
-    zeros, pose = np.zeros((FRAMES, 3), np.float32), np.zeros((FRAMES, 45), np.float32)
-    return HandTrack(wrist_m.astype(np.float32), zeros, pose, np.zeros((1, 10), np.float32), np.ones(FRAMES, bool))
-
-
 def clip(number: int, **facts) -> Clip:
     """The left hand lies on a small box and moves a little, the faster the higher the number; the right is far away
     and moves the faster the lower the number.
     """
-    corners = np.array([[x, y, z] for x in (-0.03, 0.03) for y in (-0.03, 0.03) for z in (-0.03, 0.03)])
-    faces = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
-                      [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]])  # fmt: skip
-    model = ObjectModel("box", corners, faces, np.zeros(8, np.uint8))
-    way = np.linspace(0, 1, FRAMES)[:, None] * np.array([0.001 * number, 0, 0])
-    other = np.linspace(0, 1, FRAMES)[:, None] * np.array([0.003 * (15 - number), 0, 0])
-    still = np.zeros((FRAMES, 3), np.float32)
-    return Clip(
-        f"toy/s{number % 4}/{number:02d}", "toy", f"s{number % 4}", f"{number:02d}",
-        {"left": hand(way + np.array([0, 0, 0.04])), "right": hand(other + np.array([0, 0, 2]))},
-        ObjectTrack(model, still, still),
-        np.arange(FRAMES, dtype=np.int32), np.array([0.0, 0, -1]), facts.get("verb", "lift"),
-        facts.get("object_words", "box"), synthetic=True,
-    )  # fmt: skip
+    share = np.linspace(0, 1, FRAMES)[:, None]
+    left, right = share * [0.001 * number, 0, 0] + [0, 0, 0.04], share * [0.003 * (15 - number), 0, 0] + [0, 0, 2]
+    track = still_object(box_model((0.06, 0.06, 0.06)), FRAMES)
+    hands: dict[Side, HandTrack] = {"left": flat_hand(left), "right": flat_hand(right)}
+    return clip_of(f"toy/s{number % 4}/{number:02d}", track, hands, **facts)
 
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("plain")
     made = [clip(number) for number in range(1, 15)] + [clip(15, object_words="")]
-    write_store(root / "clips", made, generated_info("toy"))
-    annotate_store(root / "clips", root / "annotation", encoder="hash")
-    contact_store(root / "clips", root / "contact")
-    split_store(root / "clips", root / "annotation", root / "splits", RULE)
-    return root
+    return write_annotated(tmp_path_factory.mktemp("plain"), made)
 
 
 def annotated_as(plain: Path, root: Path, **settings):
@@ -220,11 +197,6 @@ def test_reference_forms_are_written_where_asked_for(plain: Path, tmp_path: Path
     assert all(after.sentences(key) == reference_sentences("lift", "box", "left") for key in after.ids())
     assert after.annotation_info["forms"] == "reference"
     assert after.ids() == load_annotated(plain).ids()
-
-
-def test_unknown_forms_are_refused(plain: Path, tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="paper or reference"):
-        annotate_store(plain / "clips", tmp_path / "annotation", encoder="hash", forms="poem")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("state", ["cold", "warm", "damaged", "one bit flipped"])

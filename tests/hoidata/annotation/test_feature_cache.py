@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hoidata.annotation.encoders import HashEncoder
-from hoidata.annotation.feature_cache import MOST_FILES, DiskCachedEncoder, FeatureCache
+from hoidata.annotation.feature_cache import MOST_FILES, DiskCachedEncoder
 
 TEXTS = [f"Lift object {number} with both hands." for number in range(40)]
 
@@ -117,14 +117,6 @@ def test_features_changed_behind_a_sound_archives_back_are_noticed(tmp_path: Pat
     assert DiskCachedEncoder(HashEncoder(), tmp_path).encode(TEXTS).tobytes() == first.tobytes()
 
 
-def test_features_of_another_size_are_left_out_though_their_digest_is_right(tmp_path: Path) -> None:
-    encoder = HashEncoder()
-    for wrong in (encoder.encode(TEXTS)[:, :100], encoder.encode(TEXTS[1:])):
-        FeatureCache(tmp_path, encoder.identity).add(TEXTS, wrong)
-        assert DiskCachedEncoder(encoder, tmp_path).encode(TEXTS).tobytes() == encoder.encode(TEXTS).tobytes()
-        assert [kept.features.shape for kept in FeatureCache(tmp_path, encoder.identity).files()] == [(40, 512)]
-
-
 def test_many_small_files_become_one_and_nothing_is_lost(tmp_path: Path) -> None:
     for text in TEXTS[: MOST_FILES + 1]:
         DiskCachedEncoder(HashEncoder(), tmp_path).encode([text])
@@ -132,15 +124,6 @@ def test_many_small_files_become_one_and_nothing_is_lost(tmp_path: Path) -> None
     inner = Counting()
     DiskCachedEncoder(inner, tmp_path).encode(TEXTS[: MOST_FILES + 1])
     assert len(inner.seen) == 1
-
-
-def test_a_file_that_holds_all_the_others_outlives_their_merging(tmp_path: Path) -> None:
-    encoder = HashEncoder()
-    cache = FeatureCache(tmp_path, encoder.identity)
-    for count in range(1, MOST_FILES + 2):
-        cache.add(TEXTS[:count], encoder.encode(TEXTS[:count]))
-    [kept] = cache.files()
-    assert kept.texts == TEXTS[: MOST_FILES + 1]
 
 
 def test_a_folder_that_cannot_be_written_costs_a_message(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -6,47 +6,33 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-import trimesh
 
-from hoidata.annotation.hand_distances import hand_types_at, write_hand_distances
+from hoidata.annotation.hand_distances import hand_types_at
 from hoidata.annotation.stage import annotate_store
-from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.clips import SIDES, Clip, Side
 from hoidata.contact.hands import acting_hands
 from hoidata.contact.proximity import ProximityIndex
-from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz, write_npz
-from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
-from hoidata.splits.stage import split_store
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.hand_evidence import HandDistances, HandEvidence
-from hoidata.store.info import generated_info
-from hoidata.store.store import write_store
+from tests.builders.clips import clip_of, flat_hand, still_object
+from tests.builders.objects import box_model
+from tests.builders.stores import write_annotated
 
-RULE = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
-HEIGHTS_M = {"toy/1": (0.012, 0.5), "toy/2": (0.5, 0.015), "toy/3": (0.033, 0.018), "toy/4": (0.3, 0.4)}
+BOX = box_model((0.06, 0.06, 0.2))
+HEIGHTS_M = {"toy/s1/1": (0.012, 0.5), "toy/s2/2": (0.5, 0.015), "toy/s3/3": (0.033, 0.018), "toy/s4/4": (0.3, 0.4)}
 THRESHOLDS_M = (0.001, 0.0125, 0.02, 0.03, 0.06, 0.45, 2.0)
 
 
 def clip(name: str, heights_m: tuple[float, float], frames: int) -> Clip:
     """Each hand comes down to its height above a box and goes up again; the right hand is lost in the last frame."""
-    box = trimesh.creation.box((0.06, 0.06, 0.2))
-    model = ObjectModel("box", box.vertices, box.faces, np.zeros(8, np.uint8))
-    dip = np.abs(np.linspace(-0.05, 0.05, frames)).astype(np.float32)
-    hands: dict[Side, HandTrack] = {}
+    dip, hands = np.abs(np.linspace(-0.05, 0.05, frames)), {}
     for side, height in zip(SIDES, heights_m, strict=True):
-        wrist = np.zeros((frames, 3), np.float32)
-        wrist[:, 2] = 0.1 + height + dip
-        zeros, pose = np.zeros((frames, 3), np.float32), np.zeros((frames, 45), np.float32)
-        valid = np.arange(frames) < frames - (side == "right")
-        hands[side] = HandTrack(wrist, zeros, pose, np.zeros((1, 10), np.float32), valid)
-    still = np.zeros((frames, 3), np.float32)
-    subject = f"s{name[-1]}"
-    return Clip(
-        name, "toy", subject, subject, hands, ObjectTrack(model, still, still),
-        np.arange(frames, dtype=np.int32), np.array([0.0, 0, -1]), "lift", "box", synthetic=True,
-    )  # fmt: skip
+        wrist = np.stack([0 * dip, 0 * dip, 0.1 + height + dip], axis=1)
+        hands[side] = flat_hand(wrist, np.arange(frames) < frames - (side == "right"))
+    return clip_of(name, still_object(BOX, frames), hands)
 
 
 def made() -> list[Clip]:
@@ -55,12 +41,7 @@ def made() -> list[Clip]:
 
 @pytest.fixture(scope="module")
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    root = tmp_path_factory.mktemp("toy")
-    write_store(root / "clips", made(), generated_info("toy"))
-    annotate_store(root / "clips", root / "annotation", encoder="hash")
-    contact_store(root / "clips", root / "contact")
-    split_store(root / "clips", root / "annotation", root / "splits", RULE)
-    return root
+    return write_annotated(tmp_path_factory.mktemp("toy"), made())
 
 
 @pytest.fixture(scope="module")
@@ -101,17 +82,11 @@ def test_another_threshold_gives_what_a_run_of_the_stage_with_it_gives(
     assert types == {None, "left", "right", "both"}
 
 
-def test_the_distances_do_not_depend_on_the_threshold(root: Path, tmp_path: Path) -> None:
-    annotate_store(root / "clips", tmp_path / "other", encoder="hash", threshold_m=0.06)
-    name = "hand_distance.npz"
-    assert (tmp_path / "other" / name).read_bytes() == (root / "annotation" / name).read_bytes()
-
-
 def test_a_threshold_just_above_and_at_the_smallest_distance(annotated: AnnotatedStore) -> None:
     """A hand acts strictly below the threshold, judged by the exact minimum and not by its float32 rounding."""
-    smallest = annotated.hand_evidence("toy/1").closest_m("left")
-    assert annotated.hand_evidence("toy/1", smallest).hand_type is None
-    assert annotated.hand_evidence("toy/1", np.nextafter(smallest, 1)).hand_type == "left"
+    smallest = annotated.hand_evidence("toy/s1/1").closest_m("left")
+    assert annotated.hand_evidence("toy/s1/1", smallest).hand_type is None
+    assert annotated.hand_evidence("toy/s1/1", np.nextafter(smallest, 1)).hand_type == "left"
 
 
 def test_a_frame_at_the_threshold_is_not_near() -> None:
@@ -121,7 +96,7 @@ def test_a_frame_at_the_threshold_is_not_near() -> None:
 
 def test_frames_are_judged_one_by_one(annotated: AnnotatedStore) -> None:
     """The right hand is 6.5, 4.5, 2.5, 2.5, 4.5 cm above the box and then lost."""
-    evidence = annotated.hand_evidence("toy/2", 0.05)
+    evidence = annotated.hand_evidence("toy/s2/2", 0.05)
     assert evidence.near("right").tolist() == [False, True, True, True, True, False]
     assert evidence.at_threshold(0.03).near("right").tolist() == [False, False, True, True, False, False]
     assert not evidence.near("left").any()
@@ -130,11 +105,11 @@ def test_frames_are_judged_one_by_one(annotated: AnnotatedStore) -> None:
 def test_a_worker_maps_the_distances_anew_and_is_not_sent_them(root: Path) -> None:
     opened = load_annotated(root)
     size = len(pickle.dumps(opened))
-    before = opened.hand_evidence("toy/3")
+    before = opened.hand_evidence("toy/s3/3")
     sent = pickle.dumps(opened)
     assert len(sent) == size
     np.testing.assert_array_equal(
-        pickle.loads(sent).hand_evidence("toy/3").distance_m["left"], before.distance_m["left"]
+        pickle.loads(sent).hand_evidence("toy/s3/3").distance_m["left"], before.distance_m["left"]
     )
 
 
@@ -156,9 +131,3 @@ def test_no_length_is_no_threshold(root: Path) -> None:
     for wrong in (0.0, -0.02, float("nan")):
         with pytest.raises(BadInput, match="metres above 0"):
             hand_types_at(root / "annotation", wrong)
-
-
-def test_no_clips_give_no_distances(tmp_path: Path) -> None:
-    write_hand_distances(tmp_path / "hand_distance.npz", [])
-    with pytest.raises(IndexError):
-        HandDistances(tmp_path / "hand_distance.npz", 0).of(0)

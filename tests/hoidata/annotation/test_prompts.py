@@ -12,12 +12,8 @@ from hoidata.annotation.reference_mode import reference_sentences, reference_wor
 from hoidata.annotation.sentences import four_sentences
 from hoidata.datasets.grab.words import INTENTS, OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
+from tests.builders.words import ARCTIC_OBJECTS, ARCTIC_VERBS
 
-ARCTIC_VERBS = ("close", "cut", "grasp", "lift", "open", "operate", "place", "point", "shake", "sprinkle", "type")
-ARCTIC_OBJECTS = (
-    "box", "capsule machine", "espresso machine", "ketchup", "laptop", "microwave", "mixer", "notebook", "phone",
-    "scissors", "waffle iron",
-)  # fmt: skip
 # Every verb with every object: 36 of H2O's pairs and 55 of ARCTIC's are real actions, GRAB's are all.
 PAIRS = [
     *product(sorted({verb for verb, _ in ACTIONS[1:]}), sorted({noun for _, noun in ACTIONS[1:]})),

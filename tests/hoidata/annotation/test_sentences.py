@@ -59,6 +59,11 @@ def test_sentences_of_known_words_read_right(verb: str | None, words: str, hand,
     ("verb", "words", "expected"),
     [
         ("zip up", "jacket", "A jacket is zipped up by the left hand."),
+        ("zip up", "gloves", "Gloves are zipped up by the left hand."),
+        ("pour out", "coffee", "Coffee is poured out by the left hand."),
+        ("spread", "almond butter", "Almond butter is spread by the left hand."),
+        ("pump", "soap dispenser", "A soap dispenser is pumped by the left hand."),
+        ("unclip", "hour glass", "An hour glass is unclipped by the left hand."),
         ("unfold", "oat milk", "Oat milk is unfolded by the left hand."),
         ("grip", "garden shears", "Garden shears are gripped by the left hand."),
         ("swap", "pair of socks", "A pair of socks is swapped by the left hand."),
@@ -107,50 +112,6 @@ def test_with_its_rows_masked_the_rules_agree_with_nearly_the_whole_table(masked
     assert sum(verbs.values()) >= 0.97 * len(verbs)
     assert sum(phrases.values()) >= 0.97 * len(phrases)
     assert missed == [("take a picture with", "past_participle"), "cappuccino", "espresso", "spray"]
-
-
-def test_the_shipped_table_is_loaded_as_written() -> None:
-    grammar = default_grammar()
-    for row in table_rows("verb"):
-        forms = grammar.verb(row["base"])
-        assert [forms.gerund, forms.past_participle, forms.third_singular] == [
-            row["gerund"], row["past_participle"], row["third_singular"],
-        ]  # fmt: skip
-    for row in table_rows("object"):
-        noun = grammar.noun(row["base"])
-        assert (noun.words, noun.number) == (row["noun_phrase"], row["number"])
-    assert (len(grammar.verbs), len(grammar.nouns)) == (len(table_rows("verb")), len(table_rows("object")))
-
-
-@pytest.mark.parametrize(
-    ("verb", "words", "expected"),
-    [
-        # verbs with particles keep them together in every form
-        ("take out", "scissors", ("Take out scissors with the left hand.", "Scissors are taken out by the left hand.",
-                                  "The left hand takes out scissors.", "Taking out scissors with the left hand.")),
-        # plurals known by rule only
-        ("zip up", "gloves", ("Zip up gloves with the left hand.", "Gloves are zipped up by the left hand.",
-                              "The left hand zips up gloves.", "Zipping up gloves with the left hand.")),
-        # mass nouns known by rule only
-        ("pour out", "coffee", ("Pour out coffee with the left hand.", "Coffee is poured out by the left hand.",
-                                "The left hand pours out coffee.", "Pouring out coffee with the left hand.")),
-        ("spread", "almond butter", ("Spread almond butter with the left hand.",
-                                     "Almond butter is spread by the left hand.",
-                                     "The left hand spreads almond butter.",
-                                     "Spreading almond butter with the left hand.")),
-        # a countable noun whose words hold a mass noun or a plural
-        ("pump", "soap dispenser", ("Pump a soap dispenser with the left hand.",
-                                    "A soap dispenser is pumped by the left hand.",
-                                    "The left hand pumps a soap dispenser.",
-                                    "Pumping a soap dispenser with the left hand.")),
-        ("unclip", "hour glass", ("Unclip an hour glass with the left hand.",
-                                  "An hour glass is unclipped by the left hand.",
-                                  "The left hand unclips an hour glass.",
-                                  "Unclipping an hour glass with the left hand.")),
-    ],
-)  # fmt: skip
-def test_plural_mass_and_particle_words_stand_right_in_all_four_sentences(verb, words, expected) -> None:
-    assert four_sentences(verb, words, "left") == expected
 
 
 @pytest.mark.parametrize(

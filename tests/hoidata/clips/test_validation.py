@@ -6,14 +6,7 @@ import pytest
 from hoidata.clips import BodyTrack, CameraTrack, SourceContact
 from hoidata.clips.validation import check_clip
 from hoidata.errors import BadInput
-
-
-def with_hand(clip, **changes):
-    return replace(clip, hands={**clip.hands, "right": replace(clip.hands["right"], **changes)})
-
-
-def with_object(clip, **changes):
-    return replace(clip, object=replace(clip.object, **changes))
+from tests.builders.clips import with_hand, with_object
 
 
 def with_mesh(clip, scale):

@@ -6,36 +6,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips import SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.clips import SIDES, Clip, ObjectTrack
 from hoidata.contact.hands import acting_hands
 from hoidata.contact.maps import contact_maps, distance_entries, touched_frames
-from hoidata.contact.proximity import ENTRY, ProximityIndex
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints
+from tests.builders.clips import MIRROR, clip_of, in_another_world, mirror_image, with_hand
+from tests.builders.objects import sampled
 
 FRAMES, POINTS = 12, 300
 Joints = dict[str, np.ndarray]
-
-
-def hand_track(frames: int) -> HandTrack:
-    zeros = np.zeros((frames, 3), np.float32)
-    return HandTrack(zeros, zeros, np.zeros((frames, 45), np.float32), np.zeros((1, 10)), np.ones(frames, bool))
-
-
-def build_clip(track: ObjectTrack) -> Clip:
-    frames = track.n_frames
-    hands = {side: hand_track(frames) for side in SIDES}
-    return Clip("toy/1", "toy", "s1", "1", hands, track, np.arange(frames, dtype=np.int32), None, "lift", "box")
-
-
-def sampled(points: np.ndarray, part: np.ndarray | None = None) -> SampledPoints:
-    count = len(points)
-    part = np.zeros(count, np.uint8) if part is None else part
-    return SampledPoints(
-        points.astype(np.float32), np.zeros((count, 3), np.float32), np.zeros(count, np.int32),
-        np.zeros((count, 3), np.float32), part, "surface-fps",
-    )  # fmt: skip
 
 
 @pytest.fixture(params=[False, True], ids=["rigid", "articulated"])
@@ -48,7 +30,7 @@ def scene(request: pytest.FixtureRequest) -> tuple[Clip, Joints, SampledPoints]:
     model = ObjectModel("cloud", points, np.arange(POINTS).reshape(-1, 3), part, hinge)
     angle = np.linspace(-2.0, 1.5, FRAMES) if request.param else None
     track = ObjectTrack(model, random.normal(size=(FRAMES, 3)), random.normal(size=(FRAMES, 3)), angle)
-    clip = build_clip(track)
+    clip = clip_of("toy/s1/1", track)
     around = articulate(points, part, hinge, angle)
     centre = (track.world_from_object @ around).mean(axis=1)
     joints = {side: centre[:, None] + random.normal(0, 0.07, (FRAMES, 21, 3)) for side in SIDES}
@@ -63,15 +45,6 @@ def brute_force(clip: Clip, joints: np.ndarray, points: SampledPoints) -> np.nda
     world = np.einsum("fij,fpj->fpi", rotation, np.broadcast_to(local, (FRAMES, POINTS, 3)))
     world = world + track.translation_m[:, None]
     return np.linalg.norm(world[:, :, None] - joints[:, None], axis=3)
-
-
-def moved(clip: Clip, joints: Joints) -> tuple[Clip, Joints]:
-    """The same scene in another world frame."""
-    turn, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array([1.0, -2.0, 0.5])
-    rotvec = (turn * Rotation.from_rotvec(clip.object.rotvec)).as_rotvec()
-    track = replace(clip.object, rotvec=rotvec, translation_m=turn.apply(clip.object.translation_m) + shift)
-    turned = {side: turn.apply(array.reshape(-1, 3)).reshape(array.shape) + shift for side, array in joints.items()}
-    return replace(clip, object=track), turned
 
 
 def test_distance_maps_equal_brute_force(scene: tuple[Clip, Joints, SampledPoints]) -> None:
@@ -108,7 +81,9 @@ def test_hand_evidence_equals_brute_force(scene: tuple[Clip, Joints, SampledPoin
 
 def test_nothing_changes_when_the_world_turns_and_shifts(scene: tuple[Clip, Joints, SampledPoints]) -> None:
     clip, joints, points = scene
-    other_clip, other_joints = moved(clip, joints)
+    turn, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array([1.0, -2.0, 0.5])
+    other_clip = in_another_world(clip, turn, shift)
+    other_joints = {side: turn.apply(own.reshape(-1, 3)).reshape(own.shape) + shift for side, own in joints.items()}
     index = ProximityIndex(points)
     before, after = distance_entries(clip, joints, index), distance_entries(other_clip, other_joints, index)
     for side in SIDES:
@@ -128,19 +103,10 @@ def test_a_joint_exactly_at_the_threshold_gives_no_entry() -> None:
 def test_in_a_mirror_left_and_right_change_places(scene: tuple[Clip, Joints, SampledPoints]) -> None:
     """The mirror turns x: the object's rotation and hinge run the other way round, each hand becomes the other one."""
     clip, joints, points = scene
-    mirror, track, model = np.diag((-1.0, 1.0, 1.0)), clip.object, clip.object.model
-    hinge = model.hinge and Hinge(-mirror @ model.hinge.axis, mirror @ model.hinge.origin_m)
-    turn = mirror @ Rotation.from_rotvec(track.rotvec).as_matrix() @ mirror
-    image = replace(
-        track,
-        model=replace(model, vertices_m=model.vertices_m @ mirror, faces=model.faces[:, ::-1], hinge=hinge),
-        rotvec=Rotation.from_matrix(turn).as_rotvec(),
-        translation_m=track.translation_m @ mirror,
-    )
-    other_joints = {"left": joints["right"] @ mirror, "right": joints["left"] @ mirror}
-    other_points = replace(points, points_m=points.points_m @ mirror.astype(np.float32))
+    other_joints = {"left": joints["right"] * MIRROR, "right": joints["left"] * MIRROR}
+    other_points = replace(points, points_m=(points.points_m * MIRROR).astype(np.float32))
     before = distance_entries(clip, joints, ProximityIndex(points))
-    after = distance_entries(replace(clip, object=image), other_joints, ProximityIndex(other_points))
+    after = distance_entries(mirror_image(clip), other_joints, ProximityIndex(other_points))
     maps, other_maps = contact_maps(before, POINTS), contact_maps(after, POINTS)
     for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
         for column in ("frame", "point", "joint"):
@@ -165,7 +131,7 @@ def plane() -> tuple[Clip, SampledPoints]:
     """A flat square of points, 1/256 m apart (exact in float32), at rest in the plane z = 0."""
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(20), [0]), -1).reshape(-1, 3) / 256
     model = ObjectModel("plate", grid, np.arange(399).reshape(-1, 3), np.zeros(400, np.uint8))
-    return build_clip(ObjectTrack(model, np.zeros((2, 3)), np.zeros((2, 3)))), sampled(grid)
+    return clip_of("toy/s1/1", ObjectTrack(model, np.zeros((2, 3)), np.zeros((2, 3)))), sampled(grid)
 
 
 def hovering(left_m: float, right_m: float) -> Joints:
@@ -196,8 +162,7 @@ def test_another_threshold_needs_no_new_distances(plane) -> None:
 
 def test_an_invalid_frame_is_no_evidence(plane) -> None:
     clip, points = plane
-    unseen = replace(clip.hands["left"], valid=np.array([True, False]))
-    clip = replace(clip, hands={**clip.hands, "left": unseen})
+    clip = with_hand(clip, "left", valid=np.array([True, False]))
     joints, index = hovering(0.01, 0.01), ProximityIndex(points)
     assert acting_hands(clip, joints, index).hand_type == "right"
     assert len(distance_entries(clip, joints, index)["left"]) == 0
@@ -209,10 +174,6 @@ def test_a_joint_on_a_point_counts_with_distance_zero(plane) -> None:
     assert entries["distance_m"].min() == 0
     near = [(a, b) for a in range(-9, 10) for b in range(-9, 10) if (a * a + b * b) / 256**2 < 0.02**2]
     assert len(entries) == len(near)
-
-
-def test_an_entry_takes_9_bytes() -> None:
-    assert ENTRY.itemsize == 9
 
 
 def test_a_clip_too_long_to_count_is_refused(plane) -> None:

@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import mirror_rotvec_x
@@ -101,6 +102,14 @@ def test_left_model_mirrors_the_right_one(pair):
     np.testing.assert_array_equal(rebuilt, right.pose_directions)
 
 
+def test_the_back_of_a_bent_knuckle_rises(pair):
+    model, normals = pair.right, vertex_normals(pair.right.template_m, pair.right.faces)
+    bent = np.tile(Rotation.from_rotvec([0, 0, 0.5]).as_matrix() - np.eye(3), (15, 1, 1)).ravel()
+    risen_m = ((model.pose_directions @ bent) * normals).sum(axis=1)[normals[:, 1] > 0.9]
+    assert risen_m.max() > 0.0003
+    assert risen_m.min() >= 0
+
+
 def test_size_follows_the_first_beta_by_a_centimetre_of_hand_length(pair):
     def length_m(beta):
         betas = np.zeros((1, 10))
@@ -112,14 +121,6 @@ def test_size_follows_the_first_beta_by_a_centimetre_of_hand_length(pair):
     assert abs(length_m(1) - length_m(0) - 0.01) < 0.001
     deviations_m = np.sqrt((pair.right.shape_directions**2).sum(axis=1).mean(axis=0))
     assert (deviations_m > 5e-5).all()  # all ten components move the mesh
-
-
-def test_joints_stay_inside_the_hand_for_other_shapes(pair):
-    model = pair.right
-    for seed in range(5):
-        betas = np.random.default_rng(seed).normal(size=(1, 10))
-        shaped = model.template_m + model.shape_directions @ betas[0]
-        np.testing.assert_allclose(model.rest_joints_m(betas)[0], model.joint_regressor @ shaped, atol=1e-12)
 
 
 def test_pose_components_are_orthonormal_and_the_mean_is_a_curled_hand(pair):

@@ -45,6 +45,7 @@ def keypoints(betas: np.ndarray) -> dict[str, np.ndarray]:
     return {side: keypoints_of(waving_hand(side, betas, seed), side) for seed, side in enumerate(("left", "right"))}
 
 
+@pytest.mark.slow
 def test_hands_made_by_the_model_come_back_with_one_shape_for_both_sides(keypoints: dict) -> None:
     fits = fit_hands(keypoints, HANDS)
     np.testing.assert_array_equal(fits["left"].betas, fits["right"].betas)
@@ -107,6 +108,7 @@ def test_equal_keypoints_give_equal_bytes(keypoints: dict) -> None:
     assert first.hand_pose.tobytes() == second.hand_pose.tobytes()
 
 
+@pytest.mark.slow
 def test_more_frames_of_a_foreign_skeleton_do_not_drive_the_shape_away(keypoints: dict) -> None:
     stretched = {side: points.copy() for side, points in keypoints.items()}
     for points in stretched.values():

@@ -6,18 +6,7 @@ from scipy.linalg import expm
 from hoidata.clips import HandTrack
 from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import PARENTS, TIP_VERTICES, HandKinematics, load_embedded_hands, track_joints, track_vertices
-
-
-def random_track(n_frames, seed=0, betas_per_frame=False, template_m=None):
-    generator = np.random.default_rng(seed)
-    return HandTrack(
-        wrist_m=generator.normal(0, 0.5, (n_frames, 3)),
-        global_orient=generator.normal(0, 1, (n_frames, 3)),
-        hand_pose=generator.normal(0, 0.4, (n_frames, 45)),
-        betas=generator.normal(0, 1, (n_frames if betas_per_frame else 1, 10)),
-        valid=np.ones(n_frames, dtype=bool),
-        template_m=template_m,
-    )
+from tests.builders.clips import random_hand
 
 
 def torch_inputs(track, dtype=torch.float64):
@@ -52,7 +41,7 @@ def skinned_one_by_one(model, wrist_m, rotvec, betas, template_m):
 def test_track_functions_equal_skinning_written_out_with_matrices(side, with_template):
     model = load_embedded_hands()[side]
     template = model.template_m * 0.93 + 0.01 if with_template else None
-    track = random_track(3, betas_per_frame=True, template_m=template)
+    track = random_hand(3, betas_rows=3, template_m=template)
     vertices, joints = track_vertices(track, model), track_joints(track, model)
     for frame in range(3):
         rotvec = np.concatenate((track.global_orient[frame], track.hand_pose[frame])).reshape(16, 3)
@@ -64,7 +53,7 @@ def test_track_functions_equal_skinning_written_out_with_matrices(side, with_tem
 
 def test_identity_pose_is_the_template_moved_to_the_wrist():
     model = load_embedded_hands().right
-    track = random_track(1)
+    track = random_hand(1)
     wrist = np.array([[0.3, -0.2, 1.1]])
     flat = HandTrack(wrist, np.zeros((1, 3)), np.zeros((1, 45)), np.zeros((1, 10)), track.valid)
     expected = model.template_m - model.wrist_offset_m(np.zeros((1, 10))) + wrist
@@ -75,7 +64,7 @@ def test_identity_pose_is_the_template_moved_to_the_wrist():
 def test_joints_only_path_equals_the_full_path(with_template):
     model = load_embedded_hands().right
     layer = HandKinematics(model, torch.float64)
-    inputs = torch_inputs(random_track(5, betas_per_frame=True))
+    inputs = torch_inputs(random_hand(5, betas_rows=5))
     template = torch.as_tensor(model.template_m * 1.1) if with_template else None
     torch.testing.assert_close(
         layer.joints(*inputs, template_m=template), layer(*inputs, template_m=template)[1], atol=1e-12, rtol=0
@@ -83,14 +72,14 @@ def test_joints_only_path_equals_the_full_path(with_template):
 
 
 def test_wrist_joint_lies_exactly_where_it_was_put():
-    inputs = torch_inputs(random_track(7), torch.float32)
+    inputs = torch_inputs(random_hand(7), torch.float32)
     joints = HandKinematics(load_embedded_hands().left).joints(*inputs)
     assert torch.equal(joints[:, 0], inputs[0])
 
 
 def test_hand_follows_a_rigid_motion_of_the_world():
     layer = HandKinematics(load_embedded_hands().right, torch.float64)
-    wrist, rotmats, betas = torch_inputs(random_track(4))
+    wrist, rotmats, betas = torch_inputs(random_hand(4))
     turn = rotvec_to_rotmat(torch.tensor([0.4, -1.1, 0.7], dtype=torch.float64))
     shift = torch.tensor([0.2, 3.0, -1.0], dtype=torch.float64)
     moved = torch.cat((turn @ rotmats[:, :1], rotmats[:, 1:]), 1)
@@ -102,7 +91,7 @@ def test_hand_follows_a_rigid_motion_of_the_world():
 
 def test_left_hand_is_the_right_hand_in_a_mirror():
     pair = load_embedded_hands()
-    right = random_track(6)
+    right = random_hand(6)
     mirror = np.array([-1.0, 1.0, 1.0])
     left = HandTrack(
         wrist_m=right.wrist_m * mirror,
@@ -119,7 +108,7 @@ def test_positive_turn_about_z_bends_every_finger_towards_the_palm():
     model = load_embedded_hands().right
     bent = np.zeros((1, 15, 3))
     bent[:, :12, 2] = 0.8
-    still = random_track(1)
+    still = random_hand(1)
     zero = np.zeros((1, 3))
     flat = HandTrack(zero, zero, np.zeros((1, 45)), np.zeros((1, 10)), still.valid)
     curled = HandTrack(zero, zero, bent.reshape(1, 45), np.zeros((1, 10)), still.valid)
@@ -145,7 +134,7 @@ def test_gradients_are_right_and_finite_at_zero_pose():
 
 def test_long_tracks_come_out_the_same_in_chunks_and_frame_by_frame():
     model = load_embedded_hands().right
-    track = random_track(1030, betas_per_frame=True)
+    track = random_hand(1030, betas_rows=1030)
     joints = track_joints(track, model)
     assert joints.shape == (1030, 21, 3)
     assert joints.dtype == np.float32
@@ -153,10 +142,3 @@ def test_long_tracks_come_out_the_same_in_chunks_and_frame_by_frame():
         one = HandTrack(*(getattr(track, name)[frame : frame + 1] for name in
                           ("wrist_m", "global_orient", "hand_pose", "betas", "valid")))  # fmt: skip
         np.testing.assert_allclose(track_joints(one, model)[0], joints[frame], atol=1e-7)
-
-
-def test_one_shape_for_all_frames_equals_the_same_shape_in_every_frame():
-    layer = HandKinematics(load_embedded_hands().right, torch.float64)
-    wrist, rotmats, betas = torch_inputs(random_track(4))
-    repeated = layer(wrist, rotmats, betas.expand(4, 10))[0]
-    torch.testing.assert_close(layer(wrist, rotmats, betas)[0], repeated, atol=1e-12, rtol=0)

@@ -105,7 +105,7 @@ def test_a_clip_without_prediction_is_listed(write_annotated, tmp_path):
 def test_a_store_of_which_nothing_can_be_compared_is_refused(write_annotated, make_clip, tmp_path):
     root, _ = write_annotated()
     with pytest.raises(BadInput, match=r"<id>~<k>.*unknown"):
-        evaluate_store(written(tmp_path / "none", [make_clip(12, clip_id="unknown")]), root)
+        evaluate_store(written(tmp_path / "none", [make_clip(12, clip_id="toy/s9/unknown")]), root)
 
 
 @pytest.mark.parametrize("start", [0, 4])

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.distance import _is_inside_out, merged_surface, signed_distance
+from hoidata.objects.distance import _is_inside_out, closest_points, merged_surface, signed_distance
 
 
 def box_distance(points: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -70,14 +70,15 @@ def test_a_box_with_a_small_hole_still_knows_its_inside() -> None:
     assert (found.distance_m < 0).tolist() == [True, True, False]
 
 
-def test_no_points_give_no_distances() -> None:
-    box = trimesh.creation.box((1, 1, 1))
-    assert len(signed_distance(box.vertices, box.faces, np.zeros((0, 3))).distance_m) == 0
-
-
 @pytest.mark.parametrize(
     ("vertices", "faces"), [(np.zeros((3, 3)), [[0, 1, 2]]), (np.full((3, 3), np.nan), [[0, 1, 2]])]
 )
 def test_a_mesh_without_a_surface_is_refused(vertices: np.ndarray, faces: list) -> None:
     with pytest.raises(BadInput, match="object mesh"):
         signed_distance(vertices, np.array(faces), np.zeros((1, 3)))
+
+
+def test_a_distance_is_that_to_its_closest_point(queries: np.ndarray) -> None:
+    box = trimesh.creation.box((0.06, 0.04, 0.1))
+    found = closest_points(box.vertices, box.faces, queries)
+    np.testing.assert_allclose(found.distance_m, np.linalg.norm(found.closest_m - queries, axis=1), atol=1e-12)

@@ -5,42 +5,17 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.farthest import farthest_points
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints, sample_points
-
-
-def rigid(mesh: trimesh.Trimesh) -> ObjectModel:
-    return ObjectModel("thing", mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
+from tests.builders.objects import model_of, two_parts
 
 
 def from_barycentric(model: ObjectModel, points: SampledPoints) -> np.ndarray:
     return np.einsum("pc,pcx->px", points.barycentric, model.vertices_m[model.faces[points.face]])
 
 
-def farthest_points_by_definition(points: np.ndarray, count: int) -> list[int]:
-    points = points.astype(np.float32)
-    chosen = [0]
-    while len(chosen) < count:
-        best, best_square = -1, np.float32(-1)
-        for index, point in enumerate(points):
-            d = [(point - points[c]) ** 2 for c in chosen]
-            square = min((s[0] + s[1]) + s[2] for s in d)
-            if square > best_square:
-                best, best_square = index, square
-        chosen.append(best)
-    return chosen
-
-
-def test_farthest_points_equal_the_definition_and_take_the_lowest_index_of_equals() -> None:
-    scattered = np.random.default_rng(1).normal(size=(60, 3))
-    grid = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), -1).reshape(-1, 3)
-    for points in (scattered, grid):
-        assert farthest_points(points, 20).tolist() == farthest_points_by_definition(points, 20)
-
-
 def test_a_cube_of_8_vertices_gives_1024_distinct_points_on_its_surface() -> None:
-    model = rigid(trimesh.creation.box((0.1, 0.1, 0.1)))
+    model = model_of(trimesh.creation.box((0.1, 0.1, 0.1)))
     points = sample_points(model)
     assert points.method == "surface-fps"
     assert len(np.unique(points.points_m, axis=0)) == 1024
@@ -54,7 +29,7 @@ def model_normals(model: ObjectModel) -> np.ndarray:
 
 
 def test_surface_points_fall_on_faces_in_proportion_to_area() -> None:
-    model = rigid(trimesh.creation.box((0.1, 0.2, 0.3)))
+    model = model_of(trimesh.creation.box((0.1, 0.2, 0.3)))
     points = sample_points(model)
     side = np.abs(points.normals).argmax(axis=1)
     areas = np.array([0.2 * 0.3, 0.1 * 0.3, 0.1 * 0.2])
@@ -62,7 +37,7 @@ def test_surface_points_fall_on_faces_in_proportion_to_area() -> None:
 
 
 def test_surface_points_leave_no_hole() -> None:
-    model = rigid(trimesh.creation.box((0.1, 0.1, 0.1)))
+    model = model_of(trimesh.creation.box((0.1, 0.1, 0.1)))
     probes, _ = trimesh.sample.sample_surface(trimesh.Trimesh(model.vertices_m, model.faces), 3000, seed=3)
     gaps = np.linalg.norm(probes[:, None] - sample_points(model).points_m[None], axis=2).min(axis=1)
     # 1024 points on 600 cm^2: an ideal hexagonal layout covers everything within 4.8 mm.
@@ -71,7 +46,7 @@ def test_surface_points_leave_no_hole() -> None:
 
 def test_a_fine_mesh_is_sampled_at_its_vertices_from_the_first() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
-    model = rigid(sphere)
+    model = model_of(sphere)
     points = sample_points(model)
     assert points.method == "vertices-fps"
     np.testing.assert_array_equal(points.points_m[0], sphere.vertices[0].astype(np.float32))
@@ -84,7 +59,7 @@ def test_a_fine_mesh_is_sampled_at_its_vertices_from_the_first() -> None:
 def test_many_vertices_with_one_long_edge_are_sampled_on_the_surface() -> None:
     stretched = trimesh.creation.icosphere(subdivisions=4, radius=0.05)
     stretched.vertices[0] *= 2
-    assert sample_points(rigid(stretched)).method == "surface-fps"
+    assert sample_points(model_of(stretched)).method == "surface-fps"
 
 
 def test_vertices_off_every_face_are_never_sampled() -> None:
@@ -97,11 +72,8 @@ def test_vertices_off_every_face_are_never_sampled() -> None:
 @pytest.mark.parametrize("subdivisions", [1, 4])
 def test_points_of_the_moving_part_are_marked_and_lie_on_its_faces(subdivisions: int) -> None:
     base = trimesh.creation.icosphere(subdivisions, radius=0.05)
-    lid = trimesh.creation.icosphere(subdivisions, radius=0.03)
-    vertices = np.concatenate([base.vertices, lid.vertices + np.array([0, 0, 0.2])])
-    faces = np.concatenate([base.faces, lid.faces + len(base.vertices)])
-    part = (vertices[:, 2] > 0.1).astype(np.uint8)
-    model = ObjectModel("pot", vertices, faces, part, Hinge(np.array([1.0, 0, 0]), np.zeros(3)))
+    lid = trimesh.creation.icosphere(subdivisions, radius=0.03).apply_translation((0, 0, 0.2))
+    model = two_parts(model_of(base), model_of(lid), (1, 0, 0))
     points = sample_points(model)
     np.testing.assert_array_equal(points.part, (points.points_m[:, 2] > 0.1).astype(np.uint8))
     np.testing.assert_array_equal(points.part, model.face_part[points.face])
@@ -109,7 +81,7 @@ def test_points_of_the_moving_part_are_marked_and_lie_on_its_faces(subdivisions:
 
 
 def test_sampling_twice_gives_the_same_bytes() -> None:
-    model = rigid(trimesh.creation.cylinder(0.03, 0.1))
+    model = model_of(trimesh.creation.cylinder(0.03, 0.1))
     first, second = sample_points(model), sample_points(model)
     assert first.points_m.tobytes() == second.points_m.tobytes()
     assert first.barycentric.tobytes() == second.barycentric.tobytes()
@@ -148,3 +120,22 @@ def grid(columns: int, rows: int, longest_edge_m: float) -> ObjectModel:
 )
 def test_vertices_serve_from_1024_of_them_and_up_to_edges_of_2_cm(columns, rows, longest_edge_m, method) -> None:
     assert sample_points(grid(columns, rows, longest_edge_m)).method == method
+
+
+def test_vertices_at_the_seam_of_two_parts_take_a_face_of_their_own() -> None:
+    sphere = trimesh.creation.icosphere(4, radius=0.05)
+    part = (sphere.vertices[:, 2] > 0).astype(np.uint8)
+    model = ObjectModel("split", np.array(sphere.vertices), np.array(sphere.faces), part)
+    points = sample_points(model)
+    np.testing.assert_array_equal(points.part, points.points_m[:, 2] > 0)
+    np.testing.assert_array_equal(model.face_part[points.face], points.part)
+
+
+def test_parts_that_lie_on_each_other_keep_their_own_normals() -> None:
+    sphere = trimesh.creation.icosphere(4, radius=0.05)
+    lining = ObjectModel(
+        "in", np.array(sphere.vertices), sphere.faces[:, ::-1], np.zeros(len(sphere.vertices), np.uint8)
+    )
+    points = sample_points(two_parts(model_of(sphere), lining, (1, 0, 0)))
+    outwards = np.where(points.part == 1, -1, 1)[:, None] * points.points_m / 0.05
+    np.testing.assert_allclose(points.normals, outwards, atol=0.01)

@@ -14,14 +14,15 @@ from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, patched_holes, solid_of
 from hoidata.objects.surface_index import SurfaceIndex
+from tests.builders.objects import model_of
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 OUTER_M, INNER_M, HEIGHT_M, FLOOR_M, SECTIONS = 0.04, 0.035, 0.1, 0.008, 720
 AT_ONCE, NEVER = 0, 10**12
 
 
-def model_of(vertices: np.ndarray, faces: np.ndarray) -> ObjectModel:
-    return ObjectModel("object", np.asarray(vertices), np.asarray(faces), np.zeros(len(vertices), np.uint8))
+def solid_index(vertices: np.ndarray, faces: np.ndarray, grid_from: int = NEVER) -> SurfaceIndex:
+    return SurfaceIndex(model_of(trimesh.Trimesh(vertices, faces, process=False)), grid_from)
 
 
 def analytic_mug() -> trimesh.Trimesh:
@@ -48,7 +49,7 @@ def mug_depth(places: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
 def test_the_cavity_of_a_mug_is_outside_and_its_wall_inside(grid_from: int) -> None:
     mug, rng = analytic_mug(), np.random.default_rng(0)
-    index = SurfaceIndex(model_of(mug.vertices, mug.faces), grid_from)
+    index = solid_index(mug.vertices, mug.faces, grid_from)
     assert index.solid_note is None
     places = rng.uniform((-0.05, -0.05, -0.01), (0.05, 0.05, 0.11), (20_000, 3))
     expected = mug_depth(places)
@@ -65,7 +66,7 @@ def test_lines_through_edges_and_corners_keep_their_count() -> None:
     steps = np.array([-0.375, -0.25, 0.0, 0.25, 0.375])
     places = np.stack(np.meshgrid(steps, steps, steps), axis=-1).reshape(-1, 3)
     for grid_from in (AT_ONCE, NEVER):
-        depth = SurfaceIndex(model_of(box.vertices, box.faces), grid_from).depth_m(places[None], None)[0]
+        depth = solid_index(box.vertices, box.faces, grid_from).depth_m(places[None], None)[0]
         np.testing.assert_allclose(depth, np.maximum(0.25 - np.abs(places).max(axis=1), 0), atol=1e-15)
 
 
@@ -74,7 +75,7 @@ def test_a_line_through_the_tips_of_an_octahedron_enters_and_leaves_it_once() ->
     hull = trimesh.Trimesh(tips, process=False).convex_hull
     places = np.array([[0.1, 0, 0], [-0.2, 0, 0], [0.3, 0, 0], [0, 0.125, 0], [0, 0.125, 0.0625], [-0.3, 0, 0]])
     for grid_from in (AT_ONCE, NEVER):
-        depth = SurfaceIndex(model_of(hull.vertices, hull.faces), grid_from).depth_m(places[None], None)[0]
+        depth = solid_index(hull.vertices, hull.faces, grid_from).depth_m(places[None], None)[0]
         expected = np.maximum(0.25 - np.abs(places).sum(axis=1), 0) / np.sqrt(3)
         np.testing.assert_allclose(depth, expected, atol=1e-15)
 
@@ -92,15 +93,15 @@ def test_shells_that_overlap_are_one_solid_and_a_shell_turned_inwards_is_a_cavit
     in_either = sum((np.abs(places - at) < (0.1, 0.05, 0.05)).all(axis=1) for at in ((0, 0, 0), (0.1, 0.0201, 0.0101)))
     in_hollow = (np.abs(places) < 0.2).all(axis=1) & ~(np.abs(places) < 0.1).all(axis=1)
     for grid_from in (AT_ONCE, NEVER):
-        depth = SurfaceIndex(model_of(both.vertices, both.faces), grid_from).depth_m(places[None], None)[0]
+        depth = solid_index(both.vertices, both.faces, grid_from).depth_m(places[None], None)[0]
         np.testing.assert_array_equal(depth > 0, in_either > 0)
-        depth = SurfaceIndex(model_of(vertices, faces), grid_from).depth_m(places[None], None)[0]
+        depth = solid_index(vertices, faces, grid_from).depth_m(places[None], None)[0]
         np.testing.assert_array_equal(depth > 0, in_hollow)
 
 
 def test_a_small_hole_is_closed_and_said() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
-    index = SurfaceIndex(model_of(sphere.vertices, sphere.faces[1:]))
+    index = solid_index(sphere.vertices, sphere.faces[1:])
     assert index.solid_note == "object: 1 small hole closed"
     places = np.array([[[0, 0, 0], [0, 0, 0.06], [0, 0, 0.03]]])
     np.testing.assert_allclose(index.depth_m(places, None)[0], [0.05, 0, 0.02], atol=5e-4)
@@ -112,7 +113,7 @@ def test_a_small_hole_is_closed_and_said() -> None:
 def test_a_cup_drawn_as_one_open_sheet_is_refused_with_the_reason() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     bowl = sphere.faces[sphere.triangles_center[:, 2] < 0]
-    index = SurfaceIndex(model_of(sphere.vertices, bowl))
+    index = solid_index(sphere.vertices, bowl)
     assert not index.is_solid
     assert index.solid_note == "object has no inside: it is open"
     with pytest.raises(BadInput, match=r"encloses a solid.*it is open"):
@@ -166,18 +167,8 @@ def test_a_cup_as_thin_as_paper_is_solid_and_two_sheets_a_hundredth_of_a_millime
 def test_a_closed_surface_with_one_side_only_is_refused() -> None:
     """The projective plane of six corners: each edge has two triangles, but they cannot all be turned alike."""
     corners = np.random.default_rng(0).normal(size=(6, 3))
-    faces = [
-        (0, 1, 2),
-        (0, 2, 3),
-        (0, 3, 4),
-        (0, 4, 5),
-        (0, 5, 1),
-        (1, 2, 4),
-        (2, 3, 5),
-        (3, 4, 1),
-        (4, 5, 2),
-        (5, 1, 3),
-    ]
+    corner = "012 023 034 045 051 124 235 341 452 513"
+    faces = [[int(digit) for digit in face] for face in corner.split()]
     assert solid_of(corners, np.array(faces)) == NoSolid("its triangles do not meet at their edges two by two")
 
 

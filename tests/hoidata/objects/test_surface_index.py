@@ -11,21 +11,16 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
-from hoidata.objects.distance_grid import distance_grid
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.solid import Solid
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
-from hoidata.objects.triangle_tree import triangle_tree
+from tests.builders.objects import box_model, model_of, two_parts
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 AT_ONCE, NEVER = 0, 10**12  # from how many places on there is a grid
 THRESHOLD_M = 0.005
 CLEAR_M = 1e-12  # libigl's and our rounding may differ by less
-
-
-def rigid(mesh: trimesh.Trimesh, name: str = "object") -> ObjectModel:
-    return ObjectModel(name, np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.vertices), np.uint8))
 
 
 def bumpy_torus() -> trimesh.Trimesh:
@@ -89,7 +84,7 @@ def has_grids(index: SurfaceIndex) -> bool:
 @pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
 @pytest.mark.parametrize("name", MESHES)
 def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
-    model = rigid(MESHES[name])
+    model = model_of(MESHES[name])
     index, places = SurfaceIndex(model, grid_from), queries(model.vertices_m, 24_000)
     expected = igl_distance(model, places)
     assert (np.abs(expected - THRESHOLD_M) < 0.002).mean() > 0.1
@@ -103,15 +98,6 @@ def test_labels_and_distances_equal_libigl_s(name: str, grid_from: int) -> None:
     near = index.distance_m(places[None], None, 0.02)[0]
     np.testing.assert_array_equal(np.isinf(near), expected > 0.02)
     np.testing.assert_allclose(near[expected <= 0.02], expected[expected <= 0.02], atol=1e-14)
-
-
-def test_distances_equal_brute_force() -> None:
-    model = rigid(MESHES["bumpy torus"])
-    places = queries(model.vertices_m, 400, seed=1)
-    expected = brute_distance(model.vertices_m[model.faces], places)
-    for grid_from in (AT_ONCE, NEVER):
-        found = SurfaceIndex(model, grid_from).distance_m(places[None], None)[0]
-        np.testing.assert_allclose(found, expected, atol=1e-14)
 
 
 def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
@@ -135,17 +121,8 @@ def test_distances_to_triangles_of_every_bad_shape_equal_brute_force() -> None:
                 np.testing.assert_array_equal(within, found < threshold_m)
 
 
-def test_a_grid_has_64_cells_along_the_longest_axis_of_the_surface_and_a_centimetre_around_it() -> None:
-    box = trimesh.creation.box((0.3, 0.14, 0.06))
-    grid = distance_grid(triangle_tree(np.array(box.vertices), np.array(box.faces)), solid=True)
-    assert grid.value.shape == (17, 33, 65)
-    np.testing.assert_allclose(grid.low_m, [-0.16, -0.08, -0.04])
-    assert grid.cell_m == pytest.approx(0.005)
-    assert (grid.value[8, 16, 32], grid.value[0, 16, 32]) == pytest.approx((-0.03, 0.01), abs=1e-7)
-
-
 def test_a_grid_changes_no_bit_of_any_answer() -> None:
-    model = rigid(MESHES["bumpy torus"])
+    model = model_of(MESHES["bumpy torus"])
     with_grid, without = SurfaceIndex(model, AT_ONCE), SurfaceIndex(model, NEVER)
     places = queries(model.vertices_m, 5000, seed=2)[None]
     for ask in (lambda i: i.distance_m(places, None), lambda i: i.depth_m(places, None)):
@@ -157,7 +134,7 @@ def test_a_grid_changes_no_bit_of_any_answer() -> None:
 
 
 def test_a_distance_equal_to_the_threshold_is_not_within_and_one_equal_to_the_most_is_kept() -> None:
-    model = rigid(trimesh.creation.box((0.5, 0.5, 0.5)))
+    model = model_of(trimesh.creation.box((0.5, 0.5, 0.5)))
     places = np.array([[[0.0, 0.0, 0.5], [0.0, 0.0, 0.25]]])
     for grid_from in (AT_ONCE, NEVER):
         index = SurfaceIndex(model, grid_from)
@@ -169,14 +146,9 @@ def test_a_distance_equal_to_the_threshold_is_not_within_and_one_equal_to_the_mo
 
 def laptop() -> ObjectModel:
     """Two plates, the upper turned by a slanted hinge."""
-    base = trimesh.creation.box((0.2, 0.15, 0.01))
-    lid = trimesh.creation.box((0.2, 0.15, 0.004))
-    lid.vertices += (0, 0, 0.008)
-    part = np.repeat([0, 1], [len(base.vertices), len(lid.vertices)]).astype(np.uint8)
+    base, lid = box_model((0.2, 0.15, 0.01)), box_model((0.2, 0.15, 0.004), middle_m=(0, 0, 0.008))
     axis = np.array([1, 0.1, 0.05]) / np.linalg.norm([1, 0.1, 0.05])
-    both = np.concatenate([base.vertices, lid.vertices])
-    faces = np.concatenate([base.faces, lid.faces + len(base.vertices)])
-    return ObjectModel("laptop", both, faces, part, Hinge(axis, np.array([0, 0.075, 0.006])))
+    return two_parts(base, lid, tuple(axis), (0, 0.075, 0.006), "laptop")
 
 
 @pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
@@ -209,7 +181,7 @@ def test_an_articulated_object_without_angles_is_refused() -> None:
 def test_answers_do_not_change_when_object_and_places_move_or_are_mirrored() -> None:
     mesh = MESHES["cone"]
     places = queries(np.array(mesh.vertices), 3000, seed=5)
-    plain = SurfaceIndex(rigid(mesh))
+    plain = SurfaceIndex(model_of(mesh))
     distance, depth = plain.distance_m(places[None], None), plain.depth_m(places[None], None)
     turn, part = Rotation.from_rotvec([0.3, -1.0, 2.0]).as_matrix(), np.zeros(len(mesh.vertices), np.uint8)
     moved = ObjectModel("moved", mesh.vertices @ turn.T + [1, 2, -0.5], np.array(mesh.faces), part)
@@ -243,7 +215,7 @@ def test_the_same_mesh_gives_the_same_index_and_another_hinge_or_part_another() 
 
 def test_only_indices_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hoidata.objects.surface_index.MOST_TRIANGLES_KEPT", 30)
-    boxes = [rigid(trimesh.creation.box((0.1, 0.1, size)), f"box of {size}") for size in (0.1, 0.2, 0.3)]
+    boxes = [model_of(trimesh.creation.box((0.1, 0.1, size)), f"box of {size}") for size in (0.1, 0.2, 0.3)]
     first, second = surface_index(boxes[0]), surface_index(boxes[1])
     assert surface_index(boxes[0]) is first
     surface_index(boxes[2])

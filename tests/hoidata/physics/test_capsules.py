@@ -1,28 +1,34 @@
 """Capsules against boxes and spheres whose distances are known in closed form."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import HandTrack
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_vertices
-from hoidata.objects.model import Hinge, ObjectModel
-from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts, joined
+from hoidata.objects.model import ObjectModel
+from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts
 from hoidata.physics.mano_capsules import N_CAPSULES, THUMB_CAPSULES, fit_capsules, hand_capsules
+from tests.builders.clips import random_hand
+from tests.builders.objects import box_model, two_parts
 
 SIZE = np.array([0.1, 0.08, 0.06])
 
 
-def _box(size=SIZE) -> ObjectModel:
-    mesh = trimesh.creation.box(size)
-    return ObjectModel("box", mesh.vertices, mesh.faces, np.zeros(8, dtype=np.uint8))
+BOX = box_model(tuple(SIZE))
 
 
 def _still(n_frames: int = 1) -> ObjectPoses:
     return ObjectPoses(np.tile(np.eye(3), (n_frames, 1, 1)), np.zeros((n_frames, 3)))
+
+
+def tin(lid_m: float, origin_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> ObjectModel:
+    """Two flat boxes, the upper one so much higher, on a hinge along y."""
+    flat = (0.1, 0.1, 0.02)
+    return two_parts(box_model(flat), box_model(flat, middle_m=(0, 0, lid_m)), (0, 1, 0), origin_m)
 
 
 def _capsule(start, end, radius: float) -> Capsules:
@@ -36,14 +42,14 @@ def _box_distance(points: np.ndarray) -> np.ndarray:
 
 
 def test_a_capsule_that_dips_into_the_top_touches_there_with_the_depth_of_its_lower_end():
-    found = capsule_contacts(_box(), _still(), _capsule([0.01, 0, 0.05], [0.02, 0, 0.036], 0.01))
+    found = capsule_contacts(BOX, _still(), _capsule([0.01, 0, 0.05], [0.02, 0, 0.036], 0.01))
     assert found.depth_m == pytest.approx([0.004], abs=1e-6)
     np.testing.assert_allclose(found.point_m, [[0.02, 0, 0.03]], atol=1e-9)
     np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-9)
 
 
 def test_an_axis_inside_the_object_still_has_its_normal_outwards():
-    found = capsule_contacts(_box(), _still(), _capsule([0, 0, 0.025], [0.01, 0, 0.02], 0.01))
+    found = capsule_contacts(BOX, _still(), _capsule([0, 0, 0.025], [0.01, 0, 0.02], 0.01))
     assert found.depth_m == pytest.approx([0.02], abs=1e-6)
     np.testing.assert_allclose(found.normal, [[0, 0, 1]], atol=1e-9)
 
@@ -52,7 +58,7 @@ def test_at_an_edge_the_normal_points_from_the_edge_to_the_axis():
     corner = np.array([SIZE[0] / 2, 0, SIZE[2] / 2])
     beside = np.array([0, 0.01, 0])
     middle = corner + 0.006 * np.array([0.6, 0, 0.8])
-    found = capsule_contacts(_box(), _still(), _capsule(middle - beside, middle + beside, 0.01))
+    found = capsule_contacts(BOX, _still(), _capsule(middle - beside, middle + beside, 0.01))
     np.testing.assert_allclose(found.normal, [[0.6, 0, 0.8]], atol=1e-6)
     assert found.depth_m == pytest.approx([0.004], abs=1e-9)
 
@@ -64,7 +70,7 @@ def test_depths_of_random_capsules_are_those_of_a_dense_search_by_formula():
     radius = rng.uniform(0.005, 0.02, 400)
     share = np.linspace(0, 1, 2001)[:, None, None]
     truth = radius - _box_distance(start[0] + share * (end - start)[0]).min(axis=0)
-    found = capsule_contacts(_box(), _still(), Capsules(start, end, radius))
+    found = capsule_contacts(BOX, _still(), Capsules(start, end, radius))
     clear = np.abs(truth) > 1e-4
     hit = np.isin(np.arange(400), found.capsule)
     np.testing.assert_array_equal(hit[clear], truth[clear] > 0)
@@ -80,7 +86,7 @@ def test_contacts_move_with_the_world():
     shift = np.array([1.0, 2.0, 3.0])
     moved = Capsules(capsules.start_m @ turn.T + shift, capsules.end_m @ turn.T + shift, capsules.radius_m)
     poses = ObjectPoses(np.tile(turn, (3, 1, 1)), np.tile(shift, (3, 1)))
-    still, world = (capsule_contacts(_box(), *args) for args in ((_still(3), capsules), (poses, moved)))
+    still, world = (capsule_contacts(BOX, *args) for args in ((_still(3), capsules), (poses, moved)))
     np.testing.assert_array_equal(still.frame * 100 + still.capsule, world.frame * 100 + world.capsule)
     np.testing.assert_allclose(still.point_m @ turn.T + shift, world.point_m, atol=1e-9)
     np.testing.assert_allclose(still.normal @ turn.T, world.normal, atol=1e-6)
@@ -91,7 +97,7 @@ def test_every_capsule_has_one_contact_per_frame_in_order_and_absent_hands_have_
     start[:, :, 2] = 0.03
     start[1, 1] = np.nan
     capsules = Capsules(start, start + np.array([0.01, 0, 0]), np.array([0.01, 0.01, 0.02]))
-    found = capsule_contacts(_box(), _still(2), capsules)
+    found = capsule_contacts(BOX, _still(2), capsules)
     assert list(zip(found.frame.tolist(), found.capsule.tolist(), strict=True)) == [
         (0, 0),
         (0, 1),
@@ -103,27 +109,23 @@ def test_every_capsule_has_one_contact_per_frame_in_order_and_absent_hands_have_
 
 def test_a_tolerance_finds_a_capsule_beside_the_surface_with_negative_depth():
     near = _capsule([0, 0, 0.0415], [0.01, 0, 0.0415], 0.01)
-    assert not len(capsule_contacts(_box(), _still(), near).frame)
-    assert capsule_contacts(_box(), _still(), near, 0.002).depth_m == pytest.approx([-0.0015])
+    assert not len(capsule_contacts(BOX, _still(), near).frame)
+    assert capsule_contacts(BOX, _still(), near, 0.002).depth_m == pytest.approx([-0.0015])
 
 
 def test_the_middle_of_the_axis_can_give_point_and_normal_while_depth_stays():
     across = _capsule([0.03, 0, 0.037], [0.06, 0, 0.034], 0.01)
-    deepest, centre = (capsule_contacts(_box(), _still(), across, at_centre=value) for value in (False, True))
+    deepest, centre = (capsule_contacts(BOX, _still(), across, at_centre=value) for value in (False, True))
     assert deepest.depth_m == pytest.approx(centre.depth_m)
     np.testing.assert_allclose(centre.point_m, [[0.045, 0, 0.03]], atol=1e-9)
     assert deepest.point_m[0, 0] > 0.0499
 
 
 def test_a_lid_is_touched_where_its_hinge_has_put_it():
-    base, lid = _box((0.1, 0.1, 0.02)), _box((0.1, 0.1, 0.02))
-    vertices = np.concatenate([base.vertices_m, lid.vertices_m + np.array([0, 0, 0.03])])
-    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([-0.05, 0.0, 0.02]))
-    part = np.repeat(np.array([0, 1], dtype=np.uint8), 8)
-    model = ObjectModel("tin", vertices, np.concatenate([base.faces, lid.faces + 8]), part, hinge)
+    model = tin(0.03, (-0.05, 0.0, 0.02))
     poses = _still(2)._replace(hinge_rad=np.array([0.0, -np.pi / 2]))
     # The lid's top centre (0, 0, 0.04) turns a quarter about (-0.05, 0, 0.02): up and back.
-    turned = rotvec_to_rotmat(np.array([0.0, -np.pi / 2, 0.0])) @ np.array([0.05, 0, 0.02]) + hinge.origin_m
+    turned = rotvec_to_rotmat(np.array([0.0, -np.pi / 2, 0.0])) @ np.array([0.05, 0, 0.02]) + [-0.05, 0.0, 0.02]
     place = np.array([[[0, 0, 0.045]], [turned + np.array([-0.005, 0, 0])]])
     found = capsule_contacts(model, poses, Capsules(place, place + np.array([0, 0.001, 0]), np.array([0.01])))
     assert found.frame.tolist() == [0, 1]
@@ -133,10 +135,7 @@ def test_a_lid_is_touched_where_its_hinge_has_put_it():
 
 
 def test_a_capsule_in_the_gap_between_two_parts_touches_the_one_it_is_deeper_in():
-    base, lid = _box((0.1, 0.1, 0.02)), _box((0.1, 0.1, 0.02))
-    vertices = np.concatenate([base.vertices_m, lid.vertices_m + np.array([0, 0, 0.036])])
-    hinge, part = Hinge(np.array([0.0, 1.0, 0.0]), np.zeros(3)), np.repeat(np.array([0, 1], dtype=np.uint8), 8)
-    model = ObjectModel("tin", vertices, np.concatenate([base.faces, lid.faces + 8]), part, hinge)
+    model = tin(0.036)
     poses = _still()._replace(hinge_rad=np.zeros(1))
     for height, touched, up in ((0.017, 0, 1), (0.019, 1, -1)):  # the gap is from 10 to 26 mm
         found = capsule_contacts(model, poses, _capsule([0, 0, height], [0.01, 0, height], 0.01))
@@ -146,21 +145,14 @@ def test_a_capsule_in_the_gap_between_two_parts_touches_the_one_it_is_deeper_in(
 
 
 def test_a_hinged_object_without_angles_is_refused():
-    part = np.repeat(np.array([0, 1], dtype=np.uint8), [4, 4])
-    model = ObjectModel("tin", _box().vertices_m, _box().faces, part, Hinge(np.array([0.0, 1, 0]), np.zeros(3)))
     with pytest.raises(BadInput, match="a hinge angle for every frame"):
-        capsule_contacts(model, _still(), _capsule([0, 0, 0], [0, 0, 0.01], 0.01))
-
-
-def _track(n_frames: int = 3) -> HandTrack:
-    rng = np.random.default_rng(2)
-    one = [rng.normal(size=(n_frames, 3)), rng.normal(size=(n_frames, 3)), 0.3 * rng.normal(size=(n_frames, 45))]
-    return HandTrack(*one, rng.normal(size=(1, 10)), np.ones(n_frames, dtype=bool))
+        capsule_contacts(tin(0.03), _still(), _capsule([0, 0, 0], [0, 0, 0.01], 0.01))
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 def test_capsules_of_a_posed_hand_lie_in_its_skin_and_reach_its_fingertips(side):
-    model, track = load_embedded_hands()[side], _track()
+    model, track = load_embedded_hands()[side], random_hand(3, seed=2)
+    track = replace(track, hand_pose=0.6 * track.hand_pose)
     capsules = hand_capsules(track, model)
     assert capsules.start_m.shape == (3, N_CAPSULES, 3)
     vertices = track_vertices(track, model).astype(np.float64)
@@ -185,10 +177,3 @@ def _signed_gaps(points: np.ndarray, capsules: Capsules) -> np.ndarray:
     away = points[:, :, None] - capsules.start_m[:, None]
     along = np.clip((away * axis).sum(-1) / (axis**2).sum(-1), 0, 1)
     return (np.linalg.norm(away - along[..., None] * axis, axis=-1) - capsules.radius_m).min(axis=-1)
-
-
-def test_hands_are_joined_in_the_order_given():
-    first, second = _capsule([0, 0, 0], [0, 0, 1], 0.1), _capsule([1, 0, 0], [1, 0, 1], 0.2)
-    both = joined([first, second])
-    assert both.radius_m.tolist() == [0.1, 0.2]
-    assert both.start_m[0, 1, 0] == 1

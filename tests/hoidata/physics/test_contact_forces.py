@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.objects.mesh import mass_properties
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import (
     GRAVITY_M_S2,
     RESIDUAL_LIMIT,
@@ -12,9 +12,11 @@ from hoidata.physics.contact_forces import (
     cone_edges,
     force_residual,
     required_wrench,
+    wrench_columns,
 )
 from hoidata.physics.surface import body_motion
 from hoidata.synthetic.shapes import sharp_box
+from tests.builders.objects import box_model, two_parts
 
 DOWN = np.array([0.0, 0.0, -1.0])
 SIZE = (0.1, 0.06, 0.2)
@@ -81,6 +83,12 @@ def test_cone_edges_push_inwards_and_slide_by_the_friction_coefficient():
     np.testing.assert_allclose(np.linalg.norm(edges + normals[:, None], axis=2), 0.35)
 
 
+def test_a_push_from_above_beside_the_centre_turns_the_body_that_way():
+    """A finger at x = 1 presses down: its four edges add up to four pushes, and their torque turns about +y."""
+    columns = wrench_columns(np.array([[1.0, 0, 0]]), np.array([[0.0, 0, 1]]), np.zeros(3))
+    np.testing.assert_allclose(columns.sum(axis=1), [0, 0, -4, 0, 4, 0], atol=1e-12)
+
+
 def test_the_inertia_of_a_box_is_the_textbook_one():
     box = mass_properties(*sharp_box(SIZE))
     x, y, z = np.square(SIZE)
@@ -99,11 +107,11 @@ def test_accelerations_need_three_frames():
 
 
 def _two_boxes() -> ObjectModel:
-    base, lid = sharp_box((0.1, 0.1, 0.04)).moved((0.05, 0, -0.02)), sharp_box((0.1, 0.1, 0.02)).moved((0.05, 0, 0.01))
-    vertices = np.concatenate([base.vertices_m, lid.vertices_m])
-    faces = np.concatenate([base.faces, lid.faces + 8])
-    part = np.repeat(np.array([0, 1], dtype=np.uint8), 8)
-    return ObjectModel("boxes", vertices, faces, part, Hinge(np.array([0.0, 1.0, 0.0]), np.zeros(3)))
+    base, lid = (
+        box_model((0.1, 0.1, 0.04), middle_m=(0.05, 0, -0.02)),
+        box_model((0.1, 0.1, 0.02), middle_m=(0.05, 0, 0.01)),
+    )
+    return two_parts(base, lid, (0, 1, 0))
 
 
 def test_a_hinged_object_weighs_its_parts_by_volume_and_moves_its_centre_with_the_lid():

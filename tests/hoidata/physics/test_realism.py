@@ -2,20 +2,20 @@
 
 import numpy as np
 import pytest
-import trimesh
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.physics.as_released import AsReleased, friction_edges
 from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts
 from hoidata.physics.contact_forces import cone_edges
 from hoidata.physics.realism import score, smoothness_m_s2
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits, table_contacts
+from tests.builders.objects import box_model, two_parts
 
 SIZE = np.array([0.1, 0.08, 0.06])
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -24,15 +24,13 @@ EVERY = np.ones(20, dtype=bool)
 NONE = np.zeros((20, 0, 3))
 
 
-def _box() -> ObjectModel:
-    mesh = trimesh.creation.box(SIZE)
-    return ObjectModel("box", mesh.vertices, mesh.faces, np.zeros(8, dtype=np.uint8))
+BOX = box_model(tuple(SIZE))
 
 
 def _scene(centre_m: np.ndarray, rotmats: np.ndarray | None = None, hands: Capsules | None = None, **given) -> Scene:
     turned = np.tile(np.eye(3), (len(centre_m), 1, 1)) if rotmats is None else rotmats
     hands = Capsules(NONE, NONE, np.zeros(0)) if hands is None else hands
-    return Scene(_box(), ObjectPoses(turned, centre_m), hands, FPS, DOWN, **{"table_m": 0.0, **given})
+    return Scene(BOX, ObjectPoses(turned, centre_m), hands, FPS, DOWN, **{"table_m": 0.0, **given})
 
 
 def _times() -> np.ndarray:
@@ -95,7 +93,7 @@ def test_a_box_on_a_table_is_explained_by_the_table_and_by_nothing_less():
 def test_a_table_carries_no_box_whose_centre_lies_beyond_its_edge():
     # Turned by 30 degrees about y the box stands on one edge, its centre beside it: it must fall.
     turn = Rotation.from_rotvec([0, np.pi / 6, 0]).as_matrix()
-    lowest = (_box().vertices_m @ turn.T)[:, 2].min()
+    lowest = (BOX.vertices_m @ turn.T)[:, 2].min()
     scene = _scene(np.tile([0.0, 0.0, -lowest], (20, 1)), np.tile(turn, (20, 1, 1)))
     assert score(scene, StandardUnits(table_m=0.0), EVERY).share == 0.0
 
@@ -123,7 +121,7 @@ def test_the_answer_does_not_depend_on_the_world_frame():
     turn, shift = Rotation.from_rotvec([0.5, 1.0, -0.3]).as_matrix(), np.array([1.0, -2.0, 0.3])
     scene = _scene(centre, hands=hands)
     moved = Scene(
-        _box(),
+        BOX,
         ObjectPoses(np.tile(turn, (20, 1, 1)), centre @ turn.T + shift),
         Capsules(hands.start_m @ turn.T + shift, hands.end_m @ turn.T + shift, hands.radius_m),
         FPS,
@@ -214,7 +212,7 @@ def test_as_released_about_the_origin_differs_only_where_the_mesh_is_not_centred
     centred = _scene(path, turned, _pinch(path, turned))
     about = {name: AsReleased(reference=name) for name in ("origin", "centre of mass")}
     np.testing.assert_allclose(*(score(centred, one).residual for one in about.values()), atol=1e-12)
-    shifted = ObjectModel("box", _box().vertices_m + np.array([0, 0, 0.05]), _box().faces, np.zeros(8, dtype=np.uint8))
+    shifted = ObjectModel("box", BOX.vertices_m + np.array([0, 0, 0.05]), BOX.faces, np.zeros(8, dtype=np.uint8))
     poses = ObjectPoses(turned, path - turned @ [0, 0, 0.05])
     empty = Capsules(NONE, NONE, np.zeros(0))
     scene = Scene(shifted, poses, empty, FPS, DOWN, 0.0)
@@ -241,14 +239,8 @@ def test_the_table_of_a_recording_is_the_third_percentile_of_the_lowest_vertex()
 
 
 def test_a_lid_that_opens_counts_for_the_lowest_vertex():
-    box, hinge = _box(), Hinge(np.array([1.0, 0, 0]), np.array([0, SIZE[1] / 2, -SIZE[2] / 2]))
-    model = ObjectModel(
-        "tin",
-        np.concatenate([box.vertices_m, box.vertices_m + np.array([0, SIZE[1], 0])]),
-        np.concatenate([box.faces, box.faces + 8]),
-        np.repeat(np.array([0, 1], dtype=np.uint8), 8),
-        hinge,
-    )
+    lid = box_model(tuple(SIZE), middle_m=(0, SIZE[1], 0))
+    model = two_parts(BOX, lid, (1, 0, 0), (0, SIZE[1] / 2, -SIZE[2] / 2))
     poses = ObjectPoses(np.tile(np.eye(3), (3, 1, 1)), np.tile([0, 0, 0.5], (3, 1)), np.array([0.0, -0.5, -1.0]))
     scene = Scene(model, poses, Capsules(*np.zeros((2, 3, 0, 3)), np.zeros(0)), FPS, DOWN)
     expected = 0.5 - SIZE[2] / 2 - SIZE[1] * np.sin([0, 0.5, 1.0])

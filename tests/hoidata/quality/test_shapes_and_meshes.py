@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.quality.meshes import part_facts, surface_facts
 from hoidata.quality.penetration import depths_m
 from hoidata.quality.shape import distances_to_others, largest_beta
+from tests.builders.objects import box_model, model_of, two_parts
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 
@@ -90,32 +91,17 @@ def test_separate_pieces_are_shells():
     assert surface_facts(far.vertices, far.faces).shells == 2
 
 
-def test_collapsed_and_needle_triangles_are_degenerate():
-    vertices = np.concatenate([BOX.vertices, [[0, 0, 0], [1, 0, 0], [0.5, 1e-8, 0]]])
+@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e3])
+def test_collapsed_and_needle_triangles_are_degenerate_in_every_unit(scale):
+    vertices = scale * np.concatenate([BOX.vertices, [[0, 0, 0], [1, 0, 0], [0.5, 1e-8, 0]]])
     faces = np.concatenate([BOX.faces, [[0, 0, 1], [8, 9, 10]]])
     assert surface_facts(vertices, faces).degenerate_share == pytest.approx(2 / 14)
 
 
-@pytest.mark.parametrize("scale", [1e-5, 1.0, 1e3])
-def test_needles_are_needles_in_every_unit(scale):
-    vertices = scale * np.concatenate([BOX.vertices, [[0, 0, 0], [1, 0, 0], [0.5, 1e-8, 0]]])
-    faces = np.concatenate([BOX.faces, [[8, 9, 10]]])
-    assert surface_facts(vertices, faces).degenerate_share == pytest.approx(1 / 13)
-
-
-def test_a_collapsed_triangle_beside_the_surface_is_no_shell():
-    vertices = np.concatenate([BOX.vertices, [[1.0, 1, 1], [1, 1, 2]]])
-    faces = np.concatenate([BOX.faces, [[8, 8, 9]]])
-    assert surface_facts(vertices, faces).shells == 1
-
-
 def hinged() -> ObjectModel:
     """A base box and a lid that lies on it, turning about the y axis through the lid's edge."""
-    base, lid = trimesh.creation.box((0.2, 0.2, 0.1)), trimesh.creation.box((0.2, 0.2, 0.02))
-    lid.apply_translation((0, 0, 0.06))
-    vertices, faces = np.concatenate([base.vertices, lid.vertices]), np.concatenate([base.faces, lid.faces + 8])
-    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([-0.1, 0.0, 0.05]))
-    return ObjectModel("hinged", vertices, faces, np.repeat(np.array([0, 1], np.uint8), 8), hinge)
+    base, lid = box_model((0.2, 0.2, 0.1)), box_model((0.2, 0.2, 0.02), middle_m=(0, 0, 0.06))
+    return two_parts(base, lid, (0, 1, 0), (-0.1, 0, 0.05))
 
 
 def test_every_part_is_a_surface_of_its_own():
@@ -126,7 +112,7 @@ def test_every_part_is_a_surface_of_its_own():
 
 
 def test_depth_is_the_way_out_of_the_box_for_the_deepest_point():
-    model = ObjectModel("box", np.asarray(BOX.vertices), np.asarray(BOX.faces), np.zeros(8, np.uint8))
+    model = model_of(BOX)
     points = np.array([[[0.0, 0.0, 0.0], [0.03, 0, 0]], [[0.2, 0, 0], [0, 0.09, 0]], [[1, 1, 1], [0.051, 0, 0]]])
     assert depths_m(model, None, points, [0]) == pytest.approx([0.05, 0.01, 0])
 

@@ -5,25 +5,27 @@ import multiprocessing
 import os
 import threading
 import time
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hoidata.clips import Clip, ObjectTrack
+from hoidata.clips import Clip
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import get_adapter
 from hoidata.errors import MissingResource
 from hoidata.hands import load_embedded_hands
 from hoidata.quality import stage
-from hoidata.quality.stage import as_json, quality_store
-from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, MESH_MEASURES, Limit, Thresholds
+from hoidata.quality.stage import quality_store
+from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds
 from hoidata.quality.verdicts import left_out_reasons
-from hoidata.store.info import generated_info
-from hoidata.store.store import open_store, write_store
+from hoidata.store.store import open_store
 from hoidata.synthetic.corpus import write_corpus
+from tests.builders.clips import in_another_world, jumping
+from tests.builders.stores import write_clips
 
 FRAMES = 60
 REAL = os.environ.get("HOIDATA_MANIPNET")
@@ -42,12 +44,6 @@ def lost(clip: Clip, value: float, frames: slice) -> Clip:
     return replace(clip, hands={**clip.hands, "right": replace(track, betas=betas, valid=valid)})
 
 
-def jumping(clip: Clip) -> Clip:
-    place = clip.object.translation_m.copy()
-    place[30:] += 0.5
-    return replace(clip, object=replace(clip.object, translation_m=place))
-
-
 def of_open_box(clip: Clip) -> Clip:
     model = replace(clip.object.model, name="open_box", faces=clip.object.model.faces[1:])
     return replace(clip, object=replace(clip.object, model=model))
@@ -57,8 +53,8 @@ def of_open_box(clip: Clip) -> Clip:
 def clips_folder(make_clip, tmp_path) -> Path:
     """Four clips of one subject, of which one jumps, one has another shape and one an open mesh."""
     clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(5)]
-    clips[1], clips[2], clips[3] = jumping(clips[1]), with_betas(clips[2], -1.7), of_open_box(clips[3])
-    write_store(tmp_path / "clips", clips, generated_info("test"))
+    clips[1], clips[2], clips[3] = jumping(clips[1], 30, 0.5), with_betas(clips[2], -1.7), of_open_box(clips[3])
+    write_clips(tmp_path / "clips", clips)
     return tmp_path / "clips"
 
 
@@ -69,34 +65,24 @@ def tables(folder: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     )
 
 
-def test_every_clip_and_object_has_its_verdict_and_reasons(clips_folder, tmp_path):
-    counts = quality_store(clips_folder, tmp_path / "quality", progress=False)
+def test_every_clip_and_object_has_its_verdict_its_reasons_and_null_where_nothing_was_measured(clips_folder, tmp_path):
+    thresholds = Thresholds()
+    counts = quality_store(clips_folder, tmp_path / "quality", thresholds=thresholds, progress=False)
     clips, meshes = tables(tmp_path / "quality")
     assert clips["verdict"].tolist() == ["ok", "left out", "warned", "ok", "ok"]
-    assert clips["reasons"].iloc[0] == ""
-    assert clips["reasons"].iloc[1] == "largest sudden step of a corner of the object: 0.86 m at frame 29, above 0.2 m"
-    assert clips["reasons"].iloc[2] == "distance of the shape from the subject's other clips: 2 sd, above 1.5 sd"
+    jump = "largest sudden step of a corner of the object: 0.86 m at frame 29, above 0.2 m"
+    shape = "distance of the shape from the subject's other clips: 2 sd, above 1.5 sd"
+    assert clips["reasons"].tolist() == ["", jump, shape, "", ""]
     assert clips["note"].iloc[3] == "penetration not measured: the mesh of open_box is not solid"
+    assert clips["penetration_m"].isna().tolist() == [False, False, False, True, False]
+    assert clips["beta_distance"].tolist() == pytest.approx([0, 0, 2, 0, 0], abs=1e-6)
     assert meshes["verdict"].to_dict() == {"box": "ok", "open_box": "warned"}
     assert counts == {
         "clips": 5, "ok": 3, "warned": 1, "left_out": 1, "objects": 2, "objects_warned": 1, "objects_left_out": 0,
     }  # fmt: skip
-
-
-def test_tables_hold_every_measure_and_null_where_there_is_none(clips_folder, tmp_path):
-    quality_store(clips_folder, tmp_path / "quality", progress=False)
-    clips, meshes = tables(tmp_path / "quality")
-    assert {measure.name for measure in CLIP_MEASURES} <= set(clips)
-    assert {measure.name for measure in MESH_MEASURES} <= set(meshes)
-    assert clips["penetration_m"].isna().tolist() == [False, False, False, True, False]
-    assert clips["beta_distance"].tolist() == pytest.approx([0, 0, 2, 0, 0], abs=1e-6)
-
-
-def test_only_clips_left_out_are_told_to_the_next_stage(clips_folder, tmp_path):
-    quality_store(clips_folder, tmp_path / "quality", progress=False)
-    reasons = left_out_reasons(tmp_path / "quality")
-    assert list(reasons) == ["test/s1/1"]
-    assert reasons["test/s1/1"].startswith("left out by quality control: largest sudden step of a corner")
+    noted = json.loads((tmp_path / "quality" / "info.json").read_text())
+    assert noted == {"thresholds": asdict(thresholds), "counts": counts}
+    assert left_out_reasons(tmp_path / "quality") == {"test/s1/1": f"left out by quality control: {jump}"}
     with pytest.raises(MissingResource, match="stage 'quality'"):
         left_out_reasons(tmp_path / "elsewhere")
 
@@ -107,14 +93,6 @@ def test_mesh_that_is_left_out_takes_its_clips_with_it(clips_folder, tmp_path):
     reasons = left_out_reasons(tmp_path / "quality")
     assert list(reasons) == ["test/s1/1", "test/s1/3"]
     assert "object open_box: share of edges at a hole" in reasons["test/s1/3"]
-
-
-def test_thresholds_and_counts_are_noted(clips_folder, tmp_path):
-    thresholds = Thresholds(penetration_every=3)
-    counts = quality_store(clips_folder, tmp_path / "quality", thresholds=thresholds, progress=False)
-    noted = json.loads((tmp_path / "quality" / "info.json").read_text())
-    assert noted == {"thresholds": as_json(thresholds), "counts": counts}
-    assert noted["thresholds"]["limits"]["size_m"] == {"warn": 1.0, "leave_out": 3.0}
 
 
 def test_same_clips_give_the_same_bytes(clips_folder, tmp_path):
@@ -160,7 +138,7 @@ def test_personal_templates_have_no_shape_to_compare(make_clip, tmp_path):
         replace(clip, hands={side: replace(track, template_m=template) for side, track in clip.hands.items()})
         for clip in clips
     ]
-    write_store(tmp_path / "clips", clips, generated_info("test"))
+    write_clips(tmp_path / "clips", clips)
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     rows, _ = tables(tmp_path / "quality")
     assert rows["beta_distance"].isna().all()
@@ -175,7 +153,7 @@ def test_a_shape_is_compared_with_clips_of_the_same_subject_only(make_clip, tmp_
         for who, shape in shapes.items()
         for number in range(3)
     ]
-    write_store(tmp_path / "clips", clips, generated_info("test"))
+    write_clips(tmp_path / "clips", clips)
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     rows, _ = tables(tmp_path / "quality")
     assert rows["beta_distance"].tolist() == pytest.approx([0.0] * 6, abs=1e-6)
@@ -184,7 +162,7 @@ def test_a_shape_is_compared_with_clips_of_the_same_subject_only(make_clip, tmp_
 def test_shapes_of_frames_without_the_hand_are_not_read(make_clip, tmp_path):
     clips = [with_betas(make_clip(FRAMES, seed=3, clip_id=f"test/s1/{number}"), 0.3) for number in range(4)]
     clips[2] = lost(clips[2], 50.0, slice(10, 50))
-    write_store(tmp_path / "clips", clips, generated_info("test"))
+    write_clips(tmp_path / "clips", clips)
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     rows, _ = tables(tmp_path / "quality")
     assert rows["largest_beta"].tolist() == pytest.approx([0.3] * 4)
@@ -192,7 +170,7 @@ def test_shapes_of_frames_without_the_hand_are_not_read(make_clip, tmp_path):
 
 
 def test_store_without_clips_gives_empty_tables(tmp_path):
-    write_store(tmp_path / "clips", [], generated_info("test"))
+    write_clips(tmp_path / "clips", [])
     counts = quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     assert set(counts.values()) == {0}
     assert left_out_reasons(tmp_path / "quality") == {}
@@ -224,7 +202,7 @@ def test_no_clip_of_a_generated_corpus_is_left_out(corpus, tmp_path):
 def test_lag_planted_into_a_generated_corpus_is_found_within_a_frame(corpus, tmp_path, late):
     store = open_store(corpus / "clips")
     clips = [late_hands(store.clip(clip_id), late) for clip_id in store.ids]
-    write_store(tmp_path / "clips", clips, generated_info("test"))
+    write_clips(tmp_path / "clips", clips)
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     found = tables(tmp_path / "quality")[0]["time_offset_frames"].dropna()
     assert len(found) >= 0.6 * len(clips)
@@ -248,29 +226,10 @@ def test_no_recording_of_manipnet_is_left_out_and_its_open_cup_is_named(tmp_path
 def test_measures_do_not_depend_on_how_the_world_is_turned(make_clip, tmp_path):
     """Quarter turn about z and a shift: x to y, y to -x."""
     clip = make_clip(FRAMES, seed=3)
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    write_store(
-        tmp_path / "clips", [clip, replace(_turned(clip, turn), clip_id="test/s1/turned")], generated_info("test")
-    )
+    turned = in_another_world(clip, Rotation.from_rotvec([0, 0, np.pi / 2]), np.array([1.0, -2.0, 0.5]))
+    write_clips(tmp_path / "clips", [clip, replace(turned, clip_id="test/s1/turned")])
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
     rows, _ = tables(tmp_path / "quality")
     for measure in CLIP_MEASURES:
         first, second = rows[measure.name]
         assert first == pytest.approx(second, rel=0.02, abs=1e-4, nan_ok=True), measure.name
-
-
-def _turned(clip: Clip, turn: np.ndarray) -> Clip:
-    from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
-
-    def rotated(rotvec: np.ndarray) -> np.ndarray:
-        return rotmat_to_rotvec(turn @ rotvec_to_rotmat(rotvec.astype(np.float64))).astype(np.float32)
-
-    def moved(places: np.ndarray) -> np.ndarray:
-        return (places @ turn.T + np.array([1.0, -2.0, 0.5])).astype(np.float32)
-
-    hands = {
-        side: replace(track, wrist_m=moved(track.wrist_m), global_orient=rotated(track.global_orient))
-        for side, track in clip.hands.items()
-    }
-    thing = ObjectTrack(clip.object.model, rotated(clip.object.rotvec), moved(clip.object.translation_m))
-    return replace(clip, hands=hands, object=thing)

@@ -59,16 +59,3 @@ def test_a_file_cut_anywhere_gives_the_named_error_only(tmp_path: Path):
         (tmp_path / "cut.npz").write_bytes(whole[:length])
         with pytest.raises(BadInput, match=r"cut\.npz"):
             map_npz(tmp_path / "cut.npz")
-
-
-def test_all_arrays_of_a_file_share_one_mapping(tmp_path: Path):
-    write_npz(tmp_path / "a.npz", ARRAYS)
-    mapped = map_npz(tmp_path / "a.npz")
-
-    def owner(array: np.ndarray) -> object:
-        while isinstance(array.base, np.ndarray):
-            array = array.base
-        return memoryview(array.base).obj if isinstance(array.base, memoryview) else array.base
-
-    owners = {id(owner(mapped[name])) for name in ("a/points", "flags", "fortran")}
-    assert len(owners) == 1

@@ -16,16 +16,6 @@ def test_the_readme_is_the_one_the_table_gives():
     assert README.read_text() == readme(), "run: python -m hoidata.store_check.describe > hoidata/store/README.md"
 
 
-def test_every_field_says_what_it_is_in_the_readme():
-    text = README.read_text()
-    for file in fields.STORE_FILES:
-        assert f"## `{file.path}`" in text
-        for field in file.fields:
-            assert field.meaning
-            assert len(field.axes) == len(field.shape), field.name
-            assert f"| `{field.name}` | {field.dtype} |" in text
-
-
 def test_places_and_angles_have_a_unit_and_a_frame():
     for file in (fields.FRAMES, fields.BODY, fields.OBJECT_ARRAYS, fields.TEMPLATES):
         for field in file.fields:
@@ -50,9 +40,3 @@ def test_written_files_hold_what_the_table_says(folder):
     for field in fields.INFO.fields:
         fields.value_at(info, field.name)
     assert info["axes"]["<side>_hand_pose"] == ["frame", "joint x axis-angle"]
-
-
-def test_the_parameters_of_a_frame_take_no_more_than_500_bytes():
-    """Two hands, one object, source frame and camera; betas per clip, further objects and labels apart."""
-    per_frame = [field for field in fields.FRAMES.fields if field.shape[0] in ("frame", "camera row")]
-    assert sum(np.dtype(field.dtype).itemsize * int(np.prod(field.row_shape)) for field in per_frame) == 470

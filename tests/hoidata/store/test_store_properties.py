@@ -22,6 +22,7 @@ from hoidata.objects.sampling import sample_points
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store, write_store
 from hoidata.store_check.check import check_store
+from tests.builders.clips import in_another_world
 
 TETRAHEDRON_M = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
 FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
@@ -107,38 +108,6 @@ def test_writing_what_was_read_gives_the_same_bytes_and_a_sound_store(clips, fra
         write_store(second, [*left_out, *map(store.clip, store.ids)], store.info)
         assert contents(second) == contents(first)
         assert len(store) + len(left_out) == len(clips)
-
-
-def in_another_world(clip: Clip, turn: Rotation, shift_m: np.ndarray) -> Clip:
-    """The clip in a world whose points are ``turn(p) + shift_m``; SciPy's formulas, not ours."""
-
-    def moved(points_m: np.ndarray) -> np.ndarray:
-        return (turn.apply(points_m) + shift_m).astype(np.float32)
-
-    def turned(rotvec: np.ndarray) -> np.ndarray:
-        return (turn * Rotation.from_rotvec(rotvec)).as_rotvec().astype(np.float32)
-
-    def track(old: ObjectTrack) -> ObjectTrack:
-        return replace(old, rotvec=turned(old.rotvec), translation_m=moved(old.translation_m))
-
-    back = np.eye(4)
-    back[:3, :3], back[:3, 3] = turn.inv().as_matrix(), -turn.inv().apply(shift_m)
-    hands = {
-        side: replace(hand, wrist_m=moved(hand.wrist_m), global_orient=turned(hand.global_orient))
-        for side, hand in clip.hands.items()
-    }
-    camera = clip.camera
-    if camera is not None:
-        camera = replace(camera, rotvec=turned(camera.rotvec), position_m=moved(camera.position_m))
-    return replace(
-        clip,
-        hands=hands,
-        object=track(clip.object),
-        other_objects=tuple(map(track, clip.other_objects)),
-        gravity=None if clip.gravity is None else turn.apply(clip.gravity),
-        source_from_world=clip.source_from_world @ back,
-        camera=camera,
-    )
 
 
 def surface_m(clip: Clip, frame: int) -> np.ndarray:

@@ -11,8 +11,8 @@ from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
 from hoidata.surface.bimart_maps import BEYOND, REACH_M, bimart_map, packed_map, unpacked_map
 from hoidata.surface.contact import PlacedHand, placed_hand
+from tests.builders.clips import MIRROR, in_another_world, mirror_image, with_object
 
-MIRROR = np.diag((-1.0, 1.0, 1.0))
 POINTS = 200
 
 
@@ -22,7 +22,7 @@ def scene(request, make_clip):
     clip = make_clip(8, hand_type="both", articulated=request.param, seed=4)
     if request.param:
         angles = np.linspace(-1.4, 2.2, clip.n_frames)
-        clip = replace(clip, object=replace(clip.object, hinge_rad=angles))
+        clip = with_object(clip, hinge_rad=angles)
     hands = load_embedded_hands()
     vertices = {side: track_vertices(clip.hands[side], hands[side]).astype(np.float64) for side in SIDES}
     return clip, vertices, sample_points(clip.object.model, POINTS)
@@ -67,6 +67,19 @@ def brute_force(track: ObjectTrack, vertices: np.ndarray, points) -> np.ndarray:
     return np.where(nearest <= REACH_M, nearest, np.inf)
 
 
+def moved(clip: Clip) -> Clip:
+    return in_another_world(clip, Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array((1.0, -2.0, 0.5)))
+
+
+def turns(clip: Clip) -> np.ndarray:
+    """(frame, 3, 3) that take row vectors of the object's frame to the world."""
+    return Rotation.from_rotvec(clip.object.rotvec).as_matrix().transpose(0, 2, 1)
+
+
+def in_object(clip: Clip, places_m: np.ndarray) -> np.ndarray:
+    return (places_m - clip.object.translation_m[:, None]) @ turns(clip).transpose(0, 2, 1)
+
+
 def test_map_is_the_distance_to_the_nearest_hand_vertex(scene):
     clip, vertices, points = scene
     for side in SIDES:
@@ -77,36 +90,17 @@ def test_map_is_the_distance_to_the_nearest_hand_vertex(scene):
         np.testing.assert_allclose(bimart_map(hand, points, clip.object.model), truth, atol=1e-6)
 
 
-def test_map_is_unchanged_when_the_world_turns_and_shifts(scene):
-    clip, vertices, points = scene
-    turn, shift = Rotation.from_rotvec((0.4, -1.1, 0.7)), np.array((1.0, -2.0, 0.5))
-    rotvec = (turn * Rotation.from_rotvec(clip.object.rotvec)).as_rotvec()
-    track = replace(clip.object, rotvec=rotvec, translation_m=turn.apply(clip.object.translation_m) + shift)
-    for side in SIDES:
-        moved = turn.apply(vertices[side].reshape(-1, 3)).reshape(vertices[side].shape) + shift
-        before, after = map_of(clip.object, vertices[side], points), map_of(track, moved, points)
-        np.testing.assert_array_equal(np.isfinite(before), np.isfinite(after))
-        np.testing.assert_allclose(before, after, atol=1e-6)
-
-
-def test_mirrored_scene_has_the_maps_of_the_other_hand(scene):
+@pytest.mark.parametrize("changed", [moved, mirror_image], ids=["another world", "mirror"])
+def test_map_is_unchanged_in_another_world_and_in_a_mirror(scene, changed):
     """The mirrored right hand is a left one, before a mirrored object that turns and folds the other way round."""
     clip, vertices, points = scene
-    track, model = clip.object, clip.object.model
-    hinge = model.hinge and replace(
-        model.hinge, axis=-MIRROR @ model.hinge.axis, origin_m=MIRROR @ model.hinge.origin_m
-    )
-    turned = Rotation.from_rotvec(track.rotvec).as_matrix()
-    mirrored = replace(
-        track,
-        model=replace(model, hinge=hinge),
-        rotvec=Rotation.from_matrix(MIRROR @ turned @ MIRROR).as_rotvec(),
-        translation_m=track.translation_m @ MIRROR,
-    )
-    other_points = replace(points, points_m=points.points_m @ MIRROR.astype(np.float32))
+    other, flip = changed(clip), MIRROR if changed is mirror_image else np.ones(3)
+    other_points = replace(points, points_m=(points.points_m * flip).astype(np.float32))
     for side in SIDES:
-        found = map_of(mirrored, vertices[side] @ MIRROR, other_points)
-        np.testing.assert_allclose(found, map_of(track, vertices[side], points), atol=1e-6)
+        seen = other.object.translation_m[:, None] + (in_object(clip, vertices[side]) * flip) @ turns(other)
+        before, after = map_of(clip.object, vertices[side], points), map_of(other.object, seen, other_points)
+        np.testing.assert_array_equal(np.isfinite(before), np.isfinite(after))
+        np.testing.assert_allclose(before, after, atol=1e-6)
 
 
 def test_frames_without_the_hand_are_beyond_and_do_not_count(scene):

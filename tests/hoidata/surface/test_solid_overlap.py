@@ -9,17 +9,23 @@ from scipy.spatial.transform import Rotation
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.distance import volume_m3
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import patched_holes
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.surface.solid_overlap import SolidOverlap
+from tests.builders.objects import box_model, model_of, two_parts
 
 HAND = load_embedded_hands().right
 
 
 def overlap_of(mesh: trimesh.Trimesh, cell_m: float = 0.001) -> SolidOverlap:
-    model = ObjectModel("object", np.array(mesh.vertices), np.array(mesh.faces), np.zeros(len(mesh.vertices), np.uint8))
-    return SolidOverlap(SurfaceIndex(model), cell_m)
+    return SolidOverlap(SurfaceIndex(model_of(mesh)), cell_m)
+
+
+def tin() -> ObjectModel:
+    """Two plates of 10 x 10 x 2 cm, the upper turned by an edge along y."""
+    base, lid = box_model((0.1, 0.1, 0.02)), box_model((0.1, 0.1, 0.02), middle_m=(0, 0, 0.03))
+    return two_parts(base, lid, (0, 1, 0), (-0.05, 0, 0.015))
 
 
 def box_at(size: tuple[float, float, float], middle: tuple[float, float, float]) -> trimesh.Trimesh:
@@ -51,10 +57,7 @@ def test_the_size_of_a_cell_changes_no_volume_that_is_a_whole_number_of_cells(ce
 
 def test_volumes_in_two_parts_are_added_up() -> None:
     """A bar of 1 cm2 through both plates of 2 cm."""
-    base, lid = box_at((0.1, 0.1, 0.02), (0, 0, 0)), box_at((0.1, 0.1, 0.02), (0, 0, 0.03))
-    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([-0.05, 0, 0.015]))
-    vertices, faces = np.concatenate([base.vertices, lid.vertices]), np.concatenate([base.faces, lid.faces + 8])
-    model = ObjectModel("box", vertices, faces, np.repeat([0, 1], 8).astype(np.uint8), hinge)
+    model = tin()
     bar = box_at((0.01, 0.01, 0.2), (0.02, 0, 0))
     found = SolidOverlap(SurfaceIndex(model)).volume_m3(bar.vertices[None], bar.faces, np.zeros(1))
     np.testing.assert_allclose(found, 4e-6, atol=1e-12)
@@ -125,10 +128,8 @@ def _wrist_fan() -> np.ndarray:
 
 @pytest.mark.parametrize("angle", [-1.0, 0.0, 2.0])
 def test_the_moving_part_is_met_where_the_hinge_has_turned_it(angle: float) -> None:
-    base, lid = box_at((0.1, 0.1, 0.02), (0, 0, 0)), box_at((0.1, 0.1, 0.02), (0, 0, 0.03))
-    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([-0.05, 0, 0.015]))
-    vertices, faces = np.concatenate([base.vertices, lid.vertices]), np.concatenate([base.faces, lid.faces + 8])
-    model = ObjectModel("box", vertices, faces, np.repeat([0, 1], 8).astype(np.uint8), hinge)
+    model, hinge = tin(), tin().hinge
+    assert hinge is not None
     cube = box_at((0.01, 0.01, 0.01), (0.02, 0, 0.03))
     turn = Rotation.from_rotvec(hinge.axis * angle).as_matrix()
     there = (cube.vertices - hinge.origin_m) @ turn.T + hinge.origin_m

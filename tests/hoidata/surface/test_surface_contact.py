@@ -1,7 +1,6 @@
 """Hands of clips against the exact surface: known contacts, invariance under world motion and mirroring."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import igl
 import numpy as np
@@ -10,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips import SIDES, Clip
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_vertices
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand, touched_vertices
 from hoidata.surface.solid_overlap import SolidOverlap
+from tests.builders.clips import in_another_world, mirror_image, with_hand, with_object
 
 HANDS = load_embedded_hands()
 
@@ -37,8 +36,7 @@ def shifted(clip: Clip, way_m: float) -> Clip:
     wrist = clip.hands["right"].wrist_m
     away = wrist - clip.object.translation_m
     towards = way_m * away / np.linalg.norm(away, axis=1, keepdims=True)
-    track = replace(clip.object, translation_m=(clip.object.translation_m + towards).astype(np.float32))
-    return replace(clip, object=track)
+    return with_object(clip, translation_m=(clip.object.translation_m + towards).astype(np.float32))
 
 
 @pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
@@ -76,14 +74,13 @@ def test_a_vertex_inside_has_its_depth_however_deep_and_one_outside_only_within_
 def test_frames_without_the_hand_are_not_looked_at(make_clip: Callable[..., Clip]) -> None:
     clip = shifted(make_clip(n_frames=6), 0.02)
     valid = np.array([False, True, True, False, True, True])
-    right = replace(clip.hands["right"], valid=valid)
-    clip = replace(clip, hands={**clip.hands, "right": right})
+    clip = with_hand(clip, valid=valid)
     index, hand = SurfaceIndex(clip.object.model), placed_hand(clip, "right", HANDS)
     touched, overlap = touched_vertices(hand, index), SolidOverlap(index, 0.002)
     np.testing.assert_array_equal(touched.any(axis=1), valid)
     np.testing.assert_array_equal(np.isfinite(deepest_m(hand, index)), valid)
     np.testing.assert_array_equal(np.isfinite(shared_m3(hand, overlap)), valid)
-    gone = replace(clip, hands={**clip.hands, "right": replace(right, valid=np.zeros(6, bool))})
+    gone = with_hand(clip, valid=np.zeros(6, bool))
     assert np.isnan(deepest_m(placed_hand(gone, "right", HANDS), index)).all()
 
 
@@ -91,9 +88,9 @@ def test_the_angle_of_a_hinge_is_that_of_its_own_frame_where_others_lack_the_han
     make_clip: Callable[..., Clip],
 ) -> None:
     clip = shifted(make_clip(n_frames=6, articulated=True), 0.02)
-    track = replace(clip.object, hinge_rad=np.linspace(-0.5, 2.0, 6).astype(np.float32))
-    clip, valid = replace(clip, object=track), np.array([False, True, False, True, True, False])
-    some = replace(clip, hands={**clip.hands, "right": replace(clip.hands["right"], valid=valid)})
+    clip = with_object(clip, hinge_rad=np.linspace(-0.5, 2.0, 6).astype(np.float32))
+    valid = np.array([False, True, False, True, True, False])
+    some = with_hand(clip, valid=valid)
     index = SurfaceIndex(clip.object.model)
     overlap = SolidOverlap(index, 0.002)
     whole, part = (placed_hand(each, "right", HANDS) for each in (clip, some))
@@ -121,8 +118,7 @@ def test_deeper_hands_share_more_volume_and_a_far_hand_none(make_clip: Callable[
 @pytest.mark.parametrize("articulated", [False, True], ids=["rigid", "articulated"])
 def test_nothing_changes_when_the_world_moves(make_clip: Callable[..., Clip], articulated: bool) -> None:
     clip = shifted(make_clip(n_frames=6, articulated=articulated), 0.02)
-    turn, way = Rotation.from_rotvec([0.4, -2.0, 1.0]).as_matrix(), np.array([0.3, -0.2, 0.5])
-    moved = world_moved(clip, turn, way)
+    moved = in_another_world(clip, Rotation.from_rotvec([0.4, -2.0, 1.0]), np.array([0.3, -0.2, 0.5]))
     index = SurfaceIndex(clip.object.model)
     overlap = SolidOverlap(index)
     for side in SIDES:
@@ -135,23 +131,6 @@ def test_nothing_changes_when_the_world_moves(make_clip: Callable[..., Clip], ar
         np.testing.assert_allclose(second[both], first[both], atol=3e-6)
         volumes = [shared_m3(hand, overlap) for hand in (one, two)]
         np.testing.assert_allclose(volumes[1], volumes[0], atol=2e-8)
-
-
-def world_moved(clip: Clip, turn: np.ndarray, way_m: np.ndarray) -> Clip:
-    def turned(rotvec: np.ndarray) -> np.ndarray:
-        return rotmat_to_rotvec(turn @ rotvec_to_rotmat(rotvec.astype(np.float64))).astype(np.float32)
-
-    hands = {
-        side: replace(
-            track,
-            wrist_m=(track.wrist_m @ turn.T + way_m).astype(np.float32),
-            global_orient=turned(track.global_orient),
-        )
-        for side, track in clip.hands.items()
-    }
-    translation = (clip.object.translation_m @ turn.T + way_m).astype(np.float32)
-    track = replace(clip.object, rotvec=turned(clip.object.rotvec), translation_m=translation)
-    return replace(clip, hands=hands, object=track)
 
 
 def test_the_mirrored_clip_has_the_other_hand_s_contacts(make_clip: Callable[..., Clip]) -> None:
@@ -168,27 +147,6 @@ def test_the_mirrored_clip_has_the_other_hand_s_contacts(make_clip: Callable[...
         np.testing.assert_array_equal(touched_vertices(one, index)[clear], touched_vertices(two, other)[clear])
         volumes = [shared_m3(hand, overlap) for hand, overlap in zip((one, two), overlaps, strict=True)]
         np.testing.assert_allclose(volumes[1], volumes[0], atol=2e-8)
-
-
-def mirror_image(clip: Clip) -> Clip:
-    """The clip in a mirror that turns x: axis-angles keep x and turn y and z, left and right change places."""
-    flip = np.array([-1.0, 1, 1])
-    turn = -flip
-    hands = {}
-    for side, opposite in zip(SIDES, reversed(SIDES), strict=True):
-        track = clip.hands[opposite]
-        pose = (track.hand_pose.reshape(-1, 15, 3) * turn).reshape(track.hand_pose.shape)
-        hands[side] = replace(
-            track, wrist_m=track.wrist_m * flip, global_orient=track.global_orient * turn, hand_pose=pose
-        )
-    model = clip.object.model
-    assert model.hinge is not None
-    hinge = Hinge(model.hinge.axis * turn, model.hinge.origin_m * flip)
-    image = ObjectModel("mirrored", model.vertices_m * flip, model.faces[:, ::-1], model.part, hinge)
-    track = replace(
-        clip.object, model=image, rotvec=clip.object.rotvec * turn, translation_m=clip.object.translation_m * flip
-    )
-    return replace(clip, hands=hands, object=track)
 
 
 def test_an_open_object_has_touched_vertices_but_no_penetration(make_clip: Callable[..., Clip]) -> None:

@@ -15,18 +15,21 @@ from hoidata.hands import load_embedded_hands, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.objects.sampling import sample_points
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.store.info import generated_info
-from hoidata.store.store import open_store, write_store
+from hoidata.store.store import open_store
 from hoidata.surface.bimart_maps import bimart_map
 from hoidata.surface.contact import deepest_m, placed_hand
 from hoidata.surface.measure import ObjectShape, measure_hand
 from hoidata.surface.solid_overlap import SolidOverlap
 from hoidata.surface.stage import surface_store
 from hoidata.surface.store import open_surface
+from tests.builders.clips import with_hand, with_object
+from tests.builders.stores import write_clips
 
 POINTS = 128
 HALF_BOX_M = np.array((0.05, 0.04, 0.03))
 TOUCH_M = 0.005
+LEFT_OUT = {"test/s2/left": "left out by quality control: so"}
+ARGUMENTS: dict = {"points": POINTS, "left_out": LEFT_OUT, "progress": False}
 
 
 def box_distance(places: np.ndarray) -> np.ndarray:
@@ -63,16 +66,8 @@ def clips(make_clip):
 
 @pytest.fixture
 def written(clips, tmp_path):
-    write_store(tmp_path / "clips", clips, generated_info("grab"))
-    report = surface_store(
-        tmp_path / "clips",
-        tmp_path / "surface",
-        touch_m=TOUCH_M,
-        points=POINTS,
-        left_out={"test/s2/left": "left out by quality control: so"},
-        progress=False,
-    )
-    return tmp_path, report
+    write_clips(tmp_path / "clips", clips)
+    return tmp_path, surface_store(tmp_path / "clips", tmp_path / "surface", **ARGUMENTS)
 
 
 def test_contact_depth_and_joint_distance_are_those_of_the_box(written, clips):
@@ -163,9 +158,9 @@ def test_volume_is_that_of_the_deepest_frame_at_the_angle_of_that_frame(make_cli
     middle = track_vertices(clip.hands["right"], hands["right"]).mean(axis=1)
     beside = np.linspace(0.0, 0.07, 8)[:, None] * np.array([0.0, 0.0, 1.0])
     place = middle + beside - np.einsum("fij,fj->fi", Rotation.from_rotvec(clip.object.rotvec).as_matrix(), lid_m)
-    clip = replace(clip, object=replace(clip.object, translation_m=place.astype(np.float32), hinge_rad=angles))
-    right = replace(clip.hands["right"], valid=np.arange(8) > 1)
-    clip = replace(clip, hands={**clip.hands, "right": right})
+    clip = with_object(clip, translation_m=place.astype(np.float32), hinge_rad=angles)
+    clip = with_hand(clip, valid=np.arange(8) > 1)
+    right = clip.hands["right"]
     shape = ObjectShape(model, sample_points(model, POINTS))
     found = measure_hand(clip, "right", track_joints(right, hands["right"]), hands, shape)
     hand = placed_hand(clip, "right", hands)
@@ -189,16 +184,14 @@ def test_bits_of_touched_vertices_lie_as_the_layout_says(written):
 
 def test_bytes_repeat_and_shards_do_not_change_what_is_read(written, monkeypatch):
     folder, _ = written
-    left_out = {"test/s2/left": "left out by quality control: so"}
-    arguments = {"points": POINTS, "left_out": left_out, "progress": False}
-    surface_store(folder / "clips", folder / "again", **arguments)
+    surface_store(folder / "clips", folder / "again", **ARGUMENTS)
     names = sorted(path.name for path in (folder / "surface").iterdir())
     assert names == ["clips.parquet", "info.json", "objects.parquet", "surface-00000.npz"]
     assert [(folder / "again" / name).read_bytes() for name in names] == [
         (folder / "surface" / name).read_bytes() for name in names
     ]
     monkeypatch.setattr("hoidata.surface.store.FRAMES_PER_SHARD", 5)
-    surface_store(folder / "clips", folder / "small", **arguments)
+    surface_store(folder / "clips", folder / "small", **ARGUMENTS)
     whole, parts = open_surface(folder / "surface"), open_surface(folder / "small")
     assert parts.clips["shard"].tolist()[:2] == [0, 1]
     for clip_id in whole.ids:
@@ -216,9 +209,7 @@ def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_u
             yield clip_id, (measure(clip_id)[0], {"contact": 0.25, "maps": 1.0})
 
     monkeypatch.setattr("hoidata.surface.stage.in_workers", backwards)
-    left_out = {"test/s2/left": "left out by quality control: so"}
-    arguments = {"points": POINTS, "left_out": left_out, "progress": False}
-    report = surface_store(folder / "clips", folder / "backwards", jobs=8, **arguments)
+    report = surface_store(folder / "clips", folder / "backwards", jobs=8, **ARGUMENTS)
     for path in (folder / "surface").iterdir():
         assert (folder / "backwards" / path.name).read_bytes() == path.read_bytes()
     assert report.seconds == {"contact": 0.75, "maps": 3.0}
@@ -226,7 +217,7 @@ def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_u
     assert asked == [1]  # of 36 frames a second process would cost more than it saves
     monkeypatch.setattr("hoidata.surface.stage.FRAMES_PER_JOB", 18)
     for jobs, expected in ((8, 3), (2, 2)):
-        surface_store(folder / "clips", folder / "again", jobs=jobs, **arguments)
+        surface_store(folder / "clips", folder / "again", jobs=jobs, **ARGUMENTS)
         assert asked.pop() == expected
 
 
@@ -234,8 +225,7 @@ def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_u
 def test_bytes_do_not_depend_on_the_number_of_processes(written, monkeypatch):
     folder, _ = written
     monkeypatch.setattr("hoidata.surface.stage.FRAMES_PER_JOB", 10)
-    left_out = {"test/s2/left": "left out by quality control: so"}
-    surface_store(folder / "clips", folder / "jobs", points=POINTS, left_out=left_out, jobs=2, progress=False)
+    surface_store(folder / "clips", folder / "jobs", jobs=2, **ARGUMENTS)
     for path in (folder / "surface").iterdir():
         assert (folder / "jobs" / path.name).read_bytes() == path.read_bytes()
 
@@ -245,8 +235,8 @@ def test_object_without_an_inside_has_no_depth_and_says_so(make_clip, tmp_path):
     clip = make_clip(6)
     corners = np.array([(-0.05, -0.04, 0.03), (0.05, -0.04, 0.03), (0.05, 0.04, 0.03), (-0.05, 0.04, 0.03)])
     plate = ObjectModel("plate", corners, np.array([(0, 1, 2), (0, 2, 3)]), np.zeros(4, np.uint8))
-    clip = replace(clip, object=replace(clip.object, model=plate))
-    write_store(tmp_path / "clips", [clip], generated_info("grab"))
+    clip = with_object(clip, model=plate)
+    write_clips(tmp_path / "clips", [clip])
     report = surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
     store = open_surface(tmp_path / "surface")
     assert report.counts["objects_not_solid"] == 1
@@ -262,8 +252,8 @@ def test_object_of_metres_has_depths_but_no_volumes(make_clip, tmp_path):
     clip = make_clip(4)
     model = clip.object.model
     vertices = model.vertices_m * np.array((1.0, 60.0, 40.0))
-    large = replace(clip, object=replace(clip.object, model=replace(model, vertices_m=vertices)))
-    write_store(tmp_path / "clips", [large], generated_info("grab"))
+    large = with_object(clip, model=replace(model, vertices_m=vertices))
+    write_clips(tmp_path / "clips", [large])
     surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
     row = open_surface(tmp_path / "surface").clips.iloc[0]
     assert row["right_deepest_m"] > 0.01
@@ -278,7 +268,7 @@ def test_one_mesh_without_a_surface_costs_its_own_clips_only(clips, tmp_path, mo
 
     for module in ("stage", "measure"):
         monkeypatch.setattr(f"hoidata.surface.{module}.SurfaceIndex", index_of)
-    write_store(tmp_path / "clips", clips, generated_info("grab"))
+    write_clips(tmp_path / "clips", clips)
     report = surface_store(tmp_path / "clips", tmp_path / "surface", points=POINTS, progress=False)
     store = open_surface(tmp_path / "surface")
     assert store.ids == ["test/s1/through", "test/s2/left"]
@@ -287,9 +277,7 @@ def test_one_mesh_without_a_surface_costs_its_own_clips_only(clips, tmp_path, mo
 
 
 def test_store_without_clips_gives_a_folder_that_reads(tmp_path):
-    write_store(tmp_path / "clips", [], generated_info("grab"))
-    report = surface_store(tmp_path / "clips", tmp_path / "surface", progress=False)
-    assert report.counts["clips"] == 0
+    surface_store(write_clips(tmp_path / "clips", []), tmp_path / "surface", progress=False)
     assert open_surface(tmp_path / "surface").ids == []
 
 

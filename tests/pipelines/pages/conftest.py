@@ -1,19 +1,20 @@
 """What the pages' tests share: a made-up clip (hands beside a carried box), an independent glTF reader."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pygltflib
 import pytest
-import trimesh
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import Clip, HandTrack, ObjectTrack
+from hoidata.clips.clip import Clip, HandTrack, ObjectTrack, Side
 from hoidata.hands import load_embedded_hands
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import ObjectModel
+from tests.builders.clips import clip_of
+from tests.builders.objects import box_model, two_parts
 
 FRAMES = 24
-GRAVITY = np.array((0.0, 0.0, -1.0))
 
 
 def hand_track(wrist_m: np.ndarray, orient: np.ndarray, valid: bool, curl_rad: float = 0.9) -> HandTrack:
@@ -24,17 +25,10 @@ def hand_track(wrist_m: np.ndarray, orient: np.ndarray, valid: bool, curl_rad: f
     return HandTrack(wrist_m, orient, pose.reshape(frames, 45), betas, np.full(frames, valid))
 
 
-def box_model(hinged: bool = False) -> ObjectModel:
-    box = trimesh.creation.box((0.08, 0.12, 0.06))
-    vertices, faces = np.asarray(box.vertices), np.asarray(box.faces)
-    if not hinged:
-        return ObjectModel("box", vertices, faces, np.zeros(len(vertices), np.uint8))
-    lid = trimesh.creation.box((0.08, 0.12, 0.01))
-    lid.apply_translation((0, 0, 0.036))
-    hinge = Hinge(np.array((0.0, 1.0, 0.0)), np.array((-0.04, 0.0, 0.031)))
-    part = np.repeat(np.array((0, 1), np.uint8), 8)
-    both = np.concatenate([faces, np.asarray(lid.faces) + 8])
-    return ObjectModel("lidded box", np.concatenate([vertices, lid.vertices]), both, part, hinge)
+def page_model(hinged: bool = False) -> ObjectModel:
+    box = box_model((0.08, 0.12, 0.06))
+    lid = box_model((0.08, 0.12, 0.01), middle_m=(0, 0, 0.036))
+    return two_parts(box, lid, (0, 1, 0), (-0.04, 0, 0.031), "lidded box") if hinged else box
 
 
 def make_page_clip(right: bool = True, left: bool = False, hinged: bool = False, frames: int = FRAMES) -> Clip:
@@ -43,23 +37,12 @@ def make_page_clip(right: bool = True, left: bool = False, hinged: bool = False,
     centre = np.stack([0.1 * phase, 0.05 * phase, 0.03 + 0.2 * phase], axis=1)
     rotvec = np.stack([0 * phase, 0 * phase, 0.6 * phase], axis=1)
     hinge = -1.2 * phase if hinged else None
-    tracks = {
+    tracks: dict[Side, HandTrack] = {
         "left": hand_track(centre + np.array((-0.13, 0, 0.08)), np.tile((1.3, -0.2, -2.6), (frames, 1)), left),
         "right": hand_track(centre + np.array((0.13, 0, 0.08)), np.tile((1.3, 0.2, 2.6), (frames, 1)), right),
     }
-    return Clip(
-        clip_id="test/box_lift",
-        dataset="test",
-        subject="s1",
-        sequence="box_lift",
-        hands=tracks,  # pyright: ignore[reportArgumentType]
-        object=ObjectTrack(box_model(hinged), rotvec, centre, hinge),
-        source_frames=np.arange(frames, dtype=np.int32),
-        gravity=GRAVITY,
-        verb="lift",
-        object_words="box",
-        synthetic=True,
-    )
+    track = ObjectTrack(page_model(hinged), rotvec, centre, hinge)
+    return replace(clip_of("test/s1/box_lift", track, tracks, object_words="box"), clip_id="test/box_lift")
 
 
 _DTYPES = {5121: np.uint8, 5125: np.uint32, 5126: np.float32}

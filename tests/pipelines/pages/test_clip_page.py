@@ -11,16 +11,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.annotation.stage import annotate_store
 from hoidata.clips.clip import CameraTrack, SourceFile
-from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import track_joints, track_vertices
-from hoidata.quality.stage import quality_store
-from hoidata.splits.stage import split_store
 from hoidata.store.annotated import load_annotated
-from hoidata.store.info import generated_info
-from hoidata.store.store import write_store
 from hoidata.surface.stage import surface_store
 from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
 from pipelines.pages.clip_page_series import measure_clip
@@ -28,6 +22,7 @@ from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_ti
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import three_javascript
 from pipelines.pages.surface_facts import surface_beside
+from tests.builders.stores import write_annotated, write_clips
 
 THRESHOLD_M = 0.09
 SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
@@ -39,10 +34,8 @@ def dataset(hands, page_clip, tmp_path):
     """Three annotated clips: both hands with a hinged box, a right hand that leaves for five frames, hands far away."""
     both = replace(page_clip(left=True, hinged=True), clip_id="test/s1/lid", labelled_hand="right")
     right = page_clip()
-    valid = right.hands["right"].valid.copy()
-    valid[5:10] = False
-    hand = replace(right.hands["right"], valid=valid)
     frames = right.n_frames
+    hand = replace(right.hands["right"], valid=(np.arange(frames) < 5) | (np.arange(frames) >= 10))
     camera = CameraTrack("cam4", np.zeros((frames, 3)), np.zeros((frames, 3)), np.arange(frames, dtype=np.int32) + 700)
     right = replace(
         right,
@@ -61,11 +54,7 @@ def dataset(hands, page_clip, tmp_path):
         gravity_note="still",
     )
     root = tmp_path / "grab"
-    write_store(root / "clips", [both, right, far], generated_info("grab", hands))
-    quality_store(root / "clips", root / "quality", progress=False)
-    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=THRESHOLD_M)
-    contact_store(root / "clips", root / "contact", threshold_m=THRESHOLD_M)
-    split_store(root / "clips", root / "annotation", root / "splits", SPLIT)
+    write_annotated(root, [both, right, far], "grab", SPLIT, THRESHOLD_M, quality=True)
     return load_annotated(root, hands)
 
 
@@ -167,7 +156,7 @@ def test_surface_of_another_conversion_or_of_other_points_is_refused(dataset, ha
     with pytest.raises(BadInput, match="maps on 1024 points, got on 32"):
         surface_beside(dataset)
     shutil.rmtree(dataset.root / "surface")
-    write_store(tmp_path / "others", [page_clip()], generated_info("grab", hands))
+    write_clips(tmp_path / "others", [page_clip()], "grab")
     surface_store(tmp_path / "others", dataset.root / "surface", progress=False)
     with pytest.raises(BadInput, match="the 3 clips of the store beside it"):
         surface_beside(dataset)
@@ -244,12 +233,8 @@ def test_page_says_where_annotator_and_distances_disagree(dataset, hands, tmp_pa
 
 def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp_path):
     """A box lifted by 20 cm under the hand, of which its source says no word."""
-    root = tmp_path / "grab"
-    write_store(root / "clips", [replace(page_clip(), verb=None)], generated_info("grab", hands))
-    quality_store(root / "clips", root / "quality", progress=False)
-    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=THRESHOLD_M)
-    contact_store(root / "clips", root / "contact", threshold_m=THRESHOLD_M)
-    split_store(root / "clips", root / "annotation", root / "splits", {**SPLIT, "test": []})
+    clips, rule = [replace(page_clip(), verb=None)], {**SPLIT, "test": []}
+    root = write_annotated(tmp_path / "grab", clips, "grab", rule, THRESHOLD_M, quality=True)
     text = write_clip_page(tmp_path / "page.html", load_annotated(root, hands), "test/box_lift", hands).read_text()
     assert re.search(r"<dd>lift, derived from the motion \(.+\): the source has no label</dd>", text)
 
@@ -295,17 +280,6 @@ def test_values_under_the_cursor_are_empty_where_a_hand_is_not_valid(dataset, ha
     values = near.lines[0]["values"]
     assert values[5:10] == [None] * 5
     assert values[4] == pytest.approx(series.evidence.distance_m["right"][4] * 100, abs=0.05)
-
-
-def test_axis_of_a_still_object_does_not_magnify_its_noise():
-    """The line stays within a fortieth of its chart's height, where it would fill it without the least span."""
-    noise = np.array([0.0, 0.02, -0.01, 0.01])
-    [path] = re.findall(
-        r'<path d="M ([^"]*)"[^>]*stroke: #123456',
-        draw_timeline([Chart("height", "cm", [Line("object", "#123456", noise)], least=2)], "salt").svg,
-    )
-    heights = [float(word) for word in re.findall(r"-?[0-9.]+", path)][1::2]
-    assert max(heights) - min(heights) < 72 / 40
 
 
 def test_page_names_are_safe_file_names():

@@ -7,15 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from hoidata.annotation.stage import annotate_store
 from hoidata.clips.quarantine import Quarantined
-from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput, MissingResource
-from hoidata.quality.stage import quality_store
-from hoidata.splits.stage import split_store
 from hoidata.store.annotated import load_annotated
-from hoidata.store.info import generated_info
-from hoidata.store.store import write_store
 from hoidata.surface.stage import surface_store
 from hoidata.surface.store import open_surface
 from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
@@ -23,6 +17,7 @@ from pipelines.pages.report import ReportFolders, write_report
 from pipelines.pages.surface_facts import contact_by_object
 from pipelines.pages.view import view_of
 from pipelines.showing import closest_ids, find_clip, write_shown
+from tests.builders.stores import write_annotated, write_clips
 
 SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
 LEFT_OUT = Quarantined("grab/s1/mug_1", "s1/mug_1.npz", "finite numbers", "NaN in <frame 3>", "download it again")
@@ -40,11 +35,7 @@ def project(hands, page_clip, tmp_path, monkeypatch):
         replace(right, clip_id="grab/s1/box_far", hands=far),
     ]
     root = tmp_path / "data" / "embedded" / "grab"
-    write_store(root / "clips", [*clips, LEFT_OUT], generated_info("grab", hands))
-    quality_store(root / "clips", root / "quality", progress=False)
-    annotate_store(root / "clips", root / "annotation", encoder="hash", threshold_m=0.09)
-    contact_store(root / "clips", root / "contact", threshold_m=0.09)
-    split_store(root / "clips", root / "annotation", root / "splits", SPLIT)
+    write_annotated(root, [*clips, LEFT_OUT], "grab", SPLIT, 0.09, quality=True)
     (tmp_path / "params.yaml").write_text(yaml.safe_dump({"datasets": ["h2o", "grab"], "profile": "embedded"}))
     (tmp_path / "manifests" / "embedded").mkdir(parents=True)
     (tmp_path / "manifests" / "embedded" / "hand.json").write_text('{"present": true}')
@@ -88,7 +79,7 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
         wrist[first : first + 10] = clip.object.translation_m[first : first + 10]
         tracks[side] = replace(clip.hands[side], wrist_m=wrist)
     alone = replace(page_clip(hinged=True), clip_id="test/lid")
-    write_store(tmp_path / "clips", [replace(clip, hands=tracks), alone], generated_info("grab", hands))
+    write_clips(tmp_path / "clips", [replace(clip, hands=tracks), alone], "grab")
     surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
     store = open_surface(tmp_path / "surface")
     rows = {row.name: row for row in contact_by_object(store)}
@@ -105,7 +96,7 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
 
 def test_frames_count_as_deep_from_a_centimetre_on(page_clip, hands, tmp_path, monkeypatch):
     """The left hand is 3 mm deep in frames 5 to 14 and 11 mm in 15 to 17 of 30; the right 9.9 mm in the last two."""
-    write_store(tmp_path / "clips", [page_clip(frames=30)], generated_info("grab", hands))
+    write_clips(tmp_path / "clips", [page_clip(frames=30)], "grab")
     surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
     store = open_surface(tmp_path / "surface")
     depth = {side: np.zeros(30) for side in ("left", "right")}
@@ -127,9 +118,7 @@ def test_page_shows_contact_and_penetration_where_the_stage_ran(project, hands, 
 def test_object_without_an_inside_has_no_depths_in_the_table(page_clip, hands, tmp_path):
     clip = page_clip()
     plate = replace(clip.object.model, faces=clip.object.model.faces[:2])
-    write_store(
-        tmp_path / "clips", [replace(clip, object=replace(clip.object, model=plate))], generated_info("grab", hands)
-    )
+    write_clips(tmp_path / "clips", [replace(clip, object=replace(clip.object, model=plate))], "grab")
     surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
     [row] = contact_by_object(open_surface(tmp_path / "surface"))
     assert (row.inside, row.deep, row.deepest, row.volume) == ("", "", "", "")
@@ -165,11 +154,20 @@ def test_still_shows_the_frame_in_which_most_points_are_touched(project, hands):
 @pytest.mark.slow
 def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, hands, tmp_path):
     assert can_be_shown(project)
-    page = write_report(tmp_path / "report", "embedded", ["h2o", "grab"], hands, ReportFolders.of("embedded", tmp_path))
+    page = write_report(
+        tmp_path / "report",
+        "embedded",
+        ["h2o", "grab"],
+        ["ground-truth"],
+        hands,
+        ReportFolders.of("embedded", tmp_path),
+    )
     assert 'href="grab.html"' in page.read_text()
     assert "<h1>GRAB" in (tmp_path / "report" / "grab.html").read_text()
     (project / "splits" / "splits.parquet").unlink()
-    page = write_report(tmp_path / "less", "embedded", ["grab"], hands, ReportFolders.of("embedded", tmp_path))
+    page = write_report(
+        tmp_path / "less", "embedded", ["grab"], ["ground-truth"], hands, ReportFolders.of("embedded", tmp_path)
+    )
     assert "grab.html" not in page.read_text()
 
 
@@ -178,13 +176,6 @@ def test_show_writes_the_page_of_a_clip(project, tmp_path):
     assert path == tmp_path / "pages" / "grab_s2_lid_1.html"
     assert '<p class="quiet">grab/s2/lid_1</p>' in path.read_text()
     assert find_clip("grab/s1/box_2", "embedded", ["h2o", "grab"]).dataset == "grab"
-
-
-@pytest.mark.slow
-def test_show_writes_the_page_of_a_dataset(project, tmp_path):
-    path = write_shown("grab", "embedded", tmp_path / "pages")
-    assert path == tmp_path / "pages" / "grab.html"
-    assert "<h1>GRAB" in path.read_text()
 
 
 def test_unknown_clip_names_the_closest_ones(project, tmp_path):

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import RawTree
@@ -23,19 +22,6 @@ def root(tmp_path: Path) -> Path:
 
 def first(load_all, root: Path, **settings):
     return load_all(ArcticAdapter(**settings), root)[0]
-
-
-def test_the_head_camera_comes_along_with_the_frames_of_its_clip(root, load_all):
-    recording.write_extra(root, "egocam.dist", recording.head())
-    clip = load_all(ArcticAdapter(), root)[1]
-    assert clip.source_frames[[0, -1]].tolist() == [14, 43]
-    head, camera = recording.head(), clip.camera
-    rotation = head["R_k_cam_np"][14:44].transpose(0, 2, 1)
-    np.testing.assert_allclose(Rotation.from_rotvec(camera.rotvec).as_matrix(), rotation, atol=1e-6)
-    place = -np.einsum("fij,fjk->fi", rotation, head["T_k_cam_np"][14:44])
-    np.testing.assert_allclose(camera.position_m, place, atol=1e-6)
-    assert camera.images.tolist() == list(range(14, 44))
-    assert (camera.rotvec.dtype, camera.position_m.dtype, camera.images.dtype) == (np.float32, np.float32, np.int32)
 
 
 def test_a_shift_of_three_numbers_per_frame_is_the_same_as_one_of_three_rows(root, load_all):

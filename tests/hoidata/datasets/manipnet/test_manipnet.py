@@ -12,7 +12,6 @@ from hoidata.clips.clip import Clip
 from hoidata.datasets import Quarantined, RawTree
 from hoidata.datasets.manipnet.adapter import ManipNetAdapter, object_words, read_recording, thirty_fps_frames
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.objects import place
 from tests.builders.manipnet import KEY, MIRROR, lift_rows, write_tree
 
 HANDS = load_embedded_hands()
@@ -61,7 +60,7 @@ def test_the_way_back_leads_to_the_files_own_numbers(carried: tuple[RawTree, Cli
     world = np.append(clip.object.translation_m[-1], 1.0)
     sway = 0.002 * np.sin(596 / 9)
     np.testing.assert_allclose((clip.source_from_world @ world)[:3], [-0.9 + sway, 4.0, -0.4], atol=1e-5)
-    corner = place(clip.object.model.vertices_m[None], clip.object.rotvec, clip.object.translation_m)[-1, 0]
+    corner = (clip.object.world_from_object @ clip.object.model.vertices_m)[-1, 0]
     np.testing.assert_allclose(corner * 10 * MIRROR, [-0.9 + sway - 0.5, 4.0, -0.4], atol=1e-5)
 
 

@@ -1,0 +1,42 @@
+"""Stores of tests, written by the stages themselves."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hoidata.annotation.stage import annotate_store
+from hoidata.clips import Clip
+from hoidata.clips.quarantine import Quarantined
+from hoidata.contact.settings import ContactSettings
+from hoidata.contact.stage import contact_store
+from hoidata.quality.stage import quality_store
+from hoidata.splits.stage import split_store
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+
+BY_SUBJECT = {"by": "subject", "train": "rest", "validation": ["s2"], "test": ["s3"]}
+
+
+def write_clips(folder: Path, clips: Sequence[Clip | Quarantined], dataset: str = "test") -> Path:
+    write_store(folder, clips, generated_info(dataset))
+    return folder
+
+
+def write_annotated(
+    root: Path,
+    clips: Sequence[Clip | Quarantined],
+    dataset: str = "toy",
+    rule: dict[str, Any] | None = None,
+    threshold_m: float = 0.02,
+    points: int = 1024,
+    quality: bool = False,
+) -> Path:
+    """clips, annotation (the encoder without weights), contact and splits below ``root``; quality where asked for."""
+    contact = ContactSettings(points=points, threshold_m=threshold_m)
+    write_clips(root / "clips", clips, dataset)
+    if quality:
+        quality_store(root / "clips", root / "quality", progress=False)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", contact=contact)
+    contact_store(root / "clips", root / "contact", contact)
+    split_store(root / "clips", root / "annotation", root / "splits", rule or BY_SUBJECT)
+    return root
