@@ -93,7 +93,7 @@ def _print_json(tree, provenance: dict) -> None:
 
     kept = ("stage", "model", "config", "seed", "synthetic", "libraries", "clips", "params_digest", "code_digest")
     facts = {key: provenance[key] for key in kept if key in provenance}
-    values = {"schema": "pipelines.lineage/1", "status": overall_status(tree), **facts, "tree": tree_as_json(tree)}
+    values = {"schema": "hoidata.lineage/1", "status": overall_status(tree), **facts, "tree": tree_as_json(tree)}
     typer.echo(json_module.dumps(values, indent=2, ensure_ascii=False))
 
 

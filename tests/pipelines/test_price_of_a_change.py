@@ -116,9 +116,7 @@ CHANGES = (
         "report; annotate, contact, convert, evaluate, quality, raw, sample, split, surface, train, train-diffusion, "
         "train-refiner of toy",
     ),
-    Change(
-        "the sentences: `hoidata/annotation/sentences.py`", touch("hoidata/annotation/sentences.py"), "annotate, report"
-    ),
+    Change("the sentences: `hoidata/annotation/sentences.py`", touch("hoidata/annotation/sentences.py"), "annotate"),
     Change(
         "conformance kit, store checks, lineage, docs",
         touch("hoidata/conformance/check.py", "hoidata/store_check/check.py", "pipelines/lineage/tree.py", "README.md"),

@@ -75,7 +75,7 @@ def test_lineage_says_what_has_changed_since(built, project_tools):
     try:
         result = project_tools.run(built, "hoidata", "lineage", "checkpoints/embedded/grab/contact")
         assert result.returncode == 1
-        assert "annotate.threshold_m changed value: 0.02 -> 0.03" in result.stdout
+        assert "annotate changed threshold_m: None -> 0.03" in result.stdout
     finally:
         (built / "params.yaml").write_text(params)
 

@@ -56,8 +56,9 @@ def test_what_cannot_be_read_back_is_named() -> None:
         for thing in HOMOGRAPH_OBJECTS
         for sentence in maker.unguarded(verb, thing, "left")
     ]
-    assert {"verb", "object", None} <= set(lost)
-    assert maker.lost("Lift a stamp with the left hand.", "stamp", "stamp", "left") == "verb"
+    assert {"verb", None} <= set(lost)
+    assert maker.lost("Stamp a watch with the left hand.", "stamp", "stamp", "left") == "object"
+    assert maker.lost("Lift a stamp with the left hand.", "stamp", "stamp", "left") is not None
     assert maker.lost("Stamp a stamp with the right hand.", "stamp", "stamp", "left") == "hand"
     assert maker.lost("Stamp a stamp.", "stamp", "stamp", "left") == "hand"
 
