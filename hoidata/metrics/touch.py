@@ -11,7 +11,7 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, Side
 from hoidata.errors import BadInput
-from hoidata.hands import N_JOINTS
+from hoidata.hands.model import N_JOINTS
 from hoidata.metrics.pair import Motion, Pair
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
@@ -39,7 +39,7 @@ def contact_precision(pair: Pair, every: int) -> np.ndarray:
 
 
 def contact_recall(pair: Pair, every: int) -> np.ndarray:
-    """(1,) of the points the reference touches the share that the motion touches; as ``contact_f1`` where one is empty."""
+    """(1,) of the points the reference touches the share that the motion touches, as in ``contact_precision``."""
     del every
     made, true = touched_points(pair), pair.contact.touched
     return _share(made & true, true, made)
@@ -70,12 +70,10 @@ def touched_points(pair: Pair) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def made_entries(pair: Pair) -> dict[Side, np.ndarray]:
-    """By acting hand, every joint of the prediction that is near a sampled point, as ``ENTRY`` rows. Kept for one pair."""
+    """By acting hand, ``ENTRY`` rows of every joint of the prediction near a sampled point. Kept for one pair."""
     contact, motion = pair.contact, pair.predicted
     return {
-        side: contact.index.entries(
-            motion.joints_m[side], pair.valid(side), motion.clip.object, contact.threshold_m
-        )
+        side: contact.index.entries(motion.joints_m[side], pair.valid(side), motion.clip.object, contact.threshold_m)
         for side in pair.sides
     }
 
@@ -158,9 +156,7 @@ def _deepest_m(pair: Pair, every: int) -> np.ndarray:
 def _hands(pair: Pair, every: int) -> list[PlacedHand]:
     """The acting hands in every n-th frame in which they are looked at."""
     clip = pair.predicted.clip
-    return [
-        _at(placed_hand(clip, side, pair.predicted.hands), pair.frames(side, every)) for side in pair.sides
-    ]
+    return [_at(placed_hand(clip, side, pair.predicted.hands), pair.frames(side, every)) for side in pair.sides]
 
 
 @lru_cache(maxsize=64)
