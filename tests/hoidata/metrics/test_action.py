@@ -1,0 +1,162 @@
+"""What an object does, in numbers of motions that are known; what verbs ask, written and learnt."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips.clip import FPS, ObjectTrack
+from hoidata.errors import BadInput
+from hoidata.metrics import motion
+from hoidata.metrics.action import NUMBERS, Actions, action_numbers, learn_actions, written_limits
+from tests.builders.clips import in_another_world, with_object
+from tests.builders.objects import box_model, notebook
+
+DOWN = np.array([0.0, 0.0, -1.0])
+NOBODY = np.zeros((2, 1), bool)
+
+
+def track(path_m=None, rotvec=None, model=None, hinge_rad=None) -> ObjectTrack:
+    """An object along (frame, 3) places and turns; what is not given stays where it is."""
+    n_frames = max(len(array) for array in (path_m, rotvec, hinge_rad) if array is not None)
+    still = np.zeros((n_frames, 3), np.float32)
+    place, turn = (still if array is None else np.asarray(array, np.float32) for array in (path_m, rotvec))
+    return ObjectTrack(model or box_model(), turn, place, hinge_rad)
+
+
+def numbers_of(moving: ObjectTrack, touching=NOBODY, gravity=DOWN) -> dict[str, float]:
+    return action_numbers(moving, gravity, np.broadcast_to(touching, (2, moving.n_frames)))
+
+
+def there_and_back(n_frames: int, far: tuple[float, float, float]) -> np.ndarray:
+    way = np.concatenate([np.linspace(0, 1, n_frames // 2), np.linspace(1, 0, n_frames - n_frames // 2)])
+    return way[:, None] * np.array(far)
+
+
+def test_rise_way_and_path_are_those_of_the_object_s_middle():
+    found = numbers_of(track(there_and_back(40, (0.3, 0.4, 0.2))))
+    assert set(found) == set(NUMBERS)
+    assert found["rise_m"] == pytest.approx(0.2, abs=1e-6)
+    assert found["sideways_m"] == pytest.approx(0.5, abs=1e-6)
+    assert found["end_rise_m"] == found["end_sideways_m"] == pytest.approx(0, abs=1e-6)
+    assert found["path_m"] == pytest.approx(2 * np.sqrt(0.29), abs=1e-5)
+    off_centre = track(rotvec=np.linspace(0, np.pi, 30)[:, None] * [1, 0, 0], model=box_model(middle_m=(0, 0, -0.3)))
+    assert numbers_of(off_centre)["end_rise_m"] == pytest.approx(0.6, abs=1e-6)
+
+
+def test_tilt_is_away_from_the_upright_and_turn_about_it():
+    poured = numbers_of(track(rotvec=there_and_back(40, (np.pi / 2, 0, 0))))
+    assert (poured["tilt_deg"], poured["end_tilt_deg"]) == pytest.approx((90, 0), abs=1e-3)
+    assert poured["turn_deg"] == pytest.approx(0, abs=1e-3)
+    screwed = numbers_of(track(rotvec=np.linspace(0, 3 * np.pi, 60)[:, None] * [0, 0, 1]))
+    assert screwed["turn_deg"] == pytest.approx(540, abs=1e-2)
+    assert screwed["tilt_deg"] == pytest.approx(0, abs=0.05)
+
+
+def test_reversals_are_the_turning_points_of_a_shake_and_not_of_a_lift_that_waits_above():
+    time = np.arange(60) / FPS
+    shaken = np.zeros((60, 3))
+    shaken[:, 1] = 0.03 * np.sin(2 * np.pi * 3 * time)  # six turning points a second
+    assert numbers_of(track(shaken))["reversals_per_s"] == pytest.approx(6, abs=0.51)
+    shaken[:, 2] = 0.3 * np.clip(time * 4, 0, 1)  # the same at the top of a lift
+    assert numbers_of(track(shaken))["reversals_per_s"] > 3
+    waits = np.concatenate([np.linspace(0, 0.2, 20), np.full(20, 0.2), np.linspace(0.2, 0, 20)])
+    assert numbers_of(track(waits[:, None] * [0, 0, 1]))["reversals_per_s"] == 0
+
+
+def test_the_hinge_counts_from_where_it_was_and_a_rigid_object_has_none():
+    hinge = np.radians(np.concatenate([np.linspace(10, -70, 20), np.linspace(-70, -20, 20)]))
+    found = numbers_of(track(hinge_rad=hinge, model=notebook()))
+    assert (found["hinge_net_deg"], found["hinge_max_deg"]) == pytest.approx((-30, 80))
+    rigid = numbers_of(track(np.zeros((5, 3))))
+    assert (rigid["hinge_net_deg"], rigid["hinge_max_deg"]) == (0, 0)
+
+
+def test_the_hands_of_the_first_and_last_touched_frame_are_told():
+    touching = np.zeros((2, 10), bool)
+    touching[1, 2:6] = touching[0, 5:9] = True  # from right to left
+    found = numbers_of(track(np.zeros((10, 3))), touching)
+    hands = {name: found[name] for name in ("first_left", "first_right", "last_left", "last_right", "hand_changes")}
+    assert hands == {"first_left": 0, "first_right": 1, "last_left": 1, "last_right": 0, "hand_changes": 2}
+    assert numbers_of(track(np.zeros((10, 3))))["hand_changes"] == 0
+
+
+def test_numbers_are_the_same_in_another_world_and_without_gravity_only_what_needs_it_is_unknown(make_clip):
+    clip, turn = make_clip(20, articulated=True), Rotation.from_rotvec([0.4, -1.0, 2.0])
+    moved = in_another_world(clip, turn, np.array([1.0, -2.0, 0.5]))
+    one, other = (action_numbers(item.object, item.gravity, np.zeros((2, 20), bool)) for item in (clip, moved))
+    assert one == pytest.approx(other, abs=1e-2)
+    assert one["tilt_deg"] > 1
+    unknown = action_numbers(clip.object, None, np.zeros((2, 20), bool))
+    assert {name for name, value in unknown.items() if np.isnan(value)} == {
+        "rise_m", "end_rise_m", "sideways_m", "end_sideways_m", "tilt_deg", "end_tilt_deg", "turn_deg"
+    }  # fmt: skip
+
+
+def lifts_and_pours(seed: int) -> dict[str, list[dict[str, float]]]:
+    """Numbers of ten lifts of about 20 cm and of ten pours by about 80 degrees."""
+    draw = np.random.default_rng(seed)
+    lifts = [numbers_of(track(np.linspace(0, draw.uniform(0.15, 0.25), 30)[:, None] * [0, 0, 1])) for _ in range(10)]
+    pours = [numbers_of(track(rotvec=there_and_back(30, (np.radians(draw.uniform(70, 90)), 0, 0)))) for _ in range(10)]
+    return {"lift": lifts, "pour": pours}
+
+
+def test_limits_learnt_from_training_clips_hold_for_others_of_the_verb_and_fail_for_another_verb():
+    actions, others = learn_actions(lifts_and_pours(0)), lifts_and_pours(1)
+    assert actions.facts == {"limits": [], "learnt": {"lift": 10, "pour": 10}}
+    for verb, other in (("lift", "pour"), ("pour", "lift")):
+        assert all(actions.followed(verb, row) is True for row in others[verb])
+        assert all(actions.followed(other, row) is False for row in others[verb])
+        assert all(actions.named(row) == verb for row in others[verb])
+    assert actions.followed("juggle", others["lift"][0]) is None
+    assert actions.followed(None, others["lift"][0]) is None
+
+
+def test_written_limits_count_where_the_training_clips_keep_them():
+    numbers = lifts_and_pours(0)
+    kept = learn_actions(numbers, {"lift": {"end_rise_m": (0.1, 0.3)}})
+    assert kept.facts == {"limits": ["lift"], "learnt": {"pour": 10}}
+    assert kept.followed("lift", numbers["lift"][0] | {"tilt_deg": 170}) is True
+    assert kept.followed("lift", numbers["lift"][0] | {"end_rise_m": 0.09}) is False
+    broken = learn_actions(numbers, {"lift": {"end_rise_m": (1.0, 2.0)}})
+    assert broken.facts == {"limits": [], "learnt": {"lift": 10, "pour": 10}}
+
+
+def test_a_number_that_is_unknown_gives_no_answer_where_it_is_asked_for():
+    actions = Actions({"lift": {"rise_m": (0, 1)}, "open": {"hinge_net_deg": (20, 90)}}, {}, {}, {})
+    weightless = action_numbers(track(np.zeros((5, 3))), None, np.zeros((2, 5), bool))
+    assert actions.followed("lift", weightless) is None
+    assert actions.followed("open", weightless) is False
+    assert actions.named(weightless) is None
+
+
+def test_a_table_of_limits_is_read_and_one_that_names_no_number_is_refused(tmp_path):
+    path = tmp_path / "actions.toml"
+    path.write_text('[lift]\nrise_m = [0.05, 1]\n["hand over"]\nhand_changes = [1, 2]\n')
+    assert written_limits(path) == {"lift": {"rise_m": (0.05, 1.0)}, "hand over": {"hand_changes": (1.0, 2.0)}}
+    for wrong in ("height = [0, 1]", "rise_m = [1, 0]", "rise_m = [1]"):
+        path.write_text(f"[lift]\n{wrong}\n")
+        written_limits.cache_clear()
+        with pytest.raises(BadInput, match="lift"):
+            written_limits(path)
+    written_limits.cache_clear()
+    assert written_limits(tmp_path / "nothing.toml") == {}
+
+
+def test_the_limits_that_are_written_here_can_be_read():
+    written_limits()
+
+
+def test_a_motion_is_judged_by_the_verb_of_its_reference(make_clip, pair_of):
+    clip = make_clip(30)
+    lifted = with_object(clip, translation_m=clip.object.translation_m + np.linspace(0, 0.5, 30)[:, None] * [0, 0, 1])
+    actions = replace(learn_actions(lifts_and_pours(0)), limits={"lift": {"end_rise_m": (0.35, 0.9)}})
+    for predicted, verb, followed in ((lifted, "lift", [1.0]), (clip, "lift", [0.0]), (lifted, "juggle", [])):
+        pair = replace(pair_of(predicted, clip), verb=verb, actions=actions)
+        assert motion.action_followed(pair, 1).tolist() == followed
+    named = [
+        motion.action_named(replace(pair_of(lifted, clip), verb=verb, actions=actions), 1).tolist()
+        for verb in ("lift", "pour", "juggle")
+    ]
+    assert named == [[1.0], [0.0], []]
