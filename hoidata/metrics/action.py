@@ -43,7 +43,13 @@ OF_GIVEN_HANDS = ("first_left", "first_right", "last_left", "last_right")  # ask
 LEARNT = tuple(name for name in NUMBERS if name not in OF_GIVEN_HANDS)
 LEAST_CLIPS = 3  # of a verb to learn its limits from
 SHARE_THAT_FOLLOWS = 0.9
-MARGIN = 0.5  # standard deviations over all training clips, added to the 1st and 99th percentile of the verb's own
+MARGIN = 0.5  # deviations, added to the 1st and 99th percentile of the verb's own clips
+LEAST_DEVIATION = {
+    "m": 0.03,
+    "deg": 10.0,
+    "s": 1.0,
+    "changes": 1.0,
+}  # by the end of a number's name: what counts little
 _TURN_FRAMES, _TURN_M = 3, 0.002
 Limits = dict[str, tuple[float, float]]
 
@@ -114,7 +120,8 @@ class Actions:
 
     limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
     other verbs have theirs from ``actions.toml``. centroids: by verb, the mean of its training clips' standardised
-    numbers. scale: of each of these numbers its mean and standard deviation over all training clips.
+    numbers. scale: of each of these numbers its mean and standard deviation over all training clips, the latter at
+    least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a prediction a little off is not far off.
     """
 
     limits: Mapping[str, Limits]
@@ -167,8 +174,8 @@ def learn_actions(
     scale = {}
     for name in LEARNT:
         column = np.array([row[name] for row in every])
-        if len(column) and np.isfinite(column).all() and column.std() > 0:
-            scale[name] = float(column.mean()), float(column.std())
+        if len(column) and np.isfinite(column).all():
+            scale[name] = float(column.mean()), max(float(column.std()), LEAST_DEVIATION[name.rpartition("_")[2]])
     limits, learnt = dict[str, Limits](), dict[str, int]()
     for verb, rows in numbers.items():
         known = (written or {}).get(verb)

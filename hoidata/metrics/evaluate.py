@@ -28,7 +28,7 @@ from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
 from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count
 from hoidata.objects.model import ObjectModel
-from hoidata.physics.scene import clip_scene
+from hoidata.physics.scene import object_scene
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.distances import DistanceEntries
 from hoidata.store.store import Store, open_store
@@ -252,7 +252,7 @@ class _Bench:
             self.indices[name],
             points.part,
             annotated.contact_threshold_m,
-            None if motion.clip.gravity is None else clip_scene(motion.clip, motion.hands).table_height_m,
+            None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
             verb_of(annotated, clip_id),
         )
 

@@ -56,7 +56,7 @@ class CapsuleContacts(NamedTuple):
 
     frame, capsule: (contact,) int. part: (contact,) touched part. depth_m: (contact,) radius less signed distance of
     the deepest axis point. point_m: (contact, 3) nearest surface point to it. normal: (contact, 3) unit, out of the
-    object, the gradient of the signed distance there.
+    object, the gradient of the signed distance there. middle_point_m, middle_normal: the same of the axis's middle.
     """
 
     frame: np.ndarray
@@ -65,6 +65,12 @@ class CapsuleContacts(NamedTuple):
     depth_m: np.ndarray
     point_m: np.ndarray
     normal: np.ndarray
+    middle_point_m: np.ndarray
+    middle_normal: np.ndarray
+
+    def at_middle(self) -> "CapsuleContacts":
+        """The same overlaps with point and normal nearest to the middle of the axis, as ManipNet's release has them."""
+        return self._replace(point_m=self.middle_point_m, normal=self.middle_normal)
 
 
 def joined(hands: list[Capsules]) -> Capsules:
@@ -74,16 +80,11 @@ def joined(hands: list[Capsules]) -> Capsules:
 
 
 def capsule_contacts(
-    model: ObjectModel, poses: ObjectPoses, capsules: Capsules, tolerance_m: float = 0.0, at_centre: bool = False
+    model: ObjectModel, poses: ObjectPoses, capsules: Capsules, tolerance_m: float = 0.0
 ) -> CapsuleContacts:
-    """Every capsule within ``tolerance_m`` of the object, world frame; a hinged object counts by its nearer part.
-
-    at_centre: contact point and normal are those nearest to the middle of the axis, as ManipNet's release takes them,
-    instead of those nearest to its deepest point; depth and overlap are the same.
-    """
+    """Every capsule within ``tolerance_m`` of the object, world frame; a hinged object counts by its nearer part."""
     found = [
-        _part_contacts(model, part, poses.world_from_part(model, part), capsules, tolerance_m, at_centre)
-        for part in model.parts
+        _part_contacts(model, part, poses.world_from_part(model, part), capsules, tolerance_m) for part in model.parts
     ]
     every = CapsuleContacts(*(np.concatenate(column) for column in zip(*found, strict=True)))
     order = np.lexsort((-every.depth_m, every.capsule, every.frame))
@@ -93,30 +94,27 @@ def capsule_contacts(
 
 
 def _part_contacts(
-    model: ObjectModel,
-    part: int,
-    world_from_part: RigidTransform,
-    capsules: Capsules,
-    tolerance_m: float,
-    at_centre: bool,
+    model: ObjectModel, part: int, world_from_part: RigidTransform, capsules: Capsules, tolerance_m: float
 ) -> CapsuleContacts:
     faces = model.faces_of(part)
     start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
     frame, capsule = _candidates(model.vertices_m[np.unique(faces)], start, end, capsules.radius_m + tolerance_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
-    middle, half = (start + end) / 2, np.linalg.norm(end - start, axis=1) / 2
-    near = _distances(model, faces, middle)[0] < half + radius + tolerance_m
+    half = np.linalg.norm(end - start, axis=1) / 2
+    middle = _distances(model, faces, (start + end) / 2)
+    near = middle[0] < half + radius + tolerance_m
     frame, capsule, start, end, radius = (column[near] for column in (frame, capsule, start, end, radius))
     along = _deepest(model, faces, start, end)
-    distance, point, normal = _distances(model, faces, start + along[:, None] * (end - start))
-    if at_centre:
-        _, point, normal = _distances(model, faces, (start + end) / 2)
-    hit = distance < radius + tolerance_m
-    frame = frame[hit]
-    point = (world_from_part[frame] @ point[hit][:, None])[:, 0]
-    normal = world_from_part[frame].turn(normal[hit][:, None])[:, 0]
-    depth = (radius - distance)[hit]
-    return CapsuleContacts(frame, capsule[hit], np.full(len(frame), part), depth, point, normal)
+    deepest = _distances(model, faces, start + along[:, None] * (end - start))
+    hit = deepest[0] < radius + tolerance_m
+    frame, world = frame[hit], world_from_part[frame[hit]]
+    places = deepest[1][hit], deepest[2][hit], middle[1][near][hit], middle[2][near][hit]
+    point, normal, middle_point, middle_normal = (
+        (world.turn(rows[:, None]) if number % 2 else world @ rows[:, None])[:, 0] for number, rows in enumerate(places)
+    )
+    depth = (radius - deepest[0])[hit]
+    part_of = np.full(len(frame), part)
+    return CapsuleContacts(frame, capsule[hit], part_of, depth, point, normal, middle_point, middle_normal)
 
 
 def _candidates(

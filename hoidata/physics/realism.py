@@ -4,13 +4,14 @@ Scored are lifted frames in which no capsule is 1.5 cm or more inside the object
 """
 
 from collections.abc import Mapping
+from functools import lru_cache
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 
 from hoidata.physics.as_released import AsReleased
-from hoidata.physics.capsules import capsule_contacts
+from hoidata.physics.capsules import CapsuleContacts, capsule_contacts
 from hoidata.physics.scene import Scene
 from hoidata.physics.standard_units import StandardUnits
 
@@ -47,13 +48,8 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     At least 3 frames are needed for accelerations.
     """
     looked_at = np.flatnonzero(scene.lifted if frames is None else frames)
-    near = capsule_contacts(
-        scene.model,
-        scene.poses.taken(looked_at),
-        scene.capsules.taken(looked_at),
-        variant.tolerance_m,
-        variant.at_centre,
-    )
+    near = _near(scene, looked_at.tobytes(), variant.tolerance_m)
+    near = near.at_middle() if variant.at_centre else near
     contacts = near._replace(frame=looked_at[near.frame])
     penetration = np.full(scene.n_frames, np.nan)
     penetration[looked_at] = 0.0
@@ -63,6 +59,13 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     inside = contacts.depth_m[contacts.depth_m > 0]
     mean_depth = float(inside.mean()) if len(inside) else float("nan")
     return Realism(scored, residual, residual < variant.limit, penetration, mean_depth)
+
+
+@lru_cache(maxsize=1)
+def _near(scene: Scene, looked_at: bytes, tolerance_m: float) -> CapsuleContacts:
+    """Contacts in some frames (int64 numbers). Kept for one scene: every variant asks, and they are what costs."""
+    frames = np.frombuffer(looked_at, np.int64)
+    return capsule_contacts(scene.model, scene.poses.taken(frames), scene.capsules.taken(frames), tolerance_m)
 
 
 class HandMotion(NamedTuple):

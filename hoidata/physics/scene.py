@@ -19,7 +19,7 @@ TABLE_PERCENTILE = 3
 _FALLING = 0.05  # of the weight: an object that needs less support than this falls
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Scene:
     """One object, the capsules that may touch it (none at all is allowed), world frame, every frame of a recording.
 
@@ -76,21 +76,30 @@ class Scene:
         return self.lifted & (np.linalg.norm(self.wrench[:, :3], axis=1) > _FALLING * GRAVITY_M_S2)
 
     def with_capsules(self, capsules: Capsules) -> "Scene":
-        """The same object under other hands."""
-        return replace(self, capsules=capsules)
+        """The same object under other hands; what is known of its motion already is kept."""
+        twin = replace(self, capsules=capsules)
+        known = ("motion", "wrench", "vertices_m", "lowest_m")
+        vars(twin).update({name: value for name, value in vars(self).items() if name in known})
+        return twin
 
 
 def clip_scene(clip: Clip, hands: HandPair, table_m: float | None = None) -> Scene:
     """A clip's object and the 19 capsules of each of its hands, left before right, at 30 fps. Raises BadInput."""
-    if clip.gravity is None:
-        raise BadInput(clip.clip_id, "a clip whose gravity is known", "none", "leave it out of physical measures")
     capsules = []
     for side in SIDES:
         own, valid = hand_capsules(clip.hands[side], hands[side]), clip.hands[side].valid[:, None, None]
         capsules.append(
             Capsules(np.where(valid, own.start_m, np.nan), np.where(valid, own.end_m, np.nan), own.radius_m)
         )
-    track = clip.object
+    return object_scene(clip, table_m).with_capsules(joined(capsules))
+
+
+def object_scene(clip: Clip, table_m: float | None = None) -> Scene:
+    """A clip's object without hands. Raises BadInput where its gravity is not known."""
+    if clip.gravity is None:
+        raise BadInput(clip.clip_id, "a clip whose gravity is known", "none", "leave it out of physical measures")
+    track, nothing = clip.object, np.zeros((clip.n_frames, 0, 3))
     hinge = None if track.hinge_rad is None else np.asarray(track.hinge_rad, dtype=np.float64)
     poses = ObjectPoses(track.world_from_object.rotation, track.world_from_object.translation, hinge)
-    return Scene(clip.object.model, poses, joined(capsules), FPS, clip.gravity, table_m)
+    capsules = Capsules(nothing, nothing, np.zeros(0))
+    return Scene(clip.object.model, poses, capsules, FPS, clip.gravity, table_m)

@@ -115,7 +115,8 @@ def test_a_tolerance_finds_a_capsule_beside_the_surface_with_negative_depth():
 
 def test_the_middle_of_the_axis_can_give_point_and_normal_while_depth_stays():
     across = _capsule([0.03, 0, 0.037], [0.06, 0, 0.034], 0.01)
-    deepest, centre = (capsule_contacts(BOX, _still(), across, at_centre=value) for value in (False, True))
+    deepest = capsule_contacts(BOX, _still(), across)
+    centre = deepest.at_middle()
     assert deepest.depth_m == pytest.approx(centre.depth_m)
     np.testing.assert_allclose(centre.point_m, [[0.045, 0, 0.03]], atol=1e-9)
     assert deepest.point_m[0, 0] > 0.0499
