@@ -3,7 +3,8 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,10 @@ from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
-from models.common.family import Family, Sampler, Sources
+from models.common.family import Family, LeftOut, Sampler, Sources
 
 CLIPS_AT_ONCE = 32
+LEFT_OUT = "left_out.json"
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,8 @@ def sample_family(
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
+    Requests the family has no answer to stand in ``out/left_out.json``, where there are any.
+
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
     params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th motion for a clip is named
     ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a model takes the first frames.
@@ -61,9 +65,16 @@ def sample_family(
     sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        counts = write_store(partial / "clips", _motions(family.load(sources), test, config), info)
-        with atomic_file(partial / "diagnostics.json") as file:
-            file.write_text(json.dumps(family.diagnose(sources), indent=2, sort_keys=True) + "\n")
+        left_out = list[LeftOut]()
+        motions = _made(_motions(family.load(sources), test, config), left_out)
+        first = next(motions, None)
+        if first is None:
+            write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
+            return {"clips": 0}
+        counts = write_store(partial / "clips", chain([first], motions), info)
+        _write(partial / "diagnostics.json", family.diagnose(sources))
+        if left_out:
+            _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
     return counts
 
 
@@ -89,7 +100,21 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
     ]
 
 
-def _motions(sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig) -> Iterator[Clip]:
+def _write(path: Path, values: Any) -> None:
+    with atomic_file(path) as file:
+        file.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n")
+
+
+def _made(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterator[Clip]:
+    """The motions among the answers; the others are added to ``left_out``."""
+    for answer in answers:
+        if isinstance(answer, LeftOut):
+            left_out.append(answer)
+        else:
+            yield answer
+
+
+def _motions(sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig) -> Iterator[Clip | LeftOut]:
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
         requests = [asked for sample in test[start : start + CLIPS_AT_ONCE] for asked in requests_for(sample, config)]
