@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from rich.progress import track
 
@@ -16,6 +17,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.files import atomic_file, atomic_folder
 from hoidata.hands import HandPair
+from hoidata.metrics.asked import write_asked
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
@@ -34,6 +36,15 @@ class PredictionConfig:
     seed: int = 0
 
 
+@runtime_checkable
+class AsksContact(Protocol):
+    """A family ready to answer that decides where the object is to be touched, and can say so."""
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[np.ndarray]]:
+        """As ``Sampler.sample``, and (point,) bool of each motion: the sampled points it was asked to touch."""
+        ...
+
+
 def sample_family(
     family: Family,
     annotated_root: str | Path,
@@ -47,8 +58,8 @@ def sample_family(
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
-    Requests the family has no answer to stand in ``out/left_out.json``, where there are any.
-
+    Requests the family has no answer to stand in ``out/left_out.json``, where there are any. A family that is
+    :class:`AsksContact` also gets ``out/asked.npz`` (``hoidata.metrics.asked``).
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
     params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th motion for a clip is named
     ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a model takes the first frames.
@@ -65,13 +76,15 @@ def sample_family(
     sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        left_out = list[LeftOut]()
-        motions = _made(_motions(family.load(sources), test, config), left_out)
+        left_out, asked = list[LeftOut](), dict[str, np.ndarray]()
+        motions = _made(_motions(family.load(sources), test, config, asked), left_out)
         first = next(motions, None)
         if first is None:
             write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
             return {"clips": 0}
         counts = write_store(partial / "clips", chain([first], motions), info)
+        if asked:
+            write_asked(partial, asked)
         _write(partial / "diagnostics.json", family.diagnose(sources))
         if left_out:
             _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
@@ -114,11 +127,20 @@ def _made(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterato
             yield answer
 
 
-def _motions(sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig) -> Iterator[Clip | LeftOut]:
+def _motions(
+    sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig, asked: dict[str, np.ndarray]
+) -> Iterator[Clip | LeftOut]:
+    """The answers in order; ``asked`` is filled with the contact map of each, where the family has them."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
-        requests = [asked for sample in test[start : start + CLIPS_AT_ONCE] for asked in requests_for(sample, config)]
-        yield from sampler.sample(requests)
+        chosen = test[start : start + CLIPS_AT_ONCE]
+        requests = [request for sample in chosen for request in requests_for(sample, config)]
+        if isinstance(sampler, AsksContact):
+            answers, maps = sampler.sample_asked(requests)
+            asked |= {answer.clip_id: contact_map for answer, contact_map in zip(answers, maps, strict=True)}
+        else:
+            answers = sampler.sample(requests)
+        yield from answers
 
 
 def _seed(seed: int, clip_id: str, number: int) -> int:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,19 +20,26 @@ from models.text2hoi.sampler import Text2Hoi
 class OtherContact:
     """Text2HOI told its own sentence and the contact map another clip of the object was recorded with.
 
+    It still counts as asked for the map its own sentence gives: adherence to that is what the row must lose.
     others: those maps by clip; a clip without another of its object has none.
     """
 
     model: Text2Hoi
     others: dict[str, Tensor]
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        known = [request for request in requests if request.clip_id in self.others]
-        maps = [self.others[request.clip_id] for request in known]
-        motions = self.model.motions(known, contact_maps=maps) if known else []
-        made = {clip.clip_id: clip for clip in self.model.clips(known, motions, refined=True)}
+    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | LeftOut]:
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], list[np.ndarray]]:
+        own = self.model.contact_maps(requests)
+        given = [self.others.get(request.clip_id, mine) for request, mine in zip(requests, own, strict=True)]
+        made, _ = self.model.sample_asked(requests, contact_maps=given)
         reason = "no other test clip of its object has another contact map"
-        return [made.get(request.motion_id) or LeftOut(request.motion_id, reason) for request in requests]
+        answers = [
+            clip if request.clip_id in self.others else LeftOut(request.motion_id, reason)
+            for request, clip in zip(requests, made, strict=True)
+        ]
+        return answers, [contact_map.numpy() > 0 for contact_map in own]
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,11 @@ class OwnContact:
     told_otherwise: OtherPrompt
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        model, others = self.told_otherwise.model, self.told_otherwise.told(requests)
-        motions = model.motions(others, contact_maps=model.contact_maps(requests))
-        return model.clips(others, motions, refined=True)
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        model = self.told_otherwise.model
+        return model.sample_asked(self.told_otherwise.told(requests), contact_maps=model.contact_maps(requests))
 
 
 def other_contact_maps(sources: Sources) -> dict[str, Tensor]:

@@ -30,8 +30,10 @@ class BeforeRefiner:
     model: Text2Hoi
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        motions = self.model.motions(requests, refined=False)
-        return self.model.clips(requests, motions, refined=False)
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.model.sample_asked(requests, refined=False)
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,10 @@ class OtherPrompt:
     other: dict[str, np.ndarray]
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return self.model.sample(self.told(requests))
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.model.sample_asked(self.told(requests))
 
     def told(self, requests: Sequence[Request]) -> list[Request]:
         """The requests with the other sentences."""

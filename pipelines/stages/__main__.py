@@ -16,6 +16,7 @@ STAGES = (
     "contact",
     "surface",
     "split",
+    "evaluator",
     "train",
     "sample",
     "evaluate",
