@@ -20,6 +20,7 @@ STAGES = (
     "train",
     "sample",
     "evaluate",
+    "controls",
     "report",
 )
 

@@ -87,6 +87,8 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
+    rows = (params.get("controls") or {}).get("families") or []
+    found["controls"] = _start("controls", every | _families([family_module(family) for family in rows]))
     every |= _families([family_module(family) for family in params["families"]])
     return found | {stage: _start(stage, every) for stage in ("evaluator", "evaluate", "report")}
 
@@ -130,7 +132,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
         return section.get("seed"), (section.get(section.get("size")) or {}).get(of)
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
-    return section
+    return (section, params.get("sample")) if stage == "controls" else section
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:

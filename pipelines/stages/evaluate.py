@@ -1,6 +1,7 @@
 """Stage evaluate: every metric of one family's motions of one dataset. It knows no network and no family."""
 
 import json
+from pathlib import Path
 
 from pipelines.stages.base import Place, empty_reason, jobs, load_hands, write_json
 
@@ -15,5 +16,13 @@ def run(place: Place) -> None:
 
     hands = load_hands(place.profile)
     found = evaluate_store(place.samples / "clips", place.data, hands, jobs=jobs(), progress=True)
+    found["left_out"] = _with_reasons(found["left_out"], place.samples / "left_out.json")
     diagnostics = json.loads((place.samples / "diagnostics.json").read_text(encoding="utf-8"))
     write_json(place.metrics, found | {"diagnostics": diagnostics})
+
+
+def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
+    """What was left out, with the reason of the family itself where it had no motion for a clip."""
+    known = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else []
+    reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in known}
+    return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]
