@@ -18,10 +18,25 @@ FAMILIES = {
     "text2hoi": "models.text2hoi.family:TEXT2HOI",
     "text2hoi-coarse": "models.text2hoi.family:COARSE",
     "other-prompt": "models.text2hoi.family:OTHER_PROMPT",
-    "nearest-clip": "models.baselines.families:NEAREST_CLIP",
+    "nearest-clip": "models.baselines.lookups:NEAREST_CLIP",
     "mean-motion": "models.baselines.families:MEAN_MOTION",
     "mean-pose": "models.baselines.families:MEAN_POSE",
     "ground-truth": "models.baselines.families:GROUND_TRUTH",
+    # Rows that show what a figure sees: each must lose somewhere.
+    "one-call": "models.text2hoi.controls:ONE_CALL",
+    "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
+    "other-prompt-own-contact": "models.text2hoi.controls:OTHER_PROMPT_OWN_CONTACT",
+    "prompt-lookup": "models.baselines.lookups:PROMPT_LOOKUP",
+    "random-clip": "models.baselines.lookups:RANDOM_CLIP",
+    "other-verb": "models.baselines.lookups:OTHER_VERB",
+    "swapped-hands": "models.baselines.lookups:SWAPPED_HANDS",
+    "static": "models.baselines.controls:STATIC",
+    "reversed": "models.baselines.controls:REVERSED",
+    "object-moved": "models.baselines.controls:OBJECT_MOVED",
+    "other-hands": "models.baselines.controls:OTHER_HANDS",
+    "hands-away": "models.baselines.controls:HANDS_AWAY",
+    "pressed": "models.baselines.controls:PRESSED",
+    "noise": "models.baselines.controls:NOISE",
 }
 # Each in a module of its own, so that a change of one trains no other again.
 NETWORKS = {

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Literal
 
 from hoidata.errors import HoidataError
-from pipelines.lineage.graph import read_params
 from pipelines.lineage.manifests import Manifest
+from pipelines.params import read_params
 from pipelines.stages.adapters import manifest_of
 from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
 

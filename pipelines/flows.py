@@ -4,7 +4,7 @@ from pathlib import Path
 
 from prefect import flow
 
-from pipelines.lineage.graph import read_params
+from pipelines.params import read_params
 from pipelines.repro import reproduce
 
 

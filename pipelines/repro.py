@@ -5,8 +5,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pipelines.lineage.graph import read_graph, read_params
+from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
+from pipelines.params import read_params
 from pipelines.stages.adapters import ensure_manifests
 from pipelines.stages.base import Place, raw_root
 from pipelines.stages.code import write_code

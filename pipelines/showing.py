@@ -7,9 +7,9 @@ from hoidata.dataset_folders import dataset_title
 from hoidata.errors import BadInput, MissingResource
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store
-from pipelines.lineage.graph import read_params
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.dataset_page import write_dataset_page
+from pipelines.params import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands
 
 CLOSEST = 5

@@ -1,4 +1,4 @@
-"""Rivals as families: the recorded clip itself, mean pose, mean motion, and the nearest training clips."""
+"""Rivals as families: the recorded clip itself, mean pose, mean motion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -6,12 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
-from models.common.family import Family, Sources, motion_clip
+from models.baselines.lookups import matched_rows, train_clips
+from models.common.family import Family, motion_clip
 from models.common.features import proper_hands, proper_object
 
 TIME_BINS = 50
@@ -24,9 +25,10 @@ class GroundTruth:
     annotated: AnnotatedStore
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return [self._recorded(request) for request in requests]
+        return [self.recorded(request) for request in requests]
 
-    def _recorded(self, request: Request) -> Clip:
+    def recorded(self, request: Request) -> Clip:
+        """The recorded clip under the name and with the frames that are asked for."""
         clip = self.annotated.clip(request.clip_id).take(slice(0, request.n_frames))
         return replace(clip, clip_id=request.motion_id, other_objects=(), camera=None, body=None, source_contact=None)
 
@@ -69,38 +71,6 @@ class MeanMotion:
         return motion_clip(request, proper_hands(hands), proper_object(objects), self.synthetic)
 
 
-@dataclass(frozen=True)
-class NearestClip:
-    """Training clips looked up by sentence and hands: the most similar for the first motion, the next for the second.
-
-    The clip's motion is stretched to the length asked for and carried over to the object asked for.
-    """
-
-    train: Sequence[ClipSample]
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return [self._motion(request) for request in requests]
-
-    def _motion(self, request: Request) -> Clip:
-        found = self.train[self._rank(request)[request.number % len(self.train)]]
-        rows = matched_rows(request.n_frames, found.length)
-        hands, objects = torch.from_numpy(found.hands[:, rows]), torch.from_numpy(found.object[rows])
-        return motion_clip(request, hands, objects, found.synthetic)
-
-    def _rank(self, request: Request) -> np.ndarray:
-        """Rows of the training clips: those of the same hands first, then by similarity of the sentence."""
-        features = np.stack([sample.text[0] for sample in self.train])
-        features = features / np.linalg.norm(features, axis=1, keepdims=True)
-        similarity = features @ (request.text / np.linalg.norm(request.text))
-        same = np.array([(sample.active_hands == request.active_hands).all() for sample in self.train])
-        return np.lexsort((-similarity, ~same))
-
-
-def matched_rows(n_frames: int, length: int) -> np.ndarray:
-    """(n_frames,) for each frame of a motion the row at the same share of another's ``length``."""
-    return np.arange(n_frames) * length // max(n_frames, 1)
-
-
 def _means(total: np.ndarray, count: np.ndarray) -> np.ndarray:
     """Sums (..., bin, D) over counts (..., bin, 1); bins without any get the mean of all, or no motion at all."""
     overall = total.sum(-2, keepdims=True) / np.maximum(count.sum(-2, keepdims=True), 1)
@@ -111,11 +81,6 @@ def _means(total: np.ndarray, count: np.ndarray) -> np.ndarray:
     return np.where(count.sum(-2, keepdims=True) > 0, means, unturned)
 
 
-def _train(sources: Sources) -> list[ClipSample]:
-    return list(HoiDataset(sources.annotated, "train", crop="start"))
-
-
 GROUND_TRUTH = Family("ground-truth", "ground truth", lambda sources: GroundTruth(sources.annotated))
-MEAN_POSE = Family("mean-pose", "mean pose", lambda sources: MeanMotion.of(_train(sources), 1))
-MEAN_MOTION = Family("mean-motion", "mean motion", lambda sources: MeanMotion.of(_train(sources), TIME_BINS))
-NEAREST_CLIP = Family("nearest-clip", "nearest training clip", lambda sources: NearestClip(_train(sources)))
+MEAN_POSE = Family("mean-pose", "mean pose", lambda sources: MeanMotion.of(train_clips(sources), 1))
+MEAN_MOTION = Family("mean-motion", "mean motion", lambda sources: MeanMotion.of(train_clips(sources), TIME_BINS))

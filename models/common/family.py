@@ -101,11 +101,19 @@ class Sources:
     settings: Mapping[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class LeftOut:
+    """A request that a family has no answer to. clip_id: of the motion that was asked for; reason: in words."""
+
+    clip_id: str
+    reason: str
+
+
 class Sampler(Protocol):
     """A family that is ready to answer."""
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        """One motion per request, in their order. A request gives the same motion in whatever company it is asked."""
+    def sample(self, requests: Sequence[Request]) -> Sequence[Clip | LeftOut]:
+        """One answer per request, in their order. A request gives the same motion in whatever company it is asked."""
         ...
 
 

@@ -3,7 +3,8 @@
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -21,9 +22,10 @@ from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
-from models.common.family import Family, Sampler, Sources
+from models.common.family import Family, LeftOut, Sampler, Sources
 
 CLIPS_AT_ONCE = 32
+LEFT_OUT = "left_out.json"
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,7 @@ class PredictionConfig:
 class AsksContact(Protocol):
     """A family ready to answer that decides where the object is to be touched, and can say so."""
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[np.ndarray]]:
         """As ``Sampler.sample``, and (point,) bool of each motion: the sampled points it was asked to touch."""
         ...
 
@@ -56,7 +58,8 @@ def sample_family(
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
-    A family that is :class:`AsksContact` also gets ``out/asked.npz`` (``hoidata.metrics.asked``).
+    Requests the family has no answer to stand in ``out/left_out.json``, where there are any. A family that is
+    :class:`AsksContact` also gets ``out/asked.npz`` (``hoidata.metrics.asked``).
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
     params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th motion for a clip is named
     ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a model takes the first frames.
@@ -73,12 +76,18 @@ def sample_family(
     sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        asked = dict[str, np.ndarray]()
-        counts = write_store(partial / "clips", _motions(family.load(sources), test, config, asked), info)
+        left_out, asked = list[LeftOut](), dict[str, np.ndarray]()
+        motions = _made(_motions(family.load(sources), test, config, asked), left_out)
+        first = next(motions, None)
+        if first is None:
+            write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
+            return {"clips": 0}
+        counts = write_store(partial / "clips", chain([first], motions), info)
         if asked:
             write_asked(partial, asked)
-        with atomic_file(partial / "diagnostics.json") as file:
-            file.write_text(json.dumps(family.diagnose(sources), indent=2, sort_keys=True) + "\n")
+        _write(partial / "diagnostics.json", family.diagnose(sources))
+        if left_out:
+            _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
     return counts
 
 
@@ -104,20 +113,34 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
     ]
 
 
+def _write(path: Path, values: Any) -> None:
+    with atomic_file(path) as file:
+        file.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n")
+
+
+def _made(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterator[Clip]:
+    """The motions among the answers; the others are added to ``left_out``."""
+    for answer in answers:
+        if isinstance(answer, LeftOut):
+            left_out.append(answer)
+        else:
+            yield answer
+
+
 def _motions(
     sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig, asked: dict[str, np.ndarray]
-) -> Iterator[Clip]:
-    """The clips in order; ``asked`` is filled with the contact map of each, where the family has them."""
+) -> Iterator[Clip | LeftOut]:
+    """The answers in order; ``asked`` is filled with the contact map of each, where the family has them."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
         chosen = test[start : start + CLIPS_AT_ONCE]
         requests = [request for sample in chosen for request in requests_for(sample, config)]
         if isinstance(sampler, AsksContact):
-            clips, maps = sampler.sample_asked(requests)
-            asked |= {clip.clip_id: contact_map for clip, contact_map in zip(clips, maps, strict=True)}
+            answers, maps = sampler.sample_asked(requests)
+            asked |= {answer.clip_id: contact_map for answer, contact_map in zip(answers, maps, strict=True)}
         else:
-            clips = sampler.sample(requests)
-        yield from clips
+            answers = sampler.sample(requests)
+        yield from answers
 
 
 def _seed(seed: int, clip_id: str, number: int) -> int:

@@ -17,7 +17,8 @@ from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 NAMES = tuple(network.name for network in NETWORKS)
 
 
-def _load(sources: Sources) -> Text2Hoi:
+def load_text2hoi(sources: Sources) -> Text2Hoi:
+    """The four networks with the settings of ``sample.text2hoi``."""
     config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
     return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device)
 
@@ -49,7 +50,11 @@ class OtherPrompt:
         return self.sample_asked(requests)[0]
 
     def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
-        return self.model.sample_asked([replace(request, text=self.other[request.clip_id]) for request in requests])
+        return self.model.sample_asked(self.told(requests))
+
+    def told(self, requests: Sequence[Request]) -> list[Request]:
+        """The requests with the other sentences."""
+        return [replace(request, text=self.other[request.clip_id]) for request in requests]
 
 
 def other_prompts(sources: Sources) -> dict[str, np.ndarray]:
@@ -64,13 +69,13 @@ def other_prompts(sources: Sources) -> dict[str, np.ndarray]:
     return chosen
 
 
-TEXT2HOI = Family("text2hoi", "Text2HOI", _load, networks=NETWORKS, uses=NAMES, diagnose=diagnose)
+TEXT2HOI = Family("text2hoi", "Text2HOI", load_text2hoi, networks=NETWORKS, uses=NAMES, diagnose=diagnose)
 COARSE = Family(
-    "text2hoi-coarse", "Text2HOI before its refiner", lambda sources: BeforeRefiner(_load(sources)), uses=NAMES
+    "text2hoi-coarse", "Text2HOI before its refiner", lambda sources: BeforeRefiner(load_text2hoi(sources)), uses=NAMES
 )
 OTHER_PROMPT = Family(
     "other-prompt",
     "Text2HOI, another clip's prompt",
-    lambda sources: OtherPrompt(_load(sources), other_prompts(sources)),
+    lambda sources: OtherPrompt(load_text2hoi(sources), other_prompts(sources)),
     uses=NAMES,
 )

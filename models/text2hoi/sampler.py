@@ -83,9 +83,11 @@ class Text2Hoi:
         """Refined motions."""
         return self.sample_asked(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request], refined: bool = True) -> tuple[list[Clip], list[np.ndarray]]:
-        """Motions, and the contact map (N,) bool each of them was drawn for."""
-        motions = self.motions(requests, refined)
+    def sample_asked(
+        self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
+    ) -> tuple[list[Clip], list[np.ndarray]]:
+        """Motions, and the contact map (N,) bool each of them was drawn for; arguments as in ``motions``."""
+        motions = self.motions(requests, refined, contact_maps)
         return self.clips(requests, motions, refined), [motion.contact_map.numpy() > 0 for motion in motions]
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:
@@ -96,14 +98,27 @@ class Text2Hoi:
         ]
 
     @torch.no_grad()
-    def motions(self, requests: Sequence[Request], refined: bool = True) -> list[Text2HoiMotion]:
-        """Every stage of one motion per request; without refinement ``refined`` is ``coarse``."""
+    def motions(
+        self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
+    ) -> list[Text2HoiMotion]:
+        """Every stage of one motion per request; without refinement ``refined`` is ``coarse``.
+
+        contact_maps: (N,) per request, 0 or 1, in the place of what the contact network would draw.
+        """
         made: list[Text2HoiMotion] = []
         models = {request.object.name: request.object for request in requests}.values()
         surface = Surface.of(self.hands, models, self.config.field_resolution, self.device) if refined else None
         for start in range(0, len(requests), AT_ONCE):
-            made += self._batch_motions(requests[start : start + AT_ONCE], surface)
+            part = slice(start, start + AT_ONCE)
+            made += self._batch_motions(requests[part], surface, None if contact_maps is None else contact_maps[part])
         return made
+
+    @torch.no_grad()
+    def contact_maps(self, requests: Sequence[Request]) -> list[Tensor]:
+        """(N,) the contact map, 0 or 1, that each motion would be made for."""
+        batch = collate_requests(requests).to(self.device)
+        generators = [torch.Generator().manual_seed(request.seed) for request in requests]
+        return list(self._contact_maps(batch.points_m, batch.text, batch.active_hands, generators).cpu())
 
     def sample_lengths(self, text: Tensor, active_hands: Tensor, generator: torch.Generator) -> list[int]:
         """Numbers of frames, 8 to 150, for sentences (B, 512) and hand flags (B, 2)."""
@@ -111,10 +126,15 @@ class Text2Hoi:
         assert isinstance(network, LengthModel)
         return network.sample(text.to(self.device), active_hands.to(self.device), generator).tolist()
 
-    def _batch_motions(self, requests: Sequence[Request], surface: Surface | None) -> list[Text2HoiMotion]:
+    def _batch_motions(
+        self, requests: Sequence[Request], surface: Surface | None, given: Sequence[Tensor] | None
+    ) -> list[Text2HoiMotion]:
         batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
+        # Drawn even where they are given: the noise of a motion comes after it from the same generator.
         contact_maps = self._contact_maps(batch.points_m, batch.text, batch.active_hands, generators)
+        if given is not None:
+            contact_maps = torch.stack(list(given)).to(contact_maps)
         generator = motion_generator(self.trained["diffusion"])
         condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact_maps)
         noise = draw_each(HAND_FEATURES, OBJECT_FEATURES, batch.frames.shape[1], generators)

@@ -29,7 +29,7 @@ def enter_project() -> Path:
 
 def current_profile() -> str:
     """The profile params.yaml chooses."""
-    from pipelines.lineage.graph import read_params
+    from pipelines.params import read_params
 
     return read_params(Path())["profile"]
 

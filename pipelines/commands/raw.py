@@ -20,8 +20,8 @@ def scan(
 ) -> None:
     """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
     enter_project()
-    from pipelines.lineage.graph import read_params
     from pipelines.lineage.manifests import write_manifest
+    from pipelines.params import read_params
     from pipelines.stages.adapters import ensure_manifests
     from pipelines.stages.base import HAND, Place
 
@@ -56,8 +56,8 @@ def profile(
 
 def _scan_dataset(place, root: Path):
     from hoidata.errors import BadInput
-    from pipelines.lineage.graph import read_params
     from pipelines.lineage.manifests import absent_manifest, scan_files
+    from pipelines.params import read_params
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
 
@@ -129,7 +129,7 @@ def _scan_hand(place, root: Path):
 def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
     """Compare raw files with the manifests of the current profile. Exit code 1 when they differ or are not there."""
     enter_project()
-    from pipelines.lineage.graph import read_params
+    from pipelines.params import read_params
 
     names = [dataset] if dataset else read_params(Path())["datasets"]
     results = [_verify_one(name, asked_for=bool(dataset)) for name in names]

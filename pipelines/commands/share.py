@@ -51,7 +51,7 @@ def _config() -> Any:
 
 def _terms() -> list[str]:
     """One line per dataset of the current profile whose licence does not let derived data be passed on."""
-    from pipelines.lineage.graph import read_params
+    from pipelines.params import read_params
     from pipelines.stages.adapters import manifest_of
     from pipelines.stages.base import Place
 

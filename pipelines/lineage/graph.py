@@ -1,11 +1,9 @@
-"""The stages as DVC resolves them from all dvc.yaml of the project, and the values of params.yaml."""
+"""The stages as DVC resolves them from all dvc.yaml of the project."""
 
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import yaml
 
 from hoidata.errors import BadInput
 
@@ -28,14 +26,6 @@ class Stage:
     def data(self) -> tuple[str, ...]:
         """The files and folders this stage depends on: manifests and outputs of other stages."""
         return tuple(path for path in self.deps if not path.startswith("code/"))
-
-
-def read_params(root: Path) -> dict[str, Any]:
-    """All of params.yaml."""
-    values = yaml.safe_load((root / "params.yaml").read_text())
-    if not isinstance(values, dict):
-        raise BadInput("params.yaml", "a mapping of sections", type(values).__name__, "restore it with git checkout")
-    return values
 
 
 def look_up(values: dict[str, Any], dotted: str) -> Any:

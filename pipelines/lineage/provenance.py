@@ -10,7 +10,8 @@ from typing import Any
 
 from hoidata.errors import BadInput
 from pipelines.lineage.digests import path_digest, value_digest
-from pipelines.lineage.graph import Stage, look_up, producers, read_graph, read_params
+from pipelines.lineage.graph import Stage, look_up, producers, read_graph
+from pipelines.params import read_params
 
 SCHEMA = "hoidata.provenance/1"
 METADATA_KEY = "hoidata"

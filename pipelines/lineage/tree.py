@@ -6,8 +6,9 @@ from typing import Any, Literal
 
 from hoidata.errors import BadInput
 from pipelines.lineage.digests import path_digest
-from pipelines.lineage.graph import Stage, look_up, read_graph, read_params
+from pipelines.lineage.graph import Stage, look_up, read_graph
 from pipelines.lineage.provenance import read_provenance
+from pipelines.params import read_params
 from pipelines.stages.code import code_today
 
 Kind = Literal["checkpoint", "stage", "param", "code", "data", "manifest"]

@@ -4,6 +4,8 @@ import argparse
 import importlib
 import os
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 STAGES = (
     "code",
@@ -18,6 +20,7 @@ STAGES = (
     "train",
     "sample",
     "evaluate",
+    "controls",
     "report",
 )
 
@@ -26,7 +29,7 @@ def main() -> int:
     """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do."""
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
-    parser.add_argument("--profile", choices=("embedded", "own"), default="embedded")
+    parser.add_argument("--profile", default="", help="the one params.yaml chooses; no other has its settings there")
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
     parser.add_argument("--family", default="")
@@ -43,12 +46,16 @@ def main() -> int:
 
 
 def _run(module, options: argparse.Namespace) -> int:
-    from hoidata.errors import HoidataError
+    from hoidata.errors import BadInput, HoidataError
+    from pipelines.params import read_params
     from pipelines.stages.base import Place
 
     place = Place(options.profile, options.dataset, options.model, options.family)
     try:
-        module.run(place)
+        chosen = read_params(Path())["profile"]
+        if place.profile not in ("", chosen):
+            raise BadInput("--profile", f"{chosen}, which params.yaml chooses", place.profile, "choose it there")
+        module.run(replace(place, profile=chosen))
     except HoidataError as error:
         print(f"{options.stage} of {place}: {error}", file=sys.stderr)
         return 1

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import yaml
-
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
 from hoidata.settings import build_config
+from pipelines.params import chosen_params, read_file
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -110,18 +109,8 @@ def load_settings(kind: type[Settings], section: str, path: Path = Path("params.
 
 
 def read_section(section: str, path: Path = Path("params.yaml")) -> dict[str, Any]:
-    """One section of params.yaml as it stands there; an empty one where nothing is chosen."""
-    return _sections(path).get(section) or {}
-
-
-def _sections(path: Path) -> dict[str, Any]:
-    try:
-        values = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:
-        raise BadInput(path, "YAML text", str(error)[:300], "correct it, or restore it with git checkout") from error
-    if not isinstance(values, dict):
-        raise BadInput(path, "sections with a name each", type(values).__name__, "restore it with git checkout")
-    return values
+    """One section of params.yaml as the chosen profile has it; an empty one where nothing is chosen."""
+    return chosen_params(read_file(path)).get(section) or {}
 
 
 def root_variable(name: str) -> str:

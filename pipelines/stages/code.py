@@ -1,7 +1,8 @@
 """Stage code: for every stage the digests of exactly the code it runs, in ``code/``, which the stage depends on.
 
 Always run, so that DVC sees each change: a module that was edited, imported anew, or came with another package.
-What params.yaml sets for one dataset stands there too, so that it concerns that dataset's stages only.
+What params.yaml sets for one dataset stands there too, so that it concerns that dataset's stages only; and what the
+chosen profile sets otherwise than all profiles do, which DVC does not see in the sections.
 """
 
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
 from models.registry import NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
-from pipelines.lineage.graph import read_params
+from pipelines.params import chosen_params, read_file, read_params
 from pipelines.stages.base import Place, write_json
 
 CODE = Path("code")
@@ -62,11 +63,14 @@ def write_code(root: Path) -> None:
 
 def code_today(root: Path) -> dict[str, dict[str, str]]:
     """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``)."""
-    params = read_params(root)
+    plain = read_file(root / "params.yaml")
+    params = chosen_params(plain)
     tree = SourceTree(root, {f"{DATASETS}.{name}": folder for name, folder in outside_folders().items()})
     starts = closures(params, tree).items()
     return {
-        f"{CODE / name}.json": tree.closure([start.module], start.chosen) | _own_settings(params, name)
+        f"{CODE / name}.json": tree.closure([start.module], start.chosen)
+        | own_settings(params, name)
+        | profile_settings(plain, params, name)
         for name, start in starts
     }
 
@@ -83,6 +87,8 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
+    rows = (params.get("controls") or {}).get("families") or []
+    found["controls"] = _start("controls", every | _families([family_module(family) for family in rows]))
     every |= _families([family_module(family) for family in params["families"]])
     return found | {stage: _start(stage, every) for stage in ("evaluator", "evaluate", "report")}
 
@@ -96,7 +102,7 @@ def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
     return Start(f"pipelines.stages.{stage}", chosen)
 
 
-def _own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
+def own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
     """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same."""
     stage, _, dataset = name.partition("/")
     if stage not in SECTIONS_OF_DATASETS:
@@ -105,6 +111,28 @@ def _own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
     for key in keys:
         value = (value or {}).get(key)
     return {f"params.yaml {'.'.join(keys)}": canonical_json(value or None)}
+
+
+def profile_settings(plain: dict[str, Any], params: dict[str, Any], name: str) -> dict[str, str]:
+    """What the stages of a file of ``code/`` read, as JSON, where the chosen profile has it otherwise.
+
+    plain: params.yaml without the overlay; params: with it.
+    """
+    found = _settings_read(params, name)
+    if found == _settings_read(plain, name):
+        return {}
+    return {f"params.yaml profiles.{params['profile']}.{name.partition('/')[0]}": canonical_json(found)}
+
+
+def _settings_read(params: dict[str, Any], name: str) -> Any:
+    """The sections a stage reads, but for what it reads of a section of datasets."""
+    stage, _, of = name.partition("/")
+    section = params.get(stage) or {}
+    if stage == "train":
+        return section.get("seed"), (section.get(section.get("size")) or {}).get(of)
+    if stage in SECTIONS_OF_DATASETS:
+        return section.get("margin_frames")
+    return (section, params.get("sample")) if stage == "controls" else section
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:

@@ -1,6 +1,7 @@
 """Stage evaluate: every metric of one family's motions of one dataset. It knows no family."""
 
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipelines.stages.base import Place, empty_reason, jobs, load_hands, write_json
@@ -20,6 +21,7 @@ def run(place: Place) -> None:
     hands, encoders = load_hands(place.profile), _encoders(place)
     samples = place.samples / "clips"
     found = evaluate_store(samples, place.data, hands, encoders=encoders, jobs=jobs(), progress=True)
+    found["left_out"] = _with_reasons(found["left_out"], place.samples / "left_out.json")
     diagnostics = json.loads((place.samples / "diagnostics.json").read_text(encoding="utf-8"))
     write_json(place.metrics, found | {"diagnostics": diagnostics})
 
@@ -31,3 +33,10 @@ def _encoders(place: Place) -> list["MotionEvaluator"]:
     from models.evaluator.encoders import load_evaluators
 
     return load_evaluators(place.evaluators)
+
+
+def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
+    """What was left out, with the reason of the family itself where it had no motion for a clip."""
+    known = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else []
+    reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in known}
+    return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]

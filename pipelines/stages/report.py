@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipelines.lineage.graph import read_params
+from pipelines.params import read_params
 from pipelines.stages.base import Place, load_hands
 
 

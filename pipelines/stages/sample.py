@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pipelines.lineage.graph import read_params
+from pipelines.params import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, write_empty
 
 
@@ -11,11 +11,11 @@ def run(place: Place) -> None:
     if reason := empty_reason(place.clips):
         write_empty(place.samples, reason)
         return
-    sample(place, read_params(Path()))
+    sample(place, read_params(Path()), place.family)
 
 
-def sample(place: Place, params: dict) -> None:
-    """Motions of the family ``place.family``; params: all of params.yaml."""
+def sample(place: Place, params: dict, family: str) -> None:
+    """Motions of a family into ``place.samples``; params: all of params.yaml."""
     from models.common.device import chosen_device
     from models.common.predicting import sample_family
     from models.common.training import make_repeatable
@@ -25,7 +25,7 @@ def sample(place: Place, params: dict) -> None:
     settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
     make_repeatable(0, threads=2)
     counts = sample_family(
-        load_family(place.family),
+        load_family(family),
         place.data,
         place.checkpoints,
         place.samples,

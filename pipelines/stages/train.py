@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 from hoidata.files.atomic import atomic_folder
 from models.registry import load_network
-from pipelines.lineage.graph import producers, read_graph, read_params
+from pipelines.lineage.graph import producers, read_graph
 from pipelines.lineage.provenance import build_provenance
+from pipelines.params import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
 
 

@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from hoidata.datasets.registry import adapter_names
-from pipelines.lineage.graph import Stage, read_graph, read_params
+from pipelines.lineage.graph import Stage, read_graph
+from pipelines.params import read_params
 from pipelines.stages.__main__ import STAGES
 from pipelines.stages.code import code_today
 

@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pipelines.lineage.graph import Stage, read_graph, read_params
+from pipelines.lineage.graph import Stage, read_graph
+from pipelines.params import read_params
 
 PROJECT = Path(__file__).parents[2]
 ARCHITECTURE = PROJECT / "ARCHITECTURE.md"
@@ -105,6 +106,11 @@ CHANGES = (
         "convert, raw of grab",
     ),
     Change("its settings: `convert.adapters.grab`", set_adapter, "convert of grab"),
+    Change(
+        "a setting of one profile: `profiles.embedded.sample`",
+        lambda project: set_params(project, profiles={"embedded": {"sample": {"samples": 3}}}),
+        "sample",
+    ),
     Change(
         "a named split: `hoidata/datasets/grab/splits/text2hoi.json`",
         lambda project: (project / "hoidata/datasets/grab/splits/text2hoi.json").write_text("{}"),

@@ -1,0 +1,69 @@
+"""params.yaml as the chosen profile has it: ``profiles.<profile>`` laid over the sections of the same names."""
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from hoidata.errors import BadInput
+from hoidata.settings import refuse_unknown
+
+PROFILES = ("embedded", "own", "study")
+# dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
+TEMPLATED = ("profile", "profiles", "datasets", "families", "train.size")
+
+
+def read_params(root: Path) -> dict[str, Any]:
+    """All sections of the project's params.yaml, as the profile it chooses has them."""
+    return chosen_params(read_file(root / "params.yaml"))
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """params.yaml as it stands there, overlays apart under ``profiles``. Raises BadInput for what is no such file."""
+    try:
+        values = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, ValueError, RecursionError, OSError) as error:
+        raise BadInput(path, "YAML text", str(error)[:300], "correct it, or restore it with git checkout") from error
+    if not isinstance(values, dict):
+        raise BadInput(path, "sections with a name each", type(values).__name__, "restore it with git checkout")
+    return values
+
+
+def chosen_params(values: dict[str, Any]) -> dict[str, Any]:
+    """The sections with the chosen profile's overlay: mappings are merged, lists and single values replaced.
+
+    Raises BadInput for a profile or section that is not known, and for what dvc.yaml cannot read from an overlay.
+    """
+    sections = {name: value for name, value in values.items() if name != "profiles"}
+    overlays = _mapping(values.get("profiles"), "params.yaml: profiles")
+    refuse_unknown(overlays, PROFILES, "params.yaml: profiles")
+    for profile, overlay in overlays.items():
+        _check(_mapping(overlay, f"params.yaml: profiles.{profile}"), sections, f"params.yaml: profiles.{profile}")
+    chosen = _mapping(overlays.get(str(values.get("profile"))), "params.yaml: profiles")
+    return _laid_over(sections, {name: value for name, value in chosen.items() if value is not None})
+
+
+def _check(overlay: dict[str, Any], sections: dict[str, Any], where: str) -> None:
+    for key in TEMPLATED:
+        section, _, name = key.partition(".")
+        if section in overlay and (not name or name in _mapping(overlay[section], f"{where}.{section}")):
+            remedy = "set it at the top of params.yaml, for all profiles"
+            raise BadInput(f"{where}.{key}", "settings of a stage", "what dvc.yaml writes its stages from", remedy)
+    refuse_unknown(overlay, [name for name in sections if name not in TEMPLATED], where)
+    for name, value in overlay.items():
+        if isinstance(sections[name], dict):
+            _mapping(value, f"{where}.{name}")
+
+
+def _mapping(value: Any, where: str) -> dict[str, Any]:
+    if not isinstance(value, dict | None):
+        raise BadInput(where, "keys with values", repr(value)[:80], "correct it")
+    return value or {}
+
+
+def _laid_over(base: dict[str, Any], overlay: dict[str, Any]) -> dict[str, Any]:
+    def laid(name: str, value: Any) -> Any:
+        both = isinstance(base.get(name), dict) and isinstance(value, dict)
+        return _laid_over(base[name], value) if both else value
+
+    return {**base, **{name: laid(name, value) for name, value in overlay.items()}}
