@@ -5,7 +5,20 @@ import sys
 import typer
 
 from hoidata.errors import HoidataError
-from pipelines.commands import adapters, evaluate, generate, graph, inspect, raw, settings, share, show, store, synth
+from pipelines.commands import (
+    adapters,
+    corpus,
+    evaluate,
+    generate,
+    graph,
+    inspect,
+    raw,
+    settings,
+    share,
+    show,
+    store,
+    synth,
+)
 
 app = typer.Typer(
     name="hoidata",
@@ -27,6 +40,7 @@ app.command("lineage")(inspect.lineage)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
+app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)

@@ -8,7 +8,7 @@ from functools import lru_cache
 from hoidata.annotation.encoders import TextEncoder
 from hoidata.annotation.grammar import Grammar, default_grammar
 from hoidata.annotation.hand_choice import HandChoice, select_hand
-from hoidata.annotation.reference_mode import JOINED
+from hoidata.annotation.reference_mode import ACTIONS, JOINED
 
 _HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
@@ -106,8 +106,9 @@ class _Forms:
 
 
 def grammar_lexicon(grammar: Grammar) -> Lexicon:
-    """Every form of the verbs of a grammar, and its objects without their articles, as the reference joins them too."""
+    """Every form of the verbs of a grammar, and its objects without their articles; the reference's words for both."""
     verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(_forms(verb)))]
+    verbs += [(form, base) for base, verb in ACTIONS.items() if base in grammar.verbs for form in _forms(verb)]
     nouns = [(noun.base, noun.base) for noun in grammar.nouns.values()]
     joined = [(words, base) for base, words in JOINED.items() if base in grammar.nouns and words not in grammar.nouns]
     return Lexicon(verbs, nouns + joined)

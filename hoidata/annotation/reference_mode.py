@@ -6,7 +6,7 @@ misspellings ("openning", "takes take") and its passives without an auxiliary ar
 
 import re
 
-from hoidata.annotation.grammar import default_grammar
+from hoidata.annotation.grammar import VerbForms, default_grammar
 from hoidata.annotation.sentences import UNLABELLED_VERB, FourSentences, as_sentence
 from hoidata.clips import HandType
 
@@ -20,6 +20,8 @@ JOINED = {
     "coffee mug": "coffeemug",
     "rubber duck": "rubberduck",
 }
+# What the reference calls an action, where its words differ from the grammar's: GRAB's takepicture.
+ACTIONS = {"take a picture with": VerbForms("take picture", "taking picture", "pictured", "takes picture")}
 SIZED = re.compile(r"(?:large|medium|small) (cube|cylinder|pyramid|sphere|torus)")
 
 
@@ -31,6 +33,7 @@ def reference_sentences(verb: str | None, object_words: str, hand: HandType) -> 
     """
     grammar = default_grammar()
     forms = grammar.verb(UNLABELLED_VERB if verb is None else verb)
+    forms = ACTIONS.get(forms.base, forms)
     words = reference_words(grammar.noun(object_words).base)
     hands = HAND_WORDS[hand]
     present = forms.base if hand == "both" else forms.third_singular

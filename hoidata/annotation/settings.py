@@ -8,26 +8,31 @@ from hoidata.contact.settings import check_threshold
 from hoidata.errors import BadInput
 
 Forms = Literal["paper", "reference"]
+HandRule = Literal["proximity", "annotated-else-proximity"]
 
 
 @dataclass(frozen=True)
 class AnnotationSettings:
     """encoder: a name for ``load_encoder``. threshold_m: a hand acts when a joint comes closer to the object than this.
 
-    threshold_m: None takes the contact stage's. forms: the paper's four sentences in our English, or as the reference
-    implementation writes them. variations: further sentences, guarded. derive_verbs: a clip whose source names no verb
-    gets the one its motion shows; else its sentences say "move".
+    threshold_m: None takes the contact stage's. hand: which hands are active: those that come so near, or the one the
+    source's annotator named, where one did (Text2HOI does so for ARCTIC), as long as some hand comes near. forms: the
+    paper's four sentences in our English, or as the reference implementation writes them. variations: further
+    sentences, guarded. derive_verbs: a clip whose source names no verb gets the one its motion shows; else its
+    sentences say "move".
     """
 
     encoder: str = "use"
     threshold_m: float | None = None
+    hand: HandRule = "proximity"
     forms: Forms = "paper"
     variations: VariationSettings = field(default_factory=VariationSettings)
     derive_verbs: bool = True
 
     def __post_init__(self) -> None:
-        if self.forms not in get_args(Forms):
-            known = " or ".join(get_args(Forms))
-            raise BadInput("forms of the sentences", known, repr(self.forms), "choose one of them")
+        chosen = (("forms of the sentences", self.forms, Forms), ("annotate.hand", self.hand, HandRule))
+        for what, value, kind in chosen:
+            if value not in get_args(kind):
+                raise BadInput(what, " or ".join(get_args(kind)), repr(value), "choose one of them")
         if self.threshold_m is not None:
             check_threshold("annotate.threshold_m", self.threshold_m)

@@ -19,7 +19,7 @@ from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.hand_distances import write_hand_distances
 from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
-from hoidata.annotation.settings import AnnotationSettings, Forms
+from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips import SIDES, Clip, HandType, Side
 from hoidata.contact.hands import acting_hands
 from hoidata.contact.proximity import ProximityIndex
@@ -35,7 +35,7 @@ from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.store import Store, open_store
 
 VerbSource = Literal["source", "derived"]
-HAND_TYPE_SOURCE = "proximity"
+HandSource = Literal["proximity", "annotated"]
 _TEXT = pa.string()
 TEXT_TABLE = pa.schema([("clip_id", _TEXT), ("form", _TEXT), ("sentence", _TEXT), ("text_row", pa.int32())])
 HAND_TYPE_TABLE = pa.schema(
@@ -63,12 +63,20 @@ class _Verb(NamedTuple):
     evidence: str | None = None
 
 
+class _Hand(NamedTuple):
+    """active: the hand type; None where no hand comes near, and then it has no source."""
+
+    active: HandType | None
+    source: HandSource | None
+
+
 @dataclass(frozen=True)
 class _Annotated:
     """One clip's result; without sentences, ``reason`` says why the clip is left out."""
 
     clip_id: str
     labelled_hand: HandType | None
+    hand: _Hand
     evidence: HandEvidence
     sentences: FourSentences | None
     reason: str | None
@@ -90,21 +98,21 @@ def annotate_store(
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
 
-    A hand acts when one of its joints comes closer than the threshold to one of the object's sampled points. Clips
-    without an acting hand, or without a word for their object, are listed with that reason and get no sentence.
+    A hand is active when one of its joints comes closer than the threshold to one of the object's sampled points, or
+    by ``settings.hand`` when the annotator named it. Clips in which no hand comes near, or without a word for their
+    object, are listed with that reason and get no sentence.
     settings, changes: fields of ``changes`` replace those of ``settings``. contact: of the stage contact, whose points
     are looked at. encoder: a name for ``load_encoder`` or the encoder itself, in place of the settings'.
     hands: as in ``open_store``. left_out: reasons of further clips that get no sentence, by clip id.
     features: a folder that keeps text features between runs (``DiskCachedEncoder``); it changes no output.
     Returns counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled,
-    agreeing, derived_verbs.
+    agreeing (with the hand that comes near), derived_verbs.
     """
     settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
     threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m
     encoder = _encoder(settings.encoder if encoder is None else encoder, features)
     store, variations = open_store(clips_folder, hands), settings.variations
-    writer = _Writer(settings.forms, variations.per_clip > 0 and variations.adverbs, settings.derive_verbs)
-    found = _annotate_clips(store, threshold_m, contact.points, left_out or {}, writer)
+    found = _annotate_clips(store, threshold_m, contact.points, left_out or {}, _Writer(settings))
     named = [item for item in found if item.wording]
     varied = clip_variations([item.wording for item in named if item.wording], variations)
     sentences = _distinct(named, varied)
@@ -113,6 +121,7 @@ def annotate_store(
         "encoder": encoder.identity,
         "threshold_m": threshold_m,
         "points": contact.points,
+        **({} if settings.hand == "proximity" else {"hand": settings.hand}),
         "forms": settings.forms,
         "variations": {**asdict(variations), **varied.facts()},
         "counts": counts,
@@ -133,28 +142,36 @@ def _encoder(encoder: str | TextEncoder, features: str | Path | None) -> TextEnc
 
 @dataclass(frozen=True)
 class _Writer:
-    """How clips are put into words. measured: whether speeds are wanted. derive: verbs from motion where none is."""
+    """How clips are put into words."""
 
-    forms: Forms
-    measured: bool
-    derive: bool
+    settings: AnnotationSettings
+
+    def hand(self, clip: Clip, evidence: HandEvidence) -> _Hand:
+        """The annotator's hand, if wanted and if it was tracked; else those that come near."""
+        named, near = clip.labelled_hand, evidence.hand_type
+        if near is None or named is None or self.settings.hand == "proximity":
+            return _Hand(near, near and "proximity")
+        tracked = all(clip.hands[side].valid.any() for side in SIDES if named in (side, "both"))
+        return _Hand(named, "annotated") if tracked else _Hand(near, "proximity")
 
     def verb(self, clip: Clip, evidence: HandEvidence) -> _Verb:
         """The clip's own verb, else the one its motion shows, if wanted and if a hand acts."""
         if clip.verb is not None:
             return _Verb(clip.verb, "source")
-        if not self.derive or evidence.hand_type is None:
+        if not self.settings.derive_verbs or evidence.hand_type is None:
             return _Verb(None, None)
         derived = derive_verb(clip, evidence)
         return _Verb(derived.verb, "derived", derived.evidence)
 
-    def sentences(self, clip: Clip, evidence: HandEvidence) -> tuple[FourSentences | None, str | None]:
+    def sentences(
+        self, clip: Clip, hand: HandType | None, evidence: HandEvidence
+    ) -> tuple[FourSentences | None, str | None]:
         """The clip's sentences, or None and the reason."""
-        if evidence.hand_type is None:
+        if hand is None:
             return None, _no_hand(evidence)
-        write = four_sentences if self.forms == "paper" else reference_sentences
+        write = four_sentences if self.settings.forms == "paper" else reference_sentences
         try:
-            return write(clip.verb, clip.object_words, evidence.hand_type), None
+            return write(clip.verb, clip.object_words, hand), None
         except BadInput as error:
             return None, str(error)
 
@@ -166,7 +183,9 @@ class _Writer:
             return None
         acting: list[Side] = [side for side in SIDES if hand in (side, "both")]
         valid = {side: clip.hands[side].valid for side in acting}
-        speed = hand_speed_m_s({side: joints[side] for side in acting}, valid) if self.measured else None
+        variations = self.settings.variations
+        measured = variations.per_clip > 0 and variations.adverbs
+        speed = hand_speed_m_s({side: joints[side] for side in acting}, valid) if measured else None
         return Wording(clip.clip_id, clip.verb, clip.object_words, hand, speed, taken)
 
 
@@ -179,24 +198,24 @@ def _annotate_clips(
         clip = store.clip(clip_id)
         joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
         evidence = acting_hands(clip, joints, indices[clip.object.model.name], threshold_m)
-        verb = writer.verb(clip, evidence)
+        hand, verb = writer.hand(clip, evidence), writer.verb(clip, evidence)
         clip = replace(clip, verb=verb.base)
-        words = (None, left_out[clip_id]) if clip_id in left_out else writer.sentences(clip, evidence)
-        wording = writer.wording(clip, evidence.hand_type, words[0], joints)
-        found.append(_Annotated(clip_id, clip.labelled_hand, evidence, *words, verb, wording))
+        words = (None, left_out[clip_id]) if clip_id in left_out else writer.sentences(clip, hand.active, evidence)
+        wording = writer.wording(clip, hand.active, words[0], joints)
+        found.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, *words, verb, wording))
     return found
 
 
 def _hand_row(item: _Annotated) -> dict:
     closest = {side: item.evidence.closest_m(side) for side in SIDES}
-    found, labelled = item.evidence.hand_type, item.labelled_hand
+    near, labelled = item.evidence.hand_type, item.labelled_hand
     return {
         "clip_id": item.clip_id,
-        "hand_type": found,
-        "source": HAND_TYPE_SOURCE if found else None,
+        "hand_type": item.hand.active,
+        "source": item.hand.source,
         **{f"min_{side}_m": distance if np.isfinite(distance) else None for side, distance in closest.items()},
         "labelled_hand": labelled,
-        "agreement": None if labelled is None else labelled == found,
+        "agreement": None if labelled is None else labelled == near,
         "reason": item.reason,
         "verb": item.verb.base,
         "verb_source": item.verb.source,
@@ -236,7 +255,7 @@ def _write_embeddings(path: Path, encoder: TextEncoder, sentences: Sequence[str]
 
 
 def _counts(found: Sequence[_Annotated], sentences: Sequence[str]) -> dict[str, int]:
-    hands = Counter(item.evidence.hand_type for item in found)
+    hands = Counter(item.hand.active for item in found)
     labelled = [item for item in found if item.labelled_hand]
     return {
         "clips": len(found),

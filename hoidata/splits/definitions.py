@@ -1,6 +1,7 @@
 """Named splits, kept as data: rules in the folder of the dataset they split, ``splits/<name>.json``.
 
 Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here.
+One that stands there with its rule is any dataset's.
 """
 
 from collections.abc import Mapping
@@ -18,6 +19,7 @@ from hoidata.splits.published import published
 from hoidata.splits.rules import KINDS, SplitRule
 
 FOLDER = Path(__file__).with_name("definitions")
+OF_ANY_DATASET = ("composition", "drawn-object")
 OWN = "params.yaml"
 OWN_SOURCE = "a rule of this project's params.yaml"
 RULE_KEYS = tuple(field.name for field in fields(SplitRule))
@@ -30,6 +32,8 @@ USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
     "time": (),
     "rounds": (),
     "drawn": ("sequence", "file"),
+    "drawn-object": ("object",),
+    "composition": ("composition",),
 }
 
 
@@ -49,10 +53,11 @@ class Definition:
 
 
 def definitions_for(dataset: str) -> dict[str, Definition]:
-    """The named splits a dataset has, by name."""
+    """The named splits a dataset has, by name: those of its folder and those of any dataset."""
     folder = dataset_folder(dataset)
-    paths = [] if folder is None else (folder / "splits").glob("*.json")
-    return {path.stem: _read(path) for path in sorted(paths, key=lambda path: path.stem)}
+    own = [] if folder is None else (folder / "splits").glob("*.json")
+    paths = {path.stem: path for path in (*(FOLDER / f"{name}.json" for name in OF_ANY_DATASET), *own)}
+    return {name: _read(paths[name]) for name in sorted(paths)}
 
 
 def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
@@ -64,13 +69,12 @@ def choose(dataset: str, wanted: str | Mapping[str, Any] | None) -> Definition:
     where, known = f"params.yaml: split.{dataset}", definitions_for(dataset)
     facts = dataset_facts(dataset)
     wanted = facts.split or None if facts and wanted is None else wanted
-    names = ", ".join(known) or "none for this dataset"
     if isinstance(wanted, Mapping):
         return _own(where, dataset, wanted)
     if wanted not in known:
         got = "nothing" if wanted is None else repr(wanted)
         remedy = "correct it, or write a rule: {by: subject, train: rest, validation: [s9], test: [s10]}"
-        raise BadInput(where, f"one of: {names}", got, remedy)
+        raise BadInput(where, f"one of: {', '.join(known)}", got, remedy)
     return known[wanted]
 
 
@@ -94,7 +98,7 @@ def _rule_and_promises(where: str, values: Mapping[str, Any]) -> tuple[SplitRule
     try:
         rule = SplitRule(**{key: value for key, value in values.items() if key != "promises"})
     except TypeError as error:
-        raise BadInput(where, "shares as numbers", str(error), "correct it") from error
+        raise BadInput(where, "shares and least_clips as numbers", str(error), "correct it") from error
     promises = values.get("promises", USUAL_PROMISES[rule.by])
     if not isinstance(promises, list | tuple) or not set(promises) <= set(PROMISES):
         raise BadInput(f"{where}.promises", f"a list of: {', '.join(PROMISES)}", repr(promises), "correct it")

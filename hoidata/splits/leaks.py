@@ -8,9 +8,9 @@ from typing import Any, Literal, get_args
 
 import pandas as pd
 
-from hoidata.splits.rules import handled_objects, object_name
+from hoidata.splits.rules import composition, handled_objects, object_name
 
-Promise = Literal["subject", "object", "sequence", "file", "frame", "motion"]
+Promise = Literal["subject", "object", "sequence", "file", "frame", "motion", "composition"]
 PROMISES: tuple[Promise, ...] = get_args(Promise)
 ALWAYS: tuple[Promise, ...] = ("frame", "motion")
 SHOWN = 20
@@ -21,7 +21,8 @@ class Leaks:
     """What lies in two parts, per kind, sorted; and what the split promised to keep apart.
 
     subject; object (manipulated, or only shown); sequence of the source; file: raw motion file; frame: two clips
-    of one sequence that overlap; motion: clips of equal numbers, a copy under another name.
+    of one sequence that overlap; motion: clips of equal numbers, a copy under another name; composition: verb, object
+    and hand type together, looked for only where it is promised.
     """
 
     promised: tuple[Promise, ...]
@@ -50,18 +51,22 @@ def find_leaks(
 ) -> Leaks:
     """Everything two parts share. Clips that are left out (None, or not in ``parts``) share nothing.
 
-    sequences: a store's table. parts: clip id to part. files: path by number, as ``source_files`` counts them.
+    sequences: a store's table; with the annotation's verb and hand_type where compositions are promised.
+    parts: clip id to part. files: path by number, as ``source_files`` counts them.
     motion_files: patterns of the raw files that hold motion; others (meshes, templates) may serve all parts.
     digests: clip id to a digest of its motion.
     """
     rows = [row for row in sequences.to_dict("records") if parts.get(row["clip_id"])]
     part_of = [str(parts[row["clip_id"]]) for row in rows]
+    promises = tuple(promises)
     keys = {
         "subject": [[row["subject"]] for row in rows],
         "object": [[object_name(row["object"]), *handled_objects(row["other_objects"])] for row in rows],
         "sequence": [[row["sequence"]] for row in rows],
         "file": [_motion_paths(row, files, motion_files) for row in rows],
     }
+    if "composition" in promises:
+        keys["composition"] = [[composition(row)] for row in rows]
     shared: dict[Promise, tuple[str, ...]] = {kind: _in_two_parts(keys[kind], part_of) for kind in keys}  # type: ignore[misc]
     shared["frame"] = _overlaps(rows, part_of)
     shared["motion"] = _copies(rows, part_of, digests or {})

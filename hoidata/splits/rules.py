@@ -1,5 +1,6 @@
 """Which clips train, which validate, which test: a rule over the columns of a store's ``sequences``."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
@@ -8,13 +9,15 @@ import pandas as pd
 
 from hoidata.errors import BadInput
 from hoidata.files import sha256_bytes
+from hoidata.splits.held_out import hold_out, without_shared_frames
 
 Part = Literal["train", "validation", "test"]
-Kind = Literal["subject", "object", "sequence", "prefix", "time", "rounds", "drawn"]
+Kind = Literal["subject", "object", "sequence", "prefix", "time", "rounds", "drawn", "drawn-object", "composition"]
 PARTS: tuple[Part, ...] = get_args(Part)
 KINDS: tuple[Kind, ...] = get_args(Kind)
 IN_TIME = ("time", "rounds")
-BY_SHARE = (*IN_TIME, "drawn")  # rules that list no names
+HELD_OUT = ("drawn-object", "composition")
+BY_SHARE = (*IN_TIME, "drawn", *HELD_OUT)  # rules that list no names
 REST = "rest"
 ROUND: tuple[Part, ...] = ("train", "train", "train", "validation", "test")
 REMEDY = "mend params.yaml"
@@ -35,6 +38,10 @@ class SplitRule:
     (the shares are not used). For recordings whose end shows other actions than their beginning.
     by "drawn": whole source sequences in the order of the SHA-256 of their names; shares as by "time". For a dataset of
     which no list of sequences is known.
+    by "drawn-object": whole objects, of which every verb and hand type is also seen in training; shares of all clips.
+    by "composition": whole compositions, each a verb, an object and a hand type that training has all three of, never
+    together. A clip that shares frames with one of test (or of validation) but is of another part is left out.
+    The last two raise BadInput where fewer than ``least_clips`` test, or a part has less than half its share.
     """
 
     by: Kind = "subject"
@@ -43,6 +50,7 @@ class SplitRule:
     test: tuple[str, ...] = ()
     validation_share: float = 0.15
     test_share: float = 0.15
+    least_clips: int = 1
 
     def __post_init__(self) -> None:
         for part in PARTS:
@@ -67,7 +75,8 @@ class SplitRule:
         if self.by == "rounds":
             return {"by": self.by}
         if self.by in BY_SHARE:
-            return {"by": self.by, "validation_share": self.validation_share, "test_share": self.test_share}
+            shares = {"validation_share": self.validation_share, "test_share": self.test_share}
+            return {"by": self.by, **shares, **({"least_clips": self.least_clips} if self.by in HELD_OUT else {})}
         lists = {part: list(self.names(part)) for part in PARTS}
         return {"by": self.by, **lists, **({"train": REST} if self.train == REST else {})}
 
@@ -75,6 +84,8 @@ class SplitRule:
         shares = (self.validation_share, self.test_share)
         if min(shares) < 0 or sum(shares) >= 1:
             raise BadInput("split rule", "shares of 0 or more that sum to less than 1", str(shares), REMEDY)
+        if self.least_clips < 1:
+            raise BadInput("split rule: least_clips", "1 clips or more", str(self.least_clips), REMEDY)
 
     def _check_parts_apart(self) -> None:
         listed = [(name, part) for part in PARTS for name in self.names(part)]
@@ -94,8 +105,9 @@ def _names(part: str, value: Any) -> tuple[str, ...]:
 def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
     """ "train", "validation", "test", or None for a clip left out, under the index of a store's ``sequences``.
 
-    Uses the columns clip_id, subject, object, other_objects, sequence and first_source_frame, as far as the rule needs
-    them. Does not depend on the order of the rows.
+    Uses the columns clip_id, subject, object, other_objects, sequence, first_source_frame, last_source_frame, and of
+    the annotation verb and hand_type, as far as the rule needs them. Does not depend on the order of the rows. Raises
+    BadInput where too few clips can be held out.
     """
     rows = sequences.reset_index(drop=True)
     if rule.by in IN_TIME:
@@ -107,6 +119,8 @@ def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
         parts = [_by_prefix(name, rule) for name in rows["sequence"]]
     elif rule.by == "object":
         parts = _by_object(rows, rule)
+    elif rule.by in HELD_OUT:
+        parts = _held_out(rows, rule)
     else:
         part_of = _part_of(rule)
         parts = [_listed(name, part_of, rule) for name in rows[rule.by]]
@@ -148,6 +162,52 @@ def _by_object(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
         found: list[Part | None] = [_listed(key, part_of, rule) for key in handled]
         parts.append(found[0] if len(set(found)) == 1 else None)
     return parts
+
+
+def composition(row: Mapping[str, Any]) -> str:
+    """Verb, object and hand type of a clip, as one name."""
+    return " | ".join((_verb(row), object_name(row["object"]), row["hand_type"]))
+
+
+def _verb(row: Mapping[str, Any]) -> str:
+    return "no verb" if pd.isna(row["verb"]) else row["verb"]
+
+
+def _held_out(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:
+    clips: list[dict] = rows.to_dict("records")
+    shares = {"test": rule.test_share, "validation": rule.validation_share}
+    objects = [object_name(clip["object"]) for clip in clips]
+    seen = [[("verb", _verb(clip)), ("hand", clip["hand_type"])] for clip in clips]
+    parts: list[Any]
+    if rule.by == "composition":
+        seen = [[*words, ("object", name)] for words, name in zip(seen, objects, strict=True)]
+        names = [composition(clip) for clip in clips]
+        part_of = hold_out(names, seen, shares)
+        ends = [(clip["first_source_frame"], clip["last_source_frame"]) for clip in clips]
+        spans = [((clip["subject"], clip["sequence"]), *span) for clip, span in zip(clips, ends, strict=True)]
+        parts = without_shared_frames(spans, [part_of.get(name, "train") for name in names], (*shares, "train"))
+    else:
+        part_of = hold_out(objects, seen, shares)
+        test, validation = (tuple(name for name, part in part_of.items() if part == wanted) for wanted in shares)
+        parts = _by_object(rows, SplitRule("object", REST, validation, test))
+    _check_held_out(parts, seen, rule)
+    return parts
+
+
+def _check_held_out(parts: Sequence[Part | None], seen: Sequence[Sequence[tuple[str, str]]], rule: SplitRule) -> None:
+    """Raise BadInput where a part is too small, or holds what training does not (after clips were left out)."""
+    remedy = "choose another split, other shares, or clips in which the same verbs, objects and hands cross more often"
+    least = {"test": max(rule.least_clips, rule.test_share * len(parts) / 2)} if rule.test_share else {}
+    least |= {"validation": max(1, rule.validation_share * len(parts) / 2)} if rule.validation_share else {}
+    for part, count in least.items() if len(parts) else ():
+        if parts.count(part) < count:
+            what = f"{math.ceil(count)} clips or more that can be held out for {part}"
+            raise BadInput(f"split by {rule.by}", what, f"{parts.count(part)} of {len(parts)}", remedy)
+    trained = {item for part, row in zip(parts, seen, strict=True) if part == "train" for item in row}
+    held = {item for part, row in zip(parts, seen, strict=True) if part not in ("train", None) for item in row}
+    if unseen := sorted(held - trained):
+        got = ", ".join(f"{kind} {name}" for kind, name in unseen)
+        raise BadInput(f"split by {rule.by}", "no verb, object or hand that training has not", got, remedy)
 
 
 def _in_time(rows: pd.DataFrame, rule: SplitRule) -> list[Part | None]:

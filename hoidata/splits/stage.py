@@ -1,6 +1,7 @@
 """Stage split: every named split of a dataset, the chosen one, what they promise, and the training statistics.
 
-    splits.parquet    clip_id, one column per named split the dataset has, and `split`, the chosen one: train,
+    splits.parquet    clip_id, one column per named split the dataset has (of any dataset's, those for which it has
+                      clips enough), and `split`, the chosen one: train,
                       validation, test, or null for a clip without sentences or that no part covers; one row per clip
     info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is
     statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
@@ -11,7 +12,7 @@
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,12 @@ def split_store(
     hand_types, used = _annotated_clips(store, Path(annotation_folder))
     dataset = str(store.info["dataset"])
     chosen, named = choose(dataset, wanted), definitions_for(dataset)
-    rows = store.sequences.loc[used]
+    words = hand_types.loc[used]
+    rows = store.sequences.loc[used].assign(verb=words["verb"], hand_type=words["hand_type"])
     digests = {clip_id: motion_digest(store.clip(clip_id, motion_only=True)) for clip_id in used}
-    parts = {definition: assign_split(rows, definition.rule).to_dict() for definition in (*named.values(), chosen)}
-    leaks = {definition: _leaks(store, parts[definition], definition, digests) for definition in parts}
+    parts = _assignments(rows, chosen, named.values())
+    named = {name: item for name, item in named.items() if item in parts}
+    leaks = {definition: _leaks(store, rows, parts[definition], definition, digests) for definition in parts}
     _refuse_leaks(chosen, leaks[chosen])
     records = {name: _record(store, parts[item], item, leaks[item]) for name, item in named.items()}
     info = {
@@ -70,6 +73,18 @@ def split_store(
         _write_json(folder / "info.json", info)
         _write_json(folder / "statistics.json", statistics)
     return info["chosen"]["clips"]
+
+
+def _assignments(rows: pd.DataFrame, chosen: Definition, named: Iterable[Definition]) -> dict[Definition, Assignment]:
+    """The chosen split and every named one that these clips can be split by: a held-out part may be too small."""
+    parts: dict[Definition, Assignment] = {}
+    for definition in (*named, chosen):
+        try:
+            parts[definition] = assign_split(rows, definition.rule).to_dict()
+        except BadInput:
+            if definition == chosen:
+                raise
+    return parts
 
 
 def motion_digest(clip: Clip) -> str:
@@ -94,10 +109,12 @@ def _annotated_clips(store: Store, annotation: Path) -> tuple[pd.DataFrame, list
     return hand_types, [clip_id for clip_id in store.ids if clip_id in named]
 
 
-def _leaks(store: Store, parts: Assignment, definition: Definition, digests: Mapping[str, str]) -> Leaks:
+def _leaks(
+    store: Store, rows: pd.DataFrame, parts: Assignment, definition: Definition, digests: Mapping[str, str]
+) -> Leaks:
     patterns = published(str(store.info["dataset"])).motion_files
     paths = store.files["path"].tolist()
-    return find_leaks(store.sequences, parts, definition.promises, files=paths, motion_files=patterns, digests=digests)
+    return find_leaks(rows, parts, definition.promises, files=paths, motion_files=patterns, digests=digests)
 
 
 def _refuse_leaks(chosen: Definition, leaks: Leaks) -> None:

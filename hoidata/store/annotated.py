@@ -3,13 +3,14 @@
     clips/        the store (see ``hoidata.store.store``)
     annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip the four
                                       forms, then its variations, if any were asked for
-                  hand_type.parquet   clip_id, hand_type, source, min_left_m, min_right_m, labelled_hand, agreement,
-                                      reason (why a clip is left out), verb, verb_source (source: the clip came
-                                      with it; derived: its motion shows it), verb_evidence (what that rests on)
+                  hand_type.parquet   clip_id, hand_type, source (proximity or annotated), min_left_m, min_right_m,
+                                      labelled_hand, agreement (of it with the hand that comes near), reason (why a
+                                      clip is left out), verb, verb_source (source: the clip came with it; derived:
+                                      its motion shows it), verb_evidence (what that rests on)
                   hand_distance.npz   how near each hand is in every frame (``hoidata.store.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
-                  info.json           encoder, threshold_m, points, forms, variations (and what their guard
-                                      dropped), counts
+                  info.json           encoder, threshold_m, points, hand (where it is not proximity), forms,
+                                      variations (and what their guard dropped), counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
                   contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
@@ -117,7 +118,7 @@ class AnnotatedStore:
         return self.store.joints(clip_id, side)
 
     def hand_type(self, clip_id: str) -> HandType:
-        """The hand the proximity test found. Raises KeyError with the reason for a clip in which none acts."""
+        """The active hands, by the rule ``annotate.hand``. Raises KeyError with the reason for a clip without any."""
         found = self.hand_types.at[clip_id, "hand_type"]
         if found not in ("left", "right", "both"):
             raise KeyError(f"no hand acts in {clip_id}: {self.hand_types.at[clip_id, 'reason']}")

@@ -70,12 +70,20 @@ def hand_decision(annotated: AnnotatedStore, clip: Clip, series: ClipSeries) -> 
     return HandDecision(
         hand_type=NOTHING if pd.isna(row["hand_type"]) else str(row["hand_type"]),
         rule=f"A hand acts when, in any frame, one of its 21 joints is closer than {threshold * 100:g} cm to one of "
-        f"{points:,} points of the object (Text2HOI, supplement 6).",
+        f"{points:,} points of the object (Text2HOI, supplement 6).{_annotated_rule(annotated, row['source'])}",
         agreement=_agreement(clip, row["agreement"]),
         surface=_surface_words(series),
         points=points,
         hands=[_hand_facts(annotated, clip, series, side) for side in SIDES],
     )
+
+
+def _annotated_rule(annotated: AnnotatedStore, source: Any) -> str:
+    """What ``annotate.hand`` adds to the rule; nothing by default."""
+    if annotated.annotation_info.get("hand", "proximity") == "proximity":
+        return ""
+    taken = "as here" if source == "annotated" else "which is not so here"
+    return f" Where the source's annotator named a hand, that one is taken instead, {taken}."
 
 
 def _agreement(clip: Clip, agreement: Any) -> str:

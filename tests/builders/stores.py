@@ -30,13 +30,17 @@ def write_annotated(
     threshold_m: float = 0.02,
     points: int = 1024,
     quality: bool = False,
+    **annotate: Any,
 ) -> Path:
-    """clips, annotation (the encoder without weights), contact and splits below ``root``; quality where asked for."""
+    """clips, annotation (the encoder without weights), contact and splits below ``root``; quality where asked for.
+
+    annotate: further settings of that stage.
+    """
     contact = ContactSettings(points=points, threshold_m=threshold_m)
     write_clips(root / "clips", clips, dataset)
     if quality:
         quality_store(root / "clips", root / "quality", progress=False)
-    annotate_store(root / "clips", root / "annotation", encoder="hash", contact=contact)
+    annotate_store(root / "clips", root / "annotation", encoder="hash", contact=contact, **annotate)
     contact_store(root / "clips", root / "contact", contact)
     split_store(root / "clips", root / "annotation", root / "splits", rule or BY_SUBJECT)
     return root

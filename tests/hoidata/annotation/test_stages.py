@@ -1,5 +1,6 @@
 """The stages annotate, contact and split, and reading them back, on a small store of clips made here."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,9 @@ import pandas as pd
 import pytest
 
 from hoidata.annotation.encoders import load_encoder
+from hoidata.annotation.settings import AnnotationSettings
 from hoidata.annotation.stage import annotate_store
+from hoidata.batches.dataset import HoiDataset
 from hoidata.clips import SIDES, Clip
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import load_embedded_hands, track_joints
@@ -78,6 +81,35 @@ def test_the_labelled_hand_is_kept_beside_the_found_one(annotated: AnnotatedStor
     assert agreement["toy/s3/3"] is False
     assert agreement["toy/s1/1"] is None
     assert annotated.hand_types.at["toy/s1/1", "min_left_m"] == pytest.approx(0.01, abs=1e-3)
+
+
+def test_the_annotators_hand_is_taken_where_it_is_wanted_named_and_tracked(tmp_path: Path) -> None:
+    """Clip 3: both come near, the left is named. Clip 4: named, but none comes near. Clip 5: the left is never seen."""
+    away = clip(4, NOTEBOOK, False, False, labelled_hand="left")
+    unseen = clip(5, BOX, False, True, labelled_hand="both")
+    left = replace(unseen.hands["left"], valid=np.zeros(FRAMES, bool))
+    unseen = replace(unseen, hands={**unseen.hands, "left": left})
+    rule = {"by": "subject", "train": "rest", "test": ["s3"]}
+    found = load_annotated(
+        write_annotated(tmp_path, [*clips()[:3], away, unseen], rule=rule, hand="annotated-else-proximity")
+    )
+    said = found.hand_types[["hand_type", "source"]].fillna("none")
+    assert said["hand_type"].tolist() == ["left", "right", "left", "none", "right"]
+    assert said["source"].tolist() == ["proximity", "annotated", "annotated", "none", "proximity"]
+    assert found.hand_types["agreement"].tolist() == [None, True, False, False, False]
+    assert found.sentences("toy/s3/3")[0] == "Open a notebook with the left hand."
+    (sample,) = HoiDataset(found, "test")
+    assert sample.active_hands.tolist() == [True, False]
+    np.testing.assert_array_equal(sample.contact[0], found.contact_of("toy/s3/3", "left"))
+    assert not sample.contact[1].any()
+    assert found.annotation_info["hand"] == "annotated-else-proximity"
+    counts = found.annotation_info["counts"]
+    assert (counts["labelled"], counts["agreeing"], counts["left"], counts["both"]) == (4, 1, 2, 0)
+
+
+def test_a_rule_for_hands_that_is_none_is_refused() -> None:
+    with pytest.raises(BadInput, match=r"annotate.hand: expected proximity or annotated-else-proximity, got 'label'"):
+        AnnotationSettings(hand="label")  # type: ignore[arg-type]
 
 
 def test_every_clip_with_words_has_its_part(annotated: AnnotatedStore) -> None:

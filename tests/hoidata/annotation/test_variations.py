@@ -98,6 +98,9 @@ def test_adverbs_stand_only_where_a_speed_was_measured(arctic) -> None:
         ("hand over", "Stanford bunny", "both", (
             "Hand over stanford bunny with both hands.", "Stanford bunny is handed over with both hands.",
             "Both hands hand over stanford bunny.", "Handing over stanford bunny with both hands.")),
+        ("take a picture with", "camera", "right", (
+            "Take picture camera with right hand.", "Camera is pictured with right hand.",
+            "Right hand takes picture camera.", "Taking picture camera with right hand.")),
     ],
 )  # fmt: skip
 def test_reference_sentences_are_the_references_without_its_misspellings(verb, thing, hand, expected) -> None:

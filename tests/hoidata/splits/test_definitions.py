@@ -9,7 +9,7 @@ import pytest
 from hoidata.dataset_folders import built_in_names, dataset_facts
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.errors import BadInput
-from hoidata.splits.definitions import choose, definitions_for
+from hoidata.splits.definitions import OF_ANY_DATASET, choose, definitions_for
 from hoidata.splits.published import published
 from hoidata.splits.rules import assign_split
 
@@ -190,16 +190,17 @@ def test_a_split_with_nothing_said_of_its_source_is_refused(tmp_path, monkeypatc
 
 
 def test_manipnet_has_the_splits_in_time_and_no_split_by_its_only_subject():
-    assert set(definitions_for("manipnet")) == {"rounds", "time", "unseen-object"}
+    assert set(definitions_for("manipnet")) == {"rounds", "time", "unseen-object", *OF_ANY_DATASET}
 
 
 def test_an_unknown_name_lists_the_splits_of_that_dataset():
     with pytest.raises(
-        BadInput, match="bimart, bimart-validated, p1, p2, text2hoi, unseen-object, unseen-subject, got"
+        BadInput,
+        match=r"one of: bimart, bimart-validated, composition, drawn-object, p1, p2, text2hoi, .*unseen-subject, got",
     ):
         choose("arctic", "rounds")
     for wanted, got in (("text2hoi", "'text2hoi'"), (None, "nothing")):
-        with pytest.raises(BadInput, match=f"none for this dataset, got {got}"):
+        with pytest.raises(BadInput, match=f"one of: composition, drawn-object, got {got}"):
             choose("mydata", wanted)
 
 
@@ -224,7 +225,8 @@ def test_no_promise_is_made_that_cannot_be_checked():
     [
         ({"by": "subject", "tset": ["s1"]}, "keys among: by, train, validation, test, .*got tset"),
         ({"train": "rest"}, "no `by`"),
-        ({"by": "time", "test_share": "much"}, "shares as numbers"),
+        ({"by": "time", "test_share": "much"}, "shares and least_clips as numbers"),
+        ({"by": "composition", "least_clips": "some"}, "shares and least_clips as numbers"),
         ({"by": "subject", "train": "rest", "promises": ["object", "luck"]}, "a list of: subject, object"),
         ({"by": "subject", "train": "rest", "promises": "object"}, "a list of: subject, object"),
         ({"by": "subject", "train": "rest", "test": "s1"}, "a list of names"),

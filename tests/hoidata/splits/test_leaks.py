@@ -10,6 +10,7 @@ FILES = ["raw/a.npz", "raw/b.npz", "mesh/box.ply", "raw/sub/c.npz"]
 
 def row(clip_id: str, **facts) -> dict:
     usual = {"subject": f"of {clip_id}", "object": f"box of {clip_id}", "other_objects": [], "source_files": []}
+    usual |= {"verb": "lift", "hand_type": "left"}
     return usual | {"sequence": clip_id, "first_source_frame": 0, "last_source_frame": 9, "clip_id": clip_id} | facts
 
 
@@ -27,6 +28,7 @@ CASES = {
         "x",
     ),
     "file": ({"source_files": [0, 2]}, {"source_files": [0, 2]}, "raw/a.npz"),
+    "composition": ({"object": "mug"}, {"object": "mug#1a2b3c4d"}, "lift | mug | left"),
     "frame": (
         {"sequence": "x", "subject": "s1"},
         {"sequence": "x", "subject": "s1", "first_source_frame": 9},

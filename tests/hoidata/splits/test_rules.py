@@ -9,7 +9,7 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 
 from hoidata.errors import BadInput
-from hoidata.splits.rules import SplitRule, assign_split
+from hoidata.splits.rules import KINDS, SplitRule, assign_split
 
 COLUMNS = ["clip_id", "subject", "sequence", "first_source_frame", "last_source_frame", "object", "other_objects"]
 
@@ -125,7 +125,7 @@ def test_a_rule_that_contradicts_itself_is_refused(rule, message):
         SplitRule(**rule)
 
 
-@pytest.mark.parametrize("by", ["subject", "object", "sequence", "prefix", "time", "rounds"])
+@pytest.mark.parametrize("by", KINDS)
 def test_an_empty_table_has_an_empty_split(by):
     assert assign_split(table([]), SplitRule(by, "rest")).tolist() == []
 

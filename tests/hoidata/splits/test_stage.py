@@ -36,7 +36,8 @@ def write(root: Path, clips, without_words=(), wanted=RULE) -> Path:
     ids = [clip.clip_id for clip in clips]
     (root / "annotation").mkdir()
     nearest = {"min_left_m": [None] * len(ids), "min_right_m": [0.004] * len(ids)}
-    pd.DataFrame({"clip_id": ids, **nearest}).to_parquet(root / "annotation" / "hand_type.parquet")
+    words = {"verb": [clip.verb for clip in clips], "hand_type": ["right"] * len(ids)}
+    pd.DataFrame({"clip_id": ids, **nearest, **words}).to_parquet(root / "annotation" / "hand_type.parquet")
     words = [clip_id for clip_id in ids for _ in range(4) if clip_id not in without_words]
     pd.DataFrame({"clip_id": words}, dtype=str).to_parquet(root / "annotation" / "text.parquet")
     split_store(root / "clips", root / "annotation", root / "splits", wanted)
@@ -159,7 +160,9 @@ def test_an_annotation_of_other_clips_is_refused(clips, tmp_path):
 
 
 def test_an_unknown_split_is_refused_before_anything_is_written(clips, tmp_path):
-    with pytest.raises(BadInput, match="official, text2hoi, unseen-object, unseen-subject, got 'text2hio'"):
+    with pytest.raises(
+        BadInput, match="composition, drawn-object, official, text2hoi, unseen-object, unseen-subject, got 'text2hio'"
+    ):
         write(tmp_path, clips, wanted="text2hio")
     assert not (tmp_path / "splits").exists()
 
@@ -176,6 +179,7 @@ def test_how_complete_a_dataset_is_is_told_where_its_makers_list_the_sequences(m
     (tmp_path / "annotation").mkdir()
     nearest = [0.1] * len(clips)
     table = pd.DataFrame({"clip_id": [clip.clip_id for clip in clips], "min_left_m": nearest, "min_right_m": nearest})
+    table = table.assign(verb="lift", hand_type="right")
     for name in ("hand_type", "text"):
         table.to_parquet(tmp_path / "annotation" / f"{name}.parquet")
     split_store(tmp_path / "clips", tmp_path / "annotation", tmp_path / "splits", "bimart")

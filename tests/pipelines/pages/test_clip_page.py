@@ -6,12 +6,15 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from html import unescape
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hoidata.annotation.stage import annotate_store
 from hoidata.clips.clip import CameraTrack, SourceFile
+from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import track_joints, track_vertices
 from hoidata.store.annotated import load_annotated
@@ -229,6 +232,22 @@ def test_page_says_where_annotator_and_distances_disagree(dataset, hands, tmp_pa
     assert "annotator named: right, which DISAGREES" in text
     assert "with a hinge" in text
     assert text.count('<div class="readout"') == 7
+
+
+def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(dataset, hands, tmp_path):
+    contact = read_contact_settings(dataset.root / "contact")
+    annotate_store(
+        dataset.root / "clips",
+        dataset.root / "annotation",
+        encoder="hash",
+        contact=contact,
+        hand="annotated-else-proximity",
+    )
+    annotated = load_annotated(dataset.root, hands)
+    for clip_id, words in (("test/s1/lid", "as here."), ("test/s2/box", "which is not so here.")):
+        text = write_clip_page(tmp_path / "page.html", annotated, clip_id, hands).read_text()
+        assert f"Where the source's annotator named a hand, that one is taken instead, {words}" in unescape(text)
+        assert "<h2>Hand type: right</h2>" in text
 
 
 def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp_path):
