@@ -1,40 +1,109 @@
-"""A sentence and an object to a motion, with the models of one dataset, as files."""
+"""A sentence and an object to motions, with the models of the dataset that knows its words best, as files."""
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
-from hoidata.annotation.encoders import load_encoder
-from hoidata.annotation.hand_choice import Method
+from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
-from hoidata.objects.mesh import load_mesh
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.store import open_store
+from models.common.checkpoints import FILE_NAME, read_info
+from models.common.sampling import SamplerConfig
+from models.common.training import make_repeatable
+from models.common.vocabulary import Vocabulary, read_sentence
 from models.text2hoi.family import NAMES
-from models.text2hoi.generation import generate
+from models.text2hoi.generation import Generator, Wish
 from pipelines.pages.generation_page import write_generation
 from pipelines.stages.base import Place, empty_reason, load_hands, load_settings
 
-SMALLEST_M, LARGEST_M = 0.005, 2.0
+
+@dataclass(frozen=True)
+class MeshWish:
+    """How to read the user's mesh file; "" for what is to be assumed or found, as in ``read_user_object``."""
+
+    unit: str = ""
+    up: str = ""
+    hinge: str = ""
 
 
-def generate_files(
-    text: str, object: str | Path, seed: int, out: Path, place: Place, hand_by: Method = "rules"
-) -> list[Path]:
-    """Generate and write motion.npz, motion.glb and index.html; returns their paths.
+@dataclass(frozen=True)
+class Asked:
+    """Everything ``hoidata generate`` is told. object: a mesh file, or the name of an object of the dataset.
 
-    object: a mesh file in metres, or the name of an object of the dataset. hand_by: as in ``choose_hand``. Raises
-    MissingResource or BadInput that says what is not there.
+    model: the dataset whose models to use, or "" for the one that knows the sentence's words best.
     """
-    if reason := why_not_trained(place):
-        raise MissingResource(f"the models of {place} cannot generate: {reason}")
-    hands = load_hands(place.profile)
-    model = read_object(object) if isinstance(object, Path) else stored_object(object, place, hands)
-    encoder = load_encoder(load_settings(AnnotationSettings, "annotate").encoder)
-    motion = generate(text, model, place.checkpoints, hands, encoder, seed, hand_by=hand_by)
-    return write_generation(out, motion, hands)
+
+    text: str
+    object: str | Path
+    profile: str
+    datasets: tuple[str, ...]
+    model: str = ""
+    wish: Wish = field(default_factory=Wish)
+    mesh: MeshWish = field(default_factory=MeshWish)
+    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+
+
+@dataclass(frozen=True)
+class Written:
+    """paths of the files; notes: what was assumed, chosen or never seen in training, for the person who asked."""
+
+    paths: list[Path]
+    notes: list[str]
+
+
+def generate_files(asked: Asked, out: Path) -> Written:
+    """Generate, and write arrays, an animated GLB and a page that plays it into ``out``.
+
+    Raises MissingResource or BadInput that says what is not there or cannot be meant.
+    """
+    verb, thing = read_sentence(asked.text)
+    notes: list[str] = []
+    user = None
+    if isinstance(asked.object, Path):
+        user = read_user_object(asked.object, asked.mesh.unit, asked.mesh.up, asked.mesh.hinge)
+        notes += user.notes
+    place, why = chosen_model(asked, verb, thing)
+    notes.append(why)
+    make_repeatable(0, threads=1)  # one motion is too small for two threads to agree on
+    hands, encoder = load_hands(place.profile), _encoder()
+    model = user.model if user else stored_object(str(asked.object), place, hands)
+    generator = Generator.load(place.checkpoints, hands, encoder, sampler=asked.sampler)
+    motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
+    notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
+    return Written(write_generation(out, motions, hands, str(place.checkpoints), notes), notes)
+
+
+def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[Place, str]:
+    """The dataset whose models to use, and why, in words. Raises MissingResource where none is trained."""
+    names = (asked.model,) if asked.model else asked.datasets
+    places = [Place(asked.profile, name) for name in names]
+    reasons = {place: why_not_trained(place) for place in places}
+    trained = [place for place in places if not reasons[place]]
+    if not trained:
+        reason = "; ".join(f"{place}: {reasons[place]}" for place in places)
+        raise MissingResource(f"no models that can generate: {reason}")
+    if asked.model:
+        return trained[0], f"models: {trained[0]}, as asked for"
+    found = [(_vocabulary(place).knows(verb, thing) + 8 * _has_object(place, asked.object), place) for place in trained]
+    score, best = max(found, key=lambda item: item[0])
+    known = ", ".join(filter(None, (verb, thing))) if score else "none of the words"
+    return best, f"models: {best}, which know best of {len(trained)}: {known} (--model chooses another)"
+
+
+def _vocabulary(place: Place) -> Vocabulary:
+    return Vocabulary.read(read_info(place.checkpoints / "contact" / FILE_NAME)["facts"])
+
+
+def _has_object(place: Place, name: str | Path) -> bool:
+    """Whether the dataset has the object that was asked for by name; a mesh file is nobody's."""
+    return isinstance(name, str) and name in list(open_store(place.clips, load_hands(place.profile)).objects["object"])
+
+
+def _encoder() -> TextEncoder:
+    return load_encoder(load_settings(AnnotationSettings, "annotate").encoder)
 
 
 def why_not_trained(place: Place) -> str | None:
@@ -43,19 +112,9 @@ def why_not_trained(place: Place) -> str | None:
         folder = place.checkpoints / name
         if reason := empty_reason(folder):
             return f"{name} is empty, {reason}"
-        if not (folder / "model.safetensors").is_file():
+        if not (folder / FILE_NAME).is_file():
             return f"{folder} is not there; run `dvc repro`"
     return None
-
-
-def read_object(path: Path) -> ObjectModel:
-    """A rigid object from the user's mesh. Raises BadInput when its size in metres cannot be meant."""
-    mesh = load_mesh(path)
-    longest_m = float(np.ptp(mesh.vertices, axis=0).max())
-    if not SMALLEST_M <= longest_m <= LARGEST_M:
-        expected = f"a longest side of {SMALLEST_M} to {LARGEST_M} m"
-        raise BadInput(path, expected, f"{longest_m:.4g} m", "scale the mesh to metres")
-    return ObjectModel(path.stem, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
 
 
 def stored_object(name: str, place: Place, hands: HandPair) -> ObjectModel:
@@ -63,5 +122,6 @@ def stored_object(name: str, place: Place, hands: HandPair) -> ObjectModel:
     store = open_store(place.clips, hands)
     names = list(store.objects["object"])
     if name not in names:
-        raise BadInput("--object", f"a mesh file or one of: {', '.join(names)}", name, "correct the name or path")
+        expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
+        raise BadInput("--object", expected, name, "correct the name or path")
     return store.object_model(name)

@@ -51,7 +51,7 @@ def load_mesh(path: str | Path) -> Mesh:
         mesh = reader(path)
     except (ValueError, OSError) as error:
         raise BadInput(path, "a readable mesh", f"{type(error).__name__}: {error}") from error
-    return _checked(path, mesh)
+    return checked_mesh(path, mesh)
 
 
 def _read_obj(path: Path) -> Mesh:
@@ -78,7 +78,8 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
         if len(words) < 4:
             raise BadInput(f"{path}:{number}", "3 coordinates per vertex and 3 or more corners per face", line[:60])
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
-    return _checked(path, Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3)))
+    mesh = Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
+    return checked_mesh(path, mesh)
 
 
 def _obj_index(word: str, n_vertices: int) -> int:
@@ -93,7 +94,8 @@ def _read_ply(path: Path) -> Mesh:
     return Mesh(*parse_ply(path.read_bytes()))
 
 
-def _checked(path: str | Path, mesh: Mesh) -> Mesh:
+def checked_mesh(path: str | Path, mesh: Mesh) -> Mesh:
+    """The mesh, if it is a finite triangle mesh with area; ``path`` names it in errors. Raises BadInput."""
     vertices, faces = mesh
     if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
         raise BadInput(path, "a mesh with vertices of 3 coordinates", f"an array of shape {vertices.shape}")

@@ -12,6 +12,7 @@ from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, col
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
+from models.common.vocabulary import Vocabulary
 
 BUCKET_BATCHES = 4
 Item = TypeVar("Item")
@@ -49,6 +50,8 @@ class Corpus:
             "clips_digest": sha256_bytes(canonical_json(clips).encode()),
             "datasets": {name: sum(sample.dataset == name for sample in self.train) for name in names},
             "hand_types": {hand: sum(sample.hand_type == hand for sample in self.train) for hand in HAND_TYPES},
+            "contact_threshold_m": self.annotated.contact_threshold_m,
+            "vocabulary": Vocabulary.of(self.train).rows,
             "synthetic": any(sample.synthetic for sample in samples),
             "encoder": self.annotated.encoder_identity,
             "hand": hands.name,

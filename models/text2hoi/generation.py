@@ -5,6 +5,7 @@ zero in the first frame. Everything is drawn from one seed: the same seed gives 
 """
 
 from dataclasses import asdict, dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,16 @@ from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request
-from hoidata.clips.clip import SIDES, Clip, HandType
+from hoidata.clips.clip import FPS, SIDES, Clip, HandType
 from hoidata.clips.features import OBJECT_POSITION, WRIST
 from hoidata.errors import BadInput
+from hoidata.files import sha256_file
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints, sample_points
-from models.common.checkpoints import Checkpoint
+from models.common.checkpoints import FILE_NAME, Checkpoint
 from models.common.sampling import SamplerConfig
+from models.common.vocabulary import Vocabulary, read_sentence
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi, Text2HoiMotion
 
@@ -32,7 +35,8 @@ class GeneratedMotion:
     """clip: the motion, hands that were not asked for invalid. contact: (N,) bool contact map it was made for.
 
     points: where those points lie on the object. coarse: the motion before refinement. evidence: plain values on how
-    the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic.
+    the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "unseen": what of
+    the sentence was never in training, in words.
     """
 
     clip: Clip
@@ -42,61 +46,121 @@ class GeneratedMotion:
     evidence: dict[str, Any]
 
 
-def generate(
-    text: str,
-    object: ObjectModel,
-    checkpoints: str | Path,
-    hands: HandPair,
-    encoder: TextEncoder,
-    seed: int = 0,
-    *,
-    sampler: SamplerConfig | None = None,
-    frames: int | None = None,
-    object_words: str | None = None,
-    hand_by: Method = "rules",
-    threads: int = 2,
-    device: str = "cpu",
-) -> GeneratedMotion:
-    """A motion for ``text`` on ``object`` (metres), with the networks in ``checkpoints/<network>``.
+@dataclass(frozen=True)
+class Wish:
+    """What a person asks for beside the sentence; None leaves it to the sentence, or to the length network.
 
-    hands and encoder must be the ones the networks were trained with. frames: instead of the length network's answer.
-    hand_by: "rules", then similarity by a margin, then the share in training; or the paper's plain "similarity".
-    Raises BadInput where a network is missing or was trained with other hands or another encoder.
+    seed: of everything that is drawn. samples: how many motions; each is the same in whatever number it is asked for.
+    frames: 8 to 150 at 30 fps. hand_by: "rules", then similarity by a margin, then the share in training; or the
+    paper's plain "similarity".
     """
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(True)
-    model = Text2Hoi.load(checkpoints, hands, SamplingConfig(sampler or SamplerConfig()), device)
-    for checkpoint in model.trained.values():
-        _refuse_others(checkpoint, hands, encoder, Path(checkpoints))
-    choice = _chosen_hand(text, encoder, model.trained["contact"].facts["hand_types"], hand_by)
-    points = sample_points(object)
-    request = Request(
-        motion_id=f"generated/{object.name}",
-        object=object,
-        points=ObjectPoints(points.points_m, points.normals, points.part),
-        text=encoder.encode([text])[0],
-        active_hands=np.array([choice.hand in (side, "both") for side in SIDES]),
-        n_frames=0,
-        seed=seed,
-        clip_id=text,
-        object_words=object_words or object.name,
-    )
-    request = replace(request, n_frames=_length(model, request) if frames is None else frames)
-    if not SHORTEST_FRAMES <= request.n_frames <= MAX_FRAMES:
-        expected = f"{SHORTEST_FRAMES} to {MAX_FRAMES}"
-        raise BadInput("frames", expected, str(request.n_frames), "ask for another length")
-    motion = _started_at_origin(model.motions([request])[0])
-    evidence = {
-        "text": text,
-        "seed": seed,
-        "hand": asdict(choice),
-        "frames": request.n_frames,
-        "touched_points": int(motion.contact_map.sum()),
-        "trained_on": model.facts["datasets"],
-        "synthetic": bool(model.facts["synthetic"]),
-    }
-    refined, coarse = (model.clips([request], [motion], refined=kind)[0] for kind in (True, False))
-    return GeneratedMotion(refined, coarse, motion.contact_map.numpy() > 0, points, evidence)
+
+    seed: int = 0
+    samples: int = 1
+    hand: HandType | None = None
+    frames: int | None = None
+    hand_by: Method = "rules"
+
+
+@dataclass(frozen=True)
+class Generator:
+    """The trained networks of one dataset with their hand and text encoder: ready to answer sentences."""
+
+    model: Text2Hoi
+    hands: HandPair
+    encoder: TextEncoder
+    vocabulary: Vocabulary
+    checkpoints: dict[str, str]
+
+    @classmethod
+    def load(
+        cls,
+        checkpoints: str | Path,
+        hands: HandPair,
+        encoder: TextEncoder,
+        *,
+        sampler: SamplerConfig | None = None,
+        device: str = "cpu",
+    ) -> "Generator":
+        """From ``checkpoints/<network>``, with the hands and the encoder the networks were trained with.
+
+        Raises BadInput where a network is missing or was trained with other hands or another encoder.
+        """
+        model = Text2Hoi.load(checkpoints, hands, SamplingConfig(sampler or SamplerConfig()), device)
+        for checkpoint in model.trained.values():
+            _refuse_others(checkpoint, hands, encoder, Path(checkpoints))
+        digests = {name: sha256_file(Path(checkpoints) / name / FILE_NAME) for name in model.trained}
+        return cls(model, hands, encoder, Vocabulary.read(model.trained["contact"].facts), digests)
+
+    def generate(
+        self, text: str, object: ObjectModel, wish: Wish = Wish(), object_words: str | None = None
+    ) -> list[GeneratedMotion]:
+        """Motions for ``text`` on ``object`` (metres, z up).
+
+        Raises BadInput for no English sentence, and for a length no model was trained for.
+        """
+        verb, thing = read_sentence(text)
+        choice = self._hand(text, wish)
+        assert choice.hand is not None  # a prior decides last
+        points = sample_points(object)
+        first = Request(
+            motion_id=f"generated/{object.name}",
+            object=object,
+            points=ObjectPoints(points.points_m, points.normals, points.part),
+            text=self.encoder.encode([text])[0],
+            active_hands=np.array([choice.hand in (side, "both") for side in SIDES]),
+            n_frames=0,
+            clip_id=text,
+            object_words=object_words or object.name,
+        )
+        requests = [self._request(first, text, wish, number) for number in range(wish.samples)]
+        evidence = {
+            "text": text,
+            "seed": wish.seed,
+            "hand": asdict(choice),
+            "unseen": self.vocabulary.unseen(text, verb, object_words or thing, choice.hand, self.encoder),
+            "trained_on": self.model.facts["datasets"],
+            "synthetic": bool(self.model.facts["synthetic"]),
+            "contact_threshold_m": self.model.facts["contact_threshold_m"],
+            "checkpoints": self.checkpoints,
+        }
+        # One by one: the last bits of a matrix product depend on how many rows it has.
+        motions = [_started_at_origin(self.model.motions([request])[0]) for request in requests]
+        made = zip(requests, motions, strict=True)
+        return [self._generated(request, motion, points, evidence) for request, motion in made]
+
+    def _hand(self, text: str, wish: Wish) -> HandChoice:
+        """The hand asked for; else by the rules, and where the text names none by the share among training clips."""
+        if wish.hand:
+            return HandChoice(wish.hand, "rule", 1.0, "asked for beside the sentence")
+        counts = self.model.trained["contact"].facts["hand_types"]
+        total = max(sum(counts.values()), 1)
+        prior = {hand: count / total for hand, count in counts.items()}
+        return choose_hand(text, self.encoder, prior, wish.hand_by)
+
+    def _request(self, first: Request, text: str, wish: Wish, number: int) -> Request:
+        """The request of one sample, with a seed of its own for every sentence, object and number."""
+        motion_id = first.motion_id if number == 0 else f"{first.motion_id}~{number}"
+        drawn_from = f"{wish.seed} {number} {first.object.name} {text}"
+        seed = int.from_bytes(sha256(drawn_from.encode()).digest()[:7])
+        request = replace(first, motion_id=motion_id, seed=seed, number=number)
+        n_frames = self._length(request) if wish.frames is None else wish.frames
+        if not SHORTEST_FRAMES <= n_frames <= MAX_FRAMES:
+            seconds = f"{SHORTEST_FRAMES / FPS:.2f} to {MAX_FRAMES / FPS:g} s"
+            expected = f"{SHORTEST_FRAMES} to {MAX_FRAMES} frames ({seconds})"
+            raise BadInput("length", expected, f"{n_frames} frames", "ask for another length")
+        return replace(request, n_frames=n_frames)
+
+    def _length(self, request: Request) -> int:
+        text, active_hands = (torch.from_numpy(values)[None] for values in (request.text, request.active_hands))
+        return self.model.sample_lengths(text, active_hands, torch.Generator().manual_seed(request.seed))[0]
+
+    def _generated(
+        self, request: Request, motion: Text2HoiMotion, points: SampledPoints, evidence: dict[str, Any]
+    ) -> GeneratedMotion:
+        own = {"number": request.number, "frames": request.n_frames, "touched_points": int(motion.contact_map.sum())}
+        refined, coarse = (self.model.clips([request], [motion], refined=kind)[0] for kind in (True, False))
+        return GeneratedMotion(refined, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
 
 
 def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, where: Path) -> None:
@@ -106,17 +170,6 @@ def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder
         expected = f"hand {facts['hand']} {facts['hand_digest'][:12]}"
         raise BadInput(where, expected, f"{hands.name} {hands.digest[:12]}", remedy)
     refuse_other_encoder(where, facts["encoder"], encoder.identity)
-
-
-def _chosen_hand(text: str, encoder: TextEncoder, counts: dict[HandType, int], method: Method) -> HandChoice:
-    """Rules first; where the text names no hand, the share of hands among the training clips decides, and is named."""
-    total = max(sum(counts.values()), 1)
-    return choose_hand(text, encoder, {hand: count / total for hand, count in counts.items()}, method)
-
-
-def _length(model: Text2Hoi, request: Request) -> int:
-    text, active_hands = (torch.from_numpy(values)[None] for values in (request.text, request.active_hands))
-    return model.sample_lengths(text, active_hands, torch.Generator().manual_seed(request.seed))[0]
 
 
 def _started_at_origin(motion: Text2HoiMotion) -> Text2HoiMotion:

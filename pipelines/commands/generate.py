@@ -1,4 +1,4 @@
-"""``hoidata generate``: a sentence and a mesh become a motion."""
+"""``hoidata generate``: a sentence and an object become motions."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -10,10 +10,19 @@ from pipelines.commands.project import current_profile, enter_project
 
 def generate(
     text: Annotated[str, typer.Argument(help="E.g. 'Lift a box with the right hand.'")],
-    object: Annotated[str, typer.Option("--object", help="A mesh file in metres, or an object's name in the dataset.")],
+    object: Annotated[str, typer.Option("--object", help="A mesh file (OBJ, PLY, STL, GLB), or a dataset's object.")],
     out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-    dataset: Annotated[str, typer.Option(help="Whose trained models to use.")] = "grab",
+    samples: Annotated[int, typer.Option(help="How many motions, side by side.", min=1, max=32)] = 1,
+    hand: Annotated[Literal["left", "right", "both"] | None, typer.Option(help="Whatever the words say.")] = None,
+    length: Annotated[float | None, typer.Option(help="Seconds, instead of the length network's answer.")] = None,
+    model: Annotated[str, typer.Option(help="Dataset whose models to use; else what knows the words.")] = "",
+    sampler: Annotated[Literal["ddim", "ddpm", "dpm++"], typer.Option(help="How noise becomes motion.")] = "ddim",
+    steps: Annotated[int, typer.Option(help="Denoiser calls.", min=1, max=1000)] = 20,
+    scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 is none.")] = 1.0,
+    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm or inch; metres when left out.")] = "",
+    up: Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")] = "",
+    hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
     hand_by: Annotated[
         Literal["rules", "similarity"],
         typer.Option(
@@ -25,10 +34,28 @@ def generate(
 ) -> None:
     """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
     mesh = Path(object).resolve() if Path(object).is_file() else None
-    enter_project()
-    from pipelines.generation import generate_files
-    from pipelines.stages.base import Place
+    root = enter_project()
+    from hoidata.clips.clip import FPS
+    from models.common.sampling import SamplerConfig
+    from models.text2hoi.generation import Wish
+    from pipelines.generation import Asked, MeshWish, generate_files
+    from pipelines.lineage.graph import read_params
 
-    place = Place(profile or current_profile(), dataset)
-    for path in generate_files(text, mesh or object, seed, out, place, hand_by):
+    wish = Wish(seed, samples, hand, None if length is None else round(length * FPS), hand_by)
+    written = generate_files(
+        Asked(
+            text,
+            mesh or object,
+            profile or current_profile(),
+            tuple(read_params(root)["datasets"]),
+            model,
+            wish,
+            MeshWish(unit, up, hinge),
+            SamplerConfig(sampler, steps, scale),
+        ),
+        out,
+    )
+    for note in written.notes:
+        typer.echo(note, err=True)
+    for path in written.paths:
         typer.echo(path)

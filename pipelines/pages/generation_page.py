@@ -1,16 +1,24 @@
 """What a generated motion is written as: motion.npz (arrays), motion.glb (animated) and a page that plays it."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.contact.proximity import ProximityIndex
+from hoidata.files import atomic_file
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints
+from hoidata.objects.user_mesh import thinned
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.glb import write_glb
-from pipelines.pages.player import motion_player, write_motion_page
+from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.surface import ContactPaint
+from pipelines.pages.view import touched_side
+
+MOST_FACES_DRAWN = 30_000
 
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
 ARRAYS = {
@@ -37,51 +45,120 @@ ARRAYS = {
 }
 
 
-def write_generation(out_dir: str | Path, motion: GeneratedMotion, hands: HandPair) -> list[Path]:
-    """Write motion.npz, motion.glb and index.html; the same motion gives the same bytes. Gives the three paths.
+@dataclass(frozen=True)
+class _Shown:
+    """One motion on the page. agreement: of the contact reached with the contact asked for, in words."""
 
-    hands: the model the motion's parameters belong to.
+    caption: str
+    player: Player
+    before: Player
+    asked: Player
+    reached: Player
+    agreement: str
+
+
+def write_generation(
+    out_dir: str | Path,
+    motions: Sequence[GeneratedMotion],
+    hands: HandPair,
+    checkpoints: str,
+    notes: Sequence[str] = (),
+) -> list[Path]:
+    """Write motion.npz, motion.glb (for further motions motion-1.npz, ...) and index.html; gives their paths.
+
+    hands: the model the motions' parameters belong to. checkpoints: the folder they come from, in words. notes: shown
+    on top. The same motions give the same bytes.
     """
     folder = Path(out_dir)
     folder.mkdir(parents=True, exist_ok=True)
-    text = str(motion.evidence["text"])
-    paint = generated_contact(motion)
-    arrays = motion_arrays(motion, hands)
-    write_npz(folder / "motion.npz", arrays)
-    write_glb(folder / "motion.glb", motion.clip, hands, paint)
-    write_motion_page(
-        folder / "index.html",
-        motion_player(motion.clip, hands, text, contact=paint, contact_label="contact it was made for"),
-        text,
-        [*generation_facts(motion), ("hand model", hands.name)],
-        motion.clip.synthetic,
-        subtitle="Generated motion",
-        files=[
-            ("motion.glb", "the same motion as an animated model for any glTF 2.0 viewer"),
-            ("motion.npz", "plain arrays, metres and radians: numpy.load('motion.npz')"),
-        ],
-        arrays=[(name, ARRAYS[name]) for name in arrays],
+    paths = []
+    for motion in motions:
+        name = f"motion-{number}" if (number := motion.evidence["number"]) else "motion"
+        write_npz(folder / f"{name}.npz", motion_arrays(motion, hands))
+        write_glb(folder / f"{name}.glb", motion.clip, hands, _paint(motion, motion.contact))
+        paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
+    first = motions[0]
+    page = render_page(
+        "generation.html",
+        title=str(first.evidence["text"]),
+        synthetic=first.clip.synthetic,
+        notes=list(notes),
+        motions=[_shown(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
+        facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
+        files=[(path.name, _FILE_WORDS[path.suffix]) for path in paths],
+        arrays=[(name, ARRAYS[name]) for name in motion_arrays(first, hands)],
+        has_players=True,
     )
-    return [folder / name for name in ("motion.npz", "motion.glb", "index.html")]
+    with atomic_file(folder / "index.html") as partial:
+        partial.write_text(page, encoding="utf-8")
+    return [*paths, folder / "index.html"]
 
 
-def generated_contact(motion: GeneratedMotion) -> ContactPaint:
-    """The contact map the motion was made for, as paint."""
-    return ContactPaint(motion.points.points_m, motion.points.part, np.asarray(motion.contact, dtype=np.float64))
+_FILE_WORDS = {
+    ".glb": "an animated model for any glTF 2.0 viewer; painted: the contact asked for",
+    ".npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
+}
 
 
-def generation_facts(motion: GeneratedMotion) -> list[tuple[str, str]]:
-    """Rows (name, value) on how the motion came about: hands and why, length, object, seed, training data."""
-    evidence, clip = motion.evidence, motion.clip
+def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> _Shown:
+    """What the page shows of one motion; large meshes are thinned, the files keep them whole."""
+    text, reached = str(motion.evidence["text"]), reached_contact(motion, hands)
+    clip, coarse = (_drawn(shown) for shown in (motion.clip, motion.coarse))
+    title = f"{caption}: {text}"
+    paints = {"asked for": _paint(motion, motion.contact), "reached": _paint(motion, reached)}
+    asked, got = (
+        contact_player(clip, paint, f"{title}, {name}", name, touched_side(clip, paint), name)
+        for name, paint in paints.items()
+    )
+    player = motion_player(clip, hands, title, caption, paints["reached"], "contact reached")
+    before = motion_player(coarse, hands, f"{title}, before refinement", caption)
+    return _Shown(caption, player, before, asked, got, _agreement(motion.contact, reached))
+
+
+def _drawn(clip: Clip) -> Clip:
+    return replace(clip, object=replace(clip.object, model=thinned(clip.object.model, MOST_FACES_DRAWN)))
+
+
+def _agreement(asked: np.ndarray, reached: np.ndarray) -> str:
+    """How far two contact maps (point,) agree, in words."""
+    both, total = int((asked & reached).sum()), int(asked.sum()) + int(reached.sum())
+    f1 = 2 * both / total if total else 1.0
+    return f"{asked.sum()} points asked for, {reached.sum()} reached, {both} of them asked for (F1 {f1:.2f})"
+
+
+def reached_contact(motion: GeneratedMotion, hands: HandPair) -> np.ndarray:
+    """(P,) bool: points nearer to a joint of an acting hand in any frame than the threshold of the training data."""
+    clip, index = motion.clip, ProximityIndex(motion.points)
+    reached = np.zeros(len(motion.points.points_m), dtype=bool)
+    for side in SIDES:
+        track = clip.hands[side]
+        if track.valid.any():
+            joints = track_joints(track, hands[side])
+            near = index.entries(joints, track.valid, clip.object, motion.evidence["contact_threshold_m"])
+            reached[near["point"]] = True
+    return reached
+
+
+def _paint(motion: GeneratedMotion, contact: np.ndarray) -> ContactPaint:
+    return ContactPaint(motion.points.points_m, motion.points.part, np.asarray(contact, dtype=np.float64))
+
+
+def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> list[tuple[str, str]]:
+    """Rows (name, value) on how the motions came about: hands and why, length, object, seed, models, training data."""
+    evidence, clip = motions[0].evidence, motions[0].clip
     hand = evidence["hand"]
     kind = "SYNTHETIC" if evidence["synthetic"] else "recorded"
     clips = ", ".join(f"{count} {kind} {name} clips" for name, count in evidence["trained_on"].items())
+    lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
+    digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
     return [
         ("hands", f"{hand['hand']} (decided by {hand['source']}: {hand['evidence']})"),
-        ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s at {FPS} fps"),
+        ("length", "; ".join(lengths)),
         ("object", clip.object_words),
         ("seed", str(evidence["seed"])),
         ("trained on", clips),
+        ("checkpoints", f"{checkpoints} (sha256: {digests})"),
+        *[("never seen", note) for note in evidence["unseen"]],
     ]
 
 

@@ -4,7 +4,6 @@ three.js and its GLTFLoader (MIT) lie in ``vendor``, where their version and lic
 """
 
 import base64
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +13,6 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from hoidata.clips.clip import SIDES, Clip
-from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
 from pipelines.pages.surface import ContactPaint
@@ -91,26 +89,6 @@ def render_page(template: str, **values: object) -> str:
         player_js=Markup((_ROOM / "player.js").read_text(encoding="utf-8")) if has_players else "",
         **values,
     )
-
-
-def write_motion_page(
-    path: str | Path,
-    player: Player,
-    title: str,
-    facts: list[tuple[str, str]],
-    synthetic: bool,
-    subtitle: str = "",
-    files: Sequence[tuple[str, str]] = (),
-    arrays: Sequence[tuple[str, str]] = (),
-) -> Path:
-    """Write one self-contained page that plays ``player``. facts, files, arrays: (name, text) rows."""
-    page = render_page(
-        "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
-        files=files, arrays=arrays, has_players=True,
-    )  # fmt: skip
-    with atomic_file(path) as partial:
-        partial.write_text(page, encoding="utf-8")
-    return Path(path)
 
 
 @lru_cache(maxsize=1)

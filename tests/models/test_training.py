@@ -20,7 +20,7 @@ from models.common.checkpoints import load_checkpoint, save_checkpoint
 from models.common.corpus import batches
 from models.common.training import TrainingConfig, learning_rate_factor, train_network
 from models.registry import load_network
-from models.text2hoi.generation import GeneratedMotion, _started_at_origin, generate
+from models.text2hoi.generation import GeneratedMotion, Generator, Wish, _started_at_origin
 from models.text2hoi.sampler import Text2HoiMotion
 from tests.models.toy import PARAMS, train
 
@@ -100,7 +100,11 @@ def user_box() -> ObjectModel:
 
 
 def motion(trained: Path, text: str, seed: int) -> GeneratedMotion:
-    return generate(text, user_box(), trained, load_embedded_hands(), load_encoder("hash"), seed, threads=1)
+    return generator(trained).generate(text, user_box(), Wish(seed))[0]
+
+
+def generator(trained: Path) -> Generator:
+    return Generator.load(trained, load_embedded_hands(), load_encoder("hash"))
 
 
 def bytes_of(made: GeneratedMotion) -> bytes:
@@ -119,6 +123,28 @@ def test_generation_repeats_its_bytes_and_uses_only_the_hands_asked_for(trained:
     assert made.clip.dataset == "generated"
     assert made.clip.synthetic
     assert made.evidence["hand"]["source"] == "rule"
+
+
+def test_a_sample_is_the_same_however_many_are_asked_for_and_lengths_are_drawn_anew(trained: Path) -> None:
+    model, text = generator(trained), "Lift a box with the right hand."
+    many = model.generate(text, user_box(), Wish(samples=6))
+    assert bytes_of(many[0]) == bytes_of(model.generate(text, user_box())[0])
+    assert len({bytes_of(made) for made in many}) == 6
+    assert len({made.clip.n_frames for made in many}) > 1
+    assert {made.clip.n_frames for made in model.generate(text, user_box(), Wish(samples=2, frames=20))} == {20}
+
+
+def test_what_is_asked_for_beside_the_sentence_counts_before_its_words(trained: Path) -> None:
+    made = generator(trained).generate("Lift a box with the right hand.", user_box(), Wish(hand="left", frames=9))[0]
+    assert made.clip.hands["left"].valid.all()
+    assert not made.clip.hands["right"].valid.any()
+    with pytest.raises(BadInput, match="8 to 150 frames"):
+        generator(trained).generate("Lift a box.", user_box(), Wish(frames=151))
+
+
+def test_what_training_never_had_is_said(trained: Path) -> None:
+    said = generator(trained).generate("Juggle three oranges with both hands.", user_box(), Wish(frames=8))[0]
+    assert "the verb 'juggle' was never in training" in said.evidence["unseen"][0]
 
 
 def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(trained: Path) -> None:
@@ -146,10 +172,10 @@ def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
     pair, encoder = load_embedded_hands(), load_encoder("hash")
     other = replace(pair, left=replace(pair.left, template_m=pair.left.template_m * 1.1))
     with pytest.raises(BadInput, match="hand"):
-        generate("Lift a box.", user_box(), trained, other, encoder)
+        Generator.load(trained, other, encoder)
     encoder.identity = {"name": "another"}
     with pytest.raises(BadInput, match="text features"):
-        generate("Lift a box.", user_box(), trained, pair, encoder)
+        Generator.load(trained, pair, encoder)
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:

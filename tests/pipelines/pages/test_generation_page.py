@@ -1,32 +1,72 @@
+"""What a generated motion is written as: arrays, an animated model, and a page that fetches nothing."""
+
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import track_joints
 from hoidata.objects.sampling import sample_points
 from models.text2hoi.generation import GeneratedMotion
-from pipelines.pages.generation_page import ARRAYS, write_generation
+from pipelines.pages.generation_page import ARRAYS, reached_contact, write_generation
+from pipelines.pages.player import three_javascript
+
+TEXT = "Lift a box & hold it with the right hand."
+FETCHES = re.compile(r"""(?:src|href|data)\s*=\s*["']?\s*(?:https?:)?//|url\(\s*["']?(?:https?:)?//|@import""", re.I)
 
 
 @pytest.fixture
 def motion(page_clip):
     clip = page_clip(right=True, left=False)
     points = sample_points(clip.object.model)
-    hand = {"hand": "right", "source": "rule", "confidence": 1.0, "evidence": "the right hand"}
-    evidence = {"text": "Lift a box with the right hand.", "seed": 7, "hand": hand, "synthetic": True}
-    evidence["trained_on"] = {"grab": 12}
+    hand = {"hand": "right", "source": "rule", "confidence": 1.0, "evidence": "the right <hand>"}
+    evidence = {
+        "text": TEXT,
+        "seed": 7,
+        "number": 0,
+        "hand": hand,
+        "synthetic": True,
+        "unseen": ["the object 'vase' was never in training"],
+        "contact_threshold_m": 0.02,
+        "checkpoints": {"contact": "ab" * 32},
+        "trained_on": {"grab": 12},
+    }
     return GeneratedMotion(clip, page_clip(frames=clip.n_frames), points.points_m[:, 0] > 0.039, points, evidence)
 
 
-def test_three_files_are_written_and_repeat_byte_for_byte(motion, hands, tmp_path):
-    first, again = write_generation(tmp_path / "a", motion, hands), write_generation(tmp_path / "b", motion, hands)
+@pytest.fixture
+def write(hands, tmp_path):
+    def written(*motions, to="out"):
+        return write_generation(tmp_path / to, motions, hands, "checkpoints/embedded/grab", ["z is <taken> for up"])
+
+    return written
+
+
+def test_three_files_are_written_and_repeat_byte_for_byte(motion, write):
+    first, again = write(motion, to="a"), write(motion, to="b")
     assert [path.name for path in first] == ["motion.npz", "motion.glb", "index.html"]
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in again]
 
 
-def test_arrays_open_without_pickle_and_hold_the_motion(motion, hands, tmp_path):
-    with np.load(write_generation(tmp_path, motion, hands)[0], allow_pickle=False) as archive:
+def test_every_sample_has_its_files_and_stands_on_the_one_page(motion, write):
+    second = replace(motion, evidence=motion.evidence | {"number": 1})
+    paths = write(motion, second)
+    assert [path.name for path in paths] == [
+        "motion.npz", "motion.glb", "motion-1.npz", "motion-1.glb", "index.html",
+    ]  # fmt: skip
+    page = paths[-1].read_text()
+    assert "sample 1" in page
+    assert "sample 2" in page
+
+
+def test_arrays_open_without_pickle_and_hold_the_motion(motion, hands, write):
+    with np.load(write(motion)[0], allow_pickle=False) as archive:
         arrays = dict(archive)
-    assert str(arrays["text"]) == "Lift a box with the right hand."
+    assert str(arrays["text"]) == TEXT
     assert not arrays["joints_m"][0].any()
     assert not arrays["valid"][0].any()
     assert np.array_equal(arrays["joints_m"][1], track_joints(motion.clip.hands["right"], hands.right))
@@ -34,18 +74,68 @@ def test_arrays_open_without_pickle_and_hold_the_motion(motion, hands, tmp_path)
     assert np.allclose(arrays["object_translation_m"], motion.clip.object.translation_m, atol=1e-6)
 
 
-def test_page_names_seed_hands_length_and_that_it_is_synthetic(motion, hands, tmp_path):
-    page = write_generation(tmp_path, motion, hands)[2].read_text()
-    assert "right (decided by rule: the right hand)" in page
-    assert "12 SYNTHETIC grab clips" in page
-    assert "24 frames, 0.80 s" in page
-    assert "<dd>7</dd>" in page
-    assert "SYNTHETIC" in page
+def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, write):
+    page = write(motion)[-1].read_text()
+    for words in (
+        "right (decided by rule: the right &lt;hand&gt;)",
+        "12 SYNTHETIC grab clips",
+        "24 frames, 0.80 s",
+        "<dd>7</dd>",
+        "checkpoints/embedded/grab (sha256: contact abababababab)",
+        "the object &#39;vase&#39; was never in training",
+        "z is &lt;taken&gt; for up",
+        "Lift a box &amp; hold it",
+    ):
+        assert words in page, words
 
 
-def test_every_array_is_explained_on_the_page(motion, hands, tmp_path):
-    paths = write_generation(tmp_path, motion, hands)
-    page = paths[2].read_text()
+def test_contact_that_was_reached_is_that_of_joints_near_points(motion, hands, write):
+    reached = reached_contact(motion, hands)
+    track = motion.clip.hands["right"]
+    entries = ProximityIndex(motion.points).entries(
+        track_joints(track, hands.right), track.valid, motion.clip.object, 0.02
+    )
+    assert set(np.flatnonzero(reached)) == set(entries["point"].tolist())
+    assert f"{reached.sum()} reached" in write(motion)[-1].read_text()
+
+
+def test_every_array_is_explained_on_the_page(motion, write):
+    paths = write(motion)
+    page = paths[-1].read_text()
     with np.load(paths[0], allow_pickle=False) as archive:
         assert set(archive.files) <= set(ARRAYS)
         assert all(f"<dt>{name}</dt>" in page for name in archive.files)
+
+
+def test_page_fetches_nothing(motion, write):
+    own_text = write(motion)[-1].read_text().replace(three_javascript(), "")
+    assert not FETCHES.search(own_text)
+    assert not re.search(r"https?://", own_text)
+    assert "default-src 'none'" in own_text
+
+
+@pytest.mark.slow
+def test_the_picture_in_chromium_changes_with_time(motion, write, tmp_path):
+    page = write(motion)[-1]
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        pytest.skip("no chromium on PATH: the page was not opened")
+    pictures = [take_picture(chromium, page, tmp_path / f"{part}.png", part) for part in (0.0, 1.0)]
+    again = take_picture(chromium, page, tmp_path / "again.png", 1.0)
+    assert len({picture.size for picture in pictures}) == 1
+    assert np.abs(pictures[0] - pictures[1]).mean() > 0.3
+    assert np.abs(pictures[1] - again).mean() < 0.1
+
+
+def take_picture(chromium, page, out, part):
+    switches = [
+        "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
+        "--disable-background-networking", "--disable-component-update", "--no-first-run", "--hide-scrollbars",
+        "--window-size=900,700", "--virtual-time-budget=5000",
+    ]  # fmt: skip
+    command = [chromium, *switches, f"--user-data-dir={out.with_suffix('.profile')}", f"--screenshot={out}"]
+    subprocess.run([*command, f"{page.as_uri()}#t={part}"], check=True, capture_output=True, timeout=120)
+    from PIL import Image
+
+    with Image.open(out) as image:
+        return np.asarray(image.convert("RGB"), dtype=np.float64)

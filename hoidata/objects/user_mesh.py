@@ -1,0 +1,180 @@
+"""An object from a mesh somebody has: its unit, which way is up, its hinge; each is told, or found and said."""
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError
+
+from hoidata.errors import BadInput
+from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, checked_mesh, load_mesh
+from hoidata.objects.model import Hinge, ObjectModel
+
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+SMALLEST_M, LARGEST_M = 0.005, 2.0
+HELD_M = (0.02, 1.0)  # sizes a hand is likely to be asked to hold, for guesses of a unit
+UP_AXES = {
+    sign + letter: np.eye(3)[axis] * float(f"{sign}1") for axis, letter in enumerate("xyz") for sign in ("", "-")
+}
+METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
+NEAR_GROUND = 0.02  # of the height: vertices this low carry the object
+CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
+
+
+@dataclass(frozen=True)
+class UserObject:
+    """model: metres, z up, its origin where the file has it. notes: what was assumed, in words a person reads."""
+
+    model: ObjectModel
+    notes: tuple[str, ...]
+
+
+def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") -> UserObject:
+    """An object from an OBJ, PLY, STL or GLB file.
+
+    unit: "m", "cm", "mm" or "inch"; metres where not told. up: "z", "-y", ...; found where not told (GLB: y).
+    hinge: "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's own unit and axes, for a mesh of two
+    pieces of which the second in the file moves.
+    Raises BadInput for a size that cannot be meant, naming the unit that may be, and for a hinge that does not fit.
+    """
+    mesh = _read(path)
+    scale, notes = _scale(path, mesh, unit), list[str]()
+    vertices = mesh.vertices * scale
+    if not up:
+        up, note = ("y", "y is up, as in every GLB file") if _is_gltf(path) else found_up(vertices)
+        notes.append(f"{note}; --up tells it otherwise")
+    if up not in UP_AXES:
+        raise BadInput("--up", f"one of {', '.join(UP_AXES)}", up, "name the axis of the file that points up")
+    turn = _upright_from_file(UP_AXES[up])
+    joint = _hinge(hinge, scale, turn) if hinge else None
+    part = _second_piece(path, mesh) if joint else np.zeros(len(vertices), np.uint8)
+    return UserObject(ObjectModel(path.stem, vertices @ turn.T, mesh.faces, part, joint), tuple(notes))
+
+
+def found_up(vertices_m: np.ndarray) -> tuple[str, str]:
+    """Which axis of a mesh points up, and why: "z", or "y" where the object then stands on clearly more ground."""
+    on_z, on_y = footing(vertices_m, 2), footing(vertices_m, 1)
+    if on_y > CLEARLY * on_z:
+        return "y", f"y is taken for up: so it stands on {on_y:.0%} of its outline, with z up on {on_z:.0%}"
+    return "z", f"z is taken for up: so it stands on {on_z:.0%} of its outline"
+
+
+def footing(vertices_m: np.ndarray, axis: int) -> float:
+    """How much of the object's outline seen from above (area of its convex hull) touches the ground, 0 to 1."""
+    height = vertices_m[:, axis]
+    flat = np.delete(vertices_m, axis, axis=1)
+    low = height <= height.min() + NEAR_GROUND * np.ptp(height)
+    return _hull_area(flat[low]) / max(_hull_area(flat), 1e-12)
+
+
+def thinned(model: ObjectModel, most_faces: int) -> ObjectModel:
+    """The object with at most about ``most_faces`` faces, for drawing: vertices of one cell of a grid become one."""
+    cells = 256
+    while len(model.faces) > most_faces and cells > 8:
+        model, cells = _clustered(model, cells), cells // 2
+    return model
+
+
+def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
+    size = np.ptp(model.vertices_m, axis=0).max() / cells
+    keys = np.column_stack((np.floor((model.vertices_m - model.vertices_m.min(axis=0)) / size), model.part))
+    _, first, cell = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    faces = cell.reshape(-1)[model.faces]
+    apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return ObjectModel(model.name, model.vertices_m[first], faces[apart], model.part[first], model.hinge)
+
+
+def _read(path: Path) -> Mesh:
+    if path.suffix.lower() not in (".stl", ".glb"):
+        return load_mesh(path)
+    if path.stat().st_size > LARGEST_MESH_BYTES:
+        raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
+    try:
+        # From bytes and without a resolver: a GLB cannot make the reader open another file.
+        scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower())
+        mesh = scene.to_mesh()
+        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+    except Exception as error:  # whatever a foreign parser raises on a damaged file
+        got = f"{type(error).__name__}: {str(error)[:200]}"
+        raise BadInput(path, "a readable mesh", got, "export it anew") from error
+    return checked_mesh(path, Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)))
+
+
+def _is_gltf(path: Path) -> bool:
+    return path.suffix.lower() in METRES_AND_Y_UP
+
+
+def _scale(path: Path, mesh: Mesh, unit: str) -> float:
+    """Metres per unit of the file."""
+    if unit and unit not in UNITS_M:
+        raise BadInput("--unit", f"one of {', '.join(UNITS_M)}", unit, "name the unit of the file's numbers")
+    longest = float(np.ptp(mesh.vertices, axis=0).max())
+    metres = longest * UNITS_M[unit or "m"]
+    if SMALLEST_M <= metres <= LARGEST_M:
+        return UNITS_M[unit or "m"]
+    likely = [
+        f"--unit {name} makes it {_size(longest * factor)}"
+        for name, factor in UNITS_M.items()
+        if name != (unit or "m") and HELD_M[0] <= longest * factor <= HELD_M[1]
+    ]
+    expected = f"a longest side of {SMALLEST_M:g} to {LARGEST_M:g} m"
+    raise BadInput(path, expected, f"{metres:.4g} m in {unit or 'm'}", "; ".join(likely) or "scale the mesh to metres")
+
+
+def _size(metres: float) -> str:
+    return f"{metres * 100:.3g} cm"
+
+
+def _upright_from_file(up: np.ndarray) -> np.ndarray:
+    """(3, 3) turn that takes ``up`` to +z: about x for y, about y for x, so that the other axes stay axes."""
+    if up[2]:
+        return np.diag([1.0, up[2], up[2]])
+    along = int(np.flatnonzero(up)[0])
+    turn = np.zeros((3, 3))
+    turn[2, along] = up[along]
+    turn[along, 2] = -up[along]
+    turn[1 - along, 1 - along] = 1.0
+    return turn
+
+
+def _hinge(text: str, scale: float, turn: np.ndarray) -> Hinge:
+    try:
+        point, direction = (np.array([float(number) for number in word.split(",")]) for word in text.split())
+        if point.shape != (3,) or direction.shape != (3,) or not np.isfinite([point, direction]).all():
+            raise ValueError
+        length = np.linalg.norm(direction)
+        if length < 1e-9:
+            raise ValueError
+    except ValueError as error:
+        remedy = 'write a point on the axis, then its direction, like "0,0.1,0.05 1,0,0"'
+        raise BadInput("--hinge", "two times three numbers", text[:80], remedy) from error
+    return Hinge(turn @ direction / length, turn @ point * scale)
+
+
+def _second_piece(path: Path, mesh: Mesh) -> np.ndarray:
+    """(vertex,) 1 for the second of two pieces that share no vertex, in the order of the file."""
+    # Vertices are joined where they coincide: many files repeat them along seams.
+    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    faces = same.reshape(-1)[mesh.faces]
+    count = int(same.max()) + 1
+    rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    _, piece = connected_components(links, directed=False)
+    piece = piece[same.reshape(-1)]
+    used = list(dict.fromkeys(piece[mesh.faces[:, 0]].tolist()))
+    if len(used) != 2:
+        remedy = "give a mesh of a base and one moving piece that do not touch"
+        raise BadInput(path, "two separate pieces for --hinge", f"{len(used)}", remedy)
+    return (piece == used[1]).astype(np.uint8)
+
+
+def _hull_area(points: np.ndarray) -> float:
+    """Area of the convex hull of points (n, 2); 0 where they span none."""
+    try:
+        return float(ConvexHull(points).volume) if len(points) > 2 else 0.0
+    except QhullError:
+        return 0.0

@@ -1,0 +1,65 @@
+"""What training had, and what of a sentence it never had, each with the nearest that it did."""
+
+import pytest
+
+from hoidata.annotation.encoders import load_encoder
+from hoidata.errors import BadInput
+from models.common.vocabulary import Vocabulary, is_english, read_sentence
+
+KNOWN = Vocabulary({("lift", "mug", "right"): 5, ("pour", "teapot", "right"): 3, ("lift", "teapot", "left"): 2})
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "words"),
+        ("...", "words"),
+        ("lift " * 61, "at most 60 words"),
+        ("Hebe die Tasse mit der rechten Hand.", "hebe, tasse, mit"),
+        ("用右手拿起杯子", "English"),
+        ("Levanta la taza con la mano derecha", "levanta"),
+    ],
+)
+def test_what_is_no_english_sentence_is_refused_with_an_example(text, says):
+    with pytest.raises(BadInput, match=says) as error:
+        read_sentence(text)
+    assert "Lift a mug with the right hand." in str(error.value) or "one action" in str(error.value)
+
+
+def test_english_is_read_even_where_no_table_has_its_words():
+    assert read_sentence("Pour water from the teapot.") == ("pour", "teapot")
+    assert read_sentence("Juggle three oranges with both hands") == (None, None)
+    assert is_english("spatulas")
+    assert not is_english("tasse")
+
+
+@pytest.mark.parametrize(
+    ("verb", "thing", "hand", "says"),
+    [
+        ("lift", "mug", "right", []),
+        ("lift", "mug", "left", ["'lift' with 'mug' was in training, never with hand type 'left'"]),
+        ("pour", "mug", "right", ["'pour' and 'mug' were each in training, never together"]),
+    ],
+)
+def test_combinations_that_training_never_had_are_said(verb, thing, hand, says):
+    assert KNOWN.unseen("", verb, thing, hand, load_encoder("hash")) == says
+
+
+def test_unknown_words_come_with_the_nearest_known():
+    said = KNOWN.unseen("Juggle a vase.", None, "vase", "right", load_encoder("hash"))
+    assert said[0].startswith("the verb 'juggle' was never in training; nearest that were: ")
+    assert {"lift", "pour"} == set(said[0].split(": ")[1].split(", "))
+    assert "'vase'" in said[1]
+
+
+def test_the_better_known_sentence_scores_higher():
+    scores = [
+        KNOWN.knows(*words)
+        for words in (("lift", "mug"), ("pour", "mug"), ("lift", "vase"), (None, "mug"), (None, None))
+    ]
+    assert scores == sorted(scores, reverse=True)
+    assert scores[-1] == 0
+
+
+def test_a_checkpoint_keeps_the_vocabulary():
+    assert Vocabulary.read({"vocabulary": KNOWN.rows}) == KNOWN
