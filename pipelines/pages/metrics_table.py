@@ -1,90 +1,212 @@
-"""What evaluation found, as tables: rows are families, columns the metrics of the registry."""
+"""What evaluation found, as tables and charts: rows are families and controls, columns the metrics of the registries."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 from rich import box
 from rich.table import Table
 
+from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
 
-TRUTH, LOOKUP = "ground-truth", "nearest-clip"
+AnyMetric = Metric | FeatureMetric
+ALL_METRICS: tuple[AnyMetric, ...] = (*METRICS, *FEATURE_METRICS)
+TRUTH = "ground-truth"
+LOOKUPS = ("nearest-clip", "prompt-lookup")
+CONTROLS = "controls"
 NO_FIGURE = "-"
+OTHER_EVALUATOR = "another evaluator"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure in text. mark: "good" for the best of all families, "bad" where it loses to nearest-clip, else ""."""
+    """A figure in text. mark: "good" for the best of all families, "bad" where it loses to a lookup, else "".
+
+    spread: its 95 % interval over clips, in text; note: why there is no figure, or what it leaves out.
+    """
 
     text: str
     mark: str = ""
+    spread: str = ""
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One row of a chart, in percent of its width. clips, repetitions: ends of intervals; kind: for the colour."""
+
+    family: str
+    kind: str
+    at: float
+    clips: tuple[float, float] | None
+    repetitions: tuple[float, float] | None
+    text: str
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One metric with a bar for every row that has a figure. ends: what 0 and 100 percent stand for, in text."""
+
+    title: str
+    better: str
+    ends: tuple[str, str]
+    bars: list[Bar]
+
+
+@dataclass(frozen=True)
+class Topic:
+    """Metrics that belong together. columns: (title, unit, which are better); cells: one list for each row of the table."""
+
+    title: str
+    columns: list[tuple[str, str, str]]
+    cells: list[list[Cell]]
+    charts: list[Chart]
 
 
 @dataclass(frozen=True)
 class Row:
-    """One family. loses: titles of the metrics in which it loses to nearest-clip. empty: why it has no figures.
+    """One family. kind: "truth", "lookup", "control" or "family". words: where it loses to which lookup.
 
-    diagnostics: what the family says of its own networks, as (name, value).
+    empty: why it has no figures. diagnostics: what the family says of its own networks, as (name, value).
     """
 
     family: str
-    cells: list[Cell] = field(default_factory=list)
-    loses: list[str] = field(default_factory=list)
+    kind: str = "family"
+    words: str = ""
     empty: str = ""
     note: str = ""
     diagnostics: list[tuple[str, str]] = field(default_factory=list)
 
-    @property
-    def words(self) -> str:
-        return f"loses to {LOOKUP}: {', '.join(self.loses)}" if self.loses else ""
-
 
 @dataclass(frozen=True)
 class MetricsTable:
-    """All families of one dataset. columns: (title, unit, which figures are better)."""
+    """All families and controls of one dataset."""
 
-    columns: list[tuple[str, str, str]]
     rows: list[Row]
+    topics: list[Topic]
+
+
+@dataclass(frozen=True)
+class _Found:
+    """What evaluation wrote of every row: the JSON files, by family; which of them are controls."""
+
+    values: Mapping[str, Mapping[str, Any]]
+    controls: frozenset[str] = frozenset()
+
+    def kind(self, family: str) -> str:
+        """What a row is: "truth", "lookup", "control" or "family"."""
+        if family == TRUTH:
+            return "truth"
+        return "lookup" if family in LOOKUPS else "control" if family in self.controls else "family"
+
+    def column(self, metric: AnyMetric) -> dict[str, float]:
+        """The figure of every family that has one and whose evaluator is the one of the others."""
+        found = {name: own["figures"][metric.name] for name, own in self.values.items() if self.has(name, metric)}
+        return {name: value for name, value in found.items() if not self.is_foreign(name, metric)}
+
+    def has(self, family: str, metric: AnyMetric) -> bool:
+        return metric.name in self.values[family].get("figures", {})
+
+    def is_foreign(self, family: str, metric: AnyMetric) -> bool:
+        """Whether the figure comes from other weights than the first family's: they are not to be compared."""
+        if not isinstance(metric, FeatureMetric):
+            return False
+        digests = {name: self._digest(name, metric.encoder) for name in self.values if self.has(name, metric)}
+        return digests[family] != next(iter(digests.values())) if family in digests else False
+
+    def _digest(self, family: str, encoder: str) -> str:
+        return self.values[family].get("evaluators", {}).get(encoder, {}).get("digest", "")
+
+    def interval(self, family: str, metric: AnyMetric, kind: str) -> tuple[float, float] | None:
+        ends = self.values[family].get("intervals", {}).get(metric.name, {}).get(kind)
+        return (ends[0], ends[1]) if ends else None
+
+    def note(self, family: str, metric: AnyMetric) -> str:
+        return str(self.values[family].get("notes", {}).get(metric.name, ""))
 
 
 def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
-    """The table of ``folder/<family>.json``, families in the order given; metrics that none has are not shown."""
+    """``folder/<family>.json``, families in the order given, then ``folder/controls``; empty topics are left out."""
     folder = Path(folder)
-    found = {family: _read(folder / f"{family}.json") for family in families}
-    figures = {family: values["figures"] for family, values in found.items() if "figures" in values}
-    shown = [metric for metric in METRICS if any(metric.name in values for values in figures.values())]
-    columns = [(metric.title, metric.unit, _better(metric)) for metric in shown]
-    return MetricsTable(columns, [_row(family, found[family], shown, figures) for family in families])
+    controls = sorted(path.stem for path in (folder / CONTROLS).glob("*.json") if path.stem != "empty")
+    paths = {name: folder / f"{name}.json" for name in families}
+    paths |= {name: folder / CONTROLS / f"{name}.json" for name in controls if name not in paths}
+    found = _Found({name: _read(path) for name, path in paths.items()}, frozenset(controls))
+    shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in paths)]
+    topics = [_topic(title, list(group), found) for title, group in groupby(shown, lambda metric: metric.topic)]
+    return MetricsTable([_row(name, found, shown) for name in paths], topics)
 
 
 def _read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"empty": "not evaluated"}
 
 
-def _row(family: str, values: dict[str, Any], shown: list[Metric], figures: Mapping[str, Mapping[str, float]]) -> Row:
+def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:
+    values, kind = found.values[family], found.kind(family)
     if "figures" not in values:
-        return Row(family, empty=str(values["empty"]))
-    cells, loses = [], []
-    for metric in shown:
-        column = {name: own[metric.name] for name, own in figures.items() if metric.name in own}
-        if family not in column:
-            cells.append(Cell(NO_FIGURE))
-            continue
-        worse = loses_to_lookup(metric, family, column)
-        loses += [metric.title] if worse else []
-        mark = "bad" if worse else "good" if family in best_families(metric, column) else ""
-        cells.append(Cell(number(column[family]), mark))
+        return Row(family, kind, empty=str(values["empty"]))
+    columns = [(metric, found.column(metric)) for metric in shown]
+    lost = {name: [own.title for own, column in columns if loses_to(name, own, family, column)] for name in LOOKUPS}
+    words = [f"loses to {lookup}: {', '.join(titles)}" for lookup, titles in lost.items() if titles]
     diagnostics = [(name, number(value)) for name, value in _flat(values.get("diagnostics", {})).items()]
     left_out = len(values.get("left_out", []))
     note = f"{values['motions']:,} motions of {values['held_out_clips']:,} clips"
     note += f", {left_out:,} left out" if left_out else ""
-    return Row(family, cells, loses, note=note, diagnostics=diagnostics)
+    note += ", of lengths it chose itself" if values.get("length") == "own" else ""
+    return Row(family, kind, "; ".join(words) if kind == "family" else "", "", note, diagnostics)
 
 
-def best_families(metric: Metric, column: Mapping[str, float]) -> list[str]:
+def _topic(title: str, metrics: list[AnyMetric], found: _Found) -> Topic:
+    cells = [[_cell(name, metric, found) for metric in metrics] for name in found.values]
+    columns = [(metric.title, metric.unit, _better(metric)) for metric in metrics]
+    return Topic(title, columns, cells, [chart for metric in metrics if (chart := _chart(metric, found))])
+
+
+def _cell(family: str, metric: AnyMetric, found: _Found) -> Cell:
+    note = found.note(family, metric)
+    if not found.has(family, metric):
+        return Cell(note or NO_FIGURE)
+    if found.is_foreign(family, metric):
+        return Cell(OTHER_EVALUATOR)
+    column = found.column(metric)
+    loses = any(loses_to(lookup, metric, family, column) for lookup in LOOKUPS)
+    mark = "bad" if loses else "good" if family in best_families(metric, column) else ""
+    ends = found.interval(family, metric, "clips")
+    return Cell(number(column[family]), mark, f"{number(ends[0])} to {number(ends[1])}" if ends else "", note)
+
+
+def _chart(metric: AnyMetric, found: _Found) -> Chart | None:
+    """All rows of one metric beside each other; None where there is nothing to set beside another."""
+    column = found.column(metric)
+    if len(column) < 2:
+        return None
+    spreads = {name: [found.interval(name, metric, kind) for kind in ("clips", "repetitions")] for name in column}
+    reach = [*column.values(), *(end for ends in spreads.values() for pair in ends if pair for end in pair)]
+    low, high = min(0.0, *reach), max(reach)
+    width = (high - low) or 1.0
+
+    def percent(value: float) -> float:
+        return round(100 * (value - low) / width, 2)
+
+    bars = [
+        Bar(
+            name,
+            found.kind(name),
+            percent(value),
+            *((percent(ends[0]), percent(ends[1])) if ends else None for ends in spreads[name]),
+            number(value),
+        )
+        for name, value in column.items()
+    ]
+    unit = f", {metric.unit}" if metric.unit else ""
+    return Chart(f"{metric.title}{unit}", _better(metric), (number(low), number(high)), bars)
+
+
+def best_families(metric: AnyMetric, column: Mapping[str, float]) -> list[str]:
     """Families that no other beats in a metric; the truth itself does not compete."""
     truth = column.get(TRUTH)
     rivals = {name: value for name, value in column.items() if name != TRUTH}
@@ -97,28 +219,38 @@ def best_families(metric: Metric, column: Mapping[str, float]) -> list[str]:
     ]
 
 
-def loses_to_lookup(metric: Metric, family: str, column: Mapping[str, float]) -> bool:
-    """Whether looking up the nearest training clip gives a better figure than this family."""
-    if family in (TRUTH, LOOKUP) or LOOKUP not in column:
+def loses_to(lookup: str, metric: AnyMetric, family: str, column: Mapping[str, float]) -> bool:
+    """Whether a training clip that was looked up gives a better figure than this family."""
+    if family in (TRUTH, *LOOKUPS) or lookup not in column or family not in column:
         return False
-    return bool(is_better(metric, column[LOOKUP], column[family], column.get(TRUTH)))
+    return bool(is_better(metric, column[lookup], column[family], column.get(TRUTH)))
 
 
 def printed_table(found: Mapping[str, Any]) -> Table:
     """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
     title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips"
     table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
-    for name in ("metric", "figure", "unit", "better", "clips", "values"):
+    for name in ("metric", "figure", "95 % over clips", "unit", "better", "clips", "values"):
         table.add_column(name, justify="right" if name in ("figure", "clips", "values") else "left")
-    for metric in METRICS:
-        if metric.name in found["figures"]:
-            counts = found["counts"][metric.name]
-            sizes = (f"{counts['clips']:,}", f"{counts['values']:,}")
-            table.add_row(metric.title, number(found["figures"][metric.name]), metric.unit, _better(metric), *sizes)
+    for row in _printed_rows(found):
+        table.add_row(*row)
     return table
 
 
-def _better(metric: Metric) -> str:
+def _printed_rows(found: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
+    own = _Found({"": found})
+    for metric in ALL_METRICS:
+        if not own.has("", metric):
+            if note := own.note("", metric):
+                yield metric.title, note, "", metric.unit, _better(metric), "", ""
+            continue
+        counts, ends = found["counts"][metric.name], own.interval("", metric, "clips")
+        spread = f"{number(ends[0])} to {number(ends[1])}" if ends else ""
+        sizes = (f"{counts['clips']:,}", f"{counts['values']:,}")
+        yield metric.title, number(found["figures"][metric.name]), spread, metric.unit, _better(metric), *sizes
+
+
+def _better(metric: AnyMetric) -> str:
     if metric.floor_of:
         return "a floor"
     return metric.direction if metric.direction == "nearer the truth" else f"{metric.direction} is better"
