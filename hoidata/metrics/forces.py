@@ -8,6 +8,7 @@ import numpy as np
 
 from hoidata.metrics.pair import Pair
 from hoidata.physics.realism import VARIANTS, Realism, score
+from hoidata.physics.scene import Scene
 
 NO_VALUES = np.zeros(0)
 
@@ -44,11 +45,16 @@ def _passed(pair: Pair, variant: str, every: int) -> np.ndarray:
 
 
 def _floor(pair: Pair, variant: str, every: int) -> np.ndarray:
-    scene = pair.scene
-    if scene is None:
+    bare = _without_hands(pair)
+    if bare is None:
         return NO_VALUES
-    bare = scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
-    return score(bare, VARIANTS[variant], _looked_at(scene.lifted, every)).passed.astype(np.float64)
+    return score(bare, VARIANTS[variant], _looked_at(bare.lifted, every)).passed.astype(np.float64)
+
+
+@lru_cache(maxsize=1)
+def _without_hands(pair: Pair) -> Scene | None:
+    scene = pair.scene
+    return None if scene is None else scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
 
 
 @lru_cache(maxsize=2)

@@ -61,9 +61,9 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     return Realism(scored, residual, residual < variant.limit, penetration, mean_depth)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def _near(scene: Scene, looked_at: bytes, tolerance_m: float) -> CapsuleContacts:
-    """Contacts in some frames (int64 numbers). Kept for one scene: every variant asks, and they are what costs."""
+    """Contacts in some frames (int64 numbers), kept for a scene and its floor: every variant asks, and it is dear."""
     frames = np.frombuffer(looked_at, np.int64)
     return capsule_contacts(scene.model, scene.poses.taken(frames), scene.capsules.taken(frames), tolerance_m)
 

@@ -13,9 +13,9 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.objects.line_crossings import Intervals, common_length_m, intervals_inside
-from hoidata.objects.solid import Solid, patched_holes
+from hoidata.objects.solid import patched_holes
 from hoidata.objects.surface_index import SurfaceIndex
-from hoidata.objects.triangle_tree import triangle_tree
+from hoidata.objects.triangle_tree import TriangleTree
 
 CELL_M = 0.001
 _MOST_LINES = 1 << 22
@@ -30,11 +30,7 @@ class SolidOverlap:
     def __init__(self, index: SurfaceIndex, cell_m: float = CELL_M) -> None:
         index.check_solid()
         self.index, self.cell_m = index, cell_m
-        self._lines = {
-            part: _lines_through(index.model.name, solid, cell_m)
-            for part, solid in index.solids.items()
-            if isinstance(solid, Solid)
-        }
+        self._lines = {part: _lines_through(index.model.name, tree, cell_m) for part, tree in index.solid_trees.items()}
 
     def volume_m3(self, vertices_m: np.ndarray, faces: np.ndarray, hinge_rad: np.ndarray | None) -> np.ndarray:
         """(frame,) volume that a hand and the object both fill, cubic metres.
@@ -53,12 +49,12 @@ class SolidOverlap:
         return volume
 
 
-def _lines_through(name: str, solid: Solid, cell_m: float) -> Intervals:
-    size = np.ptp(solid.vertices_m, axis=0)
+def _lines_through(name: str, tree: TriangleTree, cell_m: float) -> Intervals:
+    size = tree.box[0, 3:] - tree.box[0, :3]
     if not cell_m > 0 or np.prod(size[1:] / cell_m) > _MOST_LINES:
         got = " x ".join(f"{side:.3g}" for side in size)
         raise BadInput(f"mesh of {name!r}", f"at most {_MOST_LINES} cells of {cell_m} m", f"{got} m", "larger cells")
-    return intervals_inside(triangle_tree(solid.vertices_m, solid.faces), cell_m)
+    return intervals_inside(tree, cell_m)
 
 
 def _frames_near(local_m: np.ndarray, lines: Intervals) -> np.ndarray:
