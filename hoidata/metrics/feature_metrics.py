@@ -56,6 +56,11 @@ class FeatureMetric:
     floor_of: str = ""
     note: str = ""
 
+    @property
+    def topic(self) -> str:
+        """What tables put together: the figures of one encoder."""
+        return f"Features of the evaluator {self.encoder!r}"
+
 
 def feature_figures(
     predicted: EncodedSet, reference: EncodedSet, train: EncodedSet | None = None

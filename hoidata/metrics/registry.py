@@ -5,7 +5,7 @@ To add one: a function of (pair, every) that gives the values of one motion as a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
 
 Direction = Literal["higher", "lower", "nearer the truth"]
+Topic = Literal["Action", "Contact", "Physics", "Motion"]
 Reduction = Literal["best of a clip's samples", "mean over motions", "mean over frames"]
 
 
@@ -22,7 +23,8 @@ Reduction = Literal["best of a clip's samples", "mean over motions", "mean over 
 class Metric:
     """What one figure is.
 
-    name: its key in files. title: in words. unit: of the figure; "" for a share or score from 0 to 1.
+    topic: what it is about; tables are divided so. name: its key in files. title: in words. unit: of the figure; ""
+    for a share or score from 0 to 1.
     direction: which figures are better; "nearer the truth": than the figure of the recorded clips themselves.
     measure: the values of one motion, given every how many frames to look at; none where nothing can be said.
     reduction: how values become one figure. "best of a clip's samples": the mean of each motion's values, the best of
@@ -34,6 +36,7 @@ class Metric:
     aligned: compares frame by frame, so there is no figure for motions of a length their family chose.
     """
 
+    topic: Topic
     name: str
     title: str
     unit: str
@@ -47,6 +50,15 @@ class Metric:
     thresholds: str = ""
     floor_of: str = ""
     aligned: bool = False
+
+
+class Directed(Protocol):
+    """What tells which of two figures is better."""
+
+    @property
+    def direction(self) -> Direction: ...
+    @property
+    def floor_of(self) -> str: ...
 
 
 class Figure(NamedTuple):
@@ -74,107 +86,110 @@ MANIPNET = "ManipNet (Zhang et al. 2021), Sec. 8"
 
 METRICS: tuple[Metric, ...] = (
     Metric(
-        "joint_error_mm", "joint error of the best sample", "mm", "lower", motion.joint_error_mm,
+        "Motion", "joint_error_mm", "joint error of the best sample", "mm", "lower", motion.joint_error_mm,
         "best of a clip's samples", HANDS,
         "mean distance of 21 joints (MPJPE), best of several samples as in Petrovich et al. 2022 (TEMOS), Sec. 4",
         aligned=True,
     ),
     Metric(
-        "contact_f1", "F1 of the contact map made", "", "higher", touch.contact_f1,
+        "Contact", "contact_f1", "F1 of the contact map made", "", "higher", touch.contact_f1,
         "mean over motions", f"{HANDS}, all of them together", "Text2HOI (Cha et al. 2024), Sec. 3.2.2: the map",
         thresholds=CONTACT,
     ),
     Metric(
-        "contact_precision", "precision of the contact map made", "", "higher", touch.contact_precision,
+        "Contact", "contact_precision", "precision of the contact map made", "", "higher", touch.contact_precision,
         "mean over motions", f"{HANDS}, all of them together", "this project: half of `contact_f1`",
         thresholds=CONTACT,
     ),
     Metric(
-        "contact_recall", "recall of the contact map made", "", "higher", touch.contact_recall,
+        "Contact", "contact_recall", "recall of the contact map made", "", "higher", touch.contact_recall,
         "mean over motions", f"{HANDS}, all of them together", "this project: the other half of `contact_f1`",
         thresholds=CONTACT,
     ),
     Metric(
-        "adherence", "F1 of the contact map asked for and the one made", "", "higher", touch.adherence,
+        "Contact", "adherence", "F1 of the contact map asked for and the one made", "", "higher", touch.adherence,
         "mean over motions", f"{HANDS}, all of them together", "this project: `asked.npz` beside the clips",
         thresholds=CONTACT,
     ),
     Metric(
-        "contact_distance_mm", "distance of joints that touch in the truth", "mm", "nearer the truth",
+        "Contact", "contact_distance_mm", "distance of joints that touch in the truth", "mm", "nearer the truth",
         touch.contact_distance_mm, "mean over motions", f"{HANDS} and a joint touches in the true clip",
         "this project; Text2HOI Sec. 3.5 refines it", every=3, samples=2, thresholds=CONTACT, aligned=True,
     ),
     Metric(
-        "penetration_mm", "penetration", "mm", "lower", touch.penetration_mm, "mean over motions", HANDS,
+        "Physics", "penetration_mm", "penetration", "mm", "lower", touch.penetration_mm, "mean over motions", HANDS,
         "depth of the deepest of 778 vertices inside the exact solid (GrabNet, Taheri et al. 2020, Sec. 5)",
         every=3, samples=2,
     ),
     Metric(
-        "deep_share", f"share of frames deeper than {touch.DEEP_MM:g} mm", "", "lower", touch.deep_share,
+        "Physics", "deep_share", f"share of frames deeper than {touch.DEEP_MM:g} mm", "", "lower", touch.deep_share,
         "mean over motions", HANDS, "this project", every=3, samples=2, thresholds=f"{touch.DEEP_MM:g} mm",
     ),
     Metric(
-        "penetration_volume_cm3", "volume that hand and object share", "cm3", "lower", touch.penetration_volume_cm3,
+        "Physics", "penetration_volume_cm3", "volume that hand and object share",
+        "cm3", "lower", touch.penetration_volume_cm3,
         "mean over motions", HANDS, "DiffH2O (Christen et al. 2024), intersection volume; of solids, not voxels",
         every=3, samples=2, thresholds=f"lines {1000 * touch.CELL_M:g} mm apart",
     ),
     Metric(
-        "hand_hand_mm", "penetration of one hand by the other", "mm", "lower", two_hands.hand_hand_mm,
+        "Physics", "hand_hand_mm", "penetration of one hand by the other", "mm", "lower", two_hands.hand_hand_mm,
         "mean over motions", f"{HANDS}, both hands", "this project: depth of the deepest of 19 x 19 capsules",
         every=3, samples=2,
     ),
     Metric(
-        "slip_cm_s", "slip of touching joints on the moving object", "cm/s", "lower", touch.slip_cm_s,
+        "Physics", "slip_cm_s", "slip of touching joints on the moving object", "cm/s", "lower", touch.slip_cm_s,
         "mean over motions", f"{HANDS}, a joint touches in two in a row, and the part under it moves",
         "this project: speed in the frame of the part touched",
         thresholds=f"{CONTACT}; moving: {touch.MOVING_CM_S:g} cm/s",
     ),
     Metric(
-        "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,
+        "Physics", "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,
         f"{MANIPNET} and Appendix A, in SI units", samples=1, thresholds=FORCES,
     ),
     Metric(
-        "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", forces.floor_si,
+        "Physics", "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", forces.floor_si,
         "mean over frames", LIFTED, "this project: what the metric gives for nothing", samples=1, thresholds=FORCES,
         floor_of="realism_si",
     ),
     Metric(
-        "realism_released", "physical realism, as released", "", "higher", forces.realism_as_released,
+        "Physics", "realism_released", "physical realism, as released", "", "higher", forces.realism_as_released,
         "mean over frames", SCORED, f"{MANIPNET} and Appendix A, units of the released sources", samples=1,
         thresholds=FORCES,
     ),
     Metric(
-        "realism_released_floor", "physical realism, as released, without hands", "", "nearer the truth",
+        "Physics", "realism_released_floor", "physical realism, as released, without hands", "", "nearer the truth",
         forces.floor_as_released, "mean over frames", LIFTED, "this project: what the metric gives for nothing",
         samples=1, thresholds=FORCES, floor_of="realism_released",
     ),
     Metric(
-        "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", forces.capsule_depth_mm,
+        "Physics", "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", forces.capsule_depth_mm,
         "mean over motions", LIFTED, f"{MANIPNET}, penetration depth", samples=1,
     ),
     Metric(
-        "smoothness_m_s2", "acceleration of joints in the wrist's frame", "m/s2", "nearer the truth",
+        "Motion", "smoothness_m_s2", "acceleration of joints in the wrist's frame", "m/s2", "nearer the truth",
         motion.smoothness, "mean over motions", f"{HANDS}, three in a row", f"{MANIPNET}, smoothness",
     ),
     Metric(
-        "jitter_m_s3", "jitter of joints in the world", "m/s3", "nearer the truth", motion.jitter_m_s3,
+        "Motion", "jitter_m_s3", "jitter of joints in the world", "m/s3", "nearer the truth", motion.jitter_m_s3,
         "mean over motions", f"{HANDS}, four in a row", "mean jerk, TransPose (Yi et al. 2021), Sec. 5.2",
     ),
     Metric(
-        "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,
+        "Action", "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,
         "mean over motions", "all", "this project: limits of height, way, tilt, hinge and hands (`action.py`)",
         thresholds="`actions.toml`, or the verb's own training clips: 1st to 99th percentile and half a deviation",
     ),
     Metric(
-        "action_named", "the object moves most like the verb's training clips", "", "higher", motion.action_named,
+        "Action", "action_named", "the object moves most like the verb's training clips",
+        "", "higher", motion.action_named,
         "mean over motions", "all", "this project: nearest centroid of the standardised numbers of `action.py`",
     ),
     Metric(
-        "length_error_frames", "error of the length a family chose", "frames", "lower", motion.length_error_frames,
+        "Motion", "length_error_frames", "error of the length a family chose",
+        "frames", "lower", motion.length_error_frames,
         "mean over motions", "all; only stores whose info says `length: own`", "this project",
     ),
     Metric(
-        "length_error_share", "error of the length a family chose, of the true one", "", "lower",
+        "Motion", "length_error_share", "error of the length a family chose, of the true one", "", "lower",
         motion.length_error_share, "mean over motions", "all; only stores whose info says `length: own`",
         "this project",
     ),
@@ -218,7 +233,7 @@ def sum_and_count(metric: Metric, samples: list[np.ndarray]) -> tuple[float, int
     return sum(means), len(means)
 
 
-def is_better(metric: Metric, value: float, other: float, truth: float | None) -> bool | None:
+def is_better(metric: Directed, value: float, other: float, truth: float | None) -> bool | None:
     """Whether ``value`` is better than ``other``; None where the truth is not known or the metric is a floor."""
     if metric.floor_of:
         return None

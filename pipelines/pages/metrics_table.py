@@ -1,9 +1,8 @@
-"""What evaluation found, as tables and charts: rows are families and controls, columns the metrics of the registries."""
+"""What evaluation found, as tables and charts: rows are families and controls, columns the registered metrics."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +58,7 @@ class Chart:
 
 @dataclass(frozen=True)
 class Topic:
-    """Metrics that belong together. columns: (title, unit, which are better); cells: one list for each row of the table."""
+    """Metrics that belong together. columns: (title, unit, which are better); cells: a list for each row."""
 
     title: str
     columns: list[tuple[str, str, str]]
@@ -137,7 +136,8 @@ def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
     paths |= {name: folder / CONTROLS / f"{name}.json" for name in controls if name not in paths}
     found = _Found({name: _read(path) for name, path in paths.items()}, frozenset(controls))
     shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in paths)]
-    topics = [_topic(title, list(group), found) for title, group in groupby(shown, lambda metric: metric.topic)]
+    titles = dict.fromkeys(metric.topic for metric in shown)
+    topics = [_topic(title, [metric for metric in shown if metric.topic == title], found) for title in titles]
     return MetricsTable([_row(name, found, shown) for name in paths], topics)
 
 

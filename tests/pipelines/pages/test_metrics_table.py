@@ -6,37 +6,73 @@ import jinja2
 import pytest
 
 from hoidata.metrics.registry import metric
-from pipelines.pages.metrics_table import NO_FIGURE, best_families, loses_to_lookup, metrics_tables, number
+from pipelines.pages.metrics_table import (
+    NO_FIGURE,
+    OTHER_EVALUATOR,
+    best_families,
+    loses_to,
+    metrics_tables,
+    number,
+    printed_table,
+)
 
+ACCURACY = "accuracy_top1_corrected"
 FIGURES = {
-    "ours": {"joint_error_mm": 30.0, "contact_f1": 0.5, "jitter_m_s3": 9.0, "realism_si_floor": 0.1},
+    "ours": {"joint_error_mm": 30.0, "contact_f1": 0.5, "jitter_m_s3": 9.0, "realism_si_floor": 0.1, ACCURACY: 0.4},
     "nearest-clip": {"joint_error_mm": 40.0, "contact_f1": 0.6, "jitter_m_s3": 12.0, "realism_si_floor": 0.0},
     "ground-truth": {"joint_error_mm": 0.0, "contact_f1": 1.0, "jitter_m_s3": 14.0, "realism_si_floor": 0.0},
 }
+FAMILIES = ["ours", "untrained", "absent", "nearest-clip", "ground-truth"]
+
+
+def written(figures, **more):
+    values = {"figures": figures, "motions": 16, "held_out_clips": 2, "left_out": [], "synthetic": True}
+    return json.dumps(values | {"evaluators": {"corrected": {"digest": "aa"}}} | more)
 
 
 @pytest.fixture
 def folder(tmp_path):
     for family, figures in FIGURES.items():
-        values = {"figures": figures, "motions": 16, "held_out_clips": 2, "left_out": [], "synthetic": True}
-        if family == "ours":
-            values |= {"left_out": [{"clip_id": "a", "reason": "b"}], "diagnostics": {"length": {"mae_frames": 10.25}}}
-        (tmp_path / f"{family}.json").write_text(json.dumps(values))
+        (tmp_path / f"{family}.json").write_text(written(figures))
+    more = {"left_out": [{"clip_id": "a", "reason": "b"}], "diagnostics": {"length": {"mae_frames": 10.25}}}
+    spread = {"contact_f1": {"clips": [0.4, 0.7], "repetitions": [0.45, 0.55]}}
+    (tmp_path / "ours.json").write_text(written(FIGURES["ours"], intervals=spread, **more))
     (tmp_path / "untrained.json").write_text(json.dumps({"empty": "not trained: <length>", "held_out_clips": 0}))
+    (tmp_path / "controls").mkdir()
+    (tmp_path / "controls" / "static.json").write_text(written({"contact_f1": 0.2, ACCURACY: 0.1}))
     return tmp_path
 
 
 def table_of(folder):
-    return metrics_tables(folder, ["ours", "untrained", "absent", "nearest-clip", "ground-truth"])
+    return metrics_tables(folder, FAMILIES)
 
 
-def test_rows_are_families_and_columns_metrics_that_one_of_them_has(folder):
+def cells_of(table, family):
+    """The cells of one row by the titles of their columns."""
+    number = [row.family for row in table.rows].index(family)
+    return {
+        column[0]: cell
+        for topic in table.topics
+        for column, cell in zip(topic.columns, topic.cells[number], strict=True)
+    }
+
+
+def title(name):
+    return metric(name).title
+
+
+def test_rows_are_families_then_controls_and_columns_what_one_of_them_has(folder):
     table = table_of(folder)
-    assert [column[1:] for column in table.columns] == [
-        ("mm", "lower is better"), ("", "higher is better"), ("", "a floor"), ("m/s3", "nearer the truth")
-    ]  # fmt: skip
+    assert [row.family for row in table.rows] == [*FAMILIES, "static"]
+    assert [row.kind for row in table.rows] == ["family", "family", "family", "lookup", "truth", "control"]
+    columns = {column[0]: column[1:] for topic in table.topics for column in topic.columns}
+    assert columns[title("joint_error_mm")] == ("mm", "lower is better")
+    assert columns[title("realism_si_floor")] == ("", "a floor")
+    assert columns[title("jitter_m_s3")] == ("m/s3", "nearer the truth")
+    assert len(columns) == 5
     rows = {row.family: row for row in table.rows}
-    assert [cell.text for cell in rows["ours"].cells] == ["30.0", "0.500", "0.100", "9.00"]
+    assert cells_of(table, "ours")[title("joint_error_mm")].text == "30.0"
+    assert cells_of(table, "static")[title("joint_error_mm")].text == NO_FIGURE
     assert rows["untrained"].empty == "not trained: <length>"
     assert rows["absent"].empty == "not evaluated"
     assert rows["ours"].note == "16 motions of 2 clips, 1 left out"
@@ -44,25 +80,48 @@ def test_rows_are_families_and_columns_metrics_that_one_of_them_has(folder):
 
 
 def test_the_best_family_is_marked_and_one_that_loses_to_the_lookup_said_in_words(folder):
-    rows = {row.family: row for row in table_of(folder).rows}
-    assert [cell.mark for cell in rows["ours"].cells] == ["good", "bad", "", "bad"]
-    assert [cell.mark for cell in rows["nearest-clip"].cells] == ["", "good", "", "good"]
-    assert [cell.mark for cell in rows["ground-truth"].cells] == [""] * 4
-    contact, jitter = metric("contact_f1").title, metric("jitter_m_s3").title
-    assert rows["ours"].words == f"loses to nearest-clip: {contact}, {jitter}"
-    assert not rows["nearest-clip"].words
+    table = table_of(folder)
+    marks = {name: {key: cell.mark for key, cell in cells_of(table, name).items()} for name in FIGURES}
+    contact, jitter, joints = title("contact_f1"), title("jitter_m_s3"), title("joint_error_mm")
+    assert (marks["ours"][joints], marks["ours"][contact], marks["ours"][jitter]) == ("good", "bad", "bad")
+    assert (marks["nearest-clip"][joints], marks["nearest-clip"][contact]) == ("", "good")
+    assert not any(marks["ground-truth"].values())
+    words = {row.family: row.words for row in table.rows}
+    assert words["ours"] == f"loses to nearest-clip: {contact}, {jitter}"
+    assert not words["nearest-clip"]
+    assert not words["static"]  # a control is there to lose
 
 
 def test_nearer_the_truth_needs_the_truth():
     column = {"ours": 9.0, "nearest-clip": 12.0}
     assert best_families(metric("jitter_m_s3"), column) == []
-    assert not loses_to_lookup(metric("jitter_m_s3"), "ours", column)
+    assert not loses_to("nearest-clip", metric("jitter_m_s3"), "ours", column)
     assert best_families(metric("jitter_m_s3"), column | {"ground-truth": 8.0}) == ["ours"]
 
 
-def test_a_metric_a_family_has_no_value_of_leaves_a_gap(folder):
-    (folder / "ours.json").write_text(json.dumps({"figures": {}, "motions": 1, "held_out_clips": 1}))
-    assert {cell.text for cell in table_of(folder).rows[0].cells} == {NO_FIGURE}
+def test_figures_of_another_evaluator_are_not_set_beside_each_other(folder):
+    other = {"evaluators": {"corrected": {"digest": "bb"}}}
+    (folder / "controls" / "static.json").write_text(written({ACCURACY: 0.9}, **other))
+    table = table_of(folder)
+    cells = [cell for cell in cells_of(table, "static").values() if cell.text != NO_FIGURE]
+    assert [cell.text for cell in cells] == [OTHER_EVALUATOR]
+    assert not [chart for topic in table.topics for chart in topic.charts if "accuracy" in chart.title]
+
+
+def test_a_figure_that_must_not_be_given_says_why(folder):
+    (folder / "controls" / "static.json").write_text(written({}, notes={ACCURACY: "N too small"}))
+    assert "N too small" in {cell.text for cell in cells_of(table_of(folder), "static").values()}
+
+
+def test_a_chart_has_a_bar_for_every_row_with_its_intervals_on_one_scale(folder):
+    charts = {chart.title: chart for topic in table_of(folder).topics for chart in topic.charts}
+    chart = charts[title("contact_f1")]
+    bars = {bar.family: bar for bar in chart.bars}
+    assert set(bars) == {"ours", "nearest-clip", "ground-truth", "static"}
+    assert (bars["ground-truth"].at, bars["static"].at, bars["ours"].at) == (100, 20, 50)
+    assert bars["ours"].clips == (40, 70)
+    assert bars["ours"].repetitions == (45, 55)
+    assert chart.ends == ("0.00", "1.00")
 
 
 def test_the_page_says_it_and_escapes_what_it_is_given(folder):
@@ -71,11 +130,22 @@ def test_the_page_says_it_and_escapes_what_it_is_given(folder):
     text = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}').render(
         table=table_of(folder)
     )
-    assert "ours loses to nearest-clip: F1 of the contact map made" in text
+    assert f"<b>ours</b> loses to nearest-clip: {title('contact_f1')}" in text
     assert '<td class="number good">30.0</td>' in text
-    assert "not evaluated: not trained: &lt;length&gt;" in text
+    assert "untrained: not evaluated, not trained: &lt;length&gt;" in text
     assert "What ours says of its own networks" in text
-    assert text.count("<tr>") == 1 + 5
+    assert 'title="0.400 to 0.700"' in text
+    assert text.count("<svg") == 5
+
+
+def test_the_terminal_shows_intervals_and_reasons():
+    found = json.loads(
+        written({"contact_f1": 0.5}, counts={"contact_f1": {"clips": 2, "motions": 4, "values": 4}},
+                intervals={"contact_f1": {"clips": [0.4, 0.7]}}, notes={ACCURACY: "N too small"})
+    )  # fmt: skip
+    cells = [list(column.cells) for column in printed_table(found).columns]
+    assert cells[1] == ["0.500", "N too small"]
+    assert cells[2] == ["0.400 to 0.700", ""]
 
 
 def test_numbers_keep_three_digits():
