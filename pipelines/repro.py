@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from hoidata.errors import MissingResource
 from pipelines.lineage.graph import read_graph, read_params
 from pipelines.lineage.manifests import read_manifest
 from pipelines.stages.adapters import ensure_manifests
@@ -47,8 +48,6 @@ def preflight() -> None:
 
 
 def _is_readable(place: Place) -> bool:
-    from hoidata.errors import MissingResource
-
     try:
         return raw_root(place).is_dir()
     except MissingResource:

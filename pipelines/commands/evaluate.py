@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.console import Console
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -31,8 +32,6 @@ def evaluate(
     split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
 ) -> None:
     """Measure every clip of a store against the clip it was made for, and print the table of metrics."""
-    from rich.console import Console
-
     from hoidata.files import atomic_file
     from hoidata.metrics.evaluate import evaluate_store
     from pipelines.pages.metrics_table import printed_table

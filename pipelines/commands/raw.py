@@ -1,11 +1,14 @@
 """``hoidata raw``: the user's own raw files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from hoidata.errors import BadInput, MissingResource
 from pipelines.commands.project import PROFILES, current_profile, enter_project, remember_root, set_profile
+from pipelines.lineage.graph import read_params
 
 app = typer.Typer(no_args_is_help=True)
 Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
@@ -20,7 +23,6 @@ def scan(
 ) -> None:
     """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
     enter_project()
-    from pipelines.lineage.graph import read_params
     from pipelines.lineage.manifests import write_manifest
     from pipelines.stages.adapters import ensure_manifests
     from pipelines.stages.base import HAND, Place
@@ -45,8 +47,6 @@ def profile(
 ) -> None:
     """Say which data this copy of the project works on, or choose it; git does not see the choice."""
     enter_project()
-    from hoidata.errors import BadInput
-
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
     if name:
@@ -55,8 +55,6 @@ def profile(
 
 
 def _scan_dataset(place, root: Path):
-    from hoidata.errors import BadInput
-    from pipelines.lineage.graph import read_params
     from pipelines.lineage.manifests import absent_manifest, scan_files
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
@@ -74,7 +72,6 @@ def _scan_dataset(place, root: Path):
 
 def _hand_problem(place) -> str:
     """What is missing of the MANO files the dataset needs; nothing where all is well."""
-    from hoidata.errors import MissingResource
     from pipelines.stages.raw import require_hand
 
     try:
@@ -89,7 +86,6 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
 
     also: another problem to name behind that of the folder.
     """
-    from hoidata.errors import BadInput
     from pipelines.lineage.manifests import missing_parts
 
     missing = missing_parts(adapter, root)
@@ -111,10 +107,7 @@ def _state_terms(manifest) -> None:
 
 
 def _scan_hand(place, root: Path):
-    from dataclasses import replace
-
     from hoidata.clips.clip import SourceFile
-    from hoidata.errors import BadInput
     from hoidata.files import sha256_file
     from pipelines.lineage.manifests import ABSENT_HAND
 
@@ -129,8 +122,6 @@ def _scan_hand(place, root: Path):
 def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
     """Compare raw files with the manifests of the current profile. Exit code 1 when they differ or are not there."""
     enter_project()
-    from pipelines.lineage.graph import read_params
-
     names = [dataset] if dataset else read_params(Path())["datasets"]
     results = [_verify_one(name, asked_for=bool(dataset)) for name in names]
     raise typer.Exit(0 if all(results) else 1)
@@ -141,7 +132,6 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
 
     asked_for: by name, so that its absence is a complaint.
     """
-    from hoidata.errors import MissingResource
     from pipelines.lineage.manifests import read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter, manifest_of
     from pipelines.stages.base import Place, raw_root
