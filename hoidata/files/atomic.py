@@ -32,6 +32,13 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
+def write_whole(path: str | Path, content: str | bytes) -> Path:
+    """Write bytes, or text as UTF-8, whole or not at all; gives the file's path."""
+    with atomic_file(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    return Path(path)
+
+
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Give an empty temporary folder beside ``path``; put it in the place of ``path`` when the block ends well.

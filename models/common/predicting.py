@@ -13,7 +13,7 @@ from rich.progress import track
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
-from hoidata.files import atomic_file, atomic_folder
+from hoidata.files import atomic_folder
 from hoidata.hands import HandPair
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
@@ -62,8 +62,8 @@ def sample_family(
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
         counts = write_store(partial / "clips", _motions(family.load(sources), test, config), info)
-        with atomic_file(partial / "diagnostics.json") as file:
-            file.write_text(json.dumps(family.diagnose(sources), indent=2, sort_keys=True) + "\n")
+        figures = json.dumps(family.diagnose(sources), indent=2, sort_keys=True)
+        (partial / "diagnostics.json").write_text(figures + "\n")
     return counts
 
 

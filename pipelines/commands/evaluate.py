@@ -32,7 +32,7 @@ def evaluate(
     split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
 ) -> None:
     """Measure every clip of a store against the clip it was made for, and print the table of metrics."""
-    from hoidata.files import atomic_file
+    from hoidata.files import write_whole
     from hoidata.metrics.evaluate import evaluate_store
     from pipelines.pages.metrics_table import printed_table
 
@@ -41,8 +41,7 @@ def evaluate(
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")
     if out is not None:
-        with atomic_file(out) as part:
-            part.write_text(json.dumps(found, indent=2, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(out, json.dumps(found, indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
 def _hands(reference: Path) -> "HandPair":

@@ -16,7 +16,7 @@ from typing import Any, Literal
 from hoidata.clips.clip import SourceFile
 from hoidata.datasets.base import Adapter, DatasetPart, RawTree
 from hoidata.errors import BadInput
-from hoidata.files import atomic_file
+from hoidata.files import write_whole
 
 SCHEMA = "hoidata.manifest/1"
 FRAME_FILE = re.compile(r"\d{6}\.txt")
@@ -78,8 +78,7 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
     lines = json.dumps(head, indent=2, ensure_ascii=False)[:-2]
     entries = ",\n    ".join(json.dumps(asdict(entry), ensure_ascii=False) for entry in manifest.files)
     body = f"[\n    {entries}\n  ]" if manifest.files else "[]"
-    with atomic_file(path) as part:
-        part.write_text(f'{lines},\n  "files": {body}\n}}\n')
+    write_whole(path, f'{lines},\n  "files": {body}\n}}\n')
 
 
 def absent_manifest(adapter: Adapter) -> Manifest:

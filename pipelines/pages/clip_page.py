@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, Side
-from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import AnnotatedStore
@@ -25,7 +24,7 @@ from pipelines.pages.clip_page_facts import (
 from pipelines.pages.clip_page_series import ClipSeries, measure_clip
 from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_charts, draw_timeline
 from pipelines.pages.examples import true_contact
-from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
@@ -51,7 +50,8 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
     points = annotated.points(annotated.object_key(clip_id))
     sides: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
     title = _title(annotated, clip)
-    page = render_page(
+    return write_page(
+        path,
         "clip_page.html",
         title=title,
         synthetic=clip.synthetic,
@@ -73,11 +73,8 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
         facts=clip_facts(annotated, clip, hands),
         files=source_rows(clip),
         has_players=True,
-        script=_script(),
+        script=(Path(__file__).parent / "clip_page.js").read_text(encoding="utf-8"),
     )
-    with atomic_file(path) as partial:
-        partial.write_text(page, encoding="utf-8")
-    return Path(path)
 
 
 def paint_values(
@@ -128,7 +125,3 @@ def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[P
         label = "share of these frames, 0 to 1"
         players.append(contact_player(clip, paint, caption, caption, touched_side(clip, paint), label))
     return players
-
-
-def _script() -> str:
-    return (Path(__file__).parent / "clip_page.js").read_text(encoding="utf-8")

@@ -13,7 +13,7 @@ import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack
-from hoidata.files import atomic_file
+from hoidata.files import write_whole
 from hoidata.hands import JOINT_NAMES, HandModel, HandPair
 from hoidata.objects.model import ObjectModel
 from pipelines.pages.gltf import GltfBuilder, linear_from_srgb
@@ -28,9 +28,7 @@ CONTACT_COLOURS = ((0.0, OBJECT_COLOUR), (0.5, (0.95, 0.62, 0.25)), (1.0, (0.78,
 
 def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> Path:
     """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable."""
-    with atomic_file(path) as partial:
-        partial.write_bytes(glb_bytes(clip, hands, contact))
-    return Path(path)
+    return write_whole(path, glb_bytes(clip, hands, contact))
 
 
 def glb_bytes(clip: Clip, hands: HandPair | None, contact: ContactPaint | None = None) -> bytes:

@@ -14,7 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from hoidata.clips.clip import SIDES, Clip
-from hoidata.files import atomic_file
+from hoidata.files import write_whole
 from hoidata.hands import HandPair
 from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
 from pipelines.pages.surface import ContactPaint
@@ -79,6 +79,11 @@ def contact_player(
     return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
 
 
+def write_page(path: str | Path, template: str, **values: object) -> Path:
+    """Write the finished HTML of one template, whole or not at all; arguments as in ``render_page``."""
+    return write_whole(path, render_page(template, **values))
+
+
 def render_page(template: str, **values: object) -> str:
     """The finished HTML of one template of this room; autoescaped, and an unknown name is an error."""
     environment = Environment(
@@ -104,13 +109,10 @@ def write_motion_page(
     arrays: Sequence[tuple[str, str]] = (),
 ) -> Path:
     """Write one self-contained page that plays ``player``. facts, files, arrays: (name, text) rows."""
-    page = render_page(
-        "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
+    return write_page(
+        path, "motion.html", title=title, subtitle=subtitle, synthetic=synthetic, player=player, facts=facts,
         files=files, arrays=arrays, has_players=True,
     )  # fmt: skip
-    with atomic_file(path) as partial:
-        partial.write_text(page, encoding="utf-8")
-    return Path(path)
 
 
 @lru_cache(maxsize=1)
