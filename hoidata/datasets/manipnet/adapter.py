@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
-from hoidata.clips.hand_parameters import HandConvention
+from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side, WorldFrame
+from hoidata.clips.hand_parameters import HandConvention, hand_track
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
@@ -34,7 +34,7 @@ from hoidata.datasets.manipnet.words import object_words
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
-from hoidata.hands.fitting import HandFit, fit_hands, fit_shape
+from hoidata.hands.fitting import fit_hands, fit_shape
 from hoidata.objects.distance import closest_points
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import ObjectModel
@@ -180,7 +180,7 @@ class ManipNetAdapter(Described):
             dataset=self.name,
             subject=key.subject,
             sequence=key.name,
-            hands={side: _hand_track(fits[side]) for side in SIDES},
+            hands={side: hand_track(f.wrist_m, f.global_orient, f.hand_pose, f.betas) for side, f in fits.items()},
             object=ObjectTrack(
                 recording.model,
                 rotmat_to_rotvec(recording.rotation[frames]).astype(np.float32),
@@ -200,7 +200,7 @@ class ManipNetAdapter(Described):
 def read_recording(raw: RawTree, name: str) -> Recording:
     """Read one sequence and convert it to 30 fps, metres and a right-handed world. Raises BadInput."""
     folder = f"sequences/{name}"
-    hand_paths = {side: _hand_path(name, side) for side in SIDES}
+    hand_paths = {side: f"{folder}/{side}Hand.bvh.gz" for side in SIDES}
     missing = [path for path in hand_paths.values() if not raw.has(path)]
     if missing:
         got = "object motion only" if len(missing) == len(SIDES) else f"no {missing[0]}"
@@ -256,10 +256,6 @@ def thirty_fps_frames(n_frames: int, frame_time_s: float) -> np.ndarray:
     count = int(np.floor((n_frames - 1) * frame_time_s * FPS + 1e-3)) + 1
     frames = np.rint(np.arange(count) / (FPS * frame_time_s)).astype(int)
     return frames[frames < n_frames]
-
-
-def _hand_path(name: str, side: Side) -> str:
-    return f"sequences/{name}/{side}Hand.bvh.gz"
 
 
 def _object_path(raw: RawTree, folder: str) -> str:
@@ -323,16 +319,6 @@ def _body(name: str, motion: BvhMotion) -> BodyMotion:
     positions, rotations = root.world_joints()
     raw = np.concatenate((motion.root_position, motion.angles_yxz_rad.reshape(motion.n_frames, -1)), axis=1)
     return BodyMotion(name, positions[:, 0] * METRES_PER_UNIT, rotations[:, 0], raw)
-
-
-def _hand_track(fit: HandFit) -> HandTrack:
-    return HandTrack(
-        wrist_m=fit.wrist_m.astype(np.float32),
-        global_orient=fit.global_orient.astype(np.float32),
-        hand_pose=fit.hand_pose.astype(np.float32),
-        betas=fit.betas.astype(np.float32),
-        valid=np.ones(len(fit.wrist_m), dtype=bool),
-    )
 
 
 def _clip_id(key: SequenceKey, start: int, last: int) -> str:
