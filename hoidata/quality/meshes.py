@@ -7,7 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
-from hoidata.objects.distance import volume_m3
+from hoidata.objects.distance import unmatched_edges, volume_m3
 from hoidata.objects.model import ObjectModel
 
 SLIVER = 1e-6
@@ -63,13 +63,7 @@ def part_facts(model: ObjectModel) -> dict[int, SurfaceFacts]:
 def _open_edge_share(faces: np.ndarray) -> float:
     if not len(faces):
         return 1.0
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    size = int(faces.max()) + 1
-    keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
-    sign = np.repeat([1, -1], len(edges))
-    found, number = np.unique(keys, return_inverse=True)
-    unmatched = np.bincount(number, sign, len(found))
-    return float(np.maximum(unmatched, 0).sum() / len(edges))
+    return float(np.maximum(unmatched_edges(faces)[1], 0).sum() / (3 * len(faces)))
 
 
 def _hull_volume(vertices_m: np.ndarray) -> float:

@@ -1,9 +1,9 @@
 """The motions of a family for a dataset's test clips, written as an ordinary store of clips."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,10 @@ def sample_family(
 
 
 def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
-    """What is asked of a family in place of a recorded clip: as often as the config says, each with its own seed."""
+    """What is asked of a family in place of a recorded clip: as often as the config says, each with its own seed.
+
+    A motion's seed does not depend on which other clips there are.
+    """
     return [
         Request(
             motion_id=f"{sample.clip_id}~{number}",
@@ -77,7 +80,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             text=sample.text[0],
             active_hands=sample.active_hands,
             n_frames=sample.length,
-            seed=_seed(config.seed, sample.clip_id, number),
+            seed=int.from_bytes(sha256(f"{config.seed} {number} {sample.clip_id}".encode()).digest()[:7]),
             number=number,
             clip_id=sample.clip_id,
             object_words=sample.object_words,
@@ -96,17 +99,10 @@ def _motions(sampler: Sampler, test: Sequence[ClipSample], config: PredictionCon
         yield from sampler.sample(requests)
 
 
-def _seed(seed: int, clip_id: str, number: int) -> int:
-    """A seed for one motion that does not depend on which other clips there are."""
-    return int.from_bytes(hashlib.sha256(f"{seed} {number} {clip_id}".encode()).digest()[:7])
-
-
 def _why_not(family: Family, root: Path, checkpoints: Path) -> str | None:
     """What is missing: an empty dataset, or a network the family uses."""
-    folders = [root / name for name in ("clips", "annotation", "contact")] + [
-        checkpoints / name for name in family.uses
-    ]
-    if reason := next((reason for folder in folders if (reason := empty_reason(folder))), None):
+    folders = [root / "clips", root / "annotation", root / "contact", *(checkpoints / name for name in family.uses)]
+    if reason := next(filter(None, map(empty_reason, folders)), None):
         return reason
     absent = [name for name in family.uses if not (checkpoints / name / FILE_NAME).is_file()]
     return f"not trained: {', '.join(absent)}" if absent else None

@@ -37,7 +37,9 @@ def scan(
     typer.echo(f"{place.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
     if name == HAND:
         return
-    _state_terms(manifest)
+    typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
+    if not manifest.may_be_shared:
+        typer.echo("What is made from it stays on this machine: `dvc push` leaves it out (see `hoidata share --help`)")
     if set_profile("own"):
         typer.echo("params.yaml: profile set to own (`hoidata profile embedded` returns; nothing is retrained)")
 
@@ -98,12 +100,6 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
         raise BadInput(root, f"sequences of {adapter.name}", got, remedy)
     for part in missing:
         typer.echo(f"{adapter.name}: without {part.what} ({part.patterns[0]}), to be had from {part.where}")
-
-
-def _state_terms(manifest) -> None:
-    typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
-    if not manifest.may_be_shared:
-        typer.echo("What is made from it stays on this machine: `dvc push` leaves it out (see `hoidata share --help`)")
 
 
 def _scan_hand(place, root: Path):

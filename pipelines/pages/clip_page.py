@@ -49,7 +49,9 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
     series = measure_clip(annotated, clip, hands)
     points = annotated.points(annotated.object_key(clip_id))
     sides: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    title = _title(annotated, clip)
+    title = f"{clip.verb or 'move'}: {clip.object_words}"
+    if clip_id in annotated.ids():
+        title = annotated.sentences(clip_id)[0]
     return write_page(
         path,
         "clip_page.html",
@@ -104,12 +106,6 @@ def paint_values(
         **{"parts": parts, "stride": int(bits["left"].shape[1]), "frames": clip.n_frames, "points": len(points)},
         **{"farthest": round(REACH_M / STEP_M), "distances": distances, **packed},
     }
-
-
-def _title(annotated: AnnotatedStore, clip: Clip) -> str:
-    if clip.clip_id in annotated.ids():
-        return annotated.sentences(clip.clip_id)[0]
-    return f"{clip.verb or 'move'}: {clip.object_words}"
 
 
 def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[Player]:

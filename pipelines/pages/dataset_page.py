@@ -18,7 +18,7 @@ from hoidata.store.annotated import AnnotatedStore, load_annotated
 from pipelines.commands.store_facts import fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.curves import COLOURS, figure_svg
-from pipelines.pages.dataset_facts import read_dataset
+from pipelines.pages.dataset_facts import has_tables, read_dataset
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, motion_player, write_page
 from pipelines.pages.quality import read_quality
@@ -94,8 +94,7 @@ def write_dataset_page(
 
 def can_be_shown(root: Path) -> bool:
     """Whether the stages have left all that the page of a dataset and those of its clips need."""
-    tables = ("quality/clips.parquet", "annotation/text.parquet", "contact/points.npz", "splits/splits.parquet")
-    return all((root / table).is_file() for table in tables)
+    return has_tables(root, "quality/clips.parquet")
 
 
 def count_charts(annotated: AnnotatedStore) -> list[Bars]:

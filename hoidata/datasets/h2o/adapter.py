@@ -25,7 +25,7 @@ from hoidata.datasets.h2o.files import (
     listed_segments,
     read_frames,
 )
-from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
+from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands
 from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
@@ -65,7 +65,7 @@ class _Sequence(NamedTuple):
 
     key: SequenceKey
     frames: SequenceFrames
-    hands: SequenceHands
+    hands: ParameterHands | KeypointHands
     objects: dict[str, _Object]
     gravity: GravityEstimate
     sources: tuple[SourceFile, ...]
