@@ -248,14 +248,7 @@ class ClipBatch(RequestBatch):
 def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
     """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
     lengths = np.array([sample.length for sample in samples])
-    asked = conditions(
-        [sample.object_model for sample in samples],
-        [sample.points for sample in samples],
-        np.stack([sample.active_hands for sample in samples]),
-        lengths,
-        np.stack([sample.betas for sample in samples]),
-        [sample.template_m for sample in samples],
-    )
+    asked = conditions(samples, [sample.object_model for sample in samples], lengths)
     n_frames = int(lengths.max())
     rows, distance = _entry_rows(samples if with_entries else ())
     arrays = {

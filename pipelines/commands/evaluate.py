@@ -3,7 +3,7 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -11,18 +11,9 @@ from rich.console import Console
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
-Store = Annotated[
-    Path,
-    typer.Argument(
-        help="A store of predicted clips, <reference id>~<k>.", exists=True, file_okay=False, resolve_path=True
-    ),
-]
-Reference = Annotated[
-    Path,
-    typer.Option(
-        help="An annotated dataset, such as data/embedded/grab.", exists=True, file_okay=False, resolve_path=True
-    ),
-]
+_FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
+Store = Annotated[Path, typer.Argument(help="A store of predicted clips, <reference id>~<k>.", **_FOLDER)]
+Reference = Annotated[Path, typer.Option(help="An annotated dataset, such as data/embedded/grab.", **_FOLDER)]
 
 
 def evaluate(

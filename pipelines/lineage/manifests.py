@@ -119,13 +119,10 @@ def _folders(root: Path, folder: str, patterns: list[tuple[str, ...]]) -> Iterat
     for entry in entries:
         below = [rest if rest[0] == "**" else rest[1:] for rest in patterns if _fits(entry.name, rest[0])]
         below = [rest for rest in below if rest]
-        if below and entry.is_dir() and not _leads_back(root / folder, Path(entry.path)):
+        # A link to a folder it lies in would never end.
+        endless = entry.is_symlink() and (root / folder).resolve().is_relative_to(Path(entry.path).resolve())
+        if below and entry.is_dir() and not endless:
             yield from _folders(root, f"{folder}/{entry.name}" if folder else entry.name, below)
-
-
-def _leads_back(place: Path, link: Path) -> bool:
-    """A link to a folder it lies in would never end."""
-    return link.is_symlink() and place.resolve().is_relative_to(link.resolve())
 
 
 def _fits(name: str, segment: str) -> bool:

@@ -91,8 +91,7 @@ def _add_hand(builder: GltfBuilder, world: int, times: int, model: HandModel, tr
     joints, weights = strongest_weights(np.asarray(model.skin_weights))
     faces = np.asarray(model.faces, dtype=np.int64)
     attributes = {
-        "POSITION": builder.array(vertices.astype(np.float32), gltf.ARRAY_BUFFER, bounds=True),
-        "NORMAL": builder.array(vertex_normals(vertices, faces).astype(np.float32), gltf.ARRAY_BUFFER),
+        **_surface_attributes(builder, Surface(vertices, vertex_normals(vertices, faces), faces), np.zeros(3)),
         "JOINTS_0": builder.array(joints, gltf.ARRAY_BUFFER),
         "WEIGHTS_0": builder.array(weights, gltf.ARRAY_BUFFER),
     }

@@ -35,10 +35,6 @@ class Player:
     contact_label: str = ""
 
     @property
-    def has_contact(self) -> bool:
-        return bool(self.contact_label)
-
-    @property
     def view_values(self) -> dict:
         return asdict(self.view)
 

@@ -208,9 +208,11 @@ def read_recording(raw: RawTree, name: str) -> Recording:
     object_path = _object_path(raw, folder)
     mesh_path, model = _read_model(raw, object_path)
     motions = {side: _read_hand(raw, path) for side, path in hand_paths.items()}
-    thing = _read_motion(raw, object_path)
+    left, thing = motions["left"], _read_motion(raw, object_path)
     for path, motion in ((hand_paths["right"], motions["right"]), (object_path, thing)):
-        _check_same_clock(path, motion, motions["left"])
+        if (motion.n_frames, motion.frame_time_s) != (left.n_frames, left.frame_time_s):
+            expected = f"{left.n_frames} frames of {left.frame_time_s} s as in the left hand's file"
+            raise BadInput(path, expected, f"{motion.n_frames} frames of {motion.frame_time_s} s")
     frames = thirty_fps_frames(thing.n_frames, thing.frame_time_s)
     tips = _read_tips(raw)
     positions, rotations = thing.at(frames).world_joints()
@@ -286,12 +288,6 @@ def _read_hand(raw: RawTree, path: str) -> BvhMotion:
     return motion
 
 
-def _check_same_clock(path: str, motion: BvhMotion, other: BvhMotion) -> None:
-    if (motion.n_frames, motion.frame_time_s) != (other.n_frames, other.frame_time_s):
-        expected = f"{other.n_frames} frames of {other.frame_time_s} s as in the left hand's file"
-        raise BadInput(path, expected, f"{motion.n_frames} frames of {motion.frame_time_s} s")
-
-
 def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
     """Finger tips of the right hand in the frames of the last joints, right-handed axes, source units."""
     try:
@@ -308,13 +304,8 @@ def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
 
 def _body(name: str, motion: BvhMotion) -> BodyMotion:
     """The root of a motion, and all its numbers."""
-    root = BvhMotion(
-        motion.names[:1],
-        motion.parents[:1],
-        motion.offsets[:1],
-        motion.root_position,
-        motion.angles_yxz_rad[:, :1],
-        motion.frame_time_s,
+    root = replace(
+        motion, names=motion.names[:1], parents=motion.parents[:1], angles_yxz_rad=motion.angles_yxz_rad[:, :1]
     )
     positions, rotations = root.world_joints()
     raw = np.concatenate((motion.root_position, motion.angles_yxz_rad.reshape(motion.n_frames, -1)), axis=1)
