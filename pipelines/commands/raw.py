@@ -1,6 +1,5 @@
 """``hoidata raw``: the user's own raw files."""
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -67,20 +66,13 @@ def _scan_dataset(place, root: Path):
         remedy = f"add {place.dataset} to `datasets` in params.yaml"
         raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
     # First what was asked about, then what it needs besides.
-    _require_parts(adapter, root, also=_hand_problem(place))
-    require_hand(place)
-    return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
-
-
-def _hand_problem(place) -> str:
-    """What is missing of the MANO files the dataset needs; nothing where all is well."""
-    from pipelines.stages.raw import require_hand
-
     try:
         require_hand(place)
     except MissingResource as error:
-        return str(error)
-    return ""
+        _require_parts(adapter, root, also=str(error))
+        raise
+    _require_parts(adapter, root)
+    return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
 
 
 def _require_parts(adapter, root: Path, also: str = "") -> None:
@@ -111,7 +103,7 @@ def _scan_hand(place, root: Path):
     if missing:
         raise BadInput(root, " and ".join(MANO_FILES), f"no {', '.join(missing)}", "see https://mano.is.tue.mpg.de")
     files = [SourceFile(name, (root / name).stat().st_size, sha256_file(root / name)) for name in sorted(MANO_FILES)]
-    return replace(ABSENT_HAND, present=True, files=tuple(files))
+    return ABSENT_HAND.with_files(tuple(files))
 
 
 @app.command()

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.clip import FPS, SIDES
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints
 from models.text2hoi.generation import GeneratedMotion
@@ -107,13 +107,8 @@ def motion_arrays(motion: GeneratedMotion, hands: HandPair) -> dict[str, np.ndar
     }
     for name in ("wrist_m", "global_orient", "hand_pose"):
         arrays[name] = _where_valid([getattr(clip.hands[side], name) for side in SIDES], valid)
-    return arrays | {"betas": _betas(clip)} | _object_arrays(motion)
-
-
-def _betas(clip: Clip) -> np.ndarray:
-    betas = [np.asarray(clip.hands[side].betas) for side in SIDES]
-    rows = max(len(values) for values in betas)
-    return np.stack([np.broadcast_to(values, (rows, values.shape[1])) for values in betas]).astype(np.float32)
+    betas = np.broadcast_arrays(*(clip.hands[side].betas for side in SIDES))
+    return arrays | {"betas": np.stack(betas).astype(np.float32)} | _object_arrays(motion)
 
 
 def _object_arrays(motion: GeneratedMotion) -> dict[str, np.ndarray]:

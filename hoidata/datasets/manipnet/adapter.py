@@ -28,10 +28,10 @@ from hoidata.datasets.manipnet.segments import (
     height_above_table,
     interactions,
     motion_verb,
-    widened,
 )
 from hoidata.datasets.manipnet.words import object_words
 from hoidata.errors import BadInput
+from hoidata.geometry.intervals import widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.hands.fitting import fit_hands, fit_shape
@@ -69,7 +69,6 @@ PARTS = (
     DatasetPart("object meshes", ("objects/*/*.obj.gz",), "the data release"),
     DatasetPart("the hand's capsules and tips", (HAND_REFERENCE,), "the data release"),
 )
-SHAPE_FRAMES = 100
 MIRROR_X = np.array([-1.0, 1.0, 1.0])
 
 
@@ -149,7 +148,7 @@ class ManipNetAdapter(Described):
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """Clips of interaction of one sequence, and the stretches left out with their reasons."""
         recording = read_recording(raw, key.name)
-        betas = recording_shape(recording, hands)
+        betas = fit_shape(recording.keypoints_m, hands)
         results: list[Clip | Quarantined] = [_left_out(key, *cut) for cut in recording.cuts]
         lift_m, centre_m, usable = recording.lift_m(), recording.centre_m(), recording.usable()
         nearest = np.minimum(*(distance.min(axis=1) for distance in recording.distances_m().values()))
@@ -207,7 +206,11 @@ def read_recording(raw: RawTree, name: str) -> Recording:
         raise BadInput(folder, "motion of both hands", got, "nothing to do: it is released without them")
     object_path = _object_path(raw, folder)
     mesh_path, model = _read_model(raw, object_path)
-    motions = {side: _read_hand(raw, path) for side, path in hand_paths.items()}
+    motions = {side: _read_motion(raw, path) for side, path in hand_paths.items()}
+    for side, motion in motions.items():
+        if motion.names != HAND_JOINTS:
+            expected = f"the {len(HAND_JOINTS)} joints WRIST to PINKY_DIP_FE"
+            raise BadInput(hand_paths[side], expected, f"{len(motion.names)} joints")
     left, thing = motions["left"], _read_motion(raw, object_path)
     for path, motion in ((hand_paths["right"], motions["right"]), (object_path, thing)):
         if (motion.n_frames, motion.frame_time_s) != (left.n_frames, left.frame_time_s):
@@ -228,15 +231,6 @@ def read_recording(raw: RawTree, name: str) -> Recording:
         ),
         paths=(*hand_paths.values(), object_path, mesh_path, HAND_REFERENCE),
     )
-
-
-def recording_shape(recording: Recording, hands: HandPair) -> np.ndarray:
-    """Betas (10,) fitted to 100 frames of one recording.
-
-    Bone lengths are the same in all recordings, and so a clip need not depend on which others are there.
-    """
-    frames = np.unique(np.linspace(0, len(recording.source_frames) - 1, SHAPE_FRAMES).astype(int))
-    return fit_shape({side: points[frames] for side, points in recording.keypoints_m.items()}, hands)
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:
@@ -279,13 +273,6 @@ def _read_model(raw: RawTree, object_path: str) -> tuple[str, ObjectModel]:
 
 def _read_motion(raw: RawTree, path: str) -> BvhMotion:
     return parse_bvh(unpack_text(raw.read(path), path), path).seen_in_mirror_x()
-
-
-def _read_hand(raw: RawTree, path: str) -> BvhMotion:
-    motion = _read_motion(raw, path)
-    if motion.names != HAND_JOINTS:
-        raise BadInput(path, f"the {len(HAND_JOINTS)} joints WRIST to PINKY_DIP_FE", f"{len(motion.names)} joints")
-    return motion
 
 
 def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:

@@ -94,16 +94,6 @@ def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) ->
     return pieces
 
 
-def widened(stretch: Interval, margin: int, usable: np.ndarray) -> Interval:
-    """The stretch with up to ``margin`` frames before and after it, as far as the frames are usable (frame,)."""
-    start, stop = stretch
-    while start > max(0, stretch.start - margin) and usable[start - 1]:
-        start -= 1
-    while stop < min(len(usable), stretch.stop + margin) and usable[stop]:
-        stop += 1
-    return Interval(start, stop)
-
-
 def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) -> str | None:
     """What the object's motion in a clip shows, or None when it neither leaves the table nor moves.
 
