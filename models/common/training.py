@@ -192,7 +192,7 @@ def _follow(kept: nn.Module, network: nn.Module, decay: float) -> None:
 
 def write_log(path: Path, log: list[dict[str, float]]) -> None:
     """log.csv: step, validation loss, and the mean training losses since the row before."""
-    with atomic_file(path) as part, open(part, "w", newline="") as stream:
+    with atomic_file(path) as partial, open(partial, "w", newline="") as stream:
         writer = csv.DictWriter(stream, list(log[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in log)

@@ -152,8 +152,8 @@ def note_empty(folder: Path, reason: str) -> None:
 
 def write_empty(folder: Path, reason: str) -> None:
     """An output that holds nothing but the reason."""
-    with atomic_folder(folder) as part:
-        note_empty(part, reason)
+    with atomic_folder(folder) as partial:
+        note_empty(partial, reason)
 
 
 def print_counts(place: Place, counts: Mapping[str, int]) -> None:

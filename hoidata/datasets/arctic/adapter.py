@@ -120,10 +120,8 @@ class ArcticAdapter(Described):
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """One clip per described range of at least 20 frames; or the whole sequence as one."""
-        if self.clips == "whole":
-            return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
         where = _found(raw, f"description/{key.name}/description.txt")
-        if self.clips == "described-else-whole" and not raw.has(where):
+        if self.clips == "whole" or (self.clips == "described-else-whole" and not raw.has(where)):
             return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
         descriptions, results = _read_descriptions(raw, where, key)
         motion = _read_motion(raw, key, hands, self.body)
