@@ -72,14 +72,11 @@ def in_workers(
     for item in lost:  # alone: it may need all the memory there is
         for _, result in _shared_out(function, [item], 1, lock):
             if isinstance(result, _Died):
-                result = _given_up(WorkerLost(item, result.cause), on_lost)
+                error = WorkerLost(item, result.cause)
+                if on_lost is None:
+                    raise error
+                result = on_lost(error)
             yield item, result
-
-
-def _given_up(error: WorkerLost, on_lost: Function | None) -> Any:
-    if on_lost is None:
-        raise error
-    return on_lost(error)
 
 
 def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) -> Iterator[tuple[Any, Any]]:
@@ -156,16 +153,11 @@ def _result_of(worker: _Worker) -> Any:
         if code >= 0:  # no fault of the item: such a process never began (a script without a __main__ guard)
             got = f"exit code {code}"
             raise BadInput(worker.item, "a worker process that starts", got, "look at what it wrote above") from None
-        return _Died(_cause(code))
+        killed = "killed by SIGKILL, as the system does when memory runs out"
+        return _Died(killed if code == -signal.SIGKILL else f"signal {signal.Signals(-code).name}")
     if problem is not None:
         raise problem
     return result
-
-
-def _cause(code: int) -> str:
-    if code == -signal.SIGKILL:
-        return "killed by SIGKILL, as the system does when memory runs out"
-    return f"signal {signal.Signals(-code).name}"
 
 
 class _Descriptor:

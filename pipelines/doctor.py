@@ -29,9 +29,9 @@ class Finding:
 def examine() -> list[Finding]:
     """Look at everything a run depends on; opens no raw file and starts nothing."""
     params = read_params(Path())
-    findings = [_python(), *_packages(), _prefect_server(), _gpu(), Finding("profile", "ok", params["profile"])]
-    findings += [_raw("embedded", name) for name in params["datasets"]]
-    findings += [_raw("own", name) for name in params["datasets"]]
+    profile = Finding("profile", "ok", params["profile"])
+    findings = [_python(), *map(_package, NEEDED), _prefect_server(), _gpu(), profile]
+    findings += [_raw(kind, name) for kind in ("embedded", "own") for name in params["datasets"]]
     return [*findings, _hand("embedded"), _hand("own"), _encoder(), _clip()]
 
 
@@ -39,10 +39,6 @@ def _python() -> Finding:
     right = sys.version_info[:2] == (3, 11)
     text = f"{sys.version.split()[0]}, {len(os.sched_getaffinity(0))} cores"
     return Finding("python", "ok" if right else "broken", text if right else f"{text}; hoidata needs 3.11")
-
-
-def _packages() -> list[Finding]:
-    return [_package(name) for name in NEEDED]
 
 
 def _package(name: str) -> Finding:
@@ -108,13 +104,10 @@ def _encoder() -> Finding:
 
     name = load_settings(AnnotationSettings, "annotate").encoder
     try:
-        return Finding("text encoder", "ok", _named(load_encoder(name).identity))
+        identity = load_encoder(name).identity
+        return Finding("text encoder", "ok", ", ".join(f"{key} {str(value)[:16]}" for key, value in identity.items()))
     except HoidataError as error:
         return Finding("text encoder", "broken", str(error))
-
-
-def _named(identity: dict) -> str:
-    return ", ".join(f"{key} {str(value)[:16]}" for key, value in identity.items())
 
 
 def _clip() -> Finding:

@@ -24,10 +24,10 @@ def write_key(path: Path = KEY_FILE) -> str:
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     path.parent.chmod(0o700)
     key = f"hoidata:{secrets.token_urlsafe(32)}"
-    handle, part = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)  # mode 0600
+    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)  # mode 0600
     with os.fdopen(handle, "w") as stream:
         stream.write(key)
-    os.replace(part, path)
+    os.replace(partial, path)
     return key
 
 

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from hoidata.errors import MissingResource
 from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
 from pipelines.params import read_params
@@ -48,8 +49,6 @@ def preflight() -> None:
 
 
 def _is_readable(place: Place) -> bool:
-    from hoidata.errors import MissingResource
-
     try:
         return raw_root(place).is_dir()
     except MissingResource:

@@ -9,7 +9,7 @@ The layout of the features stands in ``hoidata.clips.features``. Sides are order
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -17,10 +17,11 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hoidata.batches.requests import ObjectPoints, RequestBatch, conditions
-from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
+from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.clips.features import OBJECT_POSITION, WRIST, hand_features, object_features, upright
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
+from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.distances import DistanceEntries
 
 MAX_FRAMES = 150
@@ -103,22 +104,6 @@ class ClipSample:
         )
 
 
-class Annotated(Protocol):
-    """What a dataset needs of ``hoidata.store.annotated.AnnotatedStore``."""
-
-    @property
-    def contact_threshold_m(self) -> float: ...
-    def split_ids(self, split: str) -> list[str]: ...
-    def clip(self, clip_id: str) -> Clip: ...
-    def joints(self, clip_id: str, side: Side) -> np.ndarray: ...
-    def hand_type(self, clip_id: str) -> str: ...
-    def sentences(self, clip_id: str) -> Sequence[str]: ...
-    def text_embedding(self, clip_id: str) -> np.ndarray: ...
-    def object_key(self, clip_id: str) -> str: ...
-    def points(self, object_key: str) -> Any: ...
-    def distances(self, clip_id: str) -> Any: ...
-
-
 class HoiDataset(Dataset):
     """Clips of one split as :class:`ClipSample`, at most ``max_frames`` long.
 
@@ -127,7 +112,7 @@ class HoiDataset(Dataset):
     """
 
     def __init__(
-        self, annotated: Annotated, split: str, max_frames: int = MAX_FRAMES, crop: Crop = "random", seed: int = 0
+        self, annotated: AnnotatedStore, split: str, max_frames: int = MAX_FRAMES, crop: Crop = "random", seed: int = 0
     ) -> None:
         if crop not in ("random", "start"):
             raise BadInput("HoiDataset crop", '"random" or "start"', repr(crop), "name one of them")
@@ -164,7 +149,7 @@ class HoiDataset(Dataset):
         return self._samples[clip_id]
 
 
-def load_sample(annotated: Annotated, clip_id: str) -> ClipSample:
+def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
     """The whole clip as a sample in the model frame."""
     clip = annotated.clip(clip_id)
     hand_type = annotated.hand_type(clip_id)
@@ -221,7 +206,7 @@ def _templates(tracks: list[HandTrack]) -> np.ndarray | None:
     return None if left is None or right is None else np.stack((left, right)).astype(np.float32)
 
 
-def _points(annotated: Annotated, object_key: str) -> ObjectPoints:
+def _points(annotated: AnnotatedStore, object_key: str) -> ObjectPoints:
     stored = annotated.points(object_key)
     return ObjectPoints(
         np.asarray(stored.points_m, np.float32), np.asarray(stored.normals, np.float32), np.asarray(stored.part)
@@ -263,14 +248,7 @@ class ClipBatch(RequestBatch):
 def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
     """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
     lengths = np.array([sample.length for sample in samples])
-    asked = conditions(
-        [sample.object_model for sample in samples],
-        [sample.points for sample in samples],
-        np.stack([sample.active_hands for sample in samples]),
-        lengths,
-        np.stack([sample.betas for sample in samples]),
-        [sample.template_m for sample in samples],
-    )
+    asked = conditions(samples, [sample.object_model for sample in samples], lengths)
     n_frames = int(lengths.max())
     rows, distance = _entry_rows(samples if with_entries else ())
     arrays = {

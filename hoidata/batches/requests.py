@@ -87,43 +87,30 @@ class RequestBatch:
 def collate_requests(requests: Sequence[Request]) -> RequestBatch:
     """Requests to one padded batch. Raises BadInput for personal hand templates in some of them only."""
     lengths = np.array([request.n_frames for request in requests])
-    return RequestBatch(
-        text=torch.from_numpy(np.stack([request.text for request in requests])),
-        **conditions(
-            [request.object for request in requests],
-            [request.points for request in requests],
-            np.stack([request.active_hands for request in requests]),
-            lengths,
-            np.stack([request.betas for request in requests]),
-            [request.template_m for request in requests],
-        ),
-    )
+    text = torch.from_numpy(np.stack([request.text for request in requests]))
+    return RequestBatch(text=text, **conditions(requests, [request.object for request in requests], lengths))
 
 
-def conditions(
-    objects: Sequence[ObjectModel],
-    points: Sequence[ObjectPoints],
-    active_hands: np.ndarray,
-    lengths: np.ndarray,
-    betas: np.ndarray,
-    templates: Sequence[np.ndarray | None],
-) -> dict[str, Any]:
-    """The fields of a :class:`RequestBatch` but the text, from what is known of each of B motions."""
+def conditions(asked: Sequence[Any], objects: Sequence[ObjectModel], lengths: np.ndarray) -> dict[str, Any]:
+    """The fields of a :class:`RequestBatch` but the text, of B requests or samples: points, hands and their shape.
+
+    objects: the model of each. lengths: (B,) frames.
+    """
     hinges = [model.hinge for model in objects]
     arrays = {
-        "points_m": np.stack([cloud.points_m for cloud in points]),
-        "normals": np.stack([cloud.normals for cloud in points]),
-        "part": np.stack([cloud.part for cloud in points]).astype(np.int64),
-        "active_hands": active_hands,
+        "points_m": np.stack([item.points.points_m for item in asked]),
+        "normals": np.stack([item.points.normals for item in asked]),
+        "part": np.stack([item.points.part for item in asked]).astype(np.int64),
+        "active_hands": np.stack([item.active_hands for item in asked]),
         "frames": np.arange(lengths.max()) < lengths[:, None],
         "lengths": lengths,
-        "betas": betas,
+        "betas": np.stack([item.betas for item in asked]),
         "hinge_axis": np.stack([np.zeros(3) if h is None else h.axis for h in hinges]).astype(np.float32),
         "hinge_origin_m": np.stack([np.zeros(3) if h is None else h.origin_m for h in hinges]).astype(np.float32),
         "articulated": np.array([hinge is not None for hinge in hinges]),
     }
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return {"objects": tuple(objects), "template_m": _batch_templates(templates), **tensors}
+    return {"objects": tuple(objects), "template_m": _batch_templates([item.template_m for item in asked]), **tensors}
 
 
 def _batch_templates(templates: Sequence[np.ndarray | None]) -> Tensor | None:

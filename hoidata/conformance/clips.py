@@ -12,8 +12,8 @@ from hoidata.conformance.loading import Loaded
 from hoidata.conformance.report import Finding, finding
 from hoidata.datasets.base import Adapter, Quarantined
 from hoidata.errors import BadInput
+from hoidata.objects.distance import volume_m3
 from hoidata.objects.model import ObjectModel
-from hoidata.quality.meshes import volume_m3
 
 VERB = re.compile(r"[a-z]+( [a-z]+)*")
 NOUN = re.compile(r"[A-Z]?[a-z]+([ '-][A-Z]?[a-z]+)*")  # a proper name may be among them: Stanford bunny

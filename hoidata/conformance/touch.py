@@ -12,7 +12,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.conformance.report import Finding, finding, skipped
-from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
 from hoidata.hands import HandModel, HandPair, track_joints
 from hoidata.objects.distance import closest_points
 
@@ -40,8 +40,8 @@ class _Touch:
 
 
 def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
-    """Rules over some frames of some clips, all warnings: data of an unusual kind may break them rightly."""
-    some = [_some_frames(clip) for clip in _spread(clips, MOST_CLIPS)]
+    """Rules over at most 24 frames of 12 clips, all warnings: data of an unusual kind may break them rightly."""
+    some = [clips[i].take(_spread(clips[i].n_frames, MOST_FRAMES)) for i in _spread(len(clips), MOST_CLIPS)]
     try:
         touches = [_touch(clip, hands) for clip in some]
     except Exception as error:  # arrays that check_clip refused, and which another rule reports
@@ -66,10 +66,9 @@ def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
     ]
 
 
-def _some_frames(clip: Clip) -> Clip:
-    """At most 24 frames of a clip, evenly spread; no longer 1/30 s apart."""
-    frames = np.unique(np.linspace(0, clip.n_frames - 1, MOST_FRAMES).astype(int))
-    return clip.take(frames)
+def _spread(length: int, most: int) -> np.ndarray:
+    """At most so many numbers below ``length``, evenly spread."""
+    return np.unique(np.linspace(0, length - 1, most).astype(int))
 
 
 def _touch(clip: Clip, hands: HandPair) -> _Touch:
@@ -166,7 +165,7 @@ def _other_readings(clips: list[Clip], touches: list[_Touch], hands: HandPair) -
 
 def _paired(touch: _Touch, other: _Touch) -> tuple[float, float]:
     """Mean tip distances under two readings, over the frames in which a hand is at the object under either."""
-    ours, theirs = (np.minimum(_nanmin_hands(t.tips_m), FAR_M) for t in (touch, other))
+    ours, theirs = (np.fmin.reduce([*t.tips_m, np.full(t.tips_m.shape[1], FAR_M)]) for t in (touch, other))
     held = np.minimum(ours, theirs) < TOUCH_M
     return (float(ours[held].mean()), float(theirs[held].mean())) if held.any() else (0.0, 0.0)
 
@@ -200,24 +199,8 @@ def _turns(clip: Clip, touch: _Touch) -> np.ndarray:
         turn = thing[pairs + 1] @ thing[pairs].transpose(0, 2, 1)
         turn_transposed = thing[pairs + 1].transpose(0, 2, 1) @ thing[pairs]
         columns = (turn.transpose(0, 2, 1) @ hand_turn, turn_transposed.transpose(0, 2, 1) @ hand_turn, turn)
-        steps.append(np.stack([_angle_rad(column) for column in columns], axis=1))
+        steps.append(np.stack([rotation_angle(column) for column in columns], axis=1))
     return np.concatenate(steps)
-
-
-def _angle_rad(rotation: np.ndarray) -> np.ndarray:
-    return np.arccos(np.clip((np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
-
-
-def _nanmin_hands(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, np.inf).min(axis=0)
-
-
-def _spread(items: list[Clip], most: int) -> list[Clip]:
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, min(most, len(items))).astype(int))]
-
-
-def _transposed(clip: Clip, hands: HandPair) -> Clip:
-    return replace(clip, object=replace(clip.object, rotvec=-clip.object.rotvec))
 
 
 def _with_mean(sign: int) -> Reading:
@@ -238,10 +221,6 @@ def _each_hand(change: Callable[[HandTrack, HandModel], dict[str, np.ndarray]]) 
     return read
 
 
-def _sides_exchanged(clip: Clip, hands: HandPair) -> Clip:
-    return replace(clip, hands={"left": clip.hands["right"], "right": clip.hands["left"]})
-
-
 def _parts_exchanged(clip: Clip, hands: HandPair) -> Clip:
     if not clip.object.is_articulated:
         return clip
@@ -250,18 +229,21 @@ def _parts_exchanged(clip: Clip, hands: HandPair) -> Clip:
 
 
 def _hinge_reversed(clip: Clip, hands: HandPair) -> Clip:
-    if clip.object.hinge_rad is None:
-        return clip
-    return replace(clip, object=replace(clip.object, hinge_rad=-clip.object.hinge_rad))
+    hinge = clip.object.hinge_rad
+    return clip if hinge is None else replace(clip, object=replace(clip.object, hinge_rad=-hinge))
 
 
 READINGS: dict[str, Reading] = {
-    "with object rotations transposed": _transposed,
+    "with object rotations transposed": lambda clip, _: replace(
+        clip, object=replace(clip.object, rotvec=-clip.object.rotvec)
+    ),
     "with the mean pose added to the fingers": _with_mean(1),
     "with the mean pose taken from the fingers": _with_mean(-1),
     "with J0 added to the wrist (MANO's transl taken for it?)": _with_wrist(1),
     "with J0 taken from the wrist (a wrist taken for MANO's transl?)": _with_wrist(-1),
-    "with left and right exchanged": _sides_exchanged,
+    "with left and right exchanged": lambda clip, _: replace(
+        clip, hands={"left": clip.hands["right"], "right": clip.hands["left"]}
+    ),
     "with the object's parts exchanged": _parts_exchanged,
     "with the hinge turned the other way": _hinge_reversed,
 }

@@ -4,6 +4,8 @@ Moving 21 joints into the frame of a part (which a hinge may have turned) instea
 one index per part serve every frame of every clip, and makes every result independent of the world frame.
 """
 
+from functools import cached_property
+
 import numpy as np
 
 from hoidata.clips import ObjectTrack
@@ -25,14 +27,13 @@ class ProximityIndex:
         self._points_m = points.points_m.astype(np.float32, copy=False)
         self._members = [np.flatnonzero(points.part == part) for part in self.parts]
         self._grids: dict[float, CellGrids] = {}
-        self._point_boxes: PointBoxes | None = None
 
     def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(frame,) distance from the nearest of the world joints ``(frame, joint, 3)`` to the nearest point, metres."""
         if not self.parts:
             return np.full(len(joints_m), np.inf)
         motion, reach = part_motion(track, self.parts), CONTACT_THRESHOLD_M
-        return closest_of_joints(joints_m, motion, self._boxes(), self._grid(reach), reach)
+        return closest_of_joints(joints_m, motion, self._boxes, self._grid(reach), reach)
 
     def entries(
         self, joints_m: np.ndarray, valid: np.ndarray, track: ObjectTrack, threshold_m: float = CONTACT_THRESHOLD_M
@@ -57,7 +58,6 @@ class ProximityIndex:
             self._grids[reach_m] = cell_grids(self._points_m, self._members, reach_m)
         return self._grids[reach_m]
 
+    @cached_property
     def _boxes(self) -> PointBoxes:
-        if self._point_boxes is None:
-            self._point_boxes = point_boxes(self._points_m.astype(np.float64), self._members)
-        return self._point_boxes
+        return point_boxes(self._points_m.astype(np.float64), self._members)

@@ -13,7 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.clips.clip import Clip, SourceFile
+from hoidata.clips.clip import SourceFile
 from hoidata.clips.hand_parameters import hands_for
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
@@ -116,7 +116,10 @@ class SequenceConverter:
     def __call__(self, key: SequenceKey) -> None:
         raw = RawTree(self.root, self.manifest)
         try:
-            results = [self._checked(item) for item in self.adapter.load(raw, key, self.hands)]
+            results = [
+                item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
+                for item in self.adapter.load(raw, key, self.hands)
+            ]
         except BadInput as error:
             self.work.keep(key, [_left_out(key, self.root, error)], None)
         except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
@@ -128,9 +131,6 @@ class SequenceConverter:
     def leave_out(self, lost: WorkerLost) -> None:
         """Keep the reason in the place of the clips; a run that goes on does not try it again."""
         self.work.keep(lost.item, [_left_out(lost.item, self.root, lost)], ())
-
-    def _checked(self, item: Clip | Quarantined) -> Clip | Quarantined:
-        return item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
 
 
 def _convert_all(convert: SequenceConverter, keys: Sequence[SequenceKey], jobs: int, lock: int, progress: bool) -> int:

@@ -54,8 +54,8 @@ class FinishedWork:
             stated.write_text(text, encoding="utf-8")
         for name in ("sequences", "shared"):
             (self.folder / name).mkdir(exist_ok=True)
-            for part in (self.folder / name).glob(".*.part"):
-                part.unlink(missing_ok=True)
+            for partial in (self.folder / name).glob(".*.part"):
+                partial.unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Delete the folder; a kill meanwhile leaves none that could be taken for a whole one."""

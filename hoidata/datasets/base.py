@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from operator import attrgetter
 from pathlib import Path
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -114,29 +115,12 @@ class Described:
 
     facts: ClassVar[DatasetFacts]
 
-    @property
-    def name(self) -> str:
-        return self.facts.name
-
-    @property
-    def version(self) -> str:
-        return self.facts.version
-
-    @property
-    def licence(self) -> str:
-        return self.facts.licence
-
-    @property
-    def may_be_shared(self) -> bool:
-        return self.facts.may_be_shared
-
-    @property
-    def where_to_register(self) -> str:
-        return self.facts.where_to_register
-
-    @property
-    def needs_mano(self) -> bool:
-        return self.facts.needs_mano
+    name = property(attrgetter("facts.name"))
+    version = property(attrgetter("facts.version"))
+    licence = property(attrgetter("facts.licence"))
+    may_be_shared = property(attrgetter("facts.may_be_shared"))
+    where_to_register = property(attrgetter("facts.where_to_register"))
+    needs_mano = property(attrgetter("facts.needs_mano"))
 
     @property
     def source_fps(self) -> float:

@@ -3,7 +3,7 @@
 ``python -m hoidata.datasets.convention_table > hoidata/datasets/CONVENTIONS.md`` writes the table anew.
 """
 
-from hoidata.dataset_folders import DatasetFacts, built_in_names, dataset_facts
+from hoidata.dataset_folders import built_in_names, dataset_facts
 from hoidata.errors import BadInput
 
 # What a dataset's facts may state, in the order of the table.
@@ -44,17 +44,13 @@ def table() -> str:
     """CONVENTIONS.md: one row per convention, one column per built-in dataset."""
     columns = [facts for name in built_in_names() if (facts := dataset_facts(name))]
     for facts in columns:
-        _refuse_unknown(facts)
+        if unknown := sorted(facts.conventions.keys() - set(ROWS)):
+            raise BadInput(f"{facts.name}/facts.toml: conventions", f"some of {', '.join(ROWS)}", ", ".join(unknown))
     lines = [("convention", *(facts.title for facts in columns)), ("---",) * (len(columns) + 1)]
     lines += [(row, *(facts.conventions.get(row, "-") for facts in columns)) for row in ROWS]
     return HEAD + "".join(f"| {' | '.join(cells)} |\n" for cells in lines).replace("| --- ", "|---").replace(
         "--- |", "---|"
     )
-
-
-def _refuse_unknown(facts: DatasetFacts) -> None:
-    if unknown := sorted(facts.conventions.keys() - set(ROWS)):
-        raise BadInput(f"{facts.name}/facts.toml: conventions", f"some of {', '.join(ROWS)}", ", ".join(unknown))
 
 
 if __name__ == "__main__":

@@ -108,7 +108,8 @@ def _rests(thing: TrackedObject, joints_m: np.ndarray, camera_rotation: np.ndarr
     # Between the image's down and ahead: within 45 degrees of gravity while the head is upright.
     below_head = camera_rotation[:, :, 1:].sum(axis=2) / np.sqrt(2)
     corners = np.array(list(product(*thing.footing.box_m.T)))
-    scene = _Scene(thing, _placed(corners, thing.poses), joints_m, below_head)
+    placed = corners @ thing.poses[:, :3, :3].transpose(0, 2, 1) + thing.poses[:, None, :3, 3]
+    scene = _Scene(thing, placed, joints_m, below_head)
     rests = []
     for start, stop in runs(thing.frames & _hands_away(thing, joints_m)):
         middle = np.median(scene.corners[start:stop], axis=0)
@@ -123,7 +124,9 @@ def _rest(scene: _Scene, still: np.ndarray) -> _Rest:
     """The directions down that neither the camera nor what happens around the stretch speaks against."""
     corners = scene.corners[still].mean(axis=0)
     turn = Rotation.from_matrix(scene.thing.poses[still, :3, :3]).mean().as_matrix()
-    around = _watched(scene.thing.frames, int(still[0]), int(still[-1]) + 1)
+    # As far as the same object is tracked without a break.
+    first, last = next((a, b) for a, b in runs(scene.thing.frames) if a <= still[0] < b)
+    around = np.arange(max(first, still[0] - WATCHED_FRAMES), min(last, still[-1] + 1 + WATCHED_FRAMES))
     near = scene.joints_m[around].reshape(-1, 3)
     near = near[np.linalg.norm(near - corners.mean(axis=0), axis=1) < REACH_M + np.ptp(corners, axis=0).max() / 2]
     below_head = scene.below_head[still].mean(axis=0)
@@ -139,10 +142,6 @@ def _rest(scene: _Scene, still: np.ndarray) -> _Rest:
     return _Rest(np.array(possible).reshape(-1, 3), corners, len(still), lifted)
 
 
-def _placed(points: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    return points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-
-
 def _depth_m(thing: TrackedObject, frames: np.ndarray, down: np.ndarray) -> np.ndarray:
     """(frame,) how far along ``down`` the object reaches."""
     turned = down @ thing.poses[frames, :3, :3]
@@ -156,12 +155,6 @@ def _hands_away(thing: TrackedObject, joints_m: np.ndarray) -> np.ndarray:
     distance = np.linalg.norm(np.maximum(np.maximum(low - local, local - high), 0), axis=-1)
     seen = np.isfinite(distance)
     return seen.any(axis=1) & (np.where(seen, distance, np.inf) > NO_HAND_M).all(axis=1)
-
-
-def _watched(frames: np.ndarray, start: int, stop: int) -> np.ndarray:
-    """Frame numbers around a stretch, as far as the same object is tracked without a break."""
-    first, last = next((a, b) for a, b in runs(frames) if a <= start < b)
-    return np.arange(max(first, start - WATCHED_FRAMES), min(last, stop + WATCHED_FRAMES))
 
 
 def _different(rests: Sequence[_Rest]) -> int:

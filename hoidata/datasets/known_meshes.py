@@ -22,12 +22,8 @@ def raw_mesh(raw: RawTree, path: str) -> Mesh:
     key = source.sha256, PurePosixPath(path).suffix.lower()
     if key not in _known:
         _known[key] = load_mesh(place)
-        while len(_known) > 1 and sum(map(_size, _known.values())) > MOST_BYTES:
+        while len(_known) > 1 and sum(array.nbytes for known in _known.values() for array in known) > MOST_BYTES:
             _known.popitem(last=False)
     _known.move_to_end(key)
     mesh = _known[key]
     return Mesh(mesh.vertices.copy(), mesh.faces.copy())
-
-
-def _size(mesh: Mesh) -> int:
-    return mesh.vertices.nbytes + mesh.faces.nbytes

@@ -18,7 +18,7 @@ def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: array {name!r} holds Python objects, which NPZ files here never do")
-    with atomic_file(path) as part, open(part, "wb") as stream:
+    with atomic_file(path) as partial, open(partial, "wb") as stream:
         np.savez(stream, allow_pickle=False, **{name: np.asarray(a, order="C") for name, a in arrays.items()})
 
 

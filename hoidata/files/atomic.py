@@ -1,4 +1,4 @@
-"""Writing that leaves either the old file or the whole new one, never a part; and one writer at a time."""
+"""Writing that leaves either the old file or the whole new one, never half of one; and one writer at a time."""
 
 import os
 import re
@@ -23,34 +23,41 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
     os.close(handle)
-    part = Path(name)
-    part.chmod(0o644)
+    partial = Path(name)
+    partial.chmod(0o644)
     try:
-        yield part
-        os.replace(part, path)
+        yield partial
+        os.replace(partial, path)
     finally:
-        part.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
+
+
+def write_whole(path: str | Path, content: str | bytes) -> Path:
+    """Write bytes, or text as UTF-8, whole or not at all; gives the file's path."""
+    with atomic_file(path) as partial:
+        partial.write_bytes(content.encode() if isinstance(content, str) else content)
+    return Path(path)
 
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Give an empty temporary folder beside ``path``; put it in the place of ``path`` when the block ends well.
 
-    The old folder is moved aside whole before it is deleted: a process killed meanwhile leaves no part of it here.
+    The old folder is moved aside whole before it is deleted: a process killed meanwhile leaves nothing of it here.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
-    part.chmod(0o755)
+    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+    partial.chmod(0o755)
     try:
-        yield part
-        old = part.with_suffix(".old")
+        yield partial
+        old = partial.with_suffix(".old")
         if path.exists():
             os.replace(path, old)
-        os.replace(part, path)
+        os.replace(partial, path)
         shutil.rmtree(old, ignore_errors=True)
     finally:
-        shutil.rmtree(part, ignore_errors=True)
+        shutil.rmtree(partial, ignore_errors=True)
 
 
 def remove_leftovers(path: str | Path) -> None:

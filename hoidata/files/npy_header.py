@@ -75,14 +75,15 @@ def _parsed(text: str) -> NpyHeader:
     if not isinstance(values, dict) or set(values) != {"descr", "fortran_order", "shape"}:
         raise ValueError("other entries than descr, fortran_order and shape")
     shape, by_columns = values["shape"], values["fortran_order"]
-    if not isinstance(shape, tuple) or len(shape) > _MOST_DIMENSIONS or not all(map(_is_length, shape)):
+    if not isinstance(shape, tuple) or len(shape) > _MOST_DIMENSIONS or not all(map(is_length, shape)):
         raise ValueError(f"the shape {str(shape)[:80]}")
     if not isinstance(by_columns, bool):
         raise ValueError(f"the order {str(by_columns)[:40]}")
     return NpyHeader(shape, by_columns, plain_dtype(values["descr"]))
 
 
-def _is_length(value: Any) -> bool:
+def is_length(value: Any) -> bool:
+    """A whole number that can count elements."""
     return type(value) is int and 0 <= value < 2**48
 
 

@@ -124,7 +124,7 @@ class _Callable(StandIn):
 def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
     """The same value with our array class replaced by ``numpy.ndarray``.
 
-    ``seen`` maps the id of each part to (part, result), so that shared and cyclic parts are visited once.
+    ``seen`` maps the id of each value to (value, result), so that shared and cyclic ones are visited once.
     """
     if id(value) in seen:
         return seen[id(value)][1]
@@ -143,11 +143,11 @@ def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:
         raise pickle.UnpicklingError(f"it holds a {type(value).__name__} by itself")
     if isinstance(value, dict | list | Record):
         seen[id(value)] = value, value
-        _make_parts_plain(value, seen)
+        _make_items_plain(value, seen)
     return value
 
 
-def _make_parts_plain(value: "dict | list | Record", seen: dict[int, tuple[Any, Any]]) -> None:
+def _make_items_plain(value: "dict | list | Record", seen: dict[int, tuple[Any, Any]]) -> None:
     if isinstance(value, dict):
         value.update({key: _plain(item, seen) for key, item in value.items()})
     elif isinstance(value, list):
@@ -197,7 +197,7 @@ class _DtypeRecord:
 
     def __setstate__(self, state: tuple) -> None:
         order, structure = state[1], state[2:5]
-        if order not in ("<", ">", "|", "=") or any(part is not None for part in structure):
+        if order not in ("<", ">", "|", "=") or any(item is not None for item in structure):
             raise pickle.UnpicklingError("a structured dtype, which is not allowed")
         self.dtype = self.dtype.newbyteorder(order)
 

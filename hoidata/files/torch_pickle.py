@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.files.npy_header import is_length
 from hoidata.files.pickle_check import REFUSED_OPCODES
 from hoidata.files.restricted_pickle import (
     Allow,
@@ -95,7 +96,7 @@ def _rebuild_tensor(
     if not isinstance(storage, _Storage) or hooks:
         raise pickle.UnpicklingError("a tensor without a storage, or with hooks")
     numbers = (offset, *size, *stride)
-    if len(size) != len(stride) or len(size) > _MAX_DIMENSIONS or not all(_is_natural(number) for number in numbers):
+    if len(size) != len(stride) or len(size) > _MAX_DIMENSIONS or not all(map(is_length, numbers)):
         raise pickle.UnpicklingError(f"a tensor of size {size} and stride {stride}"[:120])
     elements = storage.elements
     last = offset + sum((length - 1) * step for length, step in zip(size, stride, strict=True))
@@ -107,10 +108,6 @@ def _rebuild_tensor(
     strides = tuple(step * elements.itemsize for step in stride)
     view = np.lib.stride_tricks.as_strided(elements[offset:], size, strides, writeable=False)
     return view.copy().view(CheckedArray)
-
-
-def _is_natural(number: Any) -> bool:
-    return type(number) is int and 0 <= number < 2**48
 
 
 def _rebuild_parameter(tensor: Any, _requires_grad: Any = False, hooks: Any = None) -> CheckedArray:

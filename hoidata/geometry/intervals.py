@@ -19,6 +19,16 @@ def runs(flags: np.ndarray) -> list[Interval]:
     return [Interval(int(start), int(stop)) for start, stop in pairs]
 
 
+def widened(interval: Interval, margin: int, usable: np.ndarray) -> Interval:
+    """The interval with up to ``margin`` frames before and after it, as far as the frames are usable (frame,)."""
+    start, stop = interval
+    while start > max(0, interval.start - margin) and usable[start - 1]:
+        start -= 1
+    while stop < min(len(usable), interval.stop + margin) and usable[stop]:
+        stop += 1
+    return Interval(start, stop)
+
+
 def sudden_steps(step: np.ndarray, notable: float, large: float, ratio: float, neighbours: int = 5) -> np.ndarray:
     """(step,) booleans: steps above ``large``, or above ``notable`` and ``ratio`` times the motion around them.
 

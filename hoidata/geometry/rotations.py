@@ -57,6 +57,11 @@ def rotmat_to_rotvec(rotmat: Array) -> Array:
     return vectors.astype(np.result_type(source.dtype, np.float32), copy=False)
 
 
+def rotation_angle(rotmat: np.ndarray) -> np.ndarray:
+    """Angle of rotation matrices (..., 3, 3), radians in [0, pi]."""
+    return np.arccos(np.clip((np.trace(rotmat, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
+
+
 def rotmat_to_rot6d(rotmat: Array) -> Array:
     """Rotation matrices ``(..., 3, 3)`` to the 6D form ``(..., 6)`` of Zhou et al. 2019.
 

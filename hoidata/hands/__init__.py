@@ -2,7 +2,7 @@
 
 from hoidata.hands.embedded import load_embedded_hands, mirrored
 from hoidata.hands.kinematics import HandKinematics
-from hoidata.hands.mano import load_mano_hands, write_mano_pickle
+from hoidata.hands.mano import load_mano_hands
 from hoidata.hands.model import JOINT_NAMES, PARENTS, TIP_VERTICES, HandModel, HandPair
 from hoidata.hands.tracks import HandTrackLike, kinematics_of, track_joints, track_rotmats, track_vertices
 
@@ -21,5 +21,4 @@ __all__ = [
     "track_joints",
     "track_rotmats",
     "track_vertices",
-    "write_mano_pickle",
 ]

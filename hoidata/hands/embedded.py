@@ -1,7 +1,7 @@
 """The hand that comes with hoidata: MANO's layout on a CC0 mesh, so that everything runs without a licensed file.
 
-``hoidata.hand_builder`` made ``assets/embedded_hand.npz`` (right hand) once. Pose correctives and the left hand are
-rebuilt here with elementwise arithmetic only (no BLAS), so that every machine gets the same bits and the same digest.
+``tests/builders/hand_asset`` made ``assets/embedded_hand.npz`` (right hand) once. Pose correctives and the left hand
+are rebuilt here with elementwise arithmetic only (no BLAS), so that every machine gets the same bits and digest.
 """
 
 from dataclasses import replace

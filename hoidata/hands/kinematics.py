@@ -7,7 +7,6 @@ Loper et al. 2015, eq. 2-9.
 
 from collections.abc import Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -30,10 +29,10 @@ class HandKinematics(nn.Module):
     def __init__(self, model: HandModel, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
         self.side, self.digest = model.side, model.digest
-        self._buffer("template_m", model.template_m, dtype)
-        self._buffer("joint_regressor", model.joint_regressor, dtype)
-        self._buffer("rest_joints_m", model.joint_regressor @ model.template_m, dtype)
-        self._buffer("joint_directions", model.joint_directions, dtype)
+        arrays = {name: getattr(model, name) for name in ("template_m", "joint_regressor", "joint_directions")}
+        arrays["rest_joints_m"] = model.joint_regressor @ model.template_m
+        for name, value in arrays.items():
+            self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
         self.mesh = _Skin(model, range(len(model.template_m)), dtype)
         self.tips = _Skin(model, TIP_VERTICES, dtype)
 
@@ -75,9 +74,6 @@ class HandKinematics(nn.Module):
             torch.cat((wrist_m[:, None], fingers_position), 1),
             rest,
         )
-
-    def _buffer(self, name: str, value: np.ndarray, dtype: torch.dtype) -> None:
-        self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
 
 
 class _Skin(nn.Module):

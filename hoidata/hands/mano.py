@@ -5,21 +5,20 @@ evaluated here. The widespread correction of the left hand's shape directions is
 fitted with the file as it is.
 """
 
-import pickle
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files import ARRAYS, Record, atomic_file, restricted_load
-from hoidata.hands.model import N_ROTATIONS, N_SHAPE, PARENTS, HandModel, HandPair, Side, checked_model
+from hoidata.files import ARRAYS, Record, restricted_load
+from hoidata.hands.model import N_SHAPE, HandModel, HandPair, Side, checked_model
 
 MANO_SITE = "https://mano.is.tue.mpg.de"
 FILE_NAMES: dict[Side, str] = {"left": "MANO_LEFT.pkl", "right": "MANO_RIGHT.pkl"}
 _MAX_BYTES = 64 << 20
 _REMEDY = f"download mano_v1_2.zip again from {MANO_SITE} and take models/MANO_LEFT.pkl and MANO_RIGHT.pkl from it"
-_ROOT_SENTINEL = 2**32 - 1
+ROOT_SENTINEL = 2**32 - 1
 
 
 class _Ch(Record):
@@ -42,7 +41,7 @@ _ALLOW = {
     ("scipy.sparse._csc", "csc_matrix"): _Csc,
 }
 # Our fields, and MANO's names for them.
-_KEYS = {
+MANO_KEYS = {
     "template_m": "v_template",
     "shape_directions": "shapedirs",
     "pose_directions": "posedirs",
@@ -86,10 +85,10 @@ def _find(folder: Path, name: str) -> Path:
 
 
 def _fields(path: Path, content: dict[str, Any]) -> dict[str, np.ndarray]:
-    absent = sorted(key for key in _KEYS.values() if key not in content)
+    absent = sorted(key for key in MANO_KEYS.values() if key not in content)
     if absent:
-        raise BadInput(path, f"the keys {sorted(_KEYS.values())}", f"a dict without {absent}", _REMEDY)
-    values = {field: _dense(f"{path}: {key}", content[key]) for field, key in _KEYS.items()}
+        raise BadInput(path, f"the keys {sorted(MANO_KEYS.values())}", f"a dict without {absent}", _REMEDY)
+    values = {field: _dense(f"{path}: {key}", content[key]) for field, key in MANO_KEYS.items()}
     values["shape_directions"] = values["shape_directions"][..., :N_SHAPE]
     values["parents"] = _parents(values["parents"])
     return values
@@ -131,7 +130,7 @@ def _parents(table: np.ndarray) -> np.ndarray:
     if table.ndim != 2 or table.dtype.kind not in "iu":
         return table
     parents = table[0].astype(np.int64)
-    return np.where(parents == _ROOT_SENTINEL, -1, parents)
+    return np.where(parents == ROOT_SENTINEL, -1, parents)
 
 
 def _check_side(path: Path, model: HandModel) -> None:
@@ -141,20 +140,3 @@ def _check_side(path: Path, model: HandModel) -> None:
     if points_to_minus_x != (model.side == "right"):
         remedy = "give the two files their original names back"
         raise BadInput(path, f"a {model.side} hand", "fingers that point like the other hand's", remedy)
-
-
-def write_mano_pickle(model: HandModel, path: str | Path) -> None:
-    """Write a model in the layout of a MANO file, as plain arrays (pickle protocol 2, about 3.9 MB).
-
-    For tests of the user-file path and for tools that read MANO; never write a real MANO hand with it to share it.
-    """
-    content = {key: getattr(model, field) for field, key in _KEYS.items()} | {
-        "J": model.joint_regressor @ model.template_m,
-        "kintree_table": np.array([[_ROOT_SENTINEL, *PARENTS[1:]], range(N_ROTATIONS)], dtype=np.int64),
-        "f": model.faces.astype(np.uint32),
-        "hands_coeffs": np.zeros((1, len(model.mean_pose))),
-        "bs_style": "lbs",
-        "bs_type": "lrotmin",
-    }
-    with atomic_file(path) as partial:
-        partial.write_bytes(pickle.dumps(content, protocol=2))

@@ -93,6 +93,16 @@ def merged_surface(vertices_m: np.ndarray, faces: np.ndarray) -> MergedSurface:
     return MergedSurface(unique, kept)
 
 
+def unmatched_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Directed edges (edge, 2) of the triangles (face, 3), and how often each is there more than its opposite."""
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    size = int(faces.max()) + 1
+    keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
+    found, number = np.unique(keys, return_inverse=True)
+    unmatched = np.bincount(number, np.repeat([1, -1], len(edges)), len(found))
+    return np.stack(np.divmod(found, size), axis=1), unmatched
+
+
 def is_closed(faces: np.ndarray) -> bool:
     """Every directed edge is met by its opposite exactly as often: a closed, consistently oriented surface."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])

@@ -7,6 +7,7 @@ Faces it would roll over (the mantle of a can) or that the lightest push tips it
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from hoidata.objects.mesh import mass_properties
@@ -79,16 +80,8 @@ def _tip_angle(centre: np.ndarray, outline: np.ndarray, down: np.ndarray) -> flo
 
 def _sides(normals: np.ndarray, facets: np.ndarray) -> list[np.ndarray]:
     """Facets grouped into sides: each less than SAME_SIDE_RAD from another one of its side."""
-    near = normals @ normals.T >= np.cos(SAME_SIDE_RAD)
-    left, sides = set(range(len(facets))), []
-    while left:
-        side, edge = set(), {min(left)}
-        while edge:
-            side |= edge
-            edge = {int(other) for one in edge for other in np.flatnonzero(near[one])} - side
-        left -= side
-        sides.append(facets[sorted(side)])
-    return sides
+    count, side = connected_components(normals @ normals.T >= np.cos(SAME_SIDE_RAD))
+    return [facets[side == number] for number in range(count)]
 
 
 def _mean_direction(normals: np.ndarray, areas: np.ndarray) -> np.ndarray | None:

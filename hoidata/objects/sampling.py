@@ -51,15 +51,11 @@ def sample_points(model: ObjectModel, count: int = POINT_COUNT) -> SampledPoints
     corners = np.asarray(model.vertices_m, dtype=np.float64)[model.faces]
     if not len(corners) or not np.linalg.norm(_face_cross(corners), axis=1).any():
         raise BadInput(f"mesh of {model.name!r}", "faces with area", f"{len(corners)} faces without", "repair the mesh")
-    if _vertices_are_dense(model, corners, count):
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    distinct = np.unique(model.vertices_m[np.unique(model.faces)], axis=0)
+    if len(distinct) >= count and edges.max() <= LONGEST_EDGE_M:
         return _from_vertices(model, count)
     return _from_surface(model, corners, count)
-
-
-def _vertices_are_dense(model: ObjectModel, corners: np.ndarray, count: int) -> bool:
-    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    distinct = len(np.unique(model.vertices_m[np.unique(model.faces)], axis=0))
-    return distinct >= count and bool(edges.max() <= LONGEST_EDGE_M)
 
 
 def _from_vertices(model: ObjectModel, count: int) -> SampledPoints:

@@ -11,7 +11,7 @@ import igl
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from hoidata.objects.distance import is_closed, merged_surface, volume_m3
+from hoidata.objects.distance import is_closed, merged_surface, unmatched_edges, volume_m3
 
 LARGEST_PATCH = 0.01
 LEAST_SHARE = 1e-3  # of the convex hull: less is enclosed by two opposite sheets
@@ -41,10 +41,11 @@ def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
     vertices, found = surface.vertices_m, surface.faces
     repairs = []
     if not (is_closed(found) and encloses(vertices, found)):
-        single = _without_doubles(found)
+        # One triangle of each set of three vertices, the first.
+        single = found[np.sort(np.unique(np.sort(found, axis=1), axis=0, return_index=True)[1])]
         if len(single) < len(found):
             repairs.append(f"{len(found) - len(single)} triangles that lay double left out")
-        found = _evenly_turned(single)
+        found = single if is_closed(single) else np.ascontiguousarray(igl.bfs_orient(single)[0], dtype=np.int64)
         if len(single) == len(surface.faces) and not np.array_equal(found, single):
             repairs.append("neighbouring triangles turned alike")
     holes = _holes(found)
@@ -83,24 +84,10 @@ def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
     return _patched(vertices_m, faces, holes)
 
 
-def _without_doubles(faces: np.ndarray) -> np.ndarray:
-    """One triangle of each set of three vertices, the first."""
-    return faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
-
-
-def _evenly_turned(faces: np.ndarray) -> np.ndarray:
-    """Neighbours turned alike, unless they are already."""
-    return faces if is_closed(faces) else np.ascontiguousarray(igl.bfs_orient(faces)[0], dtype=np.int64)
-
-
 def _holes(faces: np.ndarray) -> list[np.ndarray] | None:
     """Vertices around each hole, in the order a patch's triangles run; None where holes share a vertex."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    size = int(faces.max()) + 1
-    keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
-    found, number = np.unique(keys, return_inverse=True)
-    unmatched = np.bincount(number, np.repeat([1, -1], len(edges)), len(found))
-    stop, start = np.divmod(found[unmatched > 0], size)  # a patch runs against the triangles beside it
+    edges, unmatched = unmatched_edges(faces)
+    stop, start = edges[unmatched > 0].T  # a patch runs against the triangles beside it
     if unmatched.max(initial=0) > 1 or len(np.unique(start)) < len(start) or len(np.unique(stop)) < len(stop):
         return None
     after, holes = dict(zip(start.tolist(), stop.tolist(), strict=True)), []

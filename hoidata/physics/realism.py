@@ -68,16 +68,6 @@ def _near(scene: Scene, looked_at: bytes, tolerance_m: float) -> CapsuleContacts
     return capsule_contacts(scene.model, scene.poses.taken(frames), scene.capsules.taken(frames), tolerance_m)
 
 
-class HandMotion(NamedTuple):
-    """joints_m: (frame, joint, 3) world, metres, the wrist first; NaN in frames in which the hand is not there.
-
-    wrist_rotmats: (frame, 3, 3) world_from_wrist.
-    """
-
-    joints_m: np.ndarray
-    wrist_rotmats: np.ndarray
-
-
 VARIANTS: Mapping[str, Variant] = MappingProxyType({"SI": StandardUnits(), "as released": AsReleased()})
 
 

@@ -45,7 +45,10 @@ def surface_distances(
     best = SurfaceDistances(np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros((*shape, 3)))
     for part in model.parts:
         object_from_part = model.object_from_part(part, hinge_rad)
-        _merge_nearer(best, _part_distances(model, model.faces_of(part), object_from_part, points_m, reach_m))
+        found = _part_distances(model, model.faces_of(part), object_from_part, points_m, reach_m)
+        nearer = found.distance_m < best.distance_m
+        for mine, new in zip(best, found, strict=True):
+            mine[nearer] = new[nearer]
     return best
 
 
@@ -62,12 +65,6 @@ def _part_distances(
         distance[near], closest[near], normal[near] = found.distance_m, found.closest_m, found.normal
         distance[distance > reach_m] = np.inf
     return SurfaceDistances(distance, object_from_part @ closest, object_from_part.turn(normal))
-
-
-def _merge_nearer(best: SurfaceDistances, other: SurfaceDistances) -> None:
-    nearer = other.distance_m < best.distance_m
-    for mine, new in zip(best, other, strict=True):
-        mine[nearer] = new[nearer]
 
 
 def penetration_depth_m(distances: SurfaceDistances) -> np.ndarray:

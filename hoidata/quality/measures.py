@@ -11,7 +11,7 @@ from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.quality import motion
-from hoidata.quality.meshes import SurfaceFacts, part_faces, part_facts
+from hoidata.quality.meshes import SurfaceFacts, part_facts
 from hoidata.quality.penetration import depths_m
 from hoidata.quality.shape import largest_beta, meant_betas
 from hoidata.quality.thresholds import Thresholds
@@ -40,7 +40,7 @@ class ObjectFacts:
     @classmethod
     def of(cls, model: ObjectModel) -> "ObjectFacts":
         surfaces, points = part_facts(model), sample_points(model, TIMING_POINTS)
-        boxes = [_box_corners(model.vertices_m[np.unique(part_faces(model, part))]) for part in surfaces]
+        boxes = [_box_corners(model.vertices_m[np.unique(model.faces_of(part))]) for part in surfaces]
         corner_part = np.repeat(np.array(list(surfaces), dtype=np.uint8), 8)
         return cls(model, surfaces, points.points_m, points.part, np.concatenate(boxes), corner_part)
 

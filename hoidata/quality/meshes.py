@@ -7,6 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from hoidata.objects.distance import unmatched_edges, volume_m3
 from hoidata.objects.model import ObjectModel
 
 SLIVER = 1e-6
@@ -56,31 +57,13 @@ def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
 
 def part_facts(model: ObjectModel) -> dict[int, SurfaceFacts]:
     """Facts of each part, by its number; one, 0, for a rigid object."""
-    parts = np.unique(model.face_part).tolist() if model.is_articulated else [0]
-    return {part: surface_facts(model.vertices_m, part_faces(model, part)) for part in parts}
-
-
-def part_faces(model: ObjectModel, part: int) -> np.ndarray:
-    """(face, 3) triangles of one part; all of them for a rigid object."""
-    return model.faces[model.face_part == part] if model.is_articulated else model.faces
+    return {part: surface_facts(model.vertices_m, model.faces_of(part)) for part in model.parts}
 
 
 def _open_edge_share(faces: np.ndarray) -> float:
     if not len(faces):
         return 1.0
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    size = int(faces.max()) + 1
-    keys = np.concatenate([edges[:, 0] * size + edges[:, 1], edges[:, 1] * size + edges[:, 0]])
-    sign = np.repeat([1, -1], len(edges))
-    found, number = np.unique(keys, return_inverse=True)
-    unmatched = np.bincount(number, sign, len(found))
-    return float(np.maximum(unmatched, 0).sum() / len(edges))
-
-
-def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:
-    """Enclosed volume by the divergence theorem: signed tetrahedra between the triangles and the vertices' centre."""
-    corners = (vertices_m - vertices_m.mean(axis=0))[faces]
-    return float(np.einsum("fx,fx->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6)
+    return float(np.maximum(unmatched_edges(faces)[1], 0).sum() / (3 * len(faces)))
 
 
 def _hull_volume(vertices_m: np.ndarray) -> float:

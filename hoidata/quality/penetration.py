@@ -10,7 +10,6 @@ import numpy as np
 
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
-from hoidata.quality.meshes import part_faces
 
 
 def depths_m(
@@ -24,7 +23,7 @@ def depths_m(
     depth = np.zeros(len(points_m))
     for part in parts:
         local = model.object_from_part(part, hinge_rad).inverse() @ points_m
-        depth = np.maximum(depth, _depths_in(model.vertices_m, part_faces(model, part), local))
+        depth = np.maximum(depth, _depths_in(model.vertices_m, model.faces_of(part), local))
     return depth
 
 

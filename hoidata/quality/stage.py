@@ -80,8 +80,10 @@ def quality_store(
     clips = _measured(store, facts, thresholds, jobs, progress)
     _add_beta_distances(store, clips)
     for row in clips:
-        found = findings(row, CLIP_MEASURES, thresholds.limits)
-        _judge(row, [*found, *_inherited(row["object"], mesh_findings[row["object"]])])
+        # A mesh that cannot be used takes its clips with it; what it is only warned of stays with the mesh.
+        unusable = [item for item in mesh_findings[row["object"]] if item.verdict == "left out"]
+        inherited = [item._replace(reason=f"object {row['object']}: {item.reason}") for item in unusable]
+        _judge(row, [*findings(row, CLIP_MEASURES, thresholds.limits), *inherited])
     for row in meshes:
         _judge(row, mesh_findings[row["object"]])
     counts = _counts(clips, meshes)
@@ -91,11 +93,6 @@ def quality_store(
         info = {"thresholds": plain_config(thresholds), "counts": counts}
         (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
-
-
-def _inherited(name: str, found: list[Finding]) -> list[Finding]:
-    """A mesh that cannot be used takes its clips with it; what it is only warned of stays with the mesh."""
-    return [Finding("left out", f"object {name}: {item.reason}") for item in found if item.verdict == "left out"]
 
 
 def _judge(row: dict[str, Any], found: list[Finding]) -> None:

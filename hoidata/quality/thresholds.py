@@ -13,38 +13,44 @@ Verdict = Literal["ok", "warned", "left out"]
 class Measure:
     """unit: "" for a count or a share. words: what it is, for people; its faults sit at high values.
 
-    frame: the column that says at which frame it was found, "" where there is none.
+    warn, leave_out: its :class:`Limit` by default. frame: the column of the frame it was found at, "" for none.
     """
 
     name: str
     unit: str
     words: str
+    warn: float | None = None
+    leave_out: float | None = None
     frame: str = ""
 
 
+# Limits are chosen on the embedded corpora (251 clips) and ManipNet's recordings (45): no clip of theirs reaches
+# ``leave_out``. Where good clips reach any value (a closed mesh around a cavity, an open mesh), a measure only warns.
 CLIP_MEASURES = (
-    Measure("wrist_acceleration_m_s2", "m/s²", "median acceleration of the wrist, the worse hand"),
-    Measure("finger_acceleration_m_s2", "m/s²", "median acceleration of the finger joints about the wrist"),
-    Measure("object_acceleration_m_s2", "m/s²", "median acceleration of the object's corners"),
-    Measure("shaking_share", "", "share of frames in which one of them shakes"),
-    Measure("hand_jump_m", "m", "largest sudden step of a joint", "hand_jump_frame"),
-    Measure("object_jump_m", "m", "largest sudden step of a corner of the object", "object_jump_frame"),
-    Measure("frozen_hand_frames", "frames", "longest stretch of one hand exactly still while something else moves"),
-    Measure("frozen_all_frames", "frames", "longest stretch of everything exactly still"),
-    Measure("penetration_m", "m", "deepest hand vertex inside the object"),
-    Measure("penetration_share", "", "share of frames in which a hand is too deep inside"),
-    Measure("time_offset_frames", "frames", "lag between hands and object, either way"),
-    Measure("largest_beta", "sd", "largest shape coefficient"),
-    Measure("beta_distance", "sd", "distance of the shape from the subject's other clips"),
-    Measure("gap_share", "", "share of frames in which a hand is lost and comes back"),
-    Measure("handless_share", "", "share of frames without any hand"),
+    Measure("wrist_acceleration_m_s2", "m/s²", "median acceleration of the wrist, the worse hand", 15.0, 60.0),
+    Measure("finger_acceleration_m_s2", "m/s²", "median acceleration of the finger joints about the wrist", 15.0, 60.0),
+    Measure("object_acceleration_m_s2", "m/s²", "median acceleration of the object's corners", 15.0, 60.0),
+    Measure("shaking_share", "", "share of frames in which one of them shakes", 0.05, 0.5),
+    Measure("hand_jump_m", "m", "largest sudden step of a joint", 0.12, 0.3, "hand_jump_frame"),
+    Measure("object_jump_m", "m", "largest sudden step of a corner of the object", 0.05, 0.2, "object_jump_frame"),
+    Measure(
+        "frozen_hand_frames", "frames", "longest stretch of one hand exactly still while something else moves", 45.0
+    ),
+    Measure("frozen_all_frames", "frames", "longest stretch of everything exactly still", 30.0, 90.0),
+    Measure("penetration_m", "m", "deepest hand vertex inside the object", 0.02),
+    Measure("penetration_share", "", "share of frames in which a hand is too deep inside", 0.5),
+    Measure("time_offset_frames", "frames", "lag between hands and object, either way", 1.0, 5.0),
+    Measure("largest_beta", "sd", "largest shape coefficient", 3.0, 10.0),
+    Measure("beta_distance", "sd", "distance of the shape from the subject's other clips", 1.5, 6.0),
+    Measure("gap_share", "", "share of frames in which a hand is lost and comes back", 0.05, 0.5),
+    Measure("handless_share", "", "share of frames without any hand", 0.1, 0.9),
 )
 MESH_MEASURES = (
-    Measure("open_edge_share", "", "share of edges at a hole, or of uneven orientation"),
-    Measure("unfilled_share", "", "1 - volume / convex hull: 1 encloses nothing, above 1 is inside out"),
-    Measure("shells", "", "separate pieces of a part"),
-    Measure("degenerate_share", "", "share of triangles without area"),
-    Measure("size_m", "m", "longest side of the bounding box"),
+    Measure("open_edge_share", "", "share of edges at a hole, or of uneven orientation", 0.0),
+    Measure("unfilled_share", "", "1 - volume / convex hull: 1 encloses nothing, above 1 is inside out", 0.99),
+    Measure("shells", "", "separate pieces of a part", 1.0),
+    Measure("degenerate_share", "", "share of triangles without area", 0.01, 0.9),
+    Measure("size_m", "m", "longest side of the bounding box", 1.0, 3.0),
 )
 MEASURES = {measure.name: measure for measure in (*CLIP_MEASURES, *MESH_MEASURES)}
 
@@ -57,30 +63,7 @@ class Limit:
     leave_out: float | None
 
 
-# Chosen on the embedded corpora (251 clips) and ManipNet's recordings (45): no clip of theirs reaches ``leave_out``.
-# Where good clips can reach any value (a closed mesh around a cavity, an open mesh), a measure only warns.
-DEFAULT_LIMITS: dict[str, Limit] = {
-    "wrist_acceleration_m_s2": Limit(15.0, 60.0),
-    "finger_acceleration_m_s2": Limit(15.0, 60.0),
-    "object_acceleration_m_s2": Limit(15.0, 60.0),
-    "shaking_share": Limit(0.05, 0.5),
-    "hand_jump_m": Limit(0.12, 0.3),
-    "object_jump_m": Limit(0.05, 0.2),
-    "frozen_hand_frames": Limit(45.0, None),
-    "frozen_all_frames": Limit(30.0, 90.0),
-    "penetration_m": Limit(0.02, None),
-    "penetration_share": Limit(0.5, None),
-    "time_offset_frames": Limit(1.0, 5.0),
-    "largest_beta": Limit(3.0, 10.0),
-    "beta_distance": Limit(1.5, 6.0),
-    "gap_share": Limit(0.05, 0.5),
-    "handless_share": Limit(0.1, 0.9),
-    "open_edge_share": Limit(0.0, None),
-    "unfilled_share": Limit(0.99, None),
-    "shells": Limit(1.0, None),
-    "degenerate_share": Limit(0.01, 0.9),
-    "size_m": Limit(1.0, 3.0),
-}
+DEFAULT_LIMITS = {name: Limit(measure.warn, measure.leave_out) for name, measure in MEASURES.items()}
 
 
 @dataclass(frozen=True)

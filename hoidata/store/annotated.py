@@ -24,7 +24,6 @@ A clip without an acting hand, or without words, has a row with the reason in ha
 belongs to no subset of a split. Clips that match no rule of a split are excluded too.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -211,14 +210,11 @@ class AnnotatedStore:
         """Raise BadInput when a stage's output belongs to another conversion than the clips beside it."""
         tables = {"annotation": self.hand_types.index, "contact": self._clips.index, "splits": self.splits}
         for folder, found in tables.items():
-            _same_ids(self.root / folder, self.store.ids, list(found))
+            if list(found) != self.store.ids:
+                got = f"{len(found)}, {len(set(found) & set(self.store.ids))} of them among these"
+                expected = f"the {len(self.store)} clips of the store beside it"
+                raise BadInput(self.root / folder, expected, got, "run its stage again")
 
 
 def _by_clip(text: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return {str(key): rows for key, rows in text.groupby("clip_id", sort=False)}
-
-
-def _same_ids(folder: Path, expected: Sequence[str], found: Sequence[str]) -> None:
-    if list(expected) != list(found):
-        got = f"{len(found)}, {len(set(found) & set(expected))} of them among these"
-        raise BadInput(folder, f"the {len(expected)} clips of the store beside it", got, "run its stage again")

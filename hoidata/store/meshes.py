@@ -55,7 +55,7 @@ class MeshWriter:
         for number, (key, facts) in enumerate(self._facts.items()):
             name = names[key]
             rows[name] = {"object": name, **facts}
-            members |= {f"{name}/{part}": array for part, array in map_npz(self._aside / f"{number}.npz").items()}
+            members |= {f"{name}/{kind}": array for kind, array in map_npz(self._aside / f"{number}.npz").items()}
         write_npz(path, dict(sorted(members.items())))
         shutil.rmtree(self._aside, ignore_errors=True)
         return [rows[name] for name in sorted(rows)]
@@ -70,4 +70,4 @@ def mesh_digest(arrays: dict[str, np.ndarray], model: ObjectModel) -> str:
     """SHA-256 of vertices_m, faces, part and, where there is a hinge, its axis and origin (float64)."""
     hinge = () if model.hinge is None else (model.hinge.axis, model.hinge.origin_m)
     ordered = [arrays[field.name] for field in OBJECT_ARRAYS.fields]
-    return sha256_bytes(b"".join(array.tobytes() for array in (*ordered, *(np.float64(part) for part in hinge))))
+    return sha256_bytes(b"".join(array.tobytes() for array in (*ordered, *map(np.float64, hinge))))

@@ -1,16 +1,6 @@
 """The unified store of one dataset: a folder of Parquet tables and stored NPZ arrays.
 
-    meta/info.json            schema_version, dataset, synthetic, fps, hand_model, units, axes, licence, frame and
-                              hand_convention (what the source's frame and hand parameters mean)
-    meta/sequences.parquet    one row per clip: id, words, and where its rows lie in the arrays
-    meta/objects.parquet      one row per object     meta/files.parquet       one row per raw file
-    meta/quarantine.parquet   what was left out, with the reason
-    arrays/frames-00000.npz   one member per array, the clips of a shard one after another; never compressed
-    arrays/body-00000.npz     SMPL-X body parameters, where the source has them
-    arrays/source_contact-00000.npz  contact labels of the source, where it has them
-    arrays/objects.npz        <object>/vertices_m, <object>/faces, <object>/part; arrays/templates.npz personal hands
-
-``hoidata/store/README.md`` describes every field. In one line:
+``hoidata/store/README.md`` describes every file and field. In one line:
 ``clip = open_store("data/embedded/grab/clips").clip("grab/s1/mug_drink_1")``. With plain NumPy::
 
     rows = pandas.read_parquet("clips/meta/sequences.parquet").set_index("clip_id")
@@ -18,9 +8,6 @@
     arrays = numpy.load(f"clips/arrays/frames-{row.shard:05d}.npz")
     wrist_m = arrays["left_wrist_m"][row.first_row : row.first_row + row.n_frames]
 
-Betas start at ``<side>_betas_row`` and have 1 row or one per frame (``<side>_betas_count``); the k-th further object
-starts at ``other_row + k * n_frames`` of the ``other_*`` arrays; camera, body and contact rows start at their own
-``*_row``, -1 for a clip that has none.
 """
 
 from dataclasses import dataclass, field

@@ -154,7 +154,9 @@ class _Writer:
     def finish(self, info: dict[str, Any]) -> dict[str, int]:
         self.shards.finish()
         names = self.meshes.names()
-        rows = [_with_names(row, names) for row in self.rows.values()]
+        for row in self.rows.values():
+            row |= {"object": names[row["object"]], "other_objects": [names[key] for key in row["other_objects"]]}
+        rows = list(self.rows.values())
         objects = self.meshes.finish(self.folder / "arrays" / "objects.npz")
         write_npz(self.folder / "arrays" / "templates.npz", dict(sorted(self.templates.items())))
         files = [vars(item) for item in self.files]
@@ -177,11 +179,6 @@ class _Writer:
 def template_key(template_m: np.ndarray) -> str:
     """The name of a personal rest mesh (778, 3) float32 in templates.npz."""
     return sha256_bytes(np.ascontiguousarray(template_m).tobytes())[:16]
-
-
-def _with_names(row: dict[str, Any], names: dict[tuple[str, str], str]) -> dict[str, Any]:
-    """The row with the final names of its objects."""
-    return row | {"object": names[row["object"]], "other_objects": [names[key] for key in row["other_objects"]]}
 
 
 def _second_of_an_id(clip: Clip, first: dict[str, Any]) -> Quarantined:

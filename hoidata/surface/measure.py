@@ -42,17 +42,8 @@ class ObjectShape:
     def __init__(self, model: ObjectModel, points: SampledPoints, index: SurfaceIndex | None = None) -> None:
         self.index = index or SurfaceIndex(model)
         self.points = points
-        self.solid = encloses_solid(self.index)
+        self.solid = self.index.is_solid
         self.overlap = _overlap(self.index) if self.solid else None
-
-
-def encloses_solid(index: SurfaceIndex) -> bool:
-    """Whether anything can be inside the object."""
-    try:
-        index.check_solid()
-    except BadInput:
-        return False
-    return True
 
 
 def _overlap(index: SurfaceIndex) -> SolidOverlap | None:

@@ -22,7 +22,7 @@ from hoidata.objects.sampling import POINT_COUNT, sample_points
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.store.store import Store, open_store
 from hoidata.surface.contact import TOUCH_M
-from hoidata.surface.measure import ObjectShape, Stopwatch, encloses_solid, measure_hand
+from hoidata.surface.measure import ObjectShape, Stopwatch, measure_hand
 from hoidata.surface.store import ClipSurface, SideSurface, SurfaceWriter
 from hoidata.workers import in_workers
 
@@ -96,7 +96,7 @@ def _object_row(model: ObjectModel) -> dict[str, Any]:
         index = SurfaceIndex(model)
     except BadInput as error:  # its clips are left out with the same words
         return {"object": model.name, "solid": False, "note": str(error)}
-    return {"object": model.name, "solid": encloses_solid(index), "note": index.solid_note}
+    return {"object": model.name, "solid": index.is_solid, "note": index.solid_note}
 
 
 _Result = tuple[ClipSurface, dict[str, float]]

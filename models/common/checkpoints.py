@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from hoidata.errors import BadInput
-from hoidata.files import atomic_file, canonical_json
+from hoidata.files import canonical_json, write_whole
 from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
 from models.common.features import Normaliser
@@ -52,10 +52,7 @@ def save_checkpoint(
         tensors |= {_NORMALISER + name: tensor for name, tensor in normaliser.tensors().items()}
     tensors = {name: tensors[name].detach().cpu().contiguous() for name in sorted(tensors)}
     known = {"format": FORMAT, "model": model_name, "config": plain_config(network.config), **info}
-    path = Path(folder) / FILE_NAME
-    with atomic_file(path) as part:
-        part.write_bytes(save(tensors, metadata={METADATA_KEY: canonical_json(known)}))
-    return path
+    return write_whole(Path(folder) / FILE_NAME, save(tensors, metadata={METADATA_KEY: canonical_json(known)}))
 
 
 def read_info(path: str | Path) -> dict[str, Any]:
@@ -97,10 +94,7 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
 
 def write_empty(folder: str | Path, reason: str) -> Path:
     """``empty.json`` in place of a checkpoint that could not be trained, with the reason."""
-    path = Path(folder) / EMPTY_NAME
-    with atomic_file(path) as part:
-        part.write_text(canonical_json({"reason": reason}) + "\n")
-    return path
+    return write_whole(Path(folder) / EMPTY_NAME, canonical_json({"reason": reason}) + "\n")
 
 
 def empty_reason(folder: str | Path) -> str | None:

@@ -1,9 +1,9 @@
 """The motions of a family for a dataset's test clips, written as an ordinary store of clips."""
 
-import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from hashlib import sha256
 from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -15,7 +15,7 @@ from rich.progress import track
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
-from hoidata.files import atomic_file, atomic_folder
+from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import write_asked
 from hoidata.settings import build_config
@@ -92,7 +92,10 @@ def sample_family(
 
 
 def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
-    """What is asked of a family in place of a recorded clip: as often as the config says, each with its own seed."""
+    """What is asked of a family in place of a recorded clip: as often as the config says, each with its own seed.
+
+    A motion's seed does not depend on which other clips there are.
+    """
     return [
         Request(
             motion_id=f"{sample.clip_id}~{number}",
@@ -101,7 +104,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             text=sample.text[0],
             active_hands=sample.active_hands,
             n_frames=sample.length,
-            seed=_seed(config.seed, sample.clip_id, number),
+            seed=int.from_bytes(sha256(f"{config.seed} {number} {sample.clip_id}".encode()).digest()[:7]),
             number=number,
             clip_id=sample.clip_id,
             object_words=sample.object_words,
@@ -114,8 +117,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
 
 
 def _write(path: Path, values: Any) -> None:
-    with atomic_file(path) as file:
-        file.write_text(json.dumps(values, indent=2, sort_keys=True) + "\n")
+    write_whole(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
 
 
 def _made(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterator[Clip]:
@@ -143,17 +145,10 @@ def _motions(
         yield from answers
 
 
-def _seed(seed: int, clip_id: str, number: int) -> int:
-    """A seed for one motion that does not depend on which other clips there are."""
-    return int.from_bytes(hashlib.sha256(f"{seed} {number} {clip_id}".encode()).digest()[:7])
-
-
 def _why_not(family: Family, root: Path, checkpoints: Path) -> str | None:
     """What is missing: an empty dataset, or a network the family uses."""
-    folders = [root / name for name in ("clips", "annotation", "contact")] + [
-        checkpoints / name for name in family.uses
-    ]
-    if reason := next((reason for folder in folders if (reason := empty_reason(folder))), None):
+    folders = [root / "clips", root / "annotation", root / "contact", *(checkpoints / name for name in family.uses)]
+    if reason := next(filter(None, map(empty_reason, folders)), None):
         return reason
     absent = [name for name in family.uses if not (checkpoints / name / FILE_NAME).is_file()]
     return f"not trained: {', '.join(absent)}" if absent else None

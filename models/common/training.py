@@ -101,7 +101,8 @@ def train_network(
         got = f"none of {', '.join(sorted(missing))}"
         raise BadInput(f"training of {network.name}", "checkpoint folders", got, "pass needed")
     make_repeatable(plan.seed, threads)
-    if reason := _nothing_to_train_on(annotated_root, needed):
+    folders = [*(Path(annotated_root) / name for name in ("clips", "annotation", "contact")), *needed.values()]
+    if reason := next(filter(None, map(empty_reason, folders)), None):
         return write_empty(out_folder, reason)
     annotated = load_annotated(annotated_root, hands)
     corpus = Corpus.of(annotated, plan.seed, crop=network.crop)
@@ -191,13 +192,7 @@ def _follow(kept: nn.Module, network: nn.Module, decay: float) -> None:
 
 def write_log(path: Path, log: list[dict[str, float]]) -> None:
     """log.csv: step, validation loss, and the mean training losses since the row before."""
-    with atomic_file(path) as part, open(part, "w", newline="") as stream:
+    with atomic_file(path) as partial, open(partial, "w", newline="") as stream:
         writer = csv.DictWriter(stream, list(log[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in log)
-
-
-def _nothing_to_train_on(annotated_root: str | Path, needed: Mapping[Network, str | Path]) -> str | None:
-    """Why this training cannot be: an empty dataset, or an empty network before it."""
-    folders = [Path(annotated_root) / name for name in ("clips", "annotation", "contact")]
-    return next((reason for folder in (*folders, *needed.values()) if (reason := empty_reason(folder))), None)

@@ -6,7 +6,7 @@ from torch import nn
 from hoidata.batches.dataset import ClipBatch, collate
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
-from models.common.family import Losses, Network, Objective, Setup
+from models.common.family import Losses, Network
 from models.text2hoi.contact import ContactConfig, ContactLossConfig, ContactModel, contact_loss, turned_and_scaled
 from models.text2hoi.thresholds import choose_contact_threshold
 
@@ -44,15 +44,16 @@ def contact_threshold(checkpoint: Checkpoint) -> float:
     return float(checkpoint.info["results"]["contact_threshold"])
 
 
-def _contact_objective(setup: Setup) -> tuple[Objective, None]:
-    return ContactObjective(ContactModel(setup.network).to(setup.device), setup.loss, setup.corpus, setup.device), None
-
-
-def _contact_results(network: nn.Module, corpus: Corpus) -> dict[str, float]:
+def _results(network: nn.Module, corpus: Corpus) -> dict[str, float]:
     assert isinstance(network, ContactModel)
     return {"contact_threshold": choose_contact_threshold(network, corpus.held_out)}
 
 
 CONTACT = Network(
-    "contact", ContactConfig, ContactModel, _contact_objective, ContactLossConfig, results=_contact_results
+    "contact",
+    ContactConfig,
+    ContactModel,
+    lambda s: (ContactObjective(ContactModel(s.network).to(s.device), s.loss, s.corpus, s.device), None),
+    ContactLossConfig,
+    results=_results,
 )

@@ -40,7 +40,10 @@ def contact_figures(
     assert isinstance(checkpoint.network, ContactModel)
     threshold = contact_threshold(checkpoint)
     f1 = mean_f1(contact_probabilities(checkpoint.network, test, CONTACT_SAMPLES, 0), true_maps(test), threshold)
-    baselines = {kind: _baseline_f1(train, held_out, test, kind) for kind in ("index", "position", "object")}
+    baselines = {}
+    for kind in ("index", "position", "object"):
+        chosen = best_threshold(mean_maps(train, held_out, kind), true_maps(held_out))
+        baselines[kind] = mean_f1(mean_maps(train, test, kind), true_maps(test), chosen)
     mean_map = max(baselines["index"], baselines["position"])
     return {
         "clips": len(test),
@@ -70,11 +73,6 @@ def length_figures(sources: Sources, train: list[ClipSample], test: list[ClipSam
     }
 
 
-def _baseline_f1(train: list[ClipSample], held_out: list[ClipSample], test: list[ClipSample], kind: str) -> float:
-    threshold = best_threshold(mean_maps(train, held_out, kind), true_maps(held_out))
-    return mean_f1(mean_maps(train, test, kind), true_maps(test), threshold)
-
-
 def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np.ndarray:
     """(clip, point) baseline maps from training clips.
 
@@ -88,7 +86,8 @@ def mean_maps(train: list[ClipSample], clips: list[ClipSample], kind: str) -> np
         keys = np.array([sample.object_key for sample in train])
         same = [train_maps[keys == sample.object_key] for sample in clips]
         return np.stack([maps.mean(axis=0) if len(maps) else train_maps.mean(axis=0) for maps in same])
-    clouds = {sample.object_key: _normalised(sample) for sample in [*train, *clips]}
+    points = {sample.object_key: torch.from_numpy(sample.points.points_m)[None] for sample in [*train, *clips]}
+    clouds = {key: normalised_points(cloud)[0][0].numpy() for key, cloud in points.items()}
     train_clouds = [clouds[sample.object_key] for sample in train]
     of_object = {
         key: mean_map_by_position(clouds[key], train_clouds, train_maps)
@@ -106,7 +105,3 @@ def mean_map_by_position(points: np.ndarray, train_clouds: list[np.ndarray], tra
     for cloud, contact in zip(train_clouds, train_maps, strict=True):
         probability += contact[KDTree(cloud).query(points)[1]]
     return probability / max(len(train_maps), 1)
-
-
-def _normalised(sample: ClipSample) -> np.ndarray:
-    return normalised_points(torch.from_numpy(sample.points.points_m)[None])[0][0].numpy()

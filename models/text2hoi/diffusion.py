@@ -171,17 +171,16 @@ def guided(model: DiffusionModel, condition: Condition, guidance: float) -> Deno
     """The model as a denoiser for ``sample_motion``; classifier-free guidance (Ho and Salimans 2022) if not 1."""
 
     def denoise(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
-        return model(hands, objects, timesteps, condition)
-
-    def denoise_guided(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
         conditional = model(hands, objects, timesteps, condition)
+        if guidance == 1:
+            return conditional
         unconditional = model(hands, objects, timesteps, condition, hands.new_zeros(len(hands), 2))
         return (
             unconditional[0] + guidance * (conditional[0] - unconditional[0]),
             unconditional[1] + guidance * (conditional[1] - unconditional[1]),
         )
 
-    return denoise if guidance == 1 else denoise_guided
+    return denoise
 
 
 @dataclass(frozen=True)

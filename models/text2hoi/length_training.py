@@ -5,7 +5,7 @@ from torch import nn
 
 from hoidata.batches.dataset import ClipBatch, collate
 from models.common.corpus import Corpus, any_form
-from models.common.family import Losses, Network, Objective, Setup
+from models.common.family import Losses, Network
 from models.text2hoi.length import LengthConfig, LengthModel, jittered_frames, length_loss
 
 
@@ -34,8 +34,9 @@ class LengthObjective:
         return float(torch.stack(errors).mean())
 
 
-def _length_objective(setup: Setup) -> tuple[Objective, None]:
-    return LengthObjective(LengthModel(setup.network).to(setup.device), setup.corpus, setup.device), None
-
-
-LENGTH = Network("length", LengthConfig, LengthModel, _length_objective)
+LENGTH = Network(
+    "length",
+    LengthConfig,
+    LengthModel,
+    lambda setup: (LengthObjective(LengthModel(setup.network).to(setup.device), setup.corpus, setup.device), None),
+)

@@ -1,9 +1,16 @@
 """``hoidata adapters``: which readers of datasets there are, and whether one keeps the rules."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+import yaml
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from hoidata.errors import BadInput
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -23,10 +30,6 @@ Strict = Annotated[bool, typer.Option("--strict", help="Warnings fail too.")]
 @app.command("list")
 def list_adapters() -> None:
     """All known adapters: dataset version, licence, where they come from, settings with their defaults."""
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     from hoidata.datasets.registry import registered_adapters
 
     table = Table("name", "version", "licence", "may be shared", "from", show_lines=True)
@@ -54,8 +57,6 @@ def check(
 
     Nothing below ROOT is written to; altered copies are hard links in a temporary folder.
     """
-    from rich.console import Console
-
     from hoidata.conformance.check import check_adapter
     from hoidata.datasets.registry import get_adapter
 
@@ -71,10 +72,6 @@ def check(
 
 def _settings(pairs: list[str]) -> dict[str, Any]:
     """``margin_frames=5`` as a number, other values as YAML reads them."""
-    import yaml
-
-    from hoidata.errors import BadInput
-
     settings = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
@@ -100,12 +97,6 @@ def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
 
 
 def _print(name: str, findings, note: str) -> None:
-    from collections import Counter
-
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     table = Table("", "rule", "seen", title=f"adapter {name}", caption=note)
     for item in findings:
         table.add_row(f"[{COLOURS[item.outcome]}]{item.outcome}", escape(item.rule), escape(item.detail))

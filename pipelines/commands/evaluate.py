@@ -3,25 +3,17 @@
 import json
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
-Store = Annotated[
-    Path,
-    typer.Argument(
-        help="A store of predicted clips, <reference id>~<k>.", exists=True, file_okay=False, resolve_path=True
-    ),
-]
-Reference = Annotated[
-    Path,
-    typer.Option(
-        help="An annotated dataset, such as data/embedded/grab.", exists=True, file_okay=False, resolve_path=True
-    ),
-]
+_FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
+Store = Annotated[Path, typer.Argument(help="A store of predicted clips, <reference id>~<k>.", **_FOLDER)]
+Reference = Annotated[Path, typer.Option(help="An annotated dataset, such as data/embedded/grab.", **_FOLDER)]
 
 
 def evaluate(
@@ -34,9 +26,7 @@ def evaluate(
     split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
 ) -> None:
     """Measure every clip of a store against the clip it was made for, and print the table of metrics."""
-    from rich.console import Console
-
-    from hoidata.files import atomic_file
+    from hoidata.files import write_whole
     from hoidata.metrics.evaluate import evaluate_store
     from pipelines.pages.metrics_table import printed_table
     from pipelines.stages.base import jobs
@@ -52,8 +42,7 @@ def evaluate(
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")
     if out is not None:
-        with atomic_file(out) as part:
-            part.write_text(json.dumps(found, indent=2, sort_keys=True, allow_nan=False) + "\n", encoding="utf-8")
+        write_whole(out, json.dumps(found, indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
 def _hands(reference: Path) -> "HandPair":

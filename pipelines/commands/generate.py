@@ -39,7 +39,7 @@ def generate(
     from models.common.sampling import SamplerConfig
     from models.text2hoi.generation import Wish
     from pipelines.generation import Asked, MeshWish, generate_files
-    from pipelines.lineage.graph import read_params
+    from pipelines.params import read_params
 
     wish = Wish(seed, samples, hand, None if length is None else round(length * FPS), hand_by)
     written = generate_files(

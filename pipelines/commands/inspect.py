@@ -4,6 +4,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+from rich.tree import Tree
 
 from pipelines.commands.project import enter_project
 
@@ -13,10 +17,6 @@ SHOWN_ROWS = 12
 def doctor() -> None:
     """Say what is installed and which raw folders, hand, encoder and GPU were found; exit code 1 if one is broken."""
     enter_project()
-    from rich.console import Console
-    from rich.markup import escape
-    from rich.table import Table
-
     from pipelines.doctor import examine
 
     findings = examine()
@@ -33,8 +33,6 @@ def info(
     everything: Annotated[bool, typer.Option("--all", help="List all objects, verbs and what was left out.")] = False,
 ) -> None:
     """Describe a store: clips by object and verb, conventions, licence, and what was left out and why."""
-    from rich.console import Console
-
     from hoidata.store.store import open_store
     from pipelines.commands.store_facts import fact_rows, group_rows, left_out_rows
     from pipelines.stages.base import empty_reason
@@ -52,9 +50,6 @@ def info(
 
 def _print_rows(console, heads: tuple[str, ...], rows: list[tuple[str, ...]], shown: int | None) -> None:
     """A table with at most ``shown`` rows; says how many more there are."""
-    from rich.markup import escape
-    from rich.table import Table
-
     if not rows:
         return
     table = Table()
@@ -98,9 +93,6 @@ def _print_json(tree, provenance: dict) -> None:
 
 
 def _print_tree(tree, provenance: dict, show_clips: bool) -> None:
-    from rich.console import Console
-    from rich.tree import Tree
-
     from pipelines.lineage.tree import overall_status
 
     console, top = Console(), Tree(_label(tree))
@@ -127,8 +119,6 @@ def _grow(parent, node) -> None:
 
 
 def _label(node) -> str:
-    from rich.markup import escape
-
     colour = {"same": "green", "changed": "yellow", "missing": "red"}[node.status]
     detail = f" [dim]{escape(node.detail)}[/]" if node.detail else ""
     return f"{node.kind} [bold]{escape(node.name)}[/] [{colour}]{node.status}[/]{detail}"

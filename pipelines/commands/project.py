@@ -1,11 +1,14 @@
 """The project folder and its settings, as commands find them."""
 
+import json
 import os
 import re
 import subprocess
+import tomllib
 from pathlib import Path
 
 from hoidata.errors import MissingResource
+from pipelines.params import read_params
 
 # Either profile, and the other one.
 PROFILES = {"embedded": "own", "own": "embedded"}
@@ -29,8 +32,6 @@ def enter_project() -> Path:
 
 def current_profile() -> str:
     """The profile params.yaml chooses."""
-    from pipelines.params import read_params
-
     return read_params(Path())["profile"]
 
 
@@ -66,10 +67,6 @@ def _keep_profile_from_git(profile: str) -> None:
 
 def remember_root(name: str, root: Path) -> None:
     """Note a raw folder in hoidata.toml, which version control ignores; its other sections stay."""
-    import json
-    import re
-    import tomllib
-
     path = Path("hoidata.toml")
     text = path.read_text() if path.is_file() else ""
     settings = tomllib.loads(text)

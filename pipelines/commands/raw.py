@@ -5,7 +5,9 @@ from typing import Annotated
 
 import typer
 
+from hoidata.errors import BadInput, MissingResource
 from pipelines.commands.project import PROFILES, current_profile, enter_project, remember_root, set_profile
+from pipelines.params import read_params
 
 app = typer.Typer(no_args_is_help=True)
 Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
@@ -21,7 +23,6 @@ def scan(
     """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
     enter_project()
     from pipelines.lineage.manifests import write_manifest
-    from pipelines.params import read_params
     from pipelines.stages.adapters import ensure_manifests
     from pipelines.stages.base import HAND, Place
 
@@ -35,7 +36,9 @@ def scan(
     typer.echo(f"{place.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
     if name == HAND:
         return
-    _state_terms(manifest)
+    typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
+    if not manifest.may_be_shared:
+        typer.echo("What is made from it stays on this machine: `dvc push` leaves it out (see `hoidata share --help`)")
     if set_profile("own"):
         typer.echo("params.yaml: profile set to own (`hoidata profile embedded` returns; nothing is retrained)")
 
@@ -45,8 +48,6 @@ def profile(
 ) -> None:
     """Say which data this copy of the project works on, or choose it; git does not see the choice."""
     enter_project()
-    from hoidata.errors import BadInput
-
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
     if name:
@@ -55,9 +56,7 @@ def profile(
 
 
 def _scan_dataset(place, root: Path):
-    from hoidata.errors import BadInput
     from pipelines.lineage.manifests import absent_manifest, scan_files
-    from pipelines.params import read_params
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
 
@@ -67,21 +66,13 @@ def _scan_dataset(place, root: Path):
         remedy = f"add {place.dataset} to `datasets` in params.yaml"
         raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
     # First what was asked about, then what it needs besides.
-    _require_parts(adapter, root, also=_hand_problem(place))
-    require_hand(place)
-    return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
-
-
-def _hand_problem(place) -> str:
-    """What is missing of the MANO files the dataset needs; nothing where all is well."""
-    from hoidata.errors import MissingResource
-    from pipelines.stages.raw import require_hand
-
     try:
         require_hand(place)
     except MissingResource as error:
-        return str(error)
-    return ""
+        _require_parts(adapter, root, also=str(error))
+        raise
+    _require_parts(adapter, root)
+    return absent_manifest(adapter).with_files(scan_files(root, adapter.parts))
 
 
 def _require_parts(adapter, root: Path, also: str = "") -> None:
@@ -89,7 +80,6 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
 
     also: another problem to name behind that of the folder.
     """
-    from hoidata.errors import BadInput
     from pipelines.lineage.manifests import missing_parts
 
     missing = missing_parts(adapter, root)
@@ -104,17 +94,8 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
         typer.echo(f"{adapter.name}: without {part.what} ({part.patterns[0]}), to be had from {part.where}")
 
 
-def _state_terms(manifest) -> None:
-    typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
-    if not manifest.may_be_shared:
-        typer.echo("What is made from it stays on this machine: `dvc push` leaves it out (see `hoidata share --help`)")
-
-
 def _scan_hand(place, root: Path):
-    from dataclasses import replace
-
     from hoidata.clips.clip import SourceFile
-    from hoidata.errors import BadInput
     from hoidata.files import sha256_file
     from pipelines.lineage.manifests import ABSENT_HAND
 
@@ -122,15 +103,13 @@ def _scan_hand(place, root: Path):
     if missing:
         raise BadInput(root, " and ".join(MANO_FILES), f"no {', '.join(missing)}", "see https://mano.is.tue.mpg.de")
     files = [SourceFile(name, (root / name).stat().st_size, sha256_file(root / name)) for name in sorted(MANO_FILES)]
-    return replace(ABSENT_HAND, present=True, files=tuple(files))
+    return ABSENT_HAND.with_files(tuple(files))
 
 
 @app.command()
 def verify(dataset: Annotated[str, typer.Argument(help="A dataset; all that are present when left out.")] = "") -> None:
     """Compare raw files with the manifests of the current profile. Exit code 1 when they differ or are not there."""
     enter_project()
-    from pipelines.params import read_params
-
     names = [dataset] if dataset else read_params(Path())["datasets"]
     results = [_verify_one(name, asked_for=bool(dataset)) for name in names]
     raise typer.Exit(0 if all(results) else 1)
@@ -141,7 +120,6 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
 
     asked_for: by name, so that its absence is a complaint.
     """
-    from hoidata.errors import MissingResource
     from pipelines.lineage.manifests import read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter, manifest_of
     from pipelines.stages.base import Place, raw_root

@@ -5,7 +5,9 @@ from typing import Annotated, Any
 
 import typer
 
+from hoidata.errors import MissingResource
 from pipelines.commands.project import current_profile, enter_project
+from pipelines.params import read_params
 
 # The remote all derived outputs belong to: by .dvc/config the cache they lie in, so that nothing is sent.
 DERIVED = "derived"
@@ -26,8 +28,6 @@ def share(
 
 def _lead_out() -> str:
     """Make the project's default remote, with all its options, that of derived outputs too; returns its address."""
-    from hoidata.errors import MissingResource
-
     config = _config()
     name = config["core"].get("remote")
     if name is None:
@@ -51,7 +51,6 @@ def _config() -> Any:
 
 def _terms() -> list[str]:
     """One line per dataset of the current profile whose licence does not let derived data be passed on."""
-    from pipelines.params import read_params
     from pipelines.stages.adapters import manifest_of
     from pipelines.stages.base import Place
 

@@ -4,7 +4,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.console import Console
 
+from hoidata.errors import BadInput, MissingResource
 from pipelines.commands.project import enter_project
 
 app = typer.Typer(no_args_is_help=True)
@@ -35,9 +37,7 @@ def check(
     Sound: at least 98 % of held frames pass, hands stay within 20 mm of the object and less than 10 mm inside it.
     """
     import numpy as np
-    from rich.console import Console
 
-    from hoidata.errors import BadInput
     from hoidata.synthetic.check import as_text, check_corpus
     from pipelines.stages.base import jobs
 
@@ -54,7 +54,6 @@ def check(
 
 
 def _chosen(dataset: str) -> list[str]:
-    from hoidata.errors import MissingResource
     from pipelines.lineage.manifests import read_manifest
 
     committed = [read_manifest(path) for path in sorted(Path("manifests/embedded").glob("*.json"))]

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
 from importlib.util import find_spec
+from itertools import accumulate
 from pathlib import Path
 
 from hoidata.files.digest import sha256_file
@@ -93,7 +94,9 @@ class SourceTree:
             statements = _imports(ast.parse(source.read_bytes())) if source else ()
             package = name if source and source.name == "__init__.py" else name.rpartition(".")[0]
             named = {item for statement in statements for item in _named(statement, package)}
-            self._imports[name] = tuple(sorted({above for item in {*named, name} for above in _with_parents(item)}))
+            # Importing a.b.c runs a, a.b and a.b.c.
+            chains = (accumulate(item.split("."), "{}.{}".format) for item in {*named, name})
+            self._imports[name] = tuple(sorted(set().union(*chains)))
         return self._imports[name]
 
     def _folder(self, package: str) -> Path | None:
@@ -196,9 +199,3 @@ def _named(statement: ast.Import | ast.ImportFrom, package: str) -> list[str]:
         above = package.split(".")[: len(package.split(".")) - statement.level + 1]
         base = ".".join(filter(None, [*above, base]))
     return [base, *(f"{base}.{alias.name}" for alias in statement.names)]
-
-
-def _with_parents(name: str) -> list[str]:
-    """``a.b.c`` to a, a.b and a.b.c: importing the last runs them all."""
-    names = name.split(".")
-    return [".".join(names[: end + 1]) for end in range(len(names))]

@@ -16,13 +16,9 @@ def path_digest(path: Path) -> str | None:
         return sha256_file(path)
     if not path.is_dir():
         return None
-    lines = [f"{sha256_file(item)}  {item.relative_to(path).as_posix()}\n" for item in _files_of(path)]
+    files = sorted(item for item in path.rglob("*") if item.is_file() and not _is_noise(item.relative_to(path)))
+    lines = [f"{sha256_file(item)}  {item.relative_to(path).as_posix()}\n" for item in files]
     return sha256_bytes("".join(lines).encode())
-
-
-def _files_of(folder: Path) -> list[Path]:
-    files = (item for item in folder.rglob("*") if item.is_file())
-    return sorted(item for item in files if not _is_noise(item.relative_to(folder)))
 
 
 def _is_noise(path: Path) -> bool:

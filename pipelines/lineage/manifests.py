@@ -16,7 +16,7 @@ from typing import Any, Literal
 from hoidata.clips.clip import SourceFile
 from hoidata.datasets.base import Adapter, DatasetPart, RawTree
 from hoidata.errors import BadInput
-from hoidata.files import atomic_file
+from hoidata.files import write_whole
 
 SCHEMA = "hoidata.manifest/1"
 FRAME_FILE = re.compile(r"\d{6}\.txt")
@@ -78,8 +78,7 @@ def write_manifest(path: Path, manifest: Manifest) -> None:
     lines = json.dumps(head, indent=2, ensure_ascii=False)[:-2]
     entries = ",\n    ".join(json.dumps(asdict(entry), ensure_ascii=False) for entry in manifest.files)
     body = f"[\n    {entries}\n  ]" if manifest.files else "[]"
-    with atomic_file(path) as part:
-        part.write_text(f'{lines},\n  "files": {body}\n}}\n')
+    write_whole(path, f'{lines},\n  "files": {body}\n}}\n')
 
 
 def absent_manifest(adapter: Adapter) -> Manifest:
@@ -120,13 +119,10 @@ def _folders(root: Path, folder: str, patterns: list[tuple[str, ...]]) -> Iterat
     for entry in entries:
         below = [rest if rest[0] == "**" else rest[1:] for rest in patterns if _fits(entry.name, rest[0])]
         below = [rest for rest in below if rest]
-        if below and entry.is_dir() and not _leads_back(root / folder, Path(entry.path)):
+        # A link to a folder it lies in would never end.
+        endless = entry.is_symlink() and (root / folder).resolve().is_relative_to(Path(entry.path).resolve())
+        if below and entry.is_dir() and not endless:
             yield from _folders(root, f"{folder}/{entry.name}" if folder else entry.name, below)
-
-
-def _leads_back(place: Path, link: Path) -> bool:
-    """A link to a folder it lies in would never end."""
-    return link.is_symlink() and place.resolve().is_relative_to(link.resolve())
 
 
 def _fits(name: str, segment: str) -> bool:

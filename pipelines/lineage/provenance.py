@@ -4,7 +4,7 @@ No time, host, user or commit is recorded; those would change the file's digest 
 """
 
 import json
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -69,13 +69,7 @@ def _record(root: Path, stage: Stage, params: dict[str, Any], known: dict[str, s
 
 def library_versions() -> dict[str, str]:
     """Versions of the libraries whose results end up in a checkpoint."""
-    found = {}
-    for name in LIBRARIES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+    return {name: version(name) for name in LIBRARIES}
 
 
 def read_checkpoint_metadata(path: Path) -> dict[str, Any]:

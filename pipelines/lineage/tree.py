@@ -122,17 +122,14 @@ def _value_changes(before: Any, after: Any, key: str = "") -> list[str]:
 def _code_node(recorded: dict[str, str], today: dict[str, str]) -> Node:
     """One node for a stage's code, with a child for each file it ran then or would run now."""
     children = tuple(_file_node(path, recorded.get(path), today.get(path)) for path in sorted({*recorded, *today}))
-    worst, changed = overall_status(Node("code", "code", "same", children=children)), _changed_names(children)
+    worst = overall_status(Node("code", "code", "same", children=children))
+    changed = ", ".join(node.name for node in children if node.status != "same")
     return Node("code", "code", worst, changed or f"{len(children)} files", children)
 
 
 def _file_node(path: str, recorded: str | None, today: str | None) -> Node:
     status: Status = "same" if today == recorded else "missing" if today is None else "changed"
     return Node("code", path, status, _short(recorded))
-
-
-def _changed_names(nodes: tuple[Node, ...]) -> str:
-    return ", ".join(node.name for node in nodes if node.status != "same")
 
 
 def _input_node(comparison: _Comparison, path: str, recorded: str | None) -> Node:

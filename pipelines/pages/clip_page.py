@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, Side
-from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import AnnotatedStore
@@ -25,7 +24,7 @@ from pipelines.pages.clip_page_facts import (
 from pipelines.pages.clip_page_series import ClipSeries, measure_clip
 from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_charts, draw_timeline
 from pipelines.pages.examples import true_contact
-from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
@@ -50,8 +49,11 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
     series = measure_clip(annotated, clip, hands)
     points = annotated.points(annotated.object_key(clip_id))
     sides: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    title = _title(annotated, clip)
-    page = render_page(
+    title = f"{clip.verb or 'move'}: {clip.object_words}"
+    if clip_id in annotated.ids():
+        title = annotated.sentences(clip_id)[0]
+    return write_page(
+        path,
         "clip_page.html",
         title=title,
         synthetic=clip.synthetic,
@@ -73,11 +75,8 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
         facts=clip_facts(annotated, clip, hands),
         files=source_rows(clip),
         has_players=True,
-        script=_script(),
+        script=(Path(__file__).parent / "clip_page.js").read_text(encoding="utf-8"),
     )
-    with atomic_file(path) as partial:
-        partial.write_text(page, encoding="utf-8")
-    return Path(path)
 
 
 def paint_values(
@@ -109,12 +108,6 @@ def paint_values(
     }
 
 
-def _title(annotated: AnnotatedStore, clip: Clip) -> str:
-    if clip.clip_id in annotated.ids():
-        return annotated.sentences(clip.clip_id)[0]
-    return f"{clip.verb or 'move'}: {clip.object_words}"
-
-
 def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[Player]:
     """Per hand that touches: the object to turn, each point by its share of the hand's frames in contact."""
     players = []
@@ -128,7 +121,3 @@ def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[P
         label = "share of these frames, 0 to 1"
         players.append(contact_player(clip, paint, caption, caption, touched_side(clip, paint), label))
     return players
-
-
-def _script() -> str:
-    return (Path(__file__).parent / "clip_page.js").read_text(encoding="utf-8")

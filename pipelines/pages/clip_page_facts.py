@@ -161,14 +161,15 @@ def split_rows(annotated: AnnotatedStore, clip_id: str) -> Rows:
 
 def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
     """(name, text) rows about the clip itself."""
-    info = annotated.info
+    info, model = annotated.info, clip.object.model
+    kind = "with a hinge" if model.is_articulated else "rigid"
     licence = f"{info['licence']}; derived data {'may be shared' if info['may_be_shared'] else 'not to be shared'}"
     return [
         ("clip", clip.clip_id),
         ("dataset", f"{info['dataset']}, version {info['dataset_version']}"),
         ("subject, sequence", f"{clip.subject}, {clip.sequence}"),
         ("verb", _verb(annotated, clip)),
-        ("object", _object_words(clip)),
+        ("object", f"{clip.object_words} ({model.name}), {kind}, {len(model.faces):,} triangles"),
         ("other objects", ", ".join(track.model.name for track in clip.other_objects) or NOTHING),
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s at {FPS} per second"),
         ("source frames", _source_frames(clip)),
@@ -192,11 +193,6 @@ def _verb(annotated: AnnotatedStore, clip: Clip) -> str:
     if row["verb_source"] == "derived":
         return f"{row['verb']}, derived from the motion ({row['verb_evidence']}): the source has no label"
     return clip.verb or "no label in the source"
-
-
-def _object_words(clip: Clip) -> str:
-    kind = "with a hinge" if clip.object.is_articulated else "rigid"
-    return f"{clip.object_words} ({clip.object.model.name}), {kind}, {len(clip.object.model.faces):,} triangles"
 
 
 def _source_frames(clip: Clip) -> str:
@@ -223,14 +219,10 @@ def _hands_from(clip: Clip) -> str:
 def _camera(clip: Clip) -> str:
     if clip.camera is None:
         return NOTHING
-    images = clip.camera.images
-    lens = (
-        ""
-        if clip.camera.intrinsics is None
-        else "; fx, fy, cx, cy, width, height: "
-        + ", ".join(f"{value:g}" for value in np.round(clip.camera.intrinsics, 1))
-    )
-    return f"{clip.camera.name}, images {int(images[0])} to {int(images[-1])}{lens}"
+    images, lens = clip.camera.images, clip.camera.intrinsics
+    numbers = "" if lens is None else ", ".join(f"{value:g}" for value in np.round(lens, 1))
+    shown = f"; fx, fy, cx, cy, width, height: {numbers}" if numbers else ""
+    return f"{clip.camera.name}, images {int(images[0])} to {int(images[-1])}{shown}"
 
 
 def _further(clip: Clip) -> str:

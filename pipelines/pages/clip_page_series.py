@@ -11,12 +11,13 @@ import numpy as np
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.contact.maps import LONGEST_CLIP
 from hoidata.hands import HandPair, track_joints
+from hoidata.objects.sampling import SampledPoints
 from hoidata.objects.surface_index import surface_index
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.surface.contact import TOUCH_M
-from hoidata.surface.measure import ObjectShape, encloses_solid, measure_hand
-from hoidata.surface.store import SideSurface, SurfaceStore
+from hoidata.surface.measure import ObjectShape, measure_hand
+from hoidata.surface.store import SideSurface
 from pipelines.pages.surface_facts import surface_beside
 
 
@@ -57,47 +58,38 @@ class ClipSeries:
 
 def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> ClipSeries:
     """The series of one clip of an annotated dataset; hands: the model of its store."""
-    centre_m = _centre_m(annotated, clip)
+    points = annotated.points(annotated.object_key(clip.clip_id))
+    # The mean of the sampled points: the moving part counts as far as its surface goes.
+    centre_m = clip.object.points_in_world(points.points_m, points.part).mean(axis=1)
     stored = surface_beside(annotated)
-    if stored is None or clip.clip_id not in stored.ids:
-        surface, touch_m = _measured(annotated, clip, hands), TOUCH_M
-    else:
-        surface, touch_m = _read(stored, clip.clip_id), float(stored.info["touch_m"])
+    surface, touch_m = {}, TOUCH_M
+    if stored is not None and clip.clip_id in stored.ids:
+        surface |= {side: stored.hand(clip.clip_id, side) for side in SIDES}
+        touch_m = float(stored.info["touch_m"])
     return ClipSeries(
-        touched={side: _touched(annotated, clip, side) for side in SIDES},
+        touched={side: _touched(annotated, clip, side, len(points)) for side in SIDES},
         evidence=annotated.hand_evidence(clip.clip_id),
-        surface=surface,
+        surface=surface or _measured(clip, hands, points),
         touch_m=touch_m,
-        solid=encloses_solid(surface_index(clip.object.model)),
+        solid=surface_index(clip.object.model).is_solid,
         speed_m_s=_speed_m_s(centre_m),
         lift_m=None if clip.gravity is None else -(centre_m - centre_m[0]) @ np.asarray(clip.gravity, np.float64),
         hinge_rad=clip.object.hinge_rad,
     )
 
 
-def _read(stored: SurfaceStore, clip_id: str) -> dict[Side, SideSurface]:
-    return {side: stored.hand(clip_id, side) for side in SIDES}
-
-
-def _measured(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> dict[Side, SideSurface]:
-    model = clip.object.model
-    shape = ObjectShape(model, annotated.points(annotated.object_key(clip.clip_id)), surface_index(model))
+def _measured(clip: Clip, hands: HandPair, points: SampledPoints) -> dict[Side, SideSurface]:
+    shape = ObjectShape(clip.object.model, points, surface_index(clip.object.model))
     return {side: measure_hand(clip, side, track_joints(clip.hands[side], hands[side]), hands, shape) for side in SIDES}
 
 
-def _touched(annotated: AnnotatedStore, clip: Clip, side: Side) -> np.ndarray:
+def _touched(annotated: AnnotatedStore, clip: Clip, side: Side, n_points: int) -> np.ndarray:
     """(frame, point) bool: a joint of the hand is within the contact stage's threshold of the point."""
     assert clip.n_frames <= LONGEST_CLIP
     entries = annotated.distances(clip.clip_id, side)
-    touched = np.zeros((clip.n_frames, len(annotated.points(annotated.object_key(clip.clip_id)))), dtype=bool)
+    touched = np.zeros((clip.n_frames, n_points), dtype=bool)
     touched[entries.frame, entries.point] = True
     return touched
-
-
-def _centre_m(annotated: AnnotatedStore, clip: Clip) -> np.ndarray:
-    """(frame, 3) mean of the sampled points in the world: the moving part counts as far as its surface goes."""
-    points = annotated.points(annotated.object_key(clip.clip_id))
-    return clip.object.points_in_world(points.points_m, points.part).mean(axis=1)
 
 
 def _speed_m_s(centre_m: np.ndarray) -> np.ndarray:

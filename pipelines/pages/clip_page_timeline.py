@@ -71,7 +71,8 @@ def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> 
     """What the page of a clip plots; sides: the hands that are ever valid."""
     threshold_cm = series.evidence.threshold_m * 100
     touched = [Line(side, SIDE_COLOURS[side], series.touched_count(side).astype(float)) for side in sides]
-    near = [Line(side, SIDE_COLOURS[side], _finite(series.evidence.distance_m[side]) * 100) for side in sides]
+    nearest = {side: np.where(np.isfinite(m), m, np.nan) for side, m in series.evidence.distance_m.items()}
+    near = [Line(side, SIDE_COLOURS[side], nearest[side] * 100) for side in sides]
     charts = [
         Chart(f"touched, of {point_count:,} points of the object", "points", touched, 10, decimals=0),
         Chart("nearest joint to the object", "cm", near, 3, (threshold_cm, f"{threshold_cm:g} cm"), FARTHEST_CM),
@@ -151,10 +152,6 @@ def _readout(line: Line, decimals: int) -> dict:
     """Name, colour and values rounded for people, as JSON knows them."""
     rounded = [round(float(value), decimals) if np.isfinite(value) else None for value in line.values]
     return {"name": line.name, "colour": line.colour, "values": rounded, "decimals": decimals}
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, np.nan)
 
 
 def _percent(fraction: float) -> float:

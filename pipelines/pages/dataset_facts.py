@@ -47,7 +47,7 @@ def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
     quarantine = [{key: str(row[key]) for key in store.quarantine} for row in store.quarantine.to_dict("records")]
     if not len(store):
         return DatasetFacts(name, False, reason or "no sequence gave a clip", [], [], quarantine, None, store.info)
-    annotated = load_annotated(root, hands) if _is_annotated(root) else None
+    annotated = load_annotated(root, hands) if has_tables(root) else None
     synthetic = bool(store.sequences["synthetic"].any())
     tiles, counts = _tiles(store, annotated), _counts(store, annotated)
     return DatasetFacts(name, synthetic, "", tiles, counts, quarantine, annotated, store.info)
@@ -59,9 +59,10 @@ def reason_for_nothing(folder: Path) -> str:
     return str(json.loads(note.read_text(encoding="utf-8"))["reason"]) if note.is_file() else ""
 
 
-def _is_annotated(root: Path) -> bool:
-    tables = ("annotation/text.parquet", "contact/points.npz", "splits/splits.parquet")
-    return all((root / table).is_file() for table in tables)
+def has_tables(root: Path, *tables: str) -> bool:
+    """Whether the stages have left these files below a dataset's folder, and what annotated clips need."""
+    needed = ("annotation/text.parquet", "contact/points.npz", "splits/splits.parquet")
+    return all((root / table).is_file() for table in (*tables, *needed))
 
 
 def _tiles(store: Store, annotated: AnnotatedStore | None) -> list[tuple[str, str]]:

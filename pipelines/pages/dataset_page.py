@@ -13,15 +13,14 @@ from matplotlib.ticker import MaxNLocator
 
 from hoidata.clips.clip import FPS, SIDES
 from hoidata.errors import MissingResource
-from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from pipelines.commands.store_facts import fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.curves import COLOURS, figure_svg
-from pipelines.pages.dataset_facts import read_dataset
+from pipelines.pages.dataset_facts import has_tables, read_dataset
 from pipelines.pages.examples import true_contact
-from pipelines.pages.player import Player, motion_player, render_page
+from pipelines.pages.player import Player, motion_player, write_page
 from pipelines.pages.quality import read_quality
 from pipelines.pages.surface_facts import contact_by_object, surface_beside
 
@@ -73,7 +72,8 @@ def write_dataset_page(
         raise MissingResource(f"{name} has no clips to show: {facts.empty}")
     annotated = load_annotated(root, hands)
     surface = surface_beside(annotated)
-    page = render_page(
+    return write_page(
+        Path(out) / f"{name}.html",
         "dataset_page.html",
         title=title or name,
         facts=facts,
@@ -90,16 +90,11 @@ def write_dataset_page(
         provenance=fact_rows(annotated.store),
         has_players=True,
     )
-    path = Path(out) / f"{name}.html"
-    with atomic_file(path) as partial:
-        partial.write_text(page, encoding="utf-8")
-    return path
 
 
 def can_be_shown(root: Path) -> bool:
     """Whether the stages have left all that the page of a dataset and those of its clips need."""
-    tables = ("quality/clips.parquet", "annotation/text.parquet", "contact/points.npz", "splits/splits.parquet")
-    return all((root / table).is_file() for table in tables)
+    return has_tables(root, "quality/clips.parquet")
 
 
 def count_charts(annotated: AnnotatedStore) -> list[Bars]:

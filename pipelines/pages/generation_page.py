@@ -8,13 +8,12 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.contact.proximity import ProximityIndex
-from hoidata.files import atomic_file
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.user_mesh import thinned
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.glb import write_glb
-from pipelines.pages.player import Player, contact_player, motion_player, render_page
+from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
 
@@ -78,7 +77,8 @@ def write_generation(
         write_glb(folder / f"{name}.glb", motion.clip, hands, _paint(motion, motion.contact))
         paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
     first = motions[0]
-    page = render_page(
+    write_page(
+        folder / "index.html",
         "generation.html",
         title=str(first.evidence["text"]),
         synthetic=first.clip.synthetic,
@@ -89,8 +89,6 @@ def write_generation(
         arrays=[(name, ARRAYS[name]) for name in motion_arrays(first, hands)],
         has_players=True,
     )
-    with atomic_file(folder / "index.html") as partial:
-        partial.write_text(page, encoding="utf-8")
     return [*paths, folder / "index.html"]
 
 
@@ -184,13 +182,8 @@ def motion_arrays(motion: GeneratedMotion, hands: HandPair) -> dict[str, np.ndar
     }
     for name in ("wrist_m", "global_orient", "hand_pose"):
         arrays[name] = _where_valid([getattr(clip.hands[side], name) for side in SIDES], valid)
-    return arrays | {"betas": _betas(clip)} | _object_arrays(motion)
-
-
-def _betas(clip: Clip) -> np.ndarray:
-    betas = [np.asarray(clip.hands[side].betas) for side in SIDES]
-    rows = max(len(values) for values in betas)
-    return np.stack([np.broadcast_to(values, (rows, values.shape[1])) for values in betas]).astype(np.float32)
+    betas = np.broadcast_arrays(*(clip.hands[side].betas for side in SIDES))
+    return arrays | {"betas": np.stack(betas).astype(np.float32)} | _object_arrays(motion)
 
 
 def _object_arrays(motion: GeneratedMotion) -> dict[str, np.ndarray]:

@@ -13,8 +13,9 @@ import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack
-from hoidata.files import atomic_file
+from hoidata.files import write_whole
 from hoidata.hands import JOINT_NAMES, HandModel, HandPair
+from hoidata.hands.embedded import vertex_normals
 from hoidata.objects.model import ObjectModel
 from pipelines.pages.gltf import GltfBuilder, linear_from_srgb
 from pipelines.pages.surface import ContactPaint, Surface, display_surface
@@ -28,9 +29,7 @@ CONTACT_COLOURS = ((0.0, OBJECT_COLOUR), (0.5, (0.95, 0.62, 0.25)), (1.0, (0.78,
 
 def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> Path:
     """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable."""
-    with atomic_file(path) as partial:
-        partial.write_bytes(glb_bytes(clip, hands, contact))
-    return Path(path)
+    return write_whole(path, glb_bytes(clip, hands, contact))
 
 
 def glb_bytes(clip: Clip, hands: HandPair | None, contact: ContactPaint | None = None) -> bytes:
@@ -92,8 +91,7 @@ def _add_hand(builder: GltfBuilder, world: int, times: int, model: HandModel, tr
     joints, weights = strongest_weights(np.asarray(model.skin_weights))
     faces = np.asarray(model.faces, dtype=np.int64)
     attributes = {
-        "POSITION": builder.array(vertices.astype(np.float32), gltf.ARRAY_BUFFER, bounds=True),
-        "NORMAL": builder.array(_smooth_normals(vertices, faces).astype(np.float32), gltf.ARRAY_BUFFER),
+        **_surface_attributes(builder, Surface(vertices, vertex_normals(vertices, faces), faces), np.zeros(3)),
         "JOINTS_0": builder.array(joints, gltf.ARRAY_BUFFER),
         "WEIGHTS_0": builder.array(weights, gltf.ARRAY_BUFFER),
     }
@@ -188,12 +186,3 @@ def continuous_quaternions(rotvec: np.ndarray) -> np.ndarray:
     flips = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) < 0
     signs = np.cumprod(np.concatenate([[1.0], np.where(flips, -1.0, 1.0)]))
     return quaternions * signs[:, None]
-
-
-def _smooth_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    triangles = vertices[faces]
-    doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], doubled)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)

@@ -13,6 +13,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from hoidata.clips.clip import SIDES, Clip
+from hoidata.files import write_whole
 from hoidata.hands import HandPair
 from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
 from pipelines.pages.surface import ContactPaint
@@ -31,10 +32,6 @@ class Player:
     caption: str = ""
     legend: tuple[tuple[str, str], ...] = ()
     contact_label: str = ""
-
-    @property
-    def has_contact(self) -> bool:
-        return bool(self.contact_label)
 
     @property
     def view_values(self) -> dict:
@@ -75,6 +72,11 @@ def contact_player(
     still = replace(clip, hands=absent, other_objects=()).take(slice(0, 1))
     view = still_view(still, look_from)
     return Player(glb=glb_bytes(still, None, paint), title=title, view=view, caption=caption, contact_label=label)
+
+
+def write_page(path: str | Path, template: str, **values: object) -> Path:
+    """Write the finished HTML of one template, whole or not at all; arguments as in ``render_page``."""
+    return write_whole(path, render_page(template, **values))
 
 
 def render_page(template: str, **values: object) -> str:

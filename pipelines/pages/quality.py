@@ -67,9 +67,9 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
         clips=[_row(clips, "clip_id", measure, limits[measure.name]) for measure in CLIP_MEASURES],
         meshes=[_row(meshes, "object", measure, limits[measure.name]) for measure in MESH_MEASURES],
         chart=Markup(measures_svg(clips, CLIP_MEASURES, limits, f"{dataset} quality")),
-        failed=_listed(clips, "left out"),
-        warned=_listed(clips, "warned"),
-        unsound=_unsound(meshes),
+        failed=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "left out"],
+        warned=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "warned"],
+        unsound=[row for row in _judged(meshes, "object") if row[1] != "ok"],
         notes=sorted(Counter(note for note in clips["note"].tolist() if note).items()),
     )
 
@@ -150,11 +150,6 @@ def _summary(counts: Mapping[str, int]) -> str:
     )
 
 
-def _listed(clips: pd.DataFrame, verdict: str) -> list[tuple[str, str]]:
-    rows = zip(clips["clip_id"].tolist(), clips["verdict"].tolist(), clips["reasons"].tolist(), strict=True)
-    return [(clip_id, reasons) for clip_id, found, reasons in rows if found == verdict]
-
-
-def _unsound(meshes: pd.DataFrame) -> list[tuple[str, str, str]]:
-    rows = zip(meshes["object"].tolist(), meshes["verdict"].tolist(), meshes["reasons"].tolist(), strict=True)
-    return [row for row in rows if row[1] != "ok"]
+def _judged(table: pd.DataFrame, key: str) -> list[tuple[str, str, str]]:
+    """(name, verdict, reasons) of each row."""
+    return list(zip(*(table[column].tolist() for column in (key, "verdict", "reasons")), strict=True))

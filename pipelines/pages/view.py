@@ -37,7 +37,8 @@ def view_of(clip: Clip, hands: HandPair) -> View:
     upright = upright_rotation(clip.gravity).as_matrix()
     object_points = _object_points(clip.object) @ upright.T
     others = [_object_points(track) @ upright.T for track in clip.other_objects]
-    everyone = [(valid, joints @ upright.T) for valid, joints in _hand_joints(clip, hands)]
+    seen = [(track, hands[side]) for side, track in clip.hands.items() if track.valid.any()]
+    everyone = [(track.valid, track_joints(track, model) @ upright.T) for track, model in seen]
     hand_points = [joints[valid] for valid, joints in everyone if _comes_near(joints, valid, object_points)]
     shown = np.concatenate([object_points.reshape(-1, 3), *(points.reshape(-1, 3) for points in hand_points)])
     centre = (shown.min(axis=0) + shown.max(axis=0)) / 2
@@ -81,12 +82,6 @@ def _object_points(track: ObjectTrack) -> np.ndarray:
     model = track.model
     step = max(1, len(model.vertices_m) // _POINTS_FOR_VIEW)
     return track.points_in_world(model.vertices_m[::step], model.part[::step])
-
-
-def _hand_joints(clip: Clip, hands: HandPair) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Valid frames (frame,) and joints (frame, 21, 3) of each hand that is ever valid."""
-    tracks = [(track, hands[side]) for side, track in clip.hands.items() if track.valid.any()]
-    return [(track.valid, track_joints(track, model)) for track, model in tracks]
 
 
 def _comes_near(joints: np.ndarray, valid: np.ndarray, object_points: np.ndarray) -> bool:

@@ -22,6 +22,16 @@ HAND = "hand"
 Settings = TypeVar("Settings")
 
 
+class _At:
+    """A path of a stage run, from a pattern with the run's fields."""
+
+    def __init__(self, pattern: str) -> None:
+        self.pattern = pattern
+
+    def __get__(self, place: "Place", owner: type) -> Path:
+        return Path(self.pattern.format(**vars(place)))
+
+
 @dataclass(frozen=True)
 class Place:
     """Where the files of one stage run lie, relative to the project folder (the current folder)."""
@@ -31,76 +41,26 @@ class Place:
     model: str = ""
     family: str = ""
 
+    manifest = _At("manifests/{profile}/{dataset}.json")
+    hand_manifest = _At(f"manifests/{{profile}}/{HAND}.json")
+    generated_raw = _At(".hoidata/raw/{profile}/{dataset}")
+    data = _At("data/{profile}/{dataset}")
+    raw_manifest = _At("data/{profile}/{dataset}/raw.json")
+    clips = _At("data/{profile}/{dataset}/clips")
+    quality = _At("data/{profile}/{dataset}/quality")
+    annotation = _At("data/{profile}/{dataset}/annotation")
+    contact = _At("data/{profile}/{dataset}/contact")
+    surface = _At("data/{profile}/{dataset}/surface")
+    splits = _At("data/{profile}/{dataset}/splits")
+    checkpoints = _At("checkpoints/{profile}/{dataset}")
+    checkpoint = _At("checkpoints/{profile}/{dataset}/{model}")
+    evaluators = _At("evaluators/{profile}/{dataset}")
+    samples = _At("samples/{profile}/{dataset}/{family}")
+    metrics = _At("metrics/{profile}/{dataset}/{family}.json")
+    report = _At("report/{profile}")
+
     def __str__(self) -> str:
         return "-".join(filter(None, (self.profile, self.dataset, self.model, self.family)))
-
-    @property
-    def data(self) -> Path:
-        return Path("data", self.profile, self.dataset)
-
-    @property
-    def manifest(self) -> Path:
-        return Path("manifests", self.profile, f"{self.dataset}.json")
-
-    @property
-    def hand_manifest(self) -> Path:
-        return Path("manifests", self.profile, f"{HAND}.json")
-
-    @property
-    def raw_manifest(self) -> Path:
-        return self.data / "raw.json"
-
-    @property
-    def clips(self) -> Path:
-        return self.data / "clips"
-
-    @property
-    def quality(self) -> Path:
-        return self.data / "quality"
-
-    @property
-    def annotation(self) -> Path:
-        return self.data / "annotation"
-
-    @property
-    def contact(self) -> Path:
-        return self.data / "contact"
-
-    @property
-    def surface(self) -> Path:
-        return self.data / "surface"
-
-    @property
-    def splits(self) -> Path:
-        return self.data / "splits"
-
-    @property
-    def checkpoints(self) -> Path:
-        return Path("checkpoints", self.profile, self.dataset)
-
-    @property
-    def checkpoint(self) -> Path:
-        return self.checkpoints / self.model
-
-    @property
-    def evaluators(self) -> Path:
-        return Path("evaluators", self.profile, self.dataset)
-
-    @property
-    def samples(self) -> Path:
-        return Path("samples", self.profile, self.dataset, self.family)
-
-    @property
-    def metrics(self) -> Path:
-        return Path("metrics", self.profile, self.dataset, f"{self.family}.json")
-
-    @property
-    def report(self) -> Path:
-        return Path("report", self.profile)
-
-    @property
-    def generated_raw(self) -> Path:
-        return Path(".hoidata", "raw", self.profile, self.dataset)
 
 
 def load_settings(kind: type[Settings], section: str, path: Path = Path("params.yaml")) -> Settings:
@@ -182,8 +142,8 @@ def note_empty(folder: Path, reason: str) -> None:
 
 def write_empty(folder: Path, reason: str) -> None:
     """An output that holds nothing but the reason."""
-    with atomic_folder(folder) as part:
-        note_empty(part, reason)
+    with atomic_folder(folder) as partial:
+        note_empty(partial, reason)
 
 
 def print_counts(place: Place, counts: Mapping[str, int]) -> None:

@@ -56,9 +56,9 @@ def run(place: Place) -> None:
 
 def write_code(root: Path) -> None:
     """Write ``code/`` of the project at ``root`` anew."""
-    with atomic_folder(root / CODE) as part:
+    with atomic_folder(root / CODE) as partial:
         for path, digests in code_today(root).items():
-            write_json(part / Path(path).relative_to(CODE), digests)
+            write_json(partial / Path(path).relative_to(CODE), digests)
 
 
 def code_today(root: Path) -> dict[str, dict[str, str]]:

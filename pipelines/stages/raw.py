@@ -4,7 +4,7 @@ from pathlib import Path
 
 from hoidata.clips.clip import SourceFile
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files.atomic import atomic_file
+from hoidata.files.atomic import write_whole
 from pipelines.lineage.closure import SourceTree
 from pipelines.lineage.digests import value_digest
 from pipelines.lineage.manifests import Manifest, scan_files, verify_files, write_manifest
@@ -33,8 +33,7 @@ def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
     stamp, wanted = root.with_suffix(".recipe"), recipe_digest(manifest)
     if not (root.is_dir() and stamp.is_file() and stamp.read_text() == wanted):
         write_generated(place, manifest, root)
-        with atomic_file(stamp) as part:
-            part.write_text(wanted)
+        write_whole(stamp, wanted)
     return scan_files(root, configured_adapter(place.dataset).parts)
 
 

@@ -25,12 +25,13 @@ import trimesh
 from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_joints, track_rotmats, write_mano_pickle
+from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_joints, track_rotmats
 from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints, sample_points
 from tests.bench.harness import Times, medians, show
+from tests.builders.mano import write_mano_pickle
 
 RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21
 

@@ -16,18 +16,18 @@ import numpy as np
 
 from hoidata.clips.clip import Clip
 from hoidata.datasets.base import RawTree, SequenceKey
-from hoidata.datasets.manipnet.source_hands import read_source_hands
 from hoidata.datasets.registry import get_adapter
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.physics.as_released import AsReleased
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
 from hoidata.physics.contact_forces import GRAVITY_M_S2
 from hoidata.physics.mano_capsules import THUMB_CAPSULES, world_rotmats
-from hoidata.physics.realism import HandMotion, Realism, Variant, has_acceleration, score, smoothness_m_s2
+from hoidata.physics.realism import Realism, Variant, has_acceleration, score, smoothness_m_s2
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits
 from tests.bench.corpus import embedded_root
 from tests.bench.harness import show
+from tests.bench.manipnet_hands import HandMotion, read_source_hands
 
 N_CAPSULES = 19
 SOURCE_THUMB = (4, 5, 6)

@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 from hoidata.clips import SIDES
 from hoidata.hands import load_embedded_hands
-from hoidata.hands.mano import write_mano_pickle
 from pipelines.cli import app
 from pipelines.commands.project import remember_root
 from pipelines.stages import annotate, contact, convert, quality, raw, split
 from pipelines.stages.base import Place, empty_reason
 from tests.builders import kitchen, taco
+from tests.builders.mano import write_mano_pickle
 
 TYPED_FILES = ("hoidata.toml", "params.yaml")
 

@@ -21,7 +21,6 @@ IMPORTERS = {"import_module", "__import__", "spec_from_file_location"}
 NEVER_OF_A_STAGE = (
     "hoidata/conformance/",
     "hoidata/store_check/",
-    "hoidata/hand_builder/",
     "pipelines/lineage/tree.py",
 )
 # Prints the files of our packages that a stage's module and everything it reaches have loaded.

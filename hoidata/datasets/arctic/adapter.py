@@ -120,10 +120,8 @@ class ArcticAdapter(Described):
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """One clip per described range of at least 20 frames; or the whole sequence as one."""
-        if self.clips == "whole":
-            return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
         where = _found(raw, f"description/{key.name}/description.txt")
-        if self.clips == "described-else-whole" and not raw.has(where):
+        if self.clips == "whole" or (self.clips == "described-else-whole" and not raw.has(where)):
             return [self._whole(raw, key, _read_motion(raw, key, hands, self.body))]
         descriptions, results = _read_descriptions(raw, where, key)
         motion = _read_motion(raw, key, hands, self.body)
@@ -131,7 +129,8 @@ class ArcticAdapter(Described):
         for description, clip_id in zip(descriptions, _clip_ids(key, descriptions), strict=True):
             problem = self._why_no_clip(where, description, noun, motion.n_frames)
             if problem is None:
-                results.append(self._clip(raw, key, clip_id, motion, description))
+                start, stop = description.start - 1 - self.margin_frames, description.stop + self.margin_frames
+                results.append(self._cut(raw, key, clip_id, motion, description, start, stop))
             else:
                 results.append(Quarantined.from_error(clip_id, problem))
         return results
@@ -156,11 +155,6 @@ class ArcticAdapter(Described):
             remedy = "nothing to do, or lower the setting trimmed_frames"
             raise BadInput(str(key), f"more than {2 * self.trimmed_frames} frames", f"{motion.n_frames}", remedy)
         return self._cut(raw, key, str(key), motion, None, start, stop)
-
-    def _clip(self, raw: RawTree, key: SequenceKey, clip_id: str, motion: _Motion, description: Description) -> Clip:
-        start = max(0, description.start - 1 - self.margin_frames)
-        stop = min(motion.n_frames, description.stop + self.margin_frames)
-        return self._cut(raw, key, clip_id, motion, description, start, stop)
 
     def _cut(
         self,
@@ -189,7 +183,7 @@ class ArcticAdapter(Described):
             camera=motion.camera,
             body=motion.body,
         )
-        return whole.take(slice(start, stop))
+        return whole.take(slice(max(0, start), stop))
 
 
 def _found(raw: RawTree, path: str) -> str:

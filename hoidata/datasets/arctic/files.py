@@ -127,18 +127,20 @@ def _matrices(where: str, value: Any, n_frames: int) -> np.ndarray:
 
 
 def _json(data: bytes, where: str, expected: str) -> Any:
-    if len(data) > LARGEST_TEXT_BYTES:
-        raise BadInput(where, f"at most {LARGEST_TEXT_BYTES} bytes", f"{len(data)}")
     try:
-        return orjson.loads(data)
+        return orjson.loads(_checked(data, where))
     except orjson.JSONDecodeError as error:
         raise BadInput(where, expected, str(error)) from error
 
 
 def _text(data: bytes, where: str) -> str:
-    if len(data) > LARGEST_TEXT_BYTES:
-        raise BadInput(where, f"at most {LARGEST_TEXT_BYTES} bytes", f"{len(data)}")
     try:
-        return data.decode("utf-8-sig")
+        return _checked(data, where).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise BadInput(where, "UTF-8 text", str(error)) from error
+
+
+def _checked(data: bytes, where: str) -> bytes:
+    if len(data) > LARGEST_TEXT_BYTES:
+        raise BadInput(where, f"at most {LARGEST_TEXT_BYTES} bytes", f"{len(data)}")
+    return data

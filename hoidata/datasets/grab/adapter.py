@@ -97,7 +97,7 @@ class GrabAdapter(Described):
             object_words=object_words(model.name),
             source_fps=float(file.fps),
             source_contact=contact.cut(start, stop),
-            body=_body(file, frames) if self.body else None,
+            body=_body(file).take(frames) if self.body else None,
         )
         return [replace(clip, sources=raw.sources)]
 
@@ -188,9 +188,8 @@ def _table(raw: RawTree, file: _SequenceFile, frames: np.ndarray) -> tuple[Objec
     return (_object_track(file, "table", _mesh_model(raw, "table", mesh), frames),)
 
 
-def _body(file: _SequenceFile, frames: np.ndarray) -> BodyTrack:
-    body = checks.body_track(f"{file.path}: body", file.params("body"), file.n_frames, {"expression": 10})
-    return body.take(frames)
+def _body(file: _SequenceFile) -> BodyTrack:
+    return checks.body_track(f"{file.path}: body", file.params("body"), file.n_frames, {"expression": 10})
 
 
 def _hand(raw: RawTree, file: _SequenceFile, side: Side, frames: np.ndarray, hands: HandPair) -> HandTrack:

@@ -25,10 +25,10 @@ from hoidata.datasets.h2o.files import (
     listed_segments,
     read_frames,
 )
-from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands, SequenceHands
+from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands
 from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
-from hoidata.geometry.intervals import runs
+from hoidata.geometry.intervals import Interval, runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import load_mesh
@@ -65,7 +65,7 @@ class _Sequence(NamedTuple):
 
     key: SequenceKey
     frames: SequenceFrames
-    hands: SequenceHands
+    hands: ParameterHands | KeypointHands
     objects: dict[str, _Object]
     gravity: GravityEstimate
     sources: tuple[SourceFile, ...]
@@ -140,7 +140,8 @@ class H2OAdapter(Described):
 
     def _clip(self, sequence: _Sequence, run: _Run) -> Clip:
         frames = sequence.frames
-        start, stop = _with_margin(frames, run.start, run.stop, self.margin_frames)
+        same = frames.classes == frames.classes[run.start]
+        start, stop = widened(Interval(run.start, run.stop), self.margin_frames, same)
         world_from_object = frames.camera[start:stop] @ frames.objects[start:stop]
         tracks, fit_error_m = sequence.hands.tracks(start, stop)
         source_frames = np.arange(frames.first + start, frames.first + stop, dtype=np.int32)
@@ -226,15 +227,6 @@ def _tracked_pieces(
 
 def _clip_id(key: SequenceKey, frames: SequenceFrames, start: int, stop: int) -> str:
     return f"{key}/{frames.first + start:06d}-{frames.first + stop - 1:06d}"
-
-
-def _with_margin(frames: SequenceFrames, start: int, stop: int, margin: int) -> tuple[int, int]:
-    """The piece and up to ``margin`` frames on both sides, as far as the same object is tracked."""
-    same = frames.classes == frames.classes[start]
-    first, last = max(0, start - margin), min(len(same), stop + margin)
-    others = np.flatnonzero(~same)
-    before, after = others[others < start], others[others >= stop]
-    return max(first, before[-1] + 1 if len(before) else 0), min(last, after[0] if len(after) else len(same))
 
 
 def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndarray) -> CameraTrack:

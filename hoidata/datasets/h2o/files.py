@@ -75,6 +75,10 @@ def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
     tracked = np.flatnonzero(objects[:, 0])
     poses = objects[:, 1:].reshape(-1, 4, 4)
     checks.rigid_transforms(kinds["obj_pose_rt"], [files[frame] for frame in tracked], poses[tracked])
+    label = _read(raw, kinds["action_label"], files, 1)[:, 0] if labelled else None
+    if label is not None:
+        _check_ids(kinds["action_label"], files, label, len(ACTIONS))
+    lens = f"{folder}/{INTRINSICS}"
     return SequenceFrames(
         folder=folder,
         first=int(files[0][:6]),
@@ -82,8 +86,8 @@ def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
         hands=hand_numbers,
         classes=objects[:, 0].astype(int),
         objects=poses,
-        label=_read_labels(raw, kinds["action_label"], files) if labelled else None,
-        intrinsics=_read_intrinsics(raw, folder),
+        label=None if label is None else label.astype(int),
+        intrinsics=parse_rows([raw.read(lens)], 6, folder, [INTRINSICS])[0] if raw.has(lens) else None,
     )
 
 
@@ -163,18 +167,6 @@ def _parse_line(line: bytes, columns: int, where: str) -> list[float]:
 
 def _read(raw: RawTree, folder: str, files: list[str], columns: int) -> np.ndarray:
     return parse_rows(raw.read_folder(folder, files), columns, folder, files)
-
-
-def _read_labels(raw: RawTree, folder: str, files: list[str]) -> np.ndarray:
-    label = _read(raw, folder, files, 1)[:, 0]
-    _check_ids(folder, files, label, len(ACTIONS))
-    return label.astype(int)
-
-
-def _read_intrinsics(raw: RawTree, folder: str) -> np.ndarray | None:
-    if not raw.has(f"{folder}/{INTRINSICS}"):
-        return None
-    return parse_rows([raw.read(f"{folder}/{INTRINSICS}")], 6, folder, [INTRINSICS])[0]
 
 
 def _folder_of(raw: RawTree, folder: str, kind: str) -> str:

@@ -1,7 +1,6 @@
 """H2O's hands in the world: from MANO parameters, or fitted to the 21 joints so that no MANO file is needed."""
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -30,21 +29,13 @@ FITTED = HandConvention(
 _PARAMETERS, _KEYPOINTS = 62, 64  # numbers of one hand; left comes first
 
 
-class SequenceHands(Protocol):
-    """Both hands of one sequence in its world."""
-
-    def tracks(self, start: int, stop: int) -> tuple[dict[Side, HandTrack], float | None]:
-        """Frames ``start`` to ``stop`` (exclusive), and the mean error of the fit in metres where there was one."""
-        ...
-
-    def joints_m(self) -> np.ndarray:
-        """(frame, 42, 3) joints of left and right hand in every frame; NaN where a hand is not annotated."""
-        ...
-
-
 @dataclass(frozen=True)
 class ParameterHands:
-    """Hands from ``hand_pose_mano``: left then right: flag, transl 3, orient 3, fingers 45, betas 10."""
+    """Hands from ``hand_pose_mano``: left then right: flag, transl 3, orient 3, fingers 45, betas 10.
+
+    tracks: frames ``start`` to ``stop`` (exclusive), and the mean error of the fit in metres where there was one.
+    joints_m: (frame, 42, 3) of left and right hand in every frame; NaN where a hand is not annotated.
+    """
 
     frames: SequenceFrames
     models: HandPair
@@ -75,7 +66,10 @@ class ParameterHands:
 
 
 class KeypointHands:
-    """Hands from ``hand_pose``: left then right: flag, 21 joints in OpenPose's order. One shape for the sequence."""
+    """Hands from ``hand_pose``: left then right: flag, 21 joints in OpenPose's order. One shape for the sequence.
+
+    Asked as ``ParameterHands`` are.
+    """
 
     def __init__(self, frames: SequenceFrames, models: HandPair) -> None:
         self.models = models

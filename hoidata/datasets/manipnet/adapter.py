@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side, WorldFrame
-from hoidata.clips.hand_parameters import HandConvention
+from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side, WorldFrame
+from hoidata.clips.hand_parameters import HandConvention, hand_track
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
@@ -28,13 +28,13 @@ from hoidata.datasets.manipnet.segments import (
     height_above_table,
     interactions,
     motion_verb,
-    widened,
 )
 from hoidata.datasets.manipnet.words import object_words
 from hoidata.errors import BadInput
+from hoidata.geometry.intervals import widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
-from hoidata.hands.fitting import HandFit, fit_hands, fit_shape
+from hoidata.hands.fitting import fit_hands, fit_shape
 from hoidata.objects.distance import closest_points
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import ObjectModel
@@ -69,7 +69,6 @@ PARTS = (
     DatasetPart("object meshes", ("objects/*/*.obj.gz",), "the data release"),
     DatasetPart("the hand's capsules and tips", (HAND_REFERENCE,), "the data release"),
 )
-SHAPE_FRAMES = 100
 MIRROR_X = np.array([-1.0, 1.0, 1.0])
 
 
@@ -149,7 +148,7 @@ class ManipNetAdapter(Described):
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """Clips of interaction of one sequence, and the stretches left out with their reasons."""
         recording = read_recording(raw, key.name)
-        betas = recording_shape(recording, hands)
+        betas = fit_shape(recording.keypoints_m, hands)
         results: list[Clip | Quarantined] = [_left_out(key, *cut) for cut in recording.cuts]
         lift_m, centre_m, usable = recording.lift_m(), recording.centre_m(), recording.usable()
         nearest = np.minimum(*(distance.min(axis=1) for distance in recording.distances_m().values()))
@@ -180,7 +179,7 @@ class ManipNetAdapter(Described):
             dataset=self.name,
             subject=key.subject,
             sequence=key.name,
-            hands={side: _hand_track(fits[side]) for side in SIDES},
+            hands={side: hand_track(f.wrist_m, f.global_orient, f.hand_pose, f.betas) for side, f in fits.items()},
             object=ObjectTrack(
                 recording.model,
                 rotmat_to_rotvec(recording.rotation[frames]).astype(np.float32),
@@ -200,17 +199,23 @@ class ManipNetAdapter(Described):
 def read_recording(raw: RawTree, name: str) -> Recording:
     """Read one sequence and convert it to 30 fps, metres and a right-handed world. Raises BadInput."""
     folder = f"sequences/{name}"
-    hand_paths = {side: _hand_path(name, side) for side in SIDES}
+    hand_paths = {side: f"{folder}/{side}Hand.bvh.gz" for side in SIDES}
     missing = [path for path in hand_paths.values() if not raw.has(path)]
     if missing:
         got = "object motion only" if len(missing) == len(SIDES) else f"no {missing[0]}"
         raise BadInput(folder, "motion of both hands", got, "nothing to do: it is released without them")
     object_path = _object_path(raw, folder)
     mesh_path, model = _read_model(raw, object_path)
-    motions = {side: _read_hand(raw, path) for side, path in hand_paths.items()}
-    thing = _read_motion(raw, object_path)
+    motions = {side: _read_motion(raw, path) for side, path in hand_paths.items()}
+    for side, motion in motions.items():
+        if motion.names != HAND_JOINTS:
+            expected = f"the {len(HAND_JOINTS)} joints WRIST to PINKY_DIP_FE"
+            raise BadInput(hand_paths[side], expected, f"{len(motion.names)} joints")
+    left, thing = motions["left"], _read_motion(raw, object_path)
     for path, motion in ((hand_paths["right"], motions["right"]), (object_path, thing)):
-        _check_same_clock(path, motion, motions["left"])
+        if (motion.n_frames, motion.frame_time_s) != (left.n_frames, left.frame_time_s):
+            expected = f"{left.n_frames} frames of {left.frame_time_s} s as in the left hand's file"
+            raise BadInput(path, expected, f"{motion.n_frames} frames of {motion.frame_time_s} s")
     frames = thirty_fps_frames(thing.n_frames, thing.frame_time_s)
     tips = _read_tips(raw)
     positions, rotations = thing.at(frames).world_joints()
@@ -226,15 +231,6 @@ def read_recording(raw: RawTree, name: str) -> Recording:
         ),
         paths=(*hand_paths.values(), object_path, mesh_path, HAND_REFERENCE),
     )
-
-
-def recording_shape(recording: Recording, hands: HandPair) -> np.ndarray:
-    """Betas (10,) fitted to 100 frames of one recording.
-
-    Bone lengths are the same in all recordings, and so a clip need not depend on which others are there.
-    """
-    frames = np.unique(np.linspace(0, len(recording.source_frames) - 1, SHAPE_FRAMES).astype(int))
-    return fit_shape({side: points[frames] for side, points in recording.keypoints_m.items()}, hands)
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:
@@ -258,10 +254,6 @@ def thirty_fps_frames(n_frames: int, frame_time_s: float) -> np.ndarray:
     return frames[frames < n_frames]
 
 
-def _hand_path(name: str, side: Side) -> str:
-    return f"sequences/{name}/{side}Hand.bvh.gz"
-
-
 def _object_path(raw: RawTree, folder: str) -> str:
     names = [name for name in raw.names(folder, ".bvh.gz") if name not in ("leftHand.bvh.gz", "rightHand.bvh.gz")]
     if len(names) != 1:
@@ -283,19 +275,6 @@ def _read_motion(raw: RawTree, path: str) -> BvhMotion:
     return parse_bvh(unpack_text(raw.read(path), path), path).seen_in_mirror_x()
 
 
-def _read_hand(raw: RawTree, path: str) -> BvhMotion:
-    motion = _read_motion(raw, path)
-    if motion.names != HAND_JOINTS:
-        raise BadInput(path, f"the {len(HAND_JOINTS)} joints WRIST to PINKY_DIP_FE", f"{len(motion.names)} joints")
-    return motion
-
-
-def _check_same_clock(path: str, motion: BvhMotion, other: BvhMotion) -> None:
-    if (motion.n_frames, motion.frame_time_s) != (other.n_frames, other.frame_time_s):
-        expected = f"{other.n_frames} frames of {other.frame_time_s} s as in the left hand's file"
-        raise BadInput(path, expected, f"{motion.n_frames} frames of {motion.frame_time_s} s")
-
-
 def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
     """Finger tips of the right hand in the frames of the last joints, right-handed axes, source units."""
     try:
@@ -312,27 +291,12 @@ def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
 
 def _body(name: str, motion: BvhMotion) -> BodyMotion:
     """The root of a motion, and all its numbers."""
-    root = BvhMotion(
-        motion.names[:1],
-        motion.parents[:1],
-        motion.offsets[:1],
-        motion.root_position,
-        motion.angles_yxz_rad[:, :1],
-        motion.frame_time_s,
+    root = replace(
+        motion, names=motion.names[:1], parents=motion.parents[:1], angles_yxz_rad=motion.angles_yxz_rad[:, :1]
     )
     positions, rotations = root.world_joints()
     raw = np.concatenate((motion.root_position, motion.angles_yxz_rad.reshape(motion.n_frames, -1)), axis=1)
     return BodyMotion(name, positions[:, 0] * METRES_PER_UNIT, rotations[:, 0], raw)
-
-
-def _hand_track(fit: HandFit) -> HandTrack:
-    return HandTrack(
-        wrist_m=fit.wrist_m.astype(np.float32),
-        global_orient=fit.global_orient.astype(np.float32),
-        hand_pose=fit.hand_pose.astype(np.float32),
-        betas=fit.betas.astype(np.float32),
-        valid=np.ones(len(fit.wrist_m), dtype=bool),
-    )
 
 
 def _clip_id(key: SequenceKey, start: int, last: int) -> str:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hoidata.geometry.intervals import Interval, runs, sudden_steps
+from hoidata.geometry.rotations import rotation_angle
 
 FROZEN_SOURCE_FRAMES = 12
 FAR_WRIST_M = 1.0
@@ -93,16 +94,6 @@ def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) ->
     return pieces
 
 
-def widened(stretch: Interval, margin: int, usable: np.ndarray) -> Interval:
-    """The stretch with up to ``margin`` frames before and after it, as far as the frames are usable (frame,)."""
-    start, stop = stretch
-    while start > max(0, stretch.start - margin) and usable[start - 1]:
-        start -= 1
-    while stop < min(len(usable), stretch.stop + margin) and usable[stop]:
-        stop += 1
-    return Interval(start, stop)
-
-
 def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) -> str | None:
     """What the object's motion in a clip shows, or None when it neither leaves the table nor moves.
 
@@ -127,11 +118,6 @@ def motion_verb(lift_m: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray) 
 def height_above_table(lowest_m: np.ndarray) -> np.ndarray:
     """(frame,) lowest object point above its 3rd percentile over the sequence, which stands for the table."""
     return lowest_m - np.percentile(lowest_m, 3)
-
-
-def rotation_angle(rotation: np.ndarray) -> np.ndarray:
-    """Angle of rotation matrices (..., 3, 3), radians."""
-    return np.arccos(np.clip((np.trace(rotation, axis1=-2, axis2=-1) - 1) / 2, -1, 1))
 
 
 def _frozen(*bodies: BodyMotion) -> list[Interval]:

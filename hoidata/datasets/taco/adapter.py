@@ -68,8 +68,8 @@ class TacoAdapter(Described):
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per recording that has hand or object poses, in a folder named as a triplet."""
         found = {path for kind in (HANDS, OBJECTS) for path in Path(root).glob(f"{kind}/(*)/*") if path.is_dir()}
-        names = {f"{path.parent.name}/{path.name}" for path in found}
-        return sorted(SequenceKey(self.name, _day(name), name) for name in names)
+        days = {f"{path.parent.name}/{path.name}": path.name.partition("_")[0] for path in found}
+        return sorted(SequenceKey(self.name, day, name) for name, day in days.items())
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """One clip, from the first to the last frame with a hand at the tool."""
@@ -117,14 +117,10 @@ def frames_of(where: str, keys: Mapping[Side, list[Hashable]], n_frames: int) ->
         if unknown and len(found) < n_frames:
             expected = f"frame numbers {complete[0]} to {complete[-1]}"
             raise BadInput(f"{where}/{side}_hand.pkl", expected, f"{unknown[0]}")
-        placed[side] = _placed(found, frame, n_frames)
+        in_turn = sorted(found, key=found.__getitem__)
+        whole = len(found) == n_frames
+        placed[side] = {key: at if whole else frame[found[key]] for at, key in enumerate(in_turn)}
     return placed
-
-
-def _placed(numbers: Mapping[Hashable, int], frame: Mapping[int, int], n_frames: int) -> dict[Hashable, int]:
-    if len(numbers) == n_frames:
-        return {key: index for index, key in enumerate(sorted(numbers, key=lambda key: numbers[key]))}
-    return {key: frame[number] for key, number in numbers.items()}
 
 
 def _numbers(where: str, keys: list[Hashable], n_frames: int) -> dict[Hashable, int]:
@@ -201,17 +197,12 @@ def _object(raw: RawTree, key: SequenceKey, kind: str) -> ObjectTrack:
     checks.finite(path, poses)
     checks.rigid_transforms(path, [f"frame {frame}" for frame in range(len(poses))], poses)
     model_path = f"{MODELS}/{names[0].removeprefix(f'{kind}_').removesuffix('.npy')}_cm.obj"
+    mesh, name = load_mesh(raw.file(model_path)), Path(model_path).name.removesuffix("_cm.obj")
     return ObjectTrack(
-        _model(raw, model_path),
+        ObjectModel(name, mesh.vertices * CENTIMETRES, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8)),
         rotmat_to_rotvec(poses[:, :3, :3]).astype(np.float32),
         poses[:, :3, 3].astype(np.float32),
     )
-
-
-def _model(raw: RawTree, path: str) -> ObjectModel:
-    mesh = load_mesh(raw.file(path))
-    name = Path(path).name.removesuffix("_cm.obj")
-    return ObjectModel(name, mesh.vertices * CENTIMETRES, mesh.faces, np.zeros(len(mesh.vertices), dtype=np.uint8))
 
 
 def _touched(clip: Clip, hands: HandPair) -> tuple[int, int]:
@@ -229,7 +220,3 @@ def _touched(clip: Clip, hands: HandPair) -> tuple[int, int]:
         raise BadInput(f"{HANDS}/{clip.sequence}", "a hand within 2 cm of the tool", "none in any frame", remedy)
     touched = np.flatnonzero(near)
     return int(touched[0]), int(touched[-1]) + 1
-
-
-def _day(name: str) -> str:
-    return name.partition("/")[2].partition("_")[0]

@@ -16,7 +16,8 @@ from hoidata.clips.hand_parameters import (
     with_corrected_left,
 )
 from hoidata.errors import BadInput
-from hoidata.hands import HandPair, load_embedded_hands, load_mano_hands, write_mano_pickle
+from hoidata.hands import HandPair, load_embedded_hands, load_mano_hands
+from tests.builders.mano import write_mano_pickle
 
 N_FRAMES = 7
 PARENT = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)

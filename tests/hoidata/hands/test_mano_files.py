@@ -11,7 +11,8 @@ import pytest
 from scipy.sparse import csc_matrix
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.hands import load_embedded_hands, load_mano_hands, write_mano_pickle
+from hoidata.hands import load_embedded_hands, load_mano_hands
+from tests.builders.mano import write_mano_pickle
 
 SEVEN_GLOBALS = {
     "numpy.core.multiarray _reconstruct",

@@ -9,7 +9,8 @@ import smplx
 import torch
 
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.hands import TIP_VERTICES, HandKinematics, load_embedded_hands, load_mano_hands, write_mano_pickle
+from hoidata.hands import TIP_VERTICES, HandKinematics, load_embedded_hands, load_mano_hands
+from tests.builders.mano import write_mano_pickle
 
 BATCH = 32
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.datasets.manipnet.segments import BodyMotion, find_cuts, interactions, motion_verb, widened
-from hoidata.geometry.intervals import Interval
+from hoidata.datasets.manipnet.segments import BodyMotion, find_cuts, interactions, motion_verb
+from hoidata.geometry.intervals import Interval, widened
 
 
 def body(name: str, position_m: np.ndarray, degrees: np.ndarray | None = None) -> BodyMotion:

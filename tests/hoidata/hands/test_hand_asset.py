@@ -5,9 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
-from hoidata.hand_builder.build import flat_hand, joint_regressor, shape_space
-from hoidata.hand_builder.makehuman import Body, Wheel
-from hoidata.hand_builder.simplify import simplify_disc
+from tests.builders.hand_asset.build import flat_hand, joint_regressor, shape_space
+from tests.builders.hand_asset.makehuman import Body, Wheel
+from tests.builders.hand_asset.simplify import simplify_disc
 
 
 def bumpy_sheet(count=24):
