@@ -13,6 +13,7 @@ from hoidata.metrics.registry import METRICS, Metric, is_better
 
 TRUTH, LOOKUP = "ground-truth", "nearest-clip"
 NO_FIGURE = "-"
+INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
 
 
 @dataclass(frozen=True)
@@ -106,15 +107,17 @@ def loses_to_lookup(metric: Metric, family: str, column: Mapping[str, float]) ->
 
 def printed_table(found: Mapping[str, Any]) -> Table:
     """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
-    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips"
+    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips, {found['length']} length"
     table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
-    for name in ("metric", "figure", "unit", "better", "clips", "values"):
-        table.add_column(name, justify="right" if name in ("figure", "clips", "values") else "left")
+    for name in ("metric", "figure", *INTERVALS.values(), "unit", "better", "clips"):
+        table.add_column(name, justify="left" if name in ("metric", "unit", "better") else "right")
     for metric in METRICS:
         if metric.name in found["figures"]:
-            counts = found["counts"][metric.name]
-            sizes = (f"{counts['clips']:,}", f"{counts['values']:,}")
-            table.add_row(metric.title, number(found["figures"][metric.name]), metric.unit, _better(metric), *sizes)
+            clips, spread = found["counts"][metric.name]["clips"], found["intervals"].get(metric.name, {})
+            ends = [" to ".join(map(number, spread.get(name, ()))) for name in INTERVALS]
+            figure = number(found["figures"][metric.name])
+            better = "a floor" if metric.floor_of else metric.direction
+            table.add_row(metric.title, figure, *ends, metric.unit, better, f"{clips:,}")
     return table
 
 
