@@ -109,8 +109,9 @@ def printed_table(found: Mapping[str, Any]) -> Table:
     """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
     title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips, {found['length']} length"
     table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
-    for name in ("metric", "figure", *INTERVALS.values(), "unit", "better", "clips"):
-        table.add_column(name, justify="left" if name in ("metric", "unit", "better") else "right")
+    table.add_column("metric", min_width=32)
+    for name in ("figure", *INTERVALS.values(), "unit", "better", "clips"):
+        table.add_column(name, justify="left" if name in ("unit", "better") else "right")
     for metric in METRICS:
         if metric.name in found["figures"]:
             clips, spread = found["counts"][metric.name]["clips"], found["intervals"].get(metric.name, {})
