@@ -36,7 +36,7 @@ from hoidata.workers import in_workers
 
 SAME_MESH_M = 1e-5  # float32 of a metre, with room
 DIGITS = 6
-WORKERS_PAY_FROM = 500  # motions: a worker needs as long to start as a hundred of them
+WORKERS_PAY_FROM = 1000  # motions: a worker takes longer to start than 200 of them take
 
 
 class Unlike(NamedTuple):
