@@ -122,12 +122,12 @@ def _summary(metrics: Sequence[Metric], measured: list[Measured]) -> dict[str, d
         if figure is not None:
             figures[metric.name] = round(figure.value, DIGITS)
             counts[metric.name] = figure.counts
-            if spread := _intervals(metric, measured):
+            if spread := intervals_of(metric, measured):
                 intervals[metric.name] = spread
     return {"figures": figures, "intervals": intervals, "counts": counts}
 
 
-def _intervals(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
+def intervals_of(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
     """repetitions and clips: ends of the 95 % intervals of a figure; none where there are fewer than two to compare.
 
     The best of all repetitions has no spread over them.

@@ -12,7 +12,7 @@ from hoidata.files.arrays import write_npz
 from hoidata.metrics import registry
 from hoidata.metrics.asked import FILE_NAME, write_asked
 from hoidata.metrics.describe import readme
-from hoidata.metrics.evaluate import evaluate_store, matched
+from hoidata.metrics.evaluate import Measured, Sample, evaluate_store, intervals_of, matched
 from hoidata.metrics.registry import METRICS, is_better, metric, reduced
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
@@ -172,6 +172,19 @@ def test_clips_are_drawn_again_by_source_sequence_and_all_samples_go_with_their_
         ends = sorted(one["figures"][name] for one in each)
         assert found["intervals"][name]["clips"] == pytest.approx(ends, abs=2e-6)
     assert not any("clips" in ends for ends in each[0]["intervals"].values())
+
+
+def test_clips_of_one_source_sequence_are_drawn_together():
+    def clip(group, value):
+        return Measured(group, [Sample(0, {"jitter_m_s3": np.array([value])})], [])
+
+    values = {"a": (1.0, 3.0), "b": (7.0, 9.0)}
+    apart = [clip(f"{name}{number}", value) for name, row in values.items() for number, value in enumerate(row)]
+    together = [clip(name, value) for name, row in values.items() for value in row]
+    assert intervals_of(metric("jitter_m_s3"), together) == {"clips": [2.0, 8.0]}  # one sequence twice, or the other
+    low, high = intervals_of(metric("jitter_m_s3"), apart)["clips"]
+    assert 1 < low < 5 < high < 9
+    assert intervals_of(metric("jitter_m_s3"), together[:2]) == {}
 
 
 def test_intervals_stand_beside_figures_they_contain(write_annotated, moved, tmp_path):
