@@ -28,17 +28,18 @@ NUMBERS = {
     "end_sideways_m": "the same in the last frame",
     "tilt_deg": "greatest angle between the object's first upright direction and the upright",
     "end_tilt_deg": "the same in the last frame",
-    "turn_deg": "greatest turn about the upright, either way, full turns added up",
+    "turn_deg": "turns about the upright, either way, added up; of steps smoothed over 5 frames, so that none is noise",
     "path_m": "length of the middle's path",
     "reversals_per_s": "how often the middle turns back: 2 mm or more in 0.1 s, and as much the other way",
     "hinge_net_deg": "hinge angle of the last frame less that of the first; 0 for a rigid object",
     "hinge_max_deg": "greatest change of the hinge angle since the first frame, either way; 0 for a rigid object",
-    "hand_changes": "hands that touch in the first touched frame and not in the last, or the reverse: 0, 1 or 2",
-    "first_left": "1 where the left hand touches in the first touched frame, else 0",
-    "first_right": "1 where the right hand does",
-    "last_left": "1 where the left hand touches in the last touched frame, else 0",
-    "last_right": "1 where the right hand does",
+    "hand_changes": "hands that hold it first and not last, or the reverse: 0, 1 or 2",
+    "first_left": "1 where the left hand holds it first: touches in half of the first quarter of the touched time",
+    "first_right": "1 where the right hand holds it first",
+    "last_left": "1 where the left hand holds it last: in half of the last quarter",
+    "last_right": "1 where the right hand holds it last",
 }
+HANDS = {"one hold": (0.0, 0.0), "change": (1.0, 2.0)}  # `hands` in actions.toml, as limits of `hand_changes`
 OF_GIVEN_HANDS = ("first_left", "first_right", "last_left", "last_right")  # asked for in words, so no part of a verb
 LEARNT = tuple(name for name in NUMBERS if name not in OF_GIVEN_HANDS)
 LEAST_CLIPS = 3  # of a verb to learn its limits from
@@ -50,7 +51,8 @@ LEAST_DEVIATION = {
     "s": 1.0,
     "changes": 1.0,
 }  # by the end of a number's name: what counts little
-_TURN_FRAMES, _TURN_M = 3, 0.002
+_BACK_FRAMES, _BACK_M = 3, 0.002
+_SMOOTH = 5
 Limits = dict[str, tuple[float, float]]
 
 
@@ -85,7 +87,7 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
     since_first = rotation @ rotation[0].T
     tilt = np.degrees(np.arccos(np.clip((since_first @ up) @ up, -1, 1)))
     steps = rotmat_to_rotvec(rotation[1:] @ rotation[:-1].swapaxes(1, 2)) @ up
-    turn = np.degrees(np.abs(np.cumsum(steps)).max(initial=0.0))
+    turn = np.degrees(np.abs(np.convolve(steps, np.full(_SMOOTH, 1 / _SMOOTH), mode="full")).sum())
     return {
         "rise_m": float(rise.max()),
         "end_rise_m": float(rise[-1]),
@@ -99,18 +101,23 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
 
 def _reversals(middle_m: np.ndarray) -> int:
     """How often a path (frame, 3) turns back on itself."""
-    step = middle_m[_TURN_FRAMES:] - middle_m[:-_TURN_FRAMES]
-    before, after = step[:-_TURN_FRAMES], step[_TURN_FRAMES:]
+    step = middle_m[_BACK_FRAMES:] - middle_m[:-_BACK_FRAMES]
+    before, after = step[:-_BACK_FRAMES], step[_BACK_FRAMES:]
     length = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
     back = (before * after).sum(axis=1) < -0.5 * length[0] * length[1]
-    return len(runs(back & (np.minimum(*length) >= _TURN_M)))
+    return len(runs(back & (np.minimum(*length) >= _BACK_M)))
 
 
 def _touching(touching: np.ndarray) -> dict[str, float]:
     frames = np.flatnonzero(touching.any(axis=0))
-    first, last = (touching[:, frames[end]] if len(frames) else np.zeros(2, bool) for end in (0, -1))
-    sides = {f"{name}_{side}": float(own[row]) for name, own in (("first", first), ("last", last))
-             for row, side in enumerate(SIDES)}  # fmt: skip
+    span = touching[:, frames[0] : frames[-1] + 1] if len(frames) else touching[:, :0]
+    quarter = -(-span.shape[1] // 4)
+    first, last = (own.sum(axis=1) * 2 >= max(quarter, 1) for own in (span[:, :quarter], span[:, -quarter:]))
+    sides = {
+        f"{name}_{side}": float(own[row])
+        for name, own in (("first", first), ("last", last))
+        for row, side in enumerate(SIDES)
+    }
     return sides | {"hand_changes": float((first != last).sum())}
 
 
@@ -209,11 +216,15 @@ def _standardised(numbers: Mapping[str, float], scale: Mapping[str, tuple[float,
 def written_limits(path: Path = TABLE) -> dict[str, Limits]:
     """The limits of ``actions.toml`` by verb; none without the file. Raises BadInput for anything else in it."""
     tables = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-    for verb, table in tables.items():
-        for name, limits in table.items():
-            if name not in NUMBERS or len(limits) != 2 or not limits[0] <= limits[1]:
-                expected = f"[least, most] of one of {', '.join(NUMBERS)}"
-                raise BadInput(f"{path.name}: {verb}", expected, f"{name} = {limits}", "correct the table")
-    return {
-        verb: {name: (float(low), float(high)) for name, (low, high) in own.items()} for verb, own in tables.items()
-    }
+    return {verb: _limits(f"{path.name}: {verb}", table) for verb, table in tables.items()}
+
+
+def _limits(where: str, table: Mapping[str, Any]) -> Limits:
+    named = {name: value for name, value in table.items() if name != "hands"}
+    if "hands" in table:
+        named["hand_changes"] = HANDS.get(table["hands"], ())
+    for name, limits in named.items():
+        if name not in NUMBERS or len(limits) != 2 or not limits[0] <= limits[1]:
+            expected = f"hands: {' or '.join(HANDS)}; [least, most] of any of {', '.join(NUMBERS)}"
+            raise BadInput(where, expected, f"{name} = {limits}", "correct the table")
+    return {name: (float(least), float(most)) for name, (least, most) in named.items()}

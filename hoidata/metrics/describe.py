@@ -6,7 +6,8 @@ _HEAD = """# Metrics
 
 Figures of predicted clips beside the clips they were made for. This file is generated from `registry.py` by
 `python -m hoidata.metrics.describe`; a test keeps it equal. `hoidata evaluate STORE --reference DATASET` prints them
-for any store of clips; `hoidata.metrics.evaluate.evaluate_store` gives them to code.
+for any store of clips, whatever made it; ten lines that write one stand in the project's README, and a test runs them.
+`hoidata.metrics.evaluate.evaluate_store` gives the figures to code.
 
 To add a metric: a function of (pair, every) that gives the values of one motion as an array, and a row in `METRICS`.
 
@@ -15,9 +16,16 @@ To add a metric: a function of (pair, every) that gives the values of one motion
   samples*: of each motion's mean the best of a clip, then the mean over clips. Motions without a value (an object
   without an inside, unknown gravity, nothing lifted) are left out; a file says how many clips, motions, values count.
 - Acting hands and the frames they are seen in are those of the reference; other hands are not looked at.
+- Two 95 % intervals stand beside a figure. `repetitions`: Student's, over repetitions of the experiment, of which the
+  k-th is motion k of every clip; it says what another run of the sampler would give. `clips`: a bootstrap that draws
+  clips again by source sequence, with all their motions; it says what other clips would give. Neither covers training.
+- `asked.npz` beside the folder of clips holds the contact maps that were asked for (`asked.py`); without it there is no
+  adherence. `action.py` lists the numbers of what an object does; limits of verbs stand in `actions.toml`.
+- A store whose info says `"length": "own"` holds motions of lengths the family chose. Its hands are seen where it has
+  them, and what is compared frame by frame has no figure. Rows of given and of own length are never one row.
 
-| name | figure | unit | better | reduction | frames | every n-th | samples of a clip | thresholds | source |
-|---|---|---|---|---|---|---|---|---|---|
+| name | figure | unit | better | reduction | frames | every n-th | samples | frame by frame | thresholds | source |
+|---|---|---|---|---|---|---|---|---|---|---|
 """
 
 
@@ -36,6 +44,7 @@ def _cells(metric: Metric) -> tuple[str, ...]:
         metric.frames,
         str(metric.every),
         "all" if metric.samples is None else f"first {metric.samples}",
+        "yes" if metric.aligned else "-",
         metric.thresholds or "-",
         metric.source,
     )

@@ -38,7 +38,7 @@ from hoidata.workers import in_workers
 
 SAME_MESH_M = 1e-5  # float32 of a metre, with room
 DIGITS = 6
-WORKERS_PAY_FROM = 500  # motions: a worker needs as long to start as a hundred of them
+WORKERS_PAY_FROM = 1000  # motions: a worker takes longer to start than 200 of them take
 
 
 class Unlike(NamedTuple):
@@ -133,12 +133,12 @@ def _summary(metrics: Sequence[Metric], measured: list[Measured]) -> dict[str, d
         if figure is not None:
             figures[metric.name] = round(figure.value, DIGITS)
             counts[metric.name] = figure.counts
-            if spread := _intervals(metric, measured):
+            if spread := intervals_of(metric, measured):
                 intervals[metric.name] = spread
     return {"figures": figures, "intervals": intervals, "counts": counts}
 
 
-def _intervals(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
+def intervals_of(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
     """repetitions and clips: ends of the 95 % intervals of a figure; none where there are fewer than two to compare.
 
     The best of all repetitions has no spread over them.

@@ -25,7 +25,7 @@ CELL_M = 0.002  # of the lattice of lines that volumes are measured along: off b
 def contact_f1(pair: Pair, every: int) -> np.ndarray:
     """(1,) F1 of the contact map the motion makes against that of the reference; 1 where both are empty."""
     del every  # a map is over all frames
-    return _f1(touched_points(pair), pair.contact.touched)
+    return _f1(*_maps(pair))
 
 
 def contact_precision(pair: Pair, every: int) -> np.ndarray:
@@ -34,14 +34,14 @@ def contact_precision(pair: Pair, every: int) -> np.ndarray:
     So it is 0, not unknown, for a motion that touches nothing though the reference does.
     """
     del every
-    made, true = touched_points(pair), pair.contact.touched
+    made, true = _maps(pair)
     return _share(made & true, made, true)
 
 
 def contact_recall(pair: Pair, every: int) -> np.ndarray:
     """(1,) of the points the reference touches the share that the motion touches, as in ``contact_precision``."""
     del every
-    made, true = touched_points(pair), pair.contact.touched
+    made, true = _maps(pair)
     return _share(made & true, true, made)
 
 
@@ -49,6 +49,11 @@ def adherence(pair: Pair, every: int) -> np.ndarray:
     """(1,) F1 of the contact map the motion makes against the one it was asked for; none where none was asked for."""
     del every
     return np.zeros(0) if pair.asked is None else _f1(touched_points(pair), pair.asked)
+
+
+def _maps(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """(point,) bool, what the motion touches and what the reference does."""
+    return touched_points(pair), pair.contact.touched
 
 
 def _f1(made: np.ndarray, true: np.ndarray) -> np.ndarray:

@@ -19,6 +19,7 @@ LOOKUPS = ("nearest-clip", "prompt-lookup")
 CONTROLS = "controls"
 NO_FIGURE = "-"
 OTHER_EVALUATOR = "another evaluator"
+INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
 
 
 @dataclass(frozen=True)
@@ -228,10 +229,11 @@ def loses_to(lookup: str, metric: AnyMetric, family: str, column: Mapping[str, f
 
 def printed_table(found: Mapping[str, Any]) -> Table:
     """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
-    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips"
+    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips, {found['length']} length"
     table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
-    for name in ("metric", "figure", "95 % over clips", "unit", "better", "clips", "values"):
-        table.add_column(name, justify="right" if name in ("figure", "clips", "values") else "left")
+    table.add_column("metric", min_width=32)
+    for name in ("figure", *INTERVALS.values(), "unit", "better", "clips"):
+        table.add_column(name, justify="left" if name in ("unit", "better") else "right")
     for row in _printed_rows(found):
         table.add_row(*row)
     return table
@@ -242,12 +244,12 @@ def _printed_rows(found: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     for metric in ALL_METRICS:
         if not own.has("", metric):
             if note := own.note("", metric):
-                yield metric.title, note, "", metric.unit, _better(metric), "", ""
+                yield metric.title, note, "", "", metric.unit, _better(metric), ""
             continue
-        counts, ends = found["counts"][metric.name], own.interval("", metric, "clips")
-        spread = f"{number(ends[0])} to {number(ends[1])}" if ends else ""
-        sizes = (f"{counts['clips']:,}", f"{counts['values']:,}")
-        yield metric.title, number(found["figures"][metric.name]), spread, metric.unit, _better(metric), *sizes
+        ends = [" to ".join(map(number, own.interval("", metric, kind) or ())) for kind in INTERVALS]
+        clips = found["counts"][metric.name]["clips"]
+        figure = number(found["figures"][metric.name])
+        yield metric.title, figure, *ends, metric.unit, _better(metric), f"{clips:,}"
 
 
 def _better(metric: AnyMetric) -> str:

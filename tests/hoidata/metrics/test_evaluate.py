@@ -1,5 +1,6 @@
 """Stores against annotated datasets: which clips are compared, how values become figures, what is left out."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -7,10 +8,13 @@ import numpy as np
 import pytest
 
 from hoidata.errors import BadInput
+from hoidata.files.arrays import write_npz
 from hoidata.metrics import registry
+from hoidata.metrics.asked import FILE_NAME, write_asked
 from hoidata.metrics.describe import readme
-from hoidata.metrics.evaluate import evaluate_store, matched
+from hoidata.metrics.evaluate import Measured, Sample, evaluate_store, intervals_of, matched
 from hoidata.metrics.registry import METRICS, is_better, metric, reduced
+from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 
@@ -128,6 +132,134 @@ def test_the_threshold_and_points_are_those_of_the_contact_stage(write_annotated
     assert narrow["figures"]["contact_f1"] == 1
     counts = [found["counts"]["contact_distance_mm"]["values"] for found in (narrow, wide)]
     assert 0 < counts[0] < counts[1]
+
+
+def test_sample_k_of_all_clips_is_repetition_k_and_its_figures_give_the_interval(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    shifts = {RIGHT: (0.0, 0.02, 0.06), BOTH: (0.0, 0.03, 0.09)}
+    predicted = [
+        named(moved(clips[clip_id], (0, 0, shift)), f"{clip_id}~{number}")
+        for clip_id, row in shifts.items()
+        for number, shift in enumerate(row)
+    ]
+    found = evaluate_store(written(tmp_path / "three", predicted), root)
+    alone = [
+        evaluate_store(written(tmp_path / f"only-{k}", predicted[k::3]), root)["figures"]["contact_f1"]
+        for k in range(3)
+    ]
+    mean, half = np.mean(alone), 4.302653 * np.std(alone, ddof=1) / np.sqrt(3)  # Student's t, 2 degrees of freedom
+    assert found["figures"]["contact_f1"] == pytest.approx(mean, abs=1e-6)
+    assert found["intervals"]["contact_f1"]["repetitions"] == pytest.approx([mean - half, mean + half], abs=2e-5)
+    assert "repetitions" not in found["intervals"]["joint_error_mm"]  # the best of all has no spread over them
+    one = evaluate_store(written(tmp_path / "one", predicted[::3]), root)
+    assert not any("repetitions" in ends for ends in one["intervals"].values())
+
+
+def test_clips_are_drawn_again_by_source_sequence_and_all_samples_go_with_their_clip(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    predicted = [
+        named(moved(clip, (0, 0, shift)), f"{clip_id}~{number}")
+        for clip_id, clip in clips.items()
+        for number, shift in enumerate((0.01, 0.03))
+    ]
+    found = evaluate_store(written(tmp_path / "two", predicted), root)
+    # Two sequences: half of the draws have one of each, a quarter each twice the same.
+    each = [
+        evaluate_store(written(tmp_path / clip_id[-1], [p for p in predicted if p.clip_id.startswith(clip_id)]), root)
+        for clip_id in clips
+    ]
+    for name in ("jitter_m_s3", "contact_f1"):
+        ends = sorted(one["figures"][name] for one in each)
+        assert found["intervals"][name]["clips"] == pytest.approx(ends, abs=2e-6)
+    assert not any("clips" in ends for ends in each[0]["intervals"].values())
+
+
+def test_clips_of_one_source_sequence_are_drawn_together():
+    def clip(group, value):
+        return Measured(group, [Sample(0, {"jitter_m_s3": np.array([value])})], [])
+
+    values = {"a": (1.0, 3.0), "b": (7.0, 9.0)}
+    apart = [clip(f"{name}{number}", value) for name, row in values.items() for number, value in enumerate(row)]
+    together = [clip(name, value) for name, row in values.items() for value in row]
+    assert intervals_of(metric("jitter_m_s3"), together) == {"clips": [2.0, 8.0]}  # one sequence twice, or the other
+    low, high = intervals_of(metric("jitter_m_s3"), apart)["clips"]
+    assert 1 < low < 5 < high < 9
+    assert intervals_of(metric("jitter_m_s3"), together[:2]) == {}
+
+
+def test_intervals_stand_beside_figures_they_contain(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    predicted = [named(moved(c, (0, 0.01 * k, 0)), f"{c.clip_id}~{k}") for c in clips.values() for k in range(3)]
+    found = evaluate_store(written(tmp_path / "three", predicted), root)
+    assert set(found["intervals"]) <= set(found["figures"])
+    for name, ends in found["intervals"].items():
+        for low, high in ends.values():
+            assert low - 1e-6 <= found["figures"][name] <= high + 1e-6, name
+
+
+@pytest.mark.slow
+def test_figures_do_not_depend_on_the_number_of_processes(write_annotated, moved, tmp_path, monkeypatch):
+    monkeypatch.setattr("hoidata.metrics.evaluate.WORKERS_PAY_FROM", 0)
+    root, clips = write_annotated()
+    predicted = [named(moved(c, (0, 0.01 * k, 0)), f"{c.clip_id}~{k}") for c in clips.values() for k in range(2)]
+    store = written(tmp_path / "two", predicted)
+    one, two = (evaluate_store(store, root, jobs=jobs) for jobs in (1, 2))
+    assert json.dumps(one) == json.dumps(two)
+
+
+def test_contact_maps_asked_for_lie_beside_the_clips(write_annotated, tmp_path):
+    root, clips = write_annotated()
+    store = written(tmp_path / "mine" / "clips", clips.values())
+    assert "adherence" not in evaluate_store(store, root)["figures"]
+    annotated = load_annotated(root)
+    true = annotated.contact_of(RIGHT, "right") > 0
+    write_asked(store.parent, {RIGHT: true})
+    found = evaluate_store(store, root)
+    assert found["figures"]["adherence"] == 1
+    assert found["counts"]["adherence"] == {"clips": 1, "motions": 1, "values": 1}
+    write_asked(store.parent, {RIGHT: ~true})
+    assert evaluate_store(store, root)["figures"]["adherence"] == 0
+    write_asked(store.parent, {RIGHT: true[:-1]})
+    reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(store, root)["left_out"]}
+    assert reasons == {RIGHT: "the contact map asked for has 255 points, 256 expected"}
+    write_npz(store.parent / FILE_NAME, {"motion_id": np.array([RIGHT]), "asked": true})
+    with pytest.raises(BadInput, match="motion_id"):
+        evaluate_store(store, root)
+
+
+def test_motions_of_a_length_their_family_chose_are_not_compared_frame_by_frame(write_annotated, make_clip, tmp_path):
+    root, clips = write_annotated()
+    clip = clips[RIGHT]
+    longer = clip.take(np.minimum(np.arange(15), 11))
+    longer = replace(longer, source_frames=np.arange(15, dtype=np.int32))
+    handless = named(clips[BOTH], f"{BOTH}~1", hands=clips[BOTH].hands | {"left": absent(clips[BOTH].hands["left"])})
+    predicted = [named(clip.take(slice(0, 10)), f"{RIGHT}~0"), named(longer, f"{RIGHT}~1"), clips[BOTH], handless]
+    folder = tmp_path / "own"
+    write_store(folder, predicted, generated_info("predicted", length="own"))
+    found = evaluate_store(folder, root)
+    assert (found["length"], found["motions"]) == ("own", 3)
+    assert [item["clip_id"] for item in found["left_out"]] == [f"{BOTH}~1"]
+    figures = found["figures"]
+    assert figures["length_error_frames"] == pytest.approx((2 + 3 + 0) / 3, abs=1e-6)
+    assert figures["length_error_share"] == pytest.approx((2 + 3 + 0) / 3 / 12, abs=1e-6)
+    assert not {item.name for item in METRICS if item.aligned} & set(figures)
+    assert {"contact_f1", "jitter_m_s3", "penetration_mm", "slip_cm_s"} <= set(figures)
+    assert found["counts"]["jitter_m_s3"]["values"] == (10 - 3) + (15 - 3) + 2 * (12 - 3)
+    given = evaluate_store(written(tmp_path / "given", clips.values()), root)
+    assert given["length"] == "given"
+    assert "length_error_frames" not in given["figures"]
+
+
+def absent(hand):
+    return replace(hand, valid=np.zeros_like(hand.valid))
+
+
+def test_the_verb_of_a_motion_is_that_of_its_reference_and_its_limits_are_said(write_annotated, tmp_path):
+    root, clips = write_annotated()
+    found = evaluate_store(written(tmp_path / "same", clips.values()), root)
+    assert found["actions"] == {"limits": [], "learnt": {}}  # too few training clips to learn from
+    assert found["figures"]["action_named"] == 1  # the one verb there is
+    assert "action_followed" not in found["figures"]
 
 
 def test_samples_are_taken_in_the_order_of_their_numbers():
