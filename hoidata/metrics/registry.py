@@ -52,15 +52,6 @@ class Metric:
     aligned: bool = False
 
 
-class Directed(Protocol):
-    """What tells which of two figures is better."""
-
-    @property
-    def direction(self) -> Direction: ...
-    @property
-    def floor_of(self) -> str: ...
-
-
 class Figure(NamedTuple):
     """value: the figure. clips, motions, values: how many went into it."""
 
@@ -233,7 +224,16 @@ def sum_and_count(metric: Metric, samples: list[np.ndarray]) -> tuple[float, int
     return sum(means), len(means)
 
 
-def is_better(metric: Directed, value: float, other: float, truth: float | None) -> bool | None:
+class Judged(Protocol):
+    """What telling the better of two figures needs of a metric of either list."""
+
+    @property
+    def direction(self) -> Direction: ...
+    @property
+    def floor_of(self) -> str: ...
+
+
+def is_better(metric: Judged, value: float, other: float, truth: float | None) -> bool | None:
     """Whether ``value`` is better than ``other``; None where the truth is not known or the metric is a floor."""
     if metric.floor_of:
         return None
