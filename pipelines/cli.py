@@ -5,7 +5,20 @@ import sys
 import typer
 
 from hoidata.errors import HoidataError
-from pipelines.commands import adapters, evaluate, generate, graph, inspect, raw, settings, share, show, store, synth
+from pipelines.commands import (
+    adapters,
+    controls,
+    evaluate,
+    generate,
+    graph,
+    inspect,
+    raw,
+    settings,
+    share,
+    show,
+    store,
+    synth,
+)
 
 app = typer.Typer(
     name="hoidata",
@@ -28,6 +41,7 @@ app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
 app.command("evaluate")(evaluate.evaluate)
+app.command("controls")(controls.controls)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)
 

@@ -18,7 +18,7 @@ OBJECT_MOVED_M = 0.10
 HANDS_AWAY_M = 0.03
 PRESSED_M = 0.01
 # Of a wrist along each axis and of every angle: together 5 mm at a joint.
-NOISE_WRIST_M, NOISE_RAD = 0.0024, 0.035
+NOISE_WRIST_M, NOISE_RAD = 0.0018, 0.025
 FRAMES_LOOKED_AT = 8
 NEVER_TOUCHES = "its hands never touch the object in the frames asked for"
 WAYS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], np.float64)
@@ -40,6 +40,9 @@ class SpoiltTruth:
             if key not in made:
                 made[key] = self.spoil(self.truth.recorded(request), Recording(self.truth.annotated, request))
         return [_answer(request, made[self._key(request)]) for request in requests]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray]]:
+        return self.sample(requests), self.truth.contact_maps(requests)
 
     def _key(self, request: Request) -> str:
         return request.motion_id if self.drawn else request.clip_id
@@ -102,7 +105,7 @@ def hands_away(clip: Clip, known: Recording) -> Clip | str:
 
 
 def pressed(clip: Clip, known: Recording) -> Clip | str:
-    """Each hand moved 1 cm into the object, against the surface where it is nearest."""
+    """Each hand moved 1 cm into the object, against the surface under the joint that comes nearest."""
     return _with_hands(clip, {side: _pressed_in(clip, known, side) for side in known.sides})
 
 
@@ -183,10 +186,16 @@ def _pressed_in(clip: Clip, known: Recording, side: Side) -> HandTrack | None:
     entries = known.annotated.distances(known.request.clip_id, side).window(0, clip.n_frames)
     if not len(entries.frame):
         return None
-    points, nearest = known.request.points, entries.point[entries.distance_m.argmin()]
-    ends = points.points_m[nearest] + np.outer((0.0, 1.0), points.normals[nearest])
-    placed = clip.object.points_in_world(ends.astype(np.float64), np.repeat(points.part[nearest], 2))
-    return _shifted(clip.hands[side], -PRESSED_M * (placed[:, 1] - placed[:, 0]))
+    nearest = entries.distance_m.argmin()
+    frame, joint = entries.frame[nearest], entries.joint[nearest]
+    under = np.unique(entries.point[(entries.frame == frame) & (entries.joint == joint)])
+    points = known.request.points
+    ends = np.concatenate((points.points_m[under], points.points_m[under] + points.normals[under])).astype(np.float64)
+    feet, tips = np.split(clip.object.points_in_world(ends, np.tile(points.part[under], 2)), 2, axis=1)
+    apart = known.annotated.joints(known.request.clip_id, side)[frame, joint] - feet[frame]
+    # Of the points near that joint the one it lies above, which at an edge need not be the nearest.
+    above = ((apart * (tips - feet)[frame]).sum(axis=1) / np.linalg.norm(apart, axis=1)).argmax()
+    return _shifted(clip.hands[side], -PRESSED_M * (tips - feet)[:, above])
 
 
 def _shifted(track: HandTrack, by_m: np.ndarray) -> HandTrack:
