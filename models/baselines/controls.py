@@ -105,7 +105,7 @@ def hands_away(clip: Clip, known: Recording) -> Clip | str:
 
 
 def pressed(clip: Clip, known: Recording) -> Clip | str:
-    """Each hand moved 1 cm into the object, against the surface under the joint that comes nearest."""
+    """Each hand moved 1 cm into the object, against the surface at the point a joint comes nearest to."""
     return _with_hands(clip, {side: _pressed_in(clip, known, side) for side in known.sides})
 
 
@@ -186,16 +186,10 @@ def _pressed_in(clip: Clip, known: Recording, side: Side) -> HandTrack | None:
     entries = known.annotated.distances(known.request.clip_id, side).window(0, clip.n_frames)
     if not len(entries.frame):
         return None
-    nearest = entries.distance_m.argmin()
-    frame, joint = entries.frame[nearest], entries.joint[nearest]
-    under = np.unique(entries.point[(entries.frame == frame) & (entries.joint == joint)])
-    points = known.request.points
-    ends = np.concatenate((points.points_m[under], points.points_m[under] + points.normals[under])).astype(np.float64)
-    feet, tips = np.split(clip.object.points_in_world(ends, np.tile(points.part[under], 2)), 2, axis=1)
-    apart = known.annotated.joints(known.request.clip_id, side)[frame, joint] - feet[frame]
-    # Of the points near that joint the one it lies above, which at an edge need not be the nearest.
-    above = ((apart * (tips - feet)[frame]).sum(axis=1) / np.linalg.norm(apart, axis=1)).argmax()
-    return _shifted(clip.hands[side], -PRESSED_M * (tips - feet)[:, above])
+    points, nearest = known.request.points, entries.point[entries.distance_m.argmin()]
+    ends = points.points_m[nearest] + np.outer((0.0, 1.0), points.normals[nearest])
+    placed = clip.object.points_in_world(ends.astype(np.float64), np.repeat(points.part[nearest], 2))
+    return _shifted(clip.hands[side], -PRESSED_M * (placed[:, 1] - placed[:, 0]))
 
 
 def _shifted(track: HandTrack, by_m: np.ndarray) -> HandTrack:
