@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Side
+from hoidata.metrics.action import verb_of
 from hoidata.metrics.pair import Motion, acting_sides
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
@@ -127,9 +128,9 @@ def _encoded(
     ids: Sequence[str],
 ) -> EncodedSet:
     known = annotated.store.sequences.loc[list(ids)]
-    hands = [annotated.hand_type(clip_id) for clip_id in ids]
-    prompt = [" | ".join(map(str, row)) for row in zip(known["verb"], known["object_words"], hands, strict=True)]
-    words = label_words(encoder.label_kind, known["verb"], known["object_words"])
+    verbs, hands = [verb_of(annotated, clip_id) for clip_id in ids], [annotated.hand_type(clip_id) for clip_id in ids]
+    prompt = [" | ".join(map(str, row)) for row in zip(verbs, known["object_words"], hands, strict=True)]
+    words = label_words(encoder.label_kind, verbs, known["object_words"])
     label = [encoder.labels.index(word) if word in encoder.labels else UNKNOWN for word in words]
     text = encoder.encode_text(np.stack([annotated.text_embedding(clip_id)[0] for clip_id in ids]))
     return EncodedSet(

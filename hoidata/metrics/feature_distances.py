@@ -55,6 +55,8 @@ def cubic_kernel(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 def kid(one: np.ndarray, other: np.ndarray) -> float:
     """Unbiased squared distance of the kernel means of two sets, cubic kernel; NaN with fewer than two rows."""
+    if min(len(one), len(other)) < 2:
+        return np.nan
     same = [mean_of_pairs(cubic_kernel(rows, rows), np.ones((1, len(rows))))[0] for rows in (one, other)]
     return float(sum(same) - 2 * cubic_kernel(one, other).mean())
 
@@ -71,10 +73,13 @@ def mean_of_pairs(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """
     off = matrix - np.diag(np.diag(matrix))
     pairs = np.square(weights.sum(axis=1)) - np.square(weights).sum(axis=1)
-    total = mean_with_itself(off, weights) * np.square(weights.sum(axis=1))
-    return np.divide(total, pairs, out=np.full(len(weights), np.nan), where=pairs > 0)
+    return np.divide(_total(off, weights), pairs, out=np.full(len(weights), np.nan), where=pairs > 0)
 
 
 def mean_with_itself(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """(draw,) mean over all pairs of rows of a (row, row) matrix, a row with itself among them; weights as above."""
-    return np.einsum("dr,dr->d", weights @ matrix, weights) / np.square(weights.sum(axis=1))
+    return _total(matrix, weights) / np.square(weights.sum(axis=1))
+
+
+def _total(matrix: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    return np.einsum("dr,dr->d", weights @ matrix, weights)

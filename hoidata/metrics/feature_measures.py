@@ -90,6 +90,7 @@ def _frechet(comparison: Comparison, other: EncodedSet, drawn_alike: bool) -> Fe
         return np.array([frechet_distance(*gaussian(first.features, row[own]), *rival) for row, rival in pairs])
 
     drawn = bootstrap_interval(comparison.clips, comparison.groups, again, FRECHET_DRAWS, about=value)
+    drawn = drawn and drawn._replace(low=max(drawn.low, 0.0))
     note = "" if len(sets) > 1 or len(comparison.repetitions) == 1 else "all repetitions together"
     return FeatureFigure(value, *counts, t_interval(runs), drawn, note)
 

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from hoidata.metrics.action import verb_of
 from hoidata.metrics.encoded import UNKNOWN, label_words, recorded
 from hoidata.store.annotated import AnnotatedStore
 from models.evaluator.inputs import corrected_input, drawn_frames, even_frames, joints_and_presence, paper_input
@@ -34,8 +35,8 @@ class Examples:
     @classmethod
     def of(cls, annotated: AnnotatedStore, split: str) -> "Examples":
         """All clips of a part that have a verb."""
-        rows = annotated.store.sequences
-        ids = [clip_id for clip_id in annotated.ids(split) if rows.at[clip_id, "verb"]]
+        verbs = {clip_id: verb_of(annotated, clip_id) for clip_id in annotated.ids(split)}
+        ids = [clip_id for clip_id, verb in verbs.items() if verb]
         asked = list(recorded(annotated, ids))
         text = [annotated.text_embedding(clip_id) for clip_id in ids]
         return cls(
@@ -43,8 +44,8 @@ class Examples:
             [corrected_input(item.motion, item.sides) for item in asked],
             [joints_and_presence(item.motion, item.sides) for item in asked],
             torch.from_numpy(np.stack(text)) if text else torch.zeros(0, 4, 512),
-            rows.loc[ids, "verb"].tolist(),
-            rows.loc[ids, "object_words"].tolist(),
+            [verbs[clip_id] for clip_id in ids],
+            annotated.store.sequences.loc[ids, "object_words"].tolist(),
             [annotated.hand_type(clip_id) for clip_id in ids],
         )
 

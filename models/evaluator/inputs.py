@@ -15,7 +15,7 @@ from hoidata.objects.surface_index import surface_index
 
 JOINTS = 42  # 21 of the left hand, then 21 of the right
 PAPER_FRAMES = 15
-EVERY, STEPS = 3, 50
+MOST_FRAMES, EVERY = 150, 3
 FAR_M = 0.10
 PAPER_SIZE = JOINTS * 3
 OBJECT = slice(PAPER_SIZE, PAPER_SIZE + 10)  # position 3, 6D 6, hinge 1
@@ -24,10 +24,13 @@ MOTIONS_KEPT = 128
 
 
 def joints_and_presence(motion: Motion, sides: tuple[Side, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """(frame, 42, 3) float64 world joints turned upright, metres, and (frame, 42) whether the hand acts and is seen."""
+    """(frame, 42, 3) float64 world joints turned upright, metres, and (frame, 42) whether the hand acts and is seen.
+
+    Of longer motions the first 150 frames, as generators make no more.
+    """
     clip = motion.clip
-    joints = np.concatenate([motion.joints_m[side] for side in SIDES], axis=1).astype(np.float64)
-    seen = [clip.hands[side].valid & (side in sides) for side in SIDES]
+    joints = np.concatenate([motion.joints_m[side][:MOST_FRAMES] for side in SIDES], axis=1).astype(np.float64)
+    seen = [clip.hands[side].valid[:MOST_FRAMES] & (side in sides) for side in SIDES]
     return joints @ upright(clip.gravity).T, np.repeat(np.stack(seen, axis=1), JOINTS // 2, axis=1)
 
 
@@ -60,7 +63,7 @@ def corrected_input(motion: Motion, sides: tuple[Side, ...]) -> np.ndarray:
     Clip frame: upright, the object's first position at zero. Kept for the last motions: two networks ask for it.
     """
     joints, present = joints_and_presence(motion, sides)
-    frames = np.arange(len(joints))[::EVERY][:STEPS]
+    frames = np.arange(len(joints))[::EVERY]
     clip, seen, turn = motion.clip, present[frames], upright(motion.clip.gravity)
     origin = clip.object.translation_m[0].astype(np.float64)
     objects = object_features(clip.object.take(frames), turn, origin)

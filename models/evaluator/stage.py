@@ -83,7 +83,11 @@ def train_evaluators(
 
 def _why_not(train: Examples, settings: EvaluatorSettings) -> str | None:
     labels = {word for word in train.label_words(settings.labels) if word}
-    return None if len(labels) > 1 else f"{len(train)} training clips with {len(labels)} labels: nothing to tell apart"
+    return (
+        None
+        if len(labels) > 1
+        else f"training clips: {len(train)}, labels among them: {len(labels)}; nothing to tell apart"
+    )
 
 
 def _trained(name: str, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings, threads: int) -> Trained:
