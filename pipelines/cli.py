@@ -7,7 +7,7 @@ import typer
 from hoidata.errors import HoidataError
 from pipelines.commands import (
     adapters,
-    corpus,
+    controls,
     evaluate,
     generate,
     graph,
@@ -42,6 +42,7 @@ app.command("settings")(settings.settings)
 app.command("share")(share.share)
 app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
+app.command("controls")(controls.controls)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)
 

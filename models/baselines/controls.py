@@ -18,7 +18,7 @@ OBJECT_MOVED_M = 0.10
 HANDS_AWAY_M = 0.03
 PRESSED_M = 0.01
 # Of a wrist along each axis and of every angle: together 5 mm at a joint.
-NOISE_WRIST_M, NOISE_RAD = 0.0024, 0.035
+NOISE_WRIST_M, NOISE_RAD = 0.0018, 0.025
 FRAMES_LOOKED_AT = 8
 NEVER_TOUCHES = "its hands never touch the object in the frames asked for"
 WAYS = np.array([(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], np.float64)
@@ -40,6 +40,9 @@ class SpoiltTruth:
             if key not in made:
                 made[key] = self.spoil(self.truth.recorded(request), Recording(self.truth.annotated, request))
         return [_answer(request, made[self._key(request)]) for request in requests]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray]]:
+        return self.sample(requests), self.truth.contact_maps(requests)
 
     def _key(self, request: Request) -> str:
         return request.motion_id if self.drawn else request.clip_id
@@ -102,7 +105,7 @@ def hands_away(clip: Clip, known: Recording) -> Clip | str:
 
 
 def pressed(clip: Clip, known: Recording) -> Clip | str:
-    """Each hand moved 1 cm into the object, against the surface where it is nearest."""
+    """Each hand moved 1 cm into the object, against the surface at the point a joint comes nearest to."""
     return _with_hands(clip, {side: _pressed_in(clip, known, side) for side in known.sides})
 
 

@@ -27,6 +27,19 @@ class GroundTruth:
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         return [self.recorded(request) for request in requests]
 
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.sample(requests), self.contact_maps(requests)
+
+    def contact_maps(self, requests: Sequence[Request]) -> list[np.ndarray]:
+        """(point,) bool: what the hands asked for touch in the recorded clips, in the frames asked for."""
+        maps = []
+        for request in requests:
+            near = self.annotated.distances(request.clip_id).window(0, request.n_frames)
+            touched = np.zeros(len(request.points.points_m), dtype=bool)
+            touched[near.point[request.active_hands[near.side]]] = True
+            maps.append(touched)
+        return maps
+
     def recorded(self, request: Request) -> Clip:
         """The recorded clip under the name and with the frames that are asked for."""
         clip = self.annotated.clip(request.clip_id).take(slice(0, request.n_frames))

@@ -26,6 +26,13 @@ def run(place: Place) -> None:
     write_json(place.metrics, found | {"diagnostics": diagnostics})
 
 
+def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
+    """What was left out, with the reason of the family itself where it had no motion for a clip."""
+    known = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else []
+    reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in known}
+    return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]
+
+
 def _encoders(place: Place) -> list["MotionEvaluator"]:
     """The networks of the stage evaluator; none, and no torch either, where that is off."""
     if not (place.evaluators / "info.json").is_file():

@@ -88,7 +88,7 @@ class Change:
 
 
 CHANGES = (
-    Change("a metric: `hoidata/metrics/touch.py`", touch("hoidata/metrics/touch.py"), "evaluate, report"),
+    Change("a metric: `hoidata/metrics/touch.py`", touch("hoidata/metrics/touch.py"), "controls, evaluate, report"),
     Change("a page: `pipelines/pages/glb.py`", touch("pipelines/pages/glb.py"), "report"),
     Change(
         "a network: `models/text2hoi/refiner.py`",
@@ -109,7 +109,7 @@ CHANGES = (
     Change(
         "a setting of one profile: `profiles.embedded.sample`",
         lambda project: set_params(project, profiles={"embedded": {"sample": {"samples": 3}}}),
-        "sample",
+        "controls, sample",
     ),
     Change(
         "a named split: `hoidata/datasets/grab/splits/text2hoi.json`",
@@ -119,8 +119,8 @@ CHANGES = (
     Change(
         "a dataset is added: `hoidata/datasets/toy/`, its word",
         add_dataset,
-        "report; annotate, contact, convert, evaluate, evaluator, quality, raw, sample, split, surface, train, "
-        "train-diffusion, train-refiner of toy",
+        "report; annotate, contact, controls, convert, evaluate, evaluator, quality, raw, sample, split, surface, "
+        "train, train-diffusion, train-refiner of toy",
     ),
     Change("the sentences: `hoidata/annotation/sentences.py`", touch("hoidata/annotation/sentences.py"), "annotate"),
     Change(

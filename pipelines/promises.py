@@ -1,0 +1,121 @@
+"""What every control must do to which figure, and whether it does: read from the metrics of one dataset.
+
+A control that keeps its promise shows that the figure sees what was taken from the motion; one that does not shows a
+figure that can be won without it.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from hoidata.errors import BadInput
+from hoidata.metrics.feature_metrics import FEATURE_METRICS
+
+TRUTH = "ground-truth"
+NOTHING = 1e-4
+# Verbs that are each other backwards.
+REVERSES = (("open", "close"), ("lift", "place"), ("put in", "take out"))
+CONFUSED = "taken for its reverse by"
+Must = Literal["fall", "rise", "be equal", "be zero"]
+
+
+@dataclass(frozen=True)
+class Promise:
+    """control, beside: families. metric: its name, or "taken for its reverse by <classifier>".
+
+    must: fall or rise beyond the interval over clips of the row ``beside``; be equal to it in every digit; be zero.
+    """
+
+    control: str
+    metric: str
+    must: Must
+    beside: str = TRUTH
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A promise with both figures. holds: None where one of them was not measured."""
+
+    promise: Promise
+    reference: float | None
+    value: float | None
+    holds: bool | None
+
+
+def _promises(must: Must, control: str, *metrics: str, beside: str = TRUTH) -> list[Promise]:
+    return [Promise(control, metric, must, beside) for metric in metrics]
+
+
+ACCURACY = ("accuracy_top1_paper", "accuracy_top1_corrected")
+PROMISES: tuple[Promise, ...] = (
+    *_promises("be equal", "object-moved", *(item.name for item in FEATURE_METRICS if item.encoder == "paper")),
+    *_promises("fall", "object-moved", "accuracy_top1_corrected", "contact_f1", "adherence", "realism_si"),
+    *_promises("fall", "static", *ACCURACY, "action_followed"),
+    *_promises("fall", "reversed", *ACCURACY),
+    *_promises("rise", "reversed", *(f"{CONFUSED} {name}" for name in ("paper", "corrected"))),
+    *_promises("fall", "hands-away", "contact_f1", "adherence", "realism_si"),
+    *_promises("rise", "pressed", "penetration_mm", "penetration_volume_cm3"),
+    *_promises("rise", "noise", "jitter_m_s3"),
+    *_promises("fall", "other-hands", "contact_f1", "realism_si"),
+    *_promises("rise", "other-hands", "slip_cm_s"),
+    *_promises("fall", "swapped-hands", "contact_f1", "accuracy_top1_corrected", "r_precision_hard_top1_text_motion"),
+    *_promises("fall", "other-verb", *ACCURACY, "r_precision_top1_text_motion"),
+    *_promises("be zero", "mean-pose", "multimodality_by_prompt_corrected"),
+    *_promises("fall", "mean-pose", "diversity_corrected"),
+    *_promises("rise", "prompt-lookup", "memorised_share_corrected"),
+    *_promises("fall", "other-prompt", "accuracy_top1_corrected", beside="text2hoi"),
+    *_promises("fall", "other-contact", "adherence", beside="text2hoi"),
+    *_promises("fall", "one-call", "multimodality_by_prompt_corrected", beside="text2hoi"),
+)
+
+
+def datasets_below(folder: Path) -> list[Path]:
+    """The folders of one dataset each that hold the truth's metrics, ``folder`` itself among them. Raises BadInput."""
+    found = sorted(path.parent for path in folder.rglob(f"{TRUTH}.json"))
+    if not found:
+        raise BadInput(folder, f"metrics with a {TRUTH}.json", "none", "name a folder below metrics/")
+    return found
+
+
+def read_rows(folder: Path) -> dict[str, dict[str, Any]]:
+    """What was measured of each family of one dataset, controls included."""
+    paths = [*folder.glob("*.json"), *folder.glob("controls/*.json")]
+    rows = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(paths)}
+    return {name: row for name, row in rows.items() if "figures" in row}
+
+
+def kept(rows: Mapping[str, Mapping[str, Any]], promises: Sequence[Promise] = PROMISES) -> list[Kept]:
+    """Every promise with what the rows say of it."""
+    return [_kept(rows, promise) for promise in promises]
+
+
+def _kept(rows: Mapping[str, Mapping[str, Any]], promise: Promise) -> Kept:
+    reference, value = (_figure(rows.get(name, {}), promise.metric) for name in (promise.beside, promise.control))
+    if value is None or reference is None:
+        return Kept(promise, reference, value, None)
+    intervals = rows[promise.beside].get("intervals", {}).get(promise.metric, {})
+    low, high = intervals.get("clips", (reference, reference))
+    holds = {
+        "fall": value < min(low, reference),
+        "rise": value > max(high, reference),
+        "be equal": value == reference,
+        "be zero": abs(value) <= NOTHING,
+    }
+    return Kept(promise, reference, value, holds[promise.must])
+
+
+def _figure(row: Mapping[str, Any], metric: str) -> float | None:
+    if metric.startswith(CONFUSED):
+        return taken_for_reverse(row.get("evaluators", {}).get(metric.removeprefix(CONFUSED).strip(), {}))
+    return row.get("figures", {}).get(metric)
+
+
+def taken_for_reverse(evaluator: Mapping[str, Any]) -> float | None:
+    """Of the motions of a verb that has a reverse, the share a classifier took for that; None where there are none."""
+    labels, table = evaluator.get("labels", []), evaluator.get("confusion", [])
+    both = [*REVERSES, *(pair[::-1] for pair in REVERSES)]
+    pairs = [(labels.index(one), labels.index(other)) for one, other in both if one in labels and other in labels]
+    motions = sum(sum(table[own]) for own, _ in pairs)
+    return sum(table[own][other] for own, other in pairs) / motions if motions else None
