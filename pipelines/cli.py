@@ -8,6 +8,7 @@ from hoidata.errors import HoidataError
 from pipelines.commands import (
     adapters,
     controls,
+    corpus,
     evaluate,
     generate,
     graph,

@@ -40,10 +40,3 @@ def _encoders(place: Place) -> list["MotionEvaluator"]:
     from models.evaluator.encoders import load_evaluators
 
     return load_evaluators(place.evaluators)
-
-
-def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
-    """What was left out, with the reason of the family itself where it had no motion for a clip."""
-    known = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else []
-    reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in known}
-    return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]

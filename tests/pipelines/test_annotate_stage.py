@@ -70,6 +70,13 @@ def test_forms_are_those_asked_for(project) -> None:
         annotated_with(forms="poem")
 
 
+def test_whose_word_counts_for_the_hand_is_written_down_where_it_is_not_the_distances(project) -> None:
+    rule = "annotated-else-proximity"
+    assert [annotated_with(**chosen)[2].get("hand") for chosen in ({}, {"hand": rule})] == [None, rule]
+    with pytest.raises(BadInput, match="hand"):
+        annotated_with(hand="nearest")
+
+
 def test_as_many_variations_are_written_as_asked_for(project) -> None:
     _, text, info = annotated_with(variations={"per_clip": 3, "adverbs": False})
     assert text.groupby("clip_id").size().tolist() == [7, 7]
