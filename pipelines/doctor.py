@@ -12,7 +12,7 @@ from hoidata.errors import HoidataError
 from pipelines.lineage.graph import read_params
 from pipelines.lineage.manifests import Manifest
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
+from pipelines.stages.base import HAND, PROFILES, Place, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
@@ -30,9 +30,8 @@ def examine() -> list[Finding]:
     """Look at everything a run depends on; opens no raw file and starts nothing."""
     params = read_params(Path())
     findings = [_python(), *_packages(), _prefect_server(), _gpu(), Finding("profile", "ok", params["profile"])]
-    findings += [_raw("embedded", name) for name in params["datasets"]]
-    findings += [_raw("own", name) for name in params["datasets"]]
-    return [*findings, _hand("embedded"), _hand("own"), _encoder(), _clip()]
+    findings += [_raw(profile, name) for profile in PROFILES for name in params["datasets"]]
+    return [*findings, *map(_hand, PROFILES), _encoder(), _clip()]
 
 
 def _python() -> Finding:
@@ -75,18 +74,18 @@ def _raw(profile: str, dataset: str) -> Finding:
         manifest = manifest_of(place)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
-    root = place.generated_raw if profile == "embedded" else own_root(dataset)
+    root = own_root(dataset) if profile == "own" else place.generated_raw
     if not manifest.present:
         return Finding(part, "absent", _why_absent(profile, manifest, root))
     if root is None or not root.is_dir():
-        remedy = "written by the stage raw" if profile == "embedded" else f"set {root_variable(dataset)}"
+        remedy = f"set {root_variable(dataset)}" if profile == "own" else "written by the stage raw"
         return Finding(part, "absent", f"manifest is there, files are not; {remedy}")
     return Finding(part, "ok", f"{root}{' (synthetic)' if manifest.synthetic else ''}")
 
 
 def _why_absent(profile: str, manifest: Manifest, root: Path | None) -> str:
-    if profile == "embedded":
-        return "has no embedded corpus"
+    if profile != "own":
+        return f"has no corpus in the profile {profile}"
     if root:
         return f"{root} is not scanned; run `hoidata raw scan {manifest.dataset} --root {root}`"
     return f"get it at: {manifest.where_to_register}"

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pipelines.commands.project import PROFILES, current_profile, enter_project, remember_root, set_profile
+from pipelines.commands.project import current_profile, enter_project, remember_root, set_profile
 
 app = typer.Typer(no_args_is_help=True)
 Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
@@ -41,11 +41,12 @@ def scan(
 
 
 def profile(
-    name: Annotated[str, typer.Argument(help="embedded or own; nothing: say which one it is.")] = "",
+    name: Annotated[str, typer.Argument(help="embedded, study or own; nothing: say which one it is.")] = "",
 ) -> None:
     """Say which data this copy of the project works on, or choose it; git does not see the choice."""
     enter_project()
     from hoidata.errors import BadInput
+    from pipelines.stages.base import PROFILES
 
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")

@@ -25,7 +25,7 @@ def main() -> int:
     """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do."""
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
-    parser.add_argument("--profile", choices=("embedded", "own"), default="embedded")
+    parser.add_argument("--profile", choices=("embedded", "study", "own"), default="embedded")
     parser.add_argument("--dataset", default="")
     parser.add_argument("--model", default="")
     parser.add_argument("--family", default="")
