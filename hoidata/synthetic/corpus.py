@@ -21,6 +21,10 @@ from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
 from hoidata.synthetic.write_h2o import write_h2o_objects_and_lists, write_h2o_sequence
 from hoidata.workers import in_workers
 
+# "full" and "small" are the embedded corpora; "study" and "study-small" another one.
+AnySize = Size | StudySize
+SIZES = ("full", "small", "study", "study-small")
+
 # Per dataset, who writes what all sequences share, and who writes one raw sequence.
 _WRITERS = {
     "h2o": (write_h2o_objects_and_lists, write_h2o_sequence),
@@ -30,7 +34,7 @@ _WRITERS = {
 
 
 def write_corpus(
-    dataset: str, root: str | Path, seed: int = 0, size: Size | StudySize = "full", jobs: int = 2
+    dataset: str, root: str | Path, seed: int = 0, size: AnySize = "full", jobs: int = 2
 ) -> list[TruthSequence]:
     """Make and write the embedded corpus of "h2o", "grab" or "arctic"; what was below ``root`` is replaced whole.
 
@@ -38,7 +42,8 @@ def write_corpus(
     Returns the truth it was written from. Bytes depend on dataset, seed and size alone, never on ``jobs``.
     Raises HoidataError for an unknown dataset or an action that cannot be made sound.
     """
-    _require_known(dataset, size)
+    if dataset not in datasets_of(size):
+        raise HoidataError(f"no corpus {size} named {dataset!r}; there are {', '.join(datasets_of(size))}")
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns) as progress, atomic_folder(root) as partial_root:
         sequences = make_corpus(dataset, seed, size, jobs, progress)
@@ -50,7 +55,7 @@ def write_corpus(
 
 
 def make_corpus(
-    dataset: str, seed: int, size: Size | StudySize, jobs: int, progress: Progress | None = None
+    dataset: str, seed: int, size: AnySize, jobs: int, progress: Progress | None = None
 ) -> list[TruthSequence]:
     """All actions of a corpus as truth, in plan order; equal for equal arguments, whatever ``jobs`` is.
 
@@ -72,15 +77,12 @@ def make_corpus(
     return place_in_raw_sequences(dataset, [pair for _, pairs in made for pair in pairs])
 
 
-def _require_known(dataset: str, size: Size | StudySize) -> None:
-    known = DATASET_IDS if size in ("full", "small") else STUDY_OBJECTS
-    if dataset not in known:
-        raise HoidataError(f"no embedded corpus named {dataset!r}; there are {', '.join(known)}")
+def datasets_of(size: AnySize) -> tuple[str, ...]:
+    """The datasets in whose formats there is a corpus of this size."""
+    return tuple(DATASET_IDS if size in ("full", "small") else STUDY_OBJECTS)
 
 
-def write_shared_files(
-    dataset: str, root: Path, sequences: list[TruthSequence], size: Size | StudySize = "full"
-) -> None:
+def write_shared_files(dataset: str, root: Path, sequences: list[TruthSequence], size: AnySize = "full") -> None:
     """Everything that does not belong to one sequence: meshes, subjects, splits."""
     specs: tuple[ObjectSpec, ...] = OBJECTS[dataset]
     if size not in ("full", "small"):

@@ -98,7 +98,7 @@ VERBS = {
 }  # fmt: skip
 HANDOVER = "hand over"
 
-# Each object's verbs; every hand does them all, and two hands also hand over what has no lid.
+# Each object's verbs; every hand does them all, and two hands also hand over what has no lid and room for both.
 _VERBS_OF = {
     "mug": "lift place push pass pour drink",
     "waterbottle": "lift turn pass pour drink shake",
@@ -114,6 +114,8 @@ _VERBS_OF = {
     "capsulemachine": "open close lift turn inspect",
     "waffleiron": "open close lift turn shake",
 }
+
+_TOO_SHORT = {"cubelarge"}
 
 # Subjects and their numbers of clips. Test and validation are those of the named splits of both datasets.
 _SHARES = {
@@ -145,7 +147,8 @@ def shares(dataset: str, size: StudySize) -> dict[str, int]:
 
 def verbs_of(thing: StudyObject, hand: HandType) -> list[str]:
     verbs = _VERBS_OF[thing.spec.name].split()
-    return [*verbs, HANDOVER] if hand == "both" and thing.spec.lid is None else verbs
+    handed_over = hand == "both" and thing.spec.lid is None and thing.spec.name not in _TOO_SHORT
+    return [*verbs, HANDOVER] if handed_over else verbs
 
 
 def choices(thing: StudyObject, verb: str, hand: HandType) -> list[tuple[Region, ...]]:

@@ -150,7 +150,10 @@ def _registered_roots(path: Path) -> dict[str, str]:
 def raw_root(place: Place) -> Path:
     """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
     if is_generated(place.manifest):
-        root, remedy = place.generated_raw, f"write it again with `hoidata synth write {place.dataset}`"
+        root, remedy = (
+            place.generated_raw,
+            f"write it again with `hoidata synth write {place.dataset} --profile {place.profile}`",
+        )
     else:
         root = own_root(place.dataset)
         remedy = f"set {root_variable(place.dataset)}, or run `hoidata raw scan {place.dataset} --root PATH`"
