@@ -1,6 +1,6 @@
 """Writing a whole embedded corpus in the raw format of one dataset."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def make_corpus(
     progress: shows how far it is. Raises HoidataError where an action cannot be made sound.
     """
 
-    def run(function: Callable, tasks: Sequence, what: str) -> Iterator[tuple]:
+    def run(function: Callable, tasks: Sequence, what: str) -> Iterable[tuple]:
         found = in_workers(function, tasks, jobs)
         return found if progress is None else progress.track(found, len(tasks), description=f"{dataset}: {what}")
 

@@ -72,15 +72,15 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
         side: _distances(truth, side, pair, hand_shift_m) for side in truth.acting_sides
     }
     penetration = np.max([penetration_depth_m(one) for one in near.values()], axis=0)
-    distances = {side: one.distance_m.min(1) for side, one in near.items()}
-    joints = {side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()}
+    distances: dict[Side, np.ndarray] = {side: one.distance_m.min(1) for side, one in near.items()}
+    joints: dict[Side, np.ndarray] = {
+        side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()
+    }
     residual = _residuals(truth, near, pair, held)
     if truth.firm:
-        distance, joint = (_while_firm(truth, values) for values in (distances, joints))
-        near_idle = _near_idle(truth, pair)
-        return Soundness(
-            residual, np.maximum(distance, 0), penetration, joint, near_idle, _NEAR_IDLE_M, _is_clear(truth, pair)
-        )
+        distance, joint = _while_firm(truth, distances), _while_firm(truth, joints)
+        idle, clear = _near_idle(truth, pair), _is_clear(truth, pair)
+        return Soundness(residual, np.maximum(distance, 0), penetration, joint, idle, _NEAR_IDLE_M, clear)
     distance, joint = (np.max([values[held] for values in both.values()], axis=0) for both in (distances, joints))
     return Soundness(residual, np.maximum(distance, 0), penetration, joint, _idle(truth, pair))
 
@@ -92,7 +92,7 @@ def _while_firm(truth: TruthSequence, values: dict[Side, np.ndarray]) -> np.ndar
 
 def _near_idle(truth: TruthSequence, pair: HandPair) -> float:
     """Distance of idle hands' joints to the object's vertices, metres."""
-    idle = [side for side in SIDES if side not in truth.acting_sides]
+    idle: list[Side] = [side for side in SIDES if side not in truth.acting_sides]
     if not idle:
         return np.inf
     return float(vertex_distances_m(truth.object, track_joints(truth.hands[idle[0]], pair[idle[0]])).min())

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import Side
 from hoidata.synthetic.catalogue import HINGE_BEHIND, ObjectSpec, box_at, hinged, object_spec, tilted
 from hoidata.synthetic.grasps import Hold, Reach
 from hoidata.synthetic.shapes import Solid, cylinder, revolved, rounded_box, united
@@ -63,6 +64,7 @@ class StudyObject:
 
 
 Vector = tuple[float, float, float]
+Reaches = tuple[tuple[Side, Reach], ...]
 
 
 def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=(0.0, 0.8), yaw=0.0) -> Region:
@@ -71,7 +73,7 @@ def _one(name: str, direction: Vector, through: Vector | None, width=0.3, blend=
 
 def _two(name: str, left: tuple, right: tuple, yaw=0.0, width=0.25) -> Region:
     """left, right: (direction, point aimed at) of each hand."""
-    reaches = (
+    reaches: Reaches = (
         ("left", Reach(left[0], width, left[1], (0, 0.7))),
         ("right", Reach(right[0], width, right[1], (0, 0.7))),
     )
@@ -83,7 +85,7 @@ def _lid(name: str, direction: Vector) -> Region:
 
 
 def _base_and_lid(name: str, base: Vector, lid: Vector) -> Region:
-    reaches = (("left", Reach(base, 0.45, None, (0, 0.8), 0)), ("right", Reach(lid, 0.45, None, (0, 0.8), 1)))
+    reaches: Reaches = (("left", Reach(base, 0.45, None, (0, 0.8), 0)), ("right", Reach(lid, 0.45, None, (0, 0.8), 1)))
     return Region(name, Hold(reaches, ANGLES[0], ANGLES))
 
 
@@ -160,7 +162,7 @@ GRAB_STUDY = (
         (_one("stem", _LOW, (0, 0, 0.055)), _one("bowl", _HIGH, (0, 0, 0.135)), _one("rim", _ABOVE, (0, 0, 0.165))),
         (
             _two("stem and bowl", (_LEFT, (0, 0, 0.05)), (_RIGHT, (0, 0, 0.14))),
-            _two("bowl", (_LEFT, (0, 0, 0.135)), (_RIGHT, (0, 0, 0.135))),
+            _two("sides of the bowl", (_LEFT, (0, 0, 0.135)), (_RIGHT, (0, 0, 0.135))),
         ),
     ),
     StudyObject(
@@ -171,7 +173,7 @@ GRAB_STUDY = (
         ),
         (
             _two("handle and rim", (_LEFT, (-0.05, 0, 0.03)), ((0.6, -0.5, 0.8), (0.155, 0, 0.055))),
-            _two("rim", (_LEFT, None), (_RIGHT, None), 90),
+            _two("both rims", (_LEFT, None), (_RIGHT, None), 90),
         ),
         across=True,
     ),
@@ -196,7 +198,7 @@ GRAB_STUDY = (
         (_one("head", _LOW, (0, 0, 0.03)), _one("tube", _HIGH, (0, 0, 0.12)), _one("end", _ABOVE, (0, 0, 0.17))),
         (
             _two("head and tube", (_LEFT, (0, 0, 0.025)), (_RIGHT, (0, 0, 0.13))),
-            _two("tube", (_LEFT, (0, 0, 0.09)), (_RIGHT, (0, 0, 0.15))),
+            _two("both on the tube", (_LEFT, (0, 0, 0.09)), (_RIGHT, (0, 0, 0.15))),
         ),
     ),
 )

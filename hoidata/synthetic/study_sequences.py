@@ -35,6 +35,11 @@ PACE = Pace(approach=14, close=7, open=6, retreat=12)
 MARGIN = 15
 SHORTEST_HOLD, LONGEST_HOLD = 26, 116
 _SPEEDS = (0.75, 1.0, 1.3)
+# How uneven the pace of a motion may be; the sway of a carried object, full from that height on; and the turn of one
+# that is moved aside, full from that distance on.
+_HURRY = 0.2
+_SWAY_M, _SWAY_DEG, _CARRIED_M = 0.003, 2.0, 0.06
+_TURNED_DEG, _FAR_ASIDE_M = 12.0, 0.15
 # When one hand leaves and the other has come, as shares of the time the object is held.
 _RECEIVED, _RELEASED = 0.42, 0.58
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -79,12 +84,14 @@ def make_study_sequence(scenario: Scenario, hold: float, pair: HandPair, rng: np
     rotmats, translation, hinge = _object_motion(scenario, times, start, hold, rng)
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
     spans = _spans(scenario, start, hold)
-    hands = {
+    hands: dict[Side, HandTrack] = {
         grip.side: acting_hand(grip, person, track, rotmats, times, spans[grip.side], PACE) for grip in scenario.grips
     }
     if len(hands) == 1:
         hands["left"] = _idle_hand(person, track, hands["right"], times, (start, stop), pair, rng)
-    firm = {side: (round(span[0] * fine), round(span[1] * fine) + 1) for side, span in spans.items()}
+    firm: dict[Side, tuple[int, int]] = {
+        side: (round(span[0] * fine), round(span[1] * fine) + 1) for side, span in spans.items()
+    }
     first, last = min(span[0] for span in firm.values()), max(span[1] for span in firm.values())
     truth = TruthSequence(
         dataset=dataset, subject=person.subject, source_key=scenario.source_key, raw_start=0, source_fps=fps,
@@ -100,16 +107,36 @@ def _object_motion(scenario: Scenario, times: np.ndarray, start: float, hold: fl
     """World-from-object rotations and translations, and the hinge angles of an object that has a lid."""
     thing, verb = scenario.thing, VERBS[scenario.verb]
     motion = verb.motion_of("both" if len(scenario.grips) == 2 else "right")
-    size, turn_size = rng.uniform(0.88, 1.12, 2)
+    size, turn_size = rng.uniform(0.85, 1.15, 2)
     if scenario.verb == "turn":
         turn_size *= rng.choice((-1.0, 1.0))
-    path = follow_path(motion, times, start, hold, False, float(size), float(turn_size))
+    path = follow_path(motion, _hurried(times, start, hold, rng), start, hold, False, float(size), float(turn_size))
     heading = np.deg2rad(rng.uniform(-verb.heading_deg, verb.heading_deg))
     path = path._replace(shift_m=path.shift_m @ rotvec_to_rotmat(np.array([0.0, 0.0, heading])).T)
-    path = path._replace(hinge_rad=_hinge(path, scenario.verb, rng))
+    path = _unsteady(path, times, rng)._replace(hinge_rad=_hinge(path, scenario.verb, rng))
     spec, model = scenario.region.standing(thing.spec), model_of(thing.spec)
     rotmats, translation = object_pose(spec, model, path, rng)
     return rotmats, translation, path.hinge_rad if model.is_articulated else None
+
+
+def _hurried(times: np.ndarray, start: float, hold: float, rng: np.random.Generator) -> np.ndarray:
+    """The times at which the path is read: some people hurry first, others last."""
+    phase = (times - start) / hold
+    inside = np.clip(phase, 0.0, 1.0)
+    return times + hold * rng.uniform(-_HURRY, _HURRY) * inside * (1 - inside)
+
+
+def _unsteady(path: ObjectPath, times: np.ndarray, rng: np.random.Generator) -> ObjectPath:
+    """A hand that carries sways a little and slowly, and what is moved aside comes to stand a little turned."""
+    rate_hz, phase = rng.uniform(0.2, 0.6, (2, 6)), rng.uniform(0, 2 * np.pi, (2, 6))
+    waves = np.sin(2 * np.pi * times[:, None, None] / FPS * rate_hz + phase).sum(axis=1) / np.sqrt(2)
+    carried = minimum_jerk(path.shift_m[:, 2:] / _CARRIED_M)
+    aside = np.linalg.norm(path.shift_m[:, :2], axis=1)
+    turned = np.deg2rad(rng.uniform(-_TURNED_DEG, _TURNED_DEG)) * aside / max(_FAR_ASIDE_M, aside.max())
+    return path._replace(
+        shift_m=path.shift_m + _SWAY_M * carried * waves[:, :3],
+        turn_rad=path.turn_rad + np.deg2rad(_SWAY_DEG) * carried * waves[:, 3:] + turned[:, None] * [0.0, 0.0, 1.0],
+    )
 
 
 def _hinge(path: ObjectPath, verb: str, rng: np.random.Generator) -> np.ndarray:
