@@ -28,7 +28,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.add_typer(synth.app, name="synth", help="The embedded corpora: write them, check their physics.")
+app.add_typer(synth.app, name="synth", help="The corpora made here: write them, check their physics.")
 app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list them, check that one keeps the rules.")
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
 app.command("repro")(graph.repro)

@@ -12,7 +12,7 @@ from hoidata.errors import HoidataError
 from pipelines.lineage.manifests import Manifest
 from pipelines.params import read_params
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
+from pipelines.stages.base import HAND, PROFILES, Place, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
@@ -31,8 +31,8 @@ def examine() -> list[Finding]:
     params = read_params(Path())
     profile = Finding("profile", "ok", params["profile"])
     findings = [_python(), *map(_package, NEEDED), _prefect_server(), _gpu(), profile]
-    findings += [_raw(kind, name) for kind in ("embedded", "own") for name in params["datasets"]]
-    return [*findings, _hand("embedded"), _hand("own"), _encoder(), _clip()]
+    findings += [_raw(kind, name) for kind in PROFILES for name in params["datasets"]]
+    return [*findings, *map(_hand, PROFILES), _encoder(), _clip()]
 
 
 def _python() -> Finding:
@@ -71,18 +71,18 @@ def _raw(profile: str, dataset: str) -> Finding:
         manifest = manifest_of(place)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
-    root = place.generated_raw if profile == "embedded" else own_root(dataset)
+    root = own_root(dataset) if profile == "own" else place.generated_raw
     if not manifest.present:
         return Finding(part, "absent", _why_absent(profile, manifest, root))
     if root is None or not root.is_dir():
-        remedy = "written by the stage raw" if profile == "embedded" else f"set {root_variable(dataset)}"
+        remedy = f"set {root_variable(dataset)}" if profile == "own" else "written by the stage raw"
         return Finding(part, "absent", f"manifest is there, files are not; {remedy}")
     return Finding(part, "ok", f"{root}{' (synthetic)' if manifest.synthetic else ''}")
 
 
 def _why_absent(profile: str, manifest: Manifest, root: Path | None) -> str:
-    if profile == "embedded":
-        return "has no embedded corpus"
+    if profile != "own":
+        return f"has no corpus in the profile {profile}"
     if root:
         return f"{root} is not scanned; run `hoidata raw scan {manifest.dataset} --root {root}`"
     return f"get it at: {manifest.where_to_register}"

@@ -10,7 +10,7 @@ from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
 from pipelines.params import read_params
 from pipelines.stages.adapters import ensure_manifests
-from pipelines.stages.base import Place, raw_root
+from pipelines.stages.base import Place, is_generated, raw_root
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
@@ -37,15 +37,16 @@ def preflight() -> None:
     ensure_manifests(params["profile"], params["datasets"])
     present = [place for place in places if read_manifest(place.manifest).present]
     for place in present:
-        if place.profile == "own":
+        if not is_generated(place.manifest):
             require_hand(place)
     unreadable = [place for place in present if not _is_readable(place)]
     stale = _stale_stages([f"{stage}@{place}" for place in unreadable for stage in ("raw", "convert")])
     for place in unreadable:
-        if place.profile == "embedded" and f"raw@{place}" not in stale and f"convert@{place}" in stale:
+        if not is_generated(place.manifest):
+            if {f"raw@{place}", f"convert@{place}"} & stale:
+                raw_root(place)
+        elif f"raw@{place}" not in stale and f"convert@{place}" in stale:
             write_generated(place, read_manifest(place.manifest), place.generated_raw)
-        elif place.profile == "own" and {f"raw@{place}", f"convert@{place}"} & stale:
-            raw_root(place)
 
 
 def _is_readable(place: Place) -> bool:

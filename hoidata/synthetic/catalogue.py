@@ -41,7 +41,7 @@ class ObjectSpec:
         return Rotation.from_euler("xyz", self.standing_deg, degrees=True).as_matrix()
 
 
-def _box_at(size, offset, radius_m=0.004, spacing_m=0.012) -> Callable[[], Solid]:
+def box_at(size, offset, radius_m=0.004, spacing_m=0.012) -> Callable[[], Solid]:
     return lambda: rounded_box(size, radius_m, spacing_m).moved(offset)
 
 
@@ -82,18 +82,18 @@ def _teapot() -> Solid:
         (0, 0.122),
     ])  # fmt: skip
     # A side handle, as on a kyusu: a thick bar to the right.
-    bar = cylinder(0.017, 0.13).rotated(_tilted(70)).moved((0.108, 0, 0.075))
-    spout = cylinder(0.011, 0.06).rotated(_tilted(-50))
+    bar = cylinder(0.017, 0.13).rotated(tilted(70)).moved((0.108, 0, 0.075))
+    spout = cylinder(0.011, 0.06).rotated(tilted(-50))
     return united(body, bar, spout.moved((-0.073, 0, 0.07)))
 
 
-def _tilted(degrees: float) -> np.ndarray:
+def tilted(degrees: float) -> np.ndarray:
     """(3, 3) turn from upright to the person's right."""
     return Rotation.from_euler("y", degrees, degrees=True).as_matrix()
 
 
 def _hammer() -> Solid:
-    handle = cylinder(0.0165, 0.2).rotated(_tilted(90))
+    handle = cylinder(0.0165, 0.2).rotated(tilted(90))
     head = rounded_box((0.034, 0.09, 0.036), 0.003).moved((-0.105, 0, 0))
     return united(handle, head).moved((0, 0, 0.02))
 
@@ -109,7 +109,7 @@ def _flashlight() -> Solid:
     upright = revolved([
         (0, 0), (0.017, 0), (0.019, 0.003), (0.019, 0.12), (0.03, 0.145), (0.03, 0.168), (0.028, 0.17), (0, 0.17),
     ])  # fmt: skip
-    return upright.moved((0, 0, -0.085)).rotated(_tilted(90)).moved((0, 0, 0.03))
+    return upright.moved((0, 0, -0.085)).rotated(tilted(90)).moved((0, 0, 0.03))
 
 
 def _bowl() -> Solid:
@@ -144,7 +144,7 @@ def _mixer_base() -> Solid:
 
 H2O_OBJECTS = (
     ObjectSpec("book", "book", lambda: sharp_box((0.15, 0.03, 0.21)).moved((0, 0, 0.105))),
-    ObjectSpec("espresso", "espresso", _box_at((0.058, 0.05, 0.12), (0, 0, 0.06))),
+    ObjectSpec("espresso", "espresso", box_at((0.058, 0.05, 0.12), (0, 0, 0.06))),
     ObjectSpec("lotion", "lotion", _bottle(0.03, 0.125, 0.013, 0.017, 0.18)),
     ObjectSpec("spray", "spray", _spray),
     ObjectSpec("milk", "milk", _milk),
@@ -154,7 +154,7 @@ H2O_OBJECTS = (
 )
 
 GRAB_OBJECTS = (
-    ObjectSpec("cubelarge", "large cube", _box_at((0.09, 0.09, 0.09), (0, 0, 0.045), 0.003)),
+    ObjectSpec("cubelarge", "large cube", box_at((0.09, 0.09, 0.09), (0, 0, 0.045), 0.003)),
     ObjectSpec("cubemedium", "medium cube", lambda: sharp_box((0.06, 0.06, 0.06)).moved((0, 0, 0.03)), stand_m=0.04),
     ObjectSpec("spherelarge", "large sphere", lambda: sphere(0.06, 48).moved((0, 0, 0.06))),
     ObjectSpec("spheremedium", "medium sphere", lambda: sphere(0.04).moved((0, 0, 0.04))),
@@ -173,27 +173,27 @@ GRAB_OBJECTS = (
 )
 
 
-def _hinged(
+def hinged(
     name: str, words: str, width: float, depth: float, base: float, lid: float, stand_m: float = 0.0
 ) -> ObjectSpec:
     """Two slabs, hinged behind: width along the hinge, depth towards the person, heights of base and lid."""
     return ObjectSpec(
         name, words,
-        _box_at((width, depth, base), (0, -depth / 2, -base / 2 - 0.0005), 0.003, 0.014),
-        _box_at((width, depth, lid), (0, -depth / 2, lid / 2 + 0.0005), 0.003, 0.014),
+        box_at((width, depth, base), (0, -depth / 2, -base / 2 - 0.0005), 0.003, 0.014),
+        box_at((width, depth, lid), (0, -depth / 2, lid / 2 + 0.0005), 0.003, 0.014),
         stand_m, HINGE_BEHIND,
     )  # fmt: skip
 
 
 ARCTIC_OBJECTS = (
-    _hinged("box", "box", 0.17, 0.13, 0.08, 0.04),
-    _hinged("laptop", "laptop", 0.24, 0.18, 0.022, 0.018, 0.08),
-    _hinged("notebook", "notebook", 0.15, 0.2, 0.018, 0.016, 0.08),
-    _hinged("phone", "phone", 0.056, 0.09, 0.016, 0.012, 0.08),
+    hinged("box", "box", 0.17, 0.13, 0.08, 0.04),
+    hinged("laptop", "laptop", 0.24, 0.18, 0.022, 0.018, 0.08),
+    hinged("notebook", "notebook", 0.15, 0.2, 0.018, 0.016, 0.08),
+    hinged("phone", "phone", 0.056, 0.09, 0.016, 0.012, 0.08),
     ObjectSpec(
         "microwave", "microwave",
-        _box_at((0.2, 0.13, 0.13), (0.1, 0.0655, 0.065), 0.003, 0.013),
-        _box_at((0.2, 0.018, 0.13), (0.1, -0.0095, 0.065), 0.003, 0.013),
+        box_at((0.2, 0.13, 0.13), (0.1, 0.0655, 0.065), 0.003, 0.013),
+        box_at((0.2, 0.018, 0.13), (0.1, -0.0095, 0.065), 0.003, 0.013),
     ),
     ObjectSpec(
         "ketchup", "ketchup",
@@ -206,11 +206,11 @@ ARCTIC_OBJECTS = (
         lambda: cylinder(0.085, 0.03).moved((0, -0.085, 0.0155)),
         0.06, HINGE_BEHIND,
     ),
-    ObjectSpec("mixer", "mixer", _mixer_base, _box_at((0.06, 0.19, 0.06), (0, -0.095, 0.0305)), 0.0, HINGE_BEHIND),
+    ObjectSpec("mixer", "mixer", _mixer_base, box_at((0.06, 0.19, 0.06), (0, -0.095, 0.0305)), 0.0, HINGE_BEHIND),
     ObjectSpec(
         "capsulemachine", "capsule machine",
-        _box_at((0.1, 0.16, 0.16), (0, -0.08, -0.0805), 0.004, 0.015),
-        _box_at((0.09, 0.15, 0.02), (0, -0.075, 0.0105)),
+        box_at((0.1, 0.16, 0.16), (0, -0.08, -0.0805), 0.004, 0.015),
+        box_at((0.09, 0.15, 0.02), (0, -0.075, 0.0105)),
         0.0, HINGE_BEHIND,
     ),
 )  # fmt: skip
@@ -223,10 +223,14 @@ def object_spec(dataset: str, name: str) -> ObjectSpec:
     return {spec.name: spec for spec in OBJECTS[dataset]}[name]
 
 
-@lru_cache(maxsize=64)
 def object_model(dataset: str, name: str) -> ObjectModel:
-    """A catalogue object in metres, made once per process: base vertices first, then those the hinge moves."""
-    spec = object_spec(dataset, name)
+    """A catalogue object in metres."""
+    return model_of(object_spec(dataset, name))
+
+
+@lru_cache(maxsize=64)
+def model_of(spec: ObjectSpec) -> ObjectModel:
+    """An object in metres, made once per process: base vertices first, then those the hinge moves."""
     base = spec.base()
     vertices, faces, part = [base.vertices_m], [base.faces], [np.zeros(len(base.vertices_m), dtype=np.uint8)]
     hinge = None

@@ -1,5 +1,6 @@
 """Writing a whole embedded corpus in the raw format of one dataset."""
 
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -8,13 +9,21 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from hoidata.errors import HoidataError
 from hoidata.files import atomic_folder
 from hoidata.hands import load_embedded_hands
+from hoidata.synthetic.catalogue import OBJECTS, ObjectSpec
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.plan import DATASET_IDS, Size
+from hoidata.synthetic.study import clip_tasks, find_grasps, make_clips, pool_tasks
+from hoidata.synthetic.study_objects import STUDY_OBJECTS
+from hoidata.synthetic.study_plan import StudySize
 from hoidata.synthetic.truth import TruthSequence
 from hoidata.synthetic.write_arctic import write_arctic_meta, write_arctic_sequence
 from hoidata.synthetic.write_grab import write_grab_meshes, write_grab_sequence
 from hoidata.synthetic.write_h2o import write_h2o_objects_and_lists, write_h2o_sequence
 from hoidata.workers import in_workers
+
+# "full" and "small" are the embedded corpora; "study" and "study-small" another one.
+AnySize = Size | StudySize
+SIZES = ("full", "small", "study", "study-small")
 
 # Per dataset, who writes what all sequences share, and who writes one raw sequence.
 _WRITERS = {
@@ -25,30 +34,60 @@ _WRITERS = {
 
 
 def write_corpus(
-    dataset: str, root: str | Path, seed: int = 0, size: Size = "full", jobs: int = 2
+    dataset: str, root: str | Path, seed: int = 0, size: AnySize = "full", jobs: int = 2
 ) -> list[TruthSequence]:
     """Make and write the embedded corpus of "h2o", "grab" or "arctic"; what was below ``root`` is replaced whole.
 
+    size: "study" is another corpus than "full", of "grab" and "arctic" alone.
     Returns the truth it was written from. Bytes depend on dataset, seed and size alone, never on ``jobs``.
     Raises HoidataError for an unknown dataset or an action that cannot be made sound.
     """
-    if dataset not in DATASET_IDS:
-        raise HoidataError(f"no embedded corpus named {dataset!r}; there are {', '.join(DATASET_IDS)}")
-    tasks = tasks_of(dataset, seed, size)
+    if dataset not in datasets_of(size):
+        raise HoidataError(f"no corpus {size} named {dataset!r}; there are {', '.join(datasets_of(size))}")
     columns = ("{task.description}", BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns) as progress, atomic_folder(root) as partial_root:
-        making = progress.track(in_workers(make_action, tasks, jobs), len(tasks), description=f"{dataset}: making")
-        sequences = place_in_raw_sequences(dataset, [pair for _, pairs in making for pair in pairs])
-        write_shared_files(dataset, partial_root, sequences)
+        sequences = make_corpus(dataset, seed, size, jobs, progress)
+        write_shared_files(dataset, partial_root, sequences, size)
         groups = by_raw_sequence(sequences)
         writing = in_workers(partial(write_raw_sequence, dataset, partial_root), groups, jobs)
         list(progress.track(writing, len(groups), description=f"{dataset}: writing"))
     return sequences
 
 
-def write_shared_files(dataset: str, root: Path, sequences: list[TruthSequence]) -> None:
+def make_corpus(
+    dataset: str, seed: int, size: AnySize, jobs: int, progress: Progress | None = None
+) -> list[TruthSequence]:
+    """All actions of a corpus as truth, in plan order; equal for equal arguments, whatever ``jobs`` is.
+
+    progress: shows how far it is. Raises HoidataError where an action cannot be made sound.
+    """
+
+    def run(function: Callable, tasks: Sequence, what: str) -> Iterable[tuple]:
+        found = in_workers(function, tasks, jobs)
+        return found if progress is None else progress.track(found, len(tasks), description=f"{dataset}: {what}")
+
+    if size in ("full", "small"):
+        made = run(make_action, tasks_of(dataset, seed, size), "making")
+    else:
+        pools = {
+            (task.thing, task.region): found
+            for task, found in run(find_grasps, pool_tasks(dataset, seed, size), "grasps")
+        }
+        made = run(make_clips, clip_tasks(dataset, seed, size, pools), "making")
+    return place_in_raw_sequences(dataset, [pair for _, pairs in made for pair in pairs])
+
+
+def datasets_of(size: AnySize) -> tuple[str, ...]:
+    """The datasets in whose formats there is a corpus of this size."""
+    return tuple(DATASET_IDS if size in ("full", "small") else STUDY_OBJECTS)
+
+
+def write_shared_files(dataset: str, root: Path, sequences: list[TruthSequence], size: AnySize = "full") -> None:
     """Everything that does not belong to one sequence: meshes, subjects, splits."""
-    _WRITERS[dataset][0](root, sequences)
+    specs: tuple[ObjectSpec, ...] = OBJECTS[dataset]
+    if size not in ("full", "small"):
+        specs = tuple(thing.spec for thing in STUDY_OBJECTS[dataset])
+    _WRITERS[dataset][0](root, sequences, specs)
 
 
 def write_raw_sequence(dataset: str, root: Path, members: list[TruthSequence]) -> None:

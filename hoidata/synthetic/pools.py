@@ -34,22 +34,31 @@ _TRIED_PER_ROUND = 6
 
 
 def search_pool(
-    scene: Scene, hold: Hold, pair: HandPair, betas: np.ndarray, rng: np.random.Generator
+    scene: Scene,
+    hold: Hold,
+    pair: HandPair,
+    betas: np.ndarray,
+    rng: np.random.Generator,
+    wanted: int = GRASPS_PER_PAIR,
+    rounds: int = _MOST_ROUNDS,
+    complete: bool = True,
 ) -> list[list[tuple[Grip, ...]]]:
-    """Grasps of ``hold`` for subjects with ``betas (subject, 10)``. Raises HoidataError where a subject has none.
+    """Grasps of ``hold`` for subjects with ``betas (subject, 10)``. Raises HoidataError where a subject has none,
+    unless the grasps need not be ``complete``.
 
-    Per subject its choices, each with one grip per hand; GRASPS_PER_PAIR are used, the others are reserves.
+    Per subject its choices, each with one grip per hand. wanted: placements that all subjects can use, after which the
+    search ends; rounds: after so many it ends anyway.
     """
     average = capsule_hands(pair.right, np.zeros((1, 10)))
     own = capsule_hands(pair.right, betas)
     table: list[list[tuple[Grip, ...]]] = [[] for _ in betas]
     ranked: list[tuple[np.ndarray, list[tuple[Grip, ...] | None]]] = []
-    for round_number in range(_MOST_ROUNDS):
+    for round_number in range(rounds):
         placements = _promising(scene, hold, average, rng)
         if placements is None:
             continue
         ranked += _for_subjects(scene, hold, placements, own, betas, pair)
-        if _enough(np.array([scores > 0 for scores, _ in ranked]), round_number):
+        if _enough(np.array([scores > 0 for scores, _ in ranked]), round_number, wanted):
             break
     ranked.sort(key=lambda entry: (-(entry[0] > 0).sum(), -entry[0].mean()))
     for _, grips in ranked:
@@ -57,15 +66,17 @@ def search_pool(
             if grip is not None and len(table[subject]) < _KEPT:
                 table[subject].append(grip)
     missing = [index for index, grips in enumerate(table) if not grips]
-    if missing:
+    if missing and complete:
         raise HoidataError(f"{scene.spec.name}: no {hold.hand} grasp found for subjects {missing} of {len(table)}")
     return table
 
 
-def _enough(works: np.ndarray, round_number: int) -> bool:
+def _enough(works: np.ndarray, round_number: int, wanted: int) -> bool:
     """works: (placement, subject) bool. Best is a placement that all subjects can use; later, any for each will do."""
     shared = int(works.all(axis=1).sum())
-    return shared >= GRASPS_PER_PAIR or (round_number >= _ENOUGH_ROUNDS and int(works.sum(axis=0).min()) >= _RESERVES)
+    return shared >= wanted or (
+        round_number >= _ENOUGH_ROUNDS and int(works.sum(axis=0).min()) >= max(wanted, _RESERVES)
+    )
 
 
 def _promising(scene: Scene, hold: Hold, hands: CapsuleHands, rng: np.random.Generator) -> list[Placement] | None:

@@ -1,6 +1,7 @@
 """From a grasp and a path to a whole action: approach, close, carry, open, retreat."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,6 +26,9 @@ _IDLE_RIGHT_M = np.array([0.6, -0.35, 0.05])
 _IDLE_RIGHT = np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 
 
+Span = tuple[float, float]
+
+
 @dataclass(frozen=True)
 class Timing:
     """In 30 fps frames, possibly fractions: first firm contact, start and length of the action proper, last contact."""
@@ -34,6 +38,18 @@ class Timing:
     length: float
     contact_stop: float
     end: float
+
+
+class Pace(NamedTuple):
+    """In 30 fps frames: the hand travels, closes, opens, travels away."""
+
+    approach: int = APPROACH
+    close: int = CLOSE
+    open: int = OPEN
+    retreat: int = RETREAT
+
+
+USUAL_PACE = Pace()
 
 
 @dataclass(frozen=True)
@@ -82,19 +98,19 @@ def make_sequence(
     hand = action.hold.hand
     size, turn_size = rng.uniform(0.9, 1.1, 2)
     path = follow_path(action.motion, times, timing.start, timing.length, hand == "left", float(size), float(turn_size))
-    rotmats, translation = _object_pose(spec, model, path, rng)
+    rotmats, translation = object_pose(spec, model, path, rng)
     hinge = path.hinge_rad if model.is_articulated else None
     idle_absent = dataset == "h2o" and bool(rng.random() < 0.5)
-    hands: dict[Side, HandTrack] = {side: _idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
-    for grip in grips:
-        hands[grip.side] = _acting_hand(grip, person, model, rotmats, translation, hinge, times, timing)
+    hands: dict[Side, HandTrack] = {side: idle_hand(side, person, len(times), rng, not idle_absent) for side in SIDES}
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats), translation, hinge)
+    for grip in grips:
+        hands[grip.side] = acting_hand(grip, person, track, rotmats, times, (timing.contact_start, timing.contact_stop))
     contact = (round(timing.contact_start * fps / FPS), round(timing.contact_stop * fps / FPS) + 1)
     return TruthSequence(
         dataset=dataset, subject=person.subject, source_key=source_key, raw_start=0, source_fps=fps, verb=action.verb,
         object_name=spec.name, object_words=spec.words, intent=action.intent, hand_type=hand, hands=hands,
         object=track, clip=_clip_span(dataset, action, timing, contact), contact=contact,
-        held=_lowest_point(track) > spec.stand_m + HELD_ABOVE_M, stand_m=spec.stand_m,
+        held=lowest_point(track) > spec.stand_m + HELD_ABOVE_M, stand_m=spec.stand_m,
     )  # fmt: skip
 
 
@@ -106,7 +122,7 @@ def _clip_span(dataset: str, action: Action, timing: Timing, contact: tuple[int,
     return round(start), round(proper_stop if action.motion.lowered_after else proper_stop + LED_OUT)
 
 
-def _object_pose(
+def object_pose(
     spec: ObjectSpec, model: ObjectModel, path: ObjectPath, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """World-from-object rotations (frame, 3, 3) and translations (frame, 3), from a start near the world's origin."""
@@ -122,25 +138,25 @@ def _object_pose(
     return rotmats, start + path.shift_m - rotmats @ middle
 
 
-def _acting_hand(
-    grip: Grip, person: Person, model: ObjectModel, rotmats, translation, hinge, times: np.ndarray, timing: Timing
+def acting_hand(
+    grip: Grip, person: Person, track: ObjectTrack, rotmats, times: np.ndarray, contact: Span, pace: Pace = USUAL_PACE
 ) -> HandTrack:
     """The hand fixed to its part of the object while it holds; before and after, straight away along its back."""
+    model, hinge = track.model, track.hinge_rad
     follow = rotmats
     if grip.part == 1 and model.hinge is not None and hinge is not None:
         follow = rotmats @ rotvec_to_rotmat(model.hinge.axis * hinge[:, None])
     world = follow @ grip.rotmat
-    arriving = 1 - minimum_jerk((times - (timing.contact_start - CLOSE - APPROACH)) / APPROACH)
-    leaving = minimum_jerk((times - timing.contact_stop - OPEN) / RETREAT)
-    wrist = follow @ grip.wrist_m + translation + _AWAY_M * (arriving + leaving)[:, None] * world[:, :, 1]
-    closed = minimum_jerk((times - timing.contact_start + CLOSE) / CLOSE) - minimum_jerk(
-        (times - timing.contact_stop) / OPEN
-    )
+    start, stop = contact
+    arriving = 1 - minimum_jerk((times - (start - pace.close - pace.approach)) / pace.approach)
+    leaving = minimum_jerk((times - stop - pace.open) / pace.retreat)
+    wrist = follow @ grip.wrist_m + track.translation_m + _AWAY_M * (arriving + leaving)[:, None] * world[:, :, 1]
+    closed = minimum_jerk((times - start + pace.close) / pace.close) - minimum_jerk((times - stop) / pace.open)
     pose = grip.open_pose + closed[:, None] * (grip.hand_pose - grip.open_pose)
-    return _track(person, grip.side, wrist, rotmat_to_rotvec(world), pose, True)
+    return hand_track(person, grip.side, wrist, rotmat_to_rotvec(world), pose, True)
 
 
-def _idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generator, present: bool) -> HandTrack:
+def idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generator, present: bool) -> HandTrack:
     """A relaxed hand that drifts a little, far to its own side of the object."""
     share = np.linspace(0, 1, n_frames)[:, None]
     drift = 0.03 * rng.normal(size=3) + 0.02 * share * rng.normal(size=3)
@@ -151,10 +167,10 @@ def _idle_hand(side: Side, person: Person, n_frames: int, rng: np.random.Generat
         wrist = wrist * np.array([-1.0, 1.0, 1.0])
         orient = mirror_rotvec_x(orient)
         pose = mirror_rotvec_x(pose.reshape(-1, 15, 3)).reshape(-1, 45)
-    return _track(person, side, wrist, orient, pose, present)
+    return hand_track(person, side, wrist, orient, pose, present)
 
 
-def _track(person: Person, side: Side, wrist, orient, pose, present: bool) -> HandTrack:
+def hand_track(person: Person, side: Side, wrist, orient, pose, present: bool) -> HandTrack:
     betas = person.betas if person.template_m is None else np.zeros(10)
     template = None if person.template_m is None else person.template_m[side]
     return HandTrack(wrist, orient, pose, betas[None], np.full(len(wrist), present), template)
@@ -172,7 +188,7 @@ def make_person(dataset: str, subject: str, pair: HandPair, rng: np.random.Gener
     return Person(subject, betas, meshes)
 
 
-def _lowest_point(track: ObjectTrack) -> np.ndarray:
+def lowest_point(track: ObjectTrack) -> np.ndarray:
     """(frame,) height of the object's lowest vertex."""
     model = track.model
     points = articulate(model.vertices_m, model.part, model.hinge, track.hinge_rad)

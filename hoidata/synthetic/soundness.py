@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import KDTree
 
-from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.hands.model import TIP_VERTICES
@@ -24,6 +25,9 @@ LARGEST_PENETRATION_M = 0.009
 LARGEST_DISTANCE_M = 0.02
 _JOINT_TOUCH_M = 0.014
 _IDLE_M = 0.2
+# In clips that say by hand when it holds (``firm``), an idle hand may be near: its joints keep out of the 2 cm within
+# which a hand counts as acting, acting joints stay above the table, and two hands keep their joints apart.
+_NEAR_IDLE_M, _TABLE_M, _HANDS_APART_M = 0.028, 0.0, 0.012
 _SAME_M = 1e-5
 # Vertices farther away than this are not looked at; a hand that has none nearer counts as away (infinite distance).
 _REACH_M = 0.008
@@ -32,24 +36,28 @@ _REACH_M = 0.008
 @dataclass(frozen=True)
 class Soundness:
     """Of one action at 30 fps. residual: (held frame,) N and N m. distance_m: (held frame,) of the farther acting hand,
-    0 inside the object. penetration_m: (frame,) over all frames. joint_m: (held frame,) nearest joint of the farther
-    acting hand. idle_m: smallest distance of a present idle hand's joints to the object's vertices."""
+    0 inside the object; where each hand has its own time, (its frame,) of every hand. penetration_m: (frame,) over all
+    frames. joint_m: as distance_m, nearest joint. idle_m: smallest distance of a present idle hand's joints to the
+    object's vertices. least_idle_m: what it must be. clear: hands stay off the table and off each other."""
 
     residual: np.ndarray
     distance_m: np.ndarray
     penetration_m: np.ndarray
     joint_m: np.ndarray
     idle_m: float
+    least_idle_m: float = _IDLE_M
+    clear: bool = True
 
     @property
     def is_sound(self) -> bool:
         return bool(
-            len(self.residual)
+            len(self.distance_m)
             and (self.residual < RESIDUAL_LIMIT).all()
             and (self.distance_m < LARGEST_DISTANCE_M).all()
             and (self.penetration_m < LARGEST_PENETRATION_M).all()
             and (self.joint_m < _JOINT_TOUCH_M).all()
-            and self.idle_m > _IDLE_M
+            and self.idle_m > self.least_idle_m
+            and self.clear
         )
 
 
@@ -64,11 +72,49 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
         side: _distances(truth, side, pair, hand_shift_m) for side in truth.acting_sides
     }
     penetration = np.max([penetration_depth_m(one) for one in near.values()], axis=0)
-    distance = np.max([one.distance_m[held].min(1) for one in near.values()], axis=0)
-    joint = np.max([_joint_distance(truth, side, pair, one, hand_shift_m)[held] for side, one in near.items()], axis=0)
-    return Soundness(
-        _residuals(truth, near, pair, held), np.maximum(distance, 0), penetration, joint, _idle(truth, pair)
-    )
+    distances: dict[Side, np.ndarray] = {side: one.distance_m.min(1) for side, one in near.items()}
+    joints: dict[Side, np.ndarray] = {
+        side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()
+    }
+    residual = _residuals(truth, near, pair, held)
+    if truth.firm:
+        distance, joint = _while_firm(truth, distances), _while_firm(truth, joints)
+        idle, clear = _near_idle(truth, pair), _is_clear(truth, pair)
+        return Soundness(residual, np.maximum(distance, 0), penetration, joint, idle, _NEAR_IDLE_M, clear)
+    distance, joint = (np.max([values[held] for values in both.values()], axis=0) for both in (distances, joints))
+    return Soundness(residual, np.maximum(distance, 0), penetration, joint, _idle(truth, pair))
+
+
+def _while_firm(truth: TruthSequence, values: dict[Side, np.ndarray]) -> np.ndarray:
+    """The values (frame,) of every hand in the frames in which it holds, one after the other."""
+    return np.concatenate([values[side][start:stop] for side, (start, stop) in truth.firm.items()])
+
+
+def _near_idle(truth: TruthSequence, pair: HandPair) -> float:
+    """Distance of idle hands' joints to the object's vertices, metres."""
+    idle: list[Side] = [side for side in SIDES if side not in truth.acting_sides]
+    if not idle:
+        return np.inf
+    return float(vertex_distances_m(truth.object, track_joints(truth.hands[idle[0]], pair[idle[0]])).min())
+
+
+def vertex_distances_m(track: ObjectTrack, points_m: np.ndarray) -> np.ndarray:
+    """(frame, point) from world points (frame, point, 3) to the nearest vertex of the object, metres."""
+    model, local = track.model, track.world_from_object.inverse() @ points_m.astype(np.float64)
+    found = [
+        KDTree(model.vertices_m[model.part == part]).query(
+            model.object_from_part(part, track.hinge_rad).inverse() @ local
+        )[0]
+        for part in model.parts
+    ]
+    return np.min(found, axis=0)
+
+
+def _is_clear(truth: TruthSequence, pair: HandPair) -> bool:
+    joints = {side: track_joints(truth.hands[side], pair[side]) for side in SIDES}
+    between = np.linalg.norm(joints["left"][:, :, None] - joints["right"][:, None], axis=-1).min()
+    lowest = min(joints[side][..., 2].min() for side in truth.acting_sides)
+    return bool(between > _HANDS_APART_M and lowest > _TABLE_M)
 
 
 def residuals_without_contact(truth: TruthSequence) -> np.ndarray:

@@ -1,6 +1,7 @@
 """What a synthetic action truly is, before any writer turns it into a dataset's own files."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -20,6 +21,7 @@ class TruthSequence:
     hands: both sides; ``valid`` is False where the source says the hand is absent. object: pose and hinge.
     clip: first frame and one past the last of the labelled interval. contact: the same for the firm grasp.
     held: (frame,) the object is more than 1.5 cm above its rest. stand_m: height of the stand it rests on.
+    firm: by side ``contact`` of that hand alone; empty where the acting hands hold together, and nobody else is near.
     """
 
     dataset: str
@@ -38,6 +40,7 @@ class TruthSequence:
     contact: tuple[int, int]
     held: np.ndarray
     stand_m: float
+    firm: dict[Side, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def n_frames(self) -> int:
@@ -63,6 +66,15 @@ class TruthSequence:
     def acting_sides(self) -> tuple[Side, ...]:
         return tuple(side for side in SIDES if self.hand_type in (side, "both"))
 
+    def holding(self) -> list[tuple[int, int, tuple[Side, ...]]]:
+        """The contact in pieces during which the same hands hold: first frame, one past the last, and the hands."""
+        firm = self.firm or dict.fromkeys(self.acting_sides, self.contact)
+        cuts = sorted({frame for span in firm.values() for frame in span})
+        return [
+            (start, stop, tuple(side for side in SIDES if side in firm and firm[side][0] <= start < firm[side][1]))
+            for start, stop in pairwise(cuts)
+        ]
+
     def at_30_fps(self) -> "TruthSequence":
         """The whole action, approach and retreat included, every ``stride``-th raw frame."""
         frames = np.arange(self.n_frames)
@@ -77,6 +89,7 @@ class TruthSequence:
             held=self.held[frames],
             clip=_span(frames, self.clip),
             contact=_span(frames, self.contact),
+            firm={side: _span(frames, span) for side, span in self.firm.items()},
         )
 
     def joints(self, pair: HandPair) -> dict[Side, np.ndarray]:

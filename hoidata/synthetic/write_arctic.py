@@ -12,7 +12,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.hands import HandPair
-from hoidata.synthetic.catalogue import ARCTIC_OBJECTS, object_model
+from hoidata.synthetic.catalogue import ObjectSpec, model_of
 from hoidata.synthetic.generate import GAP_FRAMES
 from hoidata.synthetic.object_files import obj_text, write_npy, write_text
 from hoidata.synthetic.truth import TruthSequence
@@ -21,11 +21,11 @@ MM_PER_M = 1000.0
 _SPLIT_OF = {"s05": "val", "s10": "test"}
 
 
-def write_arctic_meta(root: Path, sequences: list[TruthSequence]) -> None:
+def write_arctic_meta(root: Path, sequences: list[TruthSequence], specs: tuple[ObjectSpec, ...]) -> None:
     """meta/ and splits_json/: object templates in mm, parts, key points, subjects, protocols."""
     meta = {}
-    for spec in ARCTIC_OBJECTS:
-        model = object_model("arctic", spec.name)
+    for spec in specs:
+        model = model_of(spec)
         folder = root / "meta" / "object_vtemplates" / spec.name
         vertices = model.vertices_m * MM_PER_M
         write_text(folder / "mesh.obj", obj_text(vertices, model.faces))

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 
 from hoidata.clips.clip import SIDES, HandTrack, Side
 from hoidata.hands import HandPair, load_embedded_hands, track_vertices
-from hoidata.synthetic.catalogue import GRAB_OBJECTS, object_model
+from hoidata.synthetic.catalogue import ObjectSpec, model_of
 from hoidata.synthetic.object_files import write_npz, write_ply
 from hoidata.synthetic.shapes import sharp_box
 from hoidata.synthetic.truth import TruthSequence
@@ -30,10 +30,10 @@ _MESHES = "tools/object_meshes/contact_meshes"
 _TABLE_M = (0.9, 0.8, 0.03)
 
 
-def write_grab_meshes(root: Path, sequences: list[TruthSequence]) -> None:
+def write_grab_meshes(root: Path, sequences: list[TruthSequence], specs: tuple[ObjectSpec, ...]) -> None:
     """Object meshes, the table, and each subject's personal hands, metres."""
-    for spec in GRAB_OBJECTS:
-        model = object_model("grab", spec.name)
+    for spec in specs:
+        model = model_of(spec)
         write_ply(root / _MESHES / f"{spec.name}.ply", model.vertices_m, model.faces)
     table = sharp_box(_TABLE_M).moved((0, 0, -_TABLE_M[2] / 2))
     write_ply(root / _MESHES / "table.ply", table.vertices_m, table.faces)
@@ -121,13 +121,20 @@ def _table_parameters(truth: TruthSequence) -> dict[str, np.ndarray]:
 def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
     """(frame, object vertex) int8 ids of the hand segments that touch; 0 but for the frames of firm contact.
 
-    While the grasp is firm, hand and object do not move against each other, so one frame says it for all.
+    While the same hands hold, they and the object do not move against each other, so one frame says it for all.
     """
-    start, stop = truth.contact
+    contact = np.zeros((truth.n_frames, len(truth.object.model.vertices_m)), dtype=np.int8)
+    for start, stop, sides in truth.holding():
+        contact[start:stop] = _labels(truth, (start + stop) // 2, sides, pair)
+    return contact
+
+
+def _labels(truth: TruthSequence, frame: int, sides: tuple[Side, ...], pair: HandPair) -> np.ndarray:
+    """(object vertex,) int8 ids in one frame."""
     labels = np.zeros(len(truth.object.model.vertices_m), dtype=np.int8)
     nearest = np.full(len(labels), np.inf)
-    one = truth.take(np.array([(start + stop) // 2]))
-    for side in truth.acting_sides:
+    one = truth.take(np.array([frame]))
+    for side in sides:
         vertices = track_vertices(one.hands[side], pair[side]).astype(np.float64)
         local = (one.object.world_from_object.inverse() @ vertices)[0]
         distance, index = KDTree(local).query(truth.object.model.vertices_m)
@@ -137,6 +144,4 @@ def _object_contact(truth: TruthSequence, pair: HandPair) -> np.ndarray:
         touching = distance <= max(_TOUCH_M, distance.min())
         nearer = touching & (distance < nearest)
         labels[nearer], nearest[nearer] = ids[nearer], distance[nearer]
-    contact = np.zeros((truth.n_frames, len(labels)), dtype=np.int8)
-    contact[start:stop] = labels
-    return contact
+    return labels

@@ -14,7 +14,7 @@ from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.hands import HandPair, track_joints
 from hoidata.hands.joint_orders import OPENPOSE
 from hoidata.synthetic.actions import H2O_ACTION_IDS, H2O_OBJECT_IDS, H2O_VERB_IDS
-from hoidata.synthetic.catalogue import H2O_OBJECTS, object_model
+from hoidata.synthetic.catalogue import ObjectSpec, model_of
 from hoidata.synthetic.generate import GAP_FRAMES
 from hoidata.synthetic.object_files import obj_text, write_text
 from hoidata.synthetic.truth import TruthSequence
@@ -25,13 +25,13 @@ _ABSENT_MANO, _ABSENT_POINTS = np.zeros(62), np.zeros(64)
 _SPLITS = {"subject1": "train", "subject2": "val", "subject3": "test"}
 
 
-def write_h2o_objects_and_lists(root: Path, sequences: list[TruthSequence]) -> None:
+def write_h2o_objects_and_lists(root: Path, sequences: list[TruthSequence], specs: tuple[ObjectSpec, ...]) -> None:
     """object/<name>/<name>.obj, metres, and label_split/action_*.txt: labelled runs of each split.
 
     The test list carries no labels, as in the original.
     """
-    for spec in H2O_OBJECTS:
-        model = object_model("h2o", spec.name)
+    for spec in specs:
+        model = model_of(spec)
         write_text(root / "object" / spec.name / f"{spec.name}.obj", obj_text(model.vertices_m, model.faces))
     last = {truth.source_key: 0 for truth in sequences}
     for truth in sequences:

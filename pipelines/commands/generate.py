@@ -30,7 +30,7 @@ def generate(
             "similarity: Text2HOI's own way, the most similar of three phrases, whatever the words say."
         ),
     ] = "rules",
-    profile: Annotated[str, typer.Option(help="embedded or own; the one in params.yaml when left out.")] = "",
+    profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
 ) -> None:
     """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
     mesh = Path(object).resolve() if Path(object).is_file() else None

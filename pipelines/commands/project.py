@@ -9,9 +9,8 @@ from pathlib import Path
 
 from hoidata.errors import MissingResource
 from pipelines.params import read_params
+from pipelines.stages.base import PROFILES
 
-# Either profile, and the other one.
-PROFILES = {"embedded": "own", "own": "embedded"}
 PROFILE = re.compile("^profile: .*", re.MULTILINE)
 FILTER = "hoidata-profile"
 CHOSEN = "hoidata-profile.sed"
@@ -46,8 +45,8 @@ def set_profile(profile: str) -> bool:
 
 
 def _profile_line(profile: str) -> str:
-    """Equally long for both profiles: git looks closer at a file of the same size before it calls it changed."""
-    return f"profile: {profile}  # or {PROFILES[profile]}"
+    """Equally long for all profiles: git looks closer at a file of the same size before it calls it changed."""
+    return f"profile: {profile}  # or {', '.join(name for name in PROFILES if name != profile)}"
 
 
 def _keep_profile_from_git(profile: str) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from hoidata.errors import BadInput, MissingResource
-from pipelines.commands.project import PROFILES, current_profile, enter_project, remember_root, set_profile
+from pipelines.commands.project import current_profile, enter_project, remember_root, set_profile
 from pipelines.params import read_params
 
 app = typer.Typer(no_args_is_help=True)
@@ -44,10 +44,12 @@ def scan(
 
 
 def profile(
-    name: Annotated[str, typer.Argument(help="embedded or own; nothing: say which one it is.")] = "",
+    name: Annotated[str, typer.Argument(help="embedded, study or own; nothing: say which one it is.")] = "",
 ) -> None:
     """Say which data this copy of the project works on, or choose it; git does not see the choice."""
     enter_project()
+    from pipelines.stages.base import PROFILES
+
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
     if name:

@@ -14,7 +14,7 @@ def show(
         Path | None, typer.Option(help="Folder for the page; .hoidata/pages when left out.", resolve_path=True)
     ] = None,
     open_page: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
-    profile: Annotated[str, typer.Option(help="embedded or own; the one in params.yaml when left out.")] = "",
+    profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
 ) -> None:
     """Write a self-contained page of a clip (motion, contact, curves, words, evidence, origin) or of a dataset."""
     project = enter_project()

@@ -1,4 +1,4 @@
-"""``hoidata synth``: the embedded corpora."""
+"""``hoidata synth``: the corpora of the profiles embedded and study."""
 
 from pathlib import Path
 from typing import Annotated
@@ -10,26 +10,27 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.commands.project import enter_project
 
 app = typer.Typer(no_args_is_help=True)
-Dataset = Annotated[str, typer.Argument(help="h2o, grab or arctic; all three when left out.")]
+Dataset = Annotated[str, typer.Argument(help="h2o, grab or arctic; all the profile has when left out.")]
+Profile = Annotated[str, typer.Option(help="embedded or study.")]
 
 
 @app.command()
-def write(dataset: Dataset = "") -> None:
-    """Write the raw trees of the embedded corpora anew, as their committed recipes say."""
+def write(dataset: Dataset = "", profile: Profile = "embedded") -> None:
+    """Write the raw trees of a profile's corpora anew, as their committed recipes say."""
     enter_project()
     from pipelines.lineage.manifests import read_manifest
     from pipelines.stages.base import Place
     from pipelines.stages.raw import write_generated
 
-    for name in _chosen(dataset):
-        place = Place("embedded", name)
+    for name in _chosen(dataset, profile):
+        place = Place(profile, name)
         write_generated(place, read_manifest(place.manifest), place.generated_raw)
         typer.echo(f"{name}: written to {place.generated_raw}")
 
 
 @app.command()
 def check(
-    size: Annotated[str, typer.Option(help="full or small.")] = "full",
+    size: Annotated[str, typer.Option(help="full or small: of embedded; study or study-small.")] = "full",
     seed: Annotated[int, typer.Option(help="Seed of the corpora.")] = 0,
 ) -> None:
     """Make the corpora anew and measure them: contact forces, distances, penetration, controls. Exit code 1 if unsound.
@@ -39,10 +40,11 @@ def check(
     import numpy as np
 
     from hoidata.synthetic.check import as_text, check_corpus
+    from hoidata.synthetic.corpus import SIZES
     from pipelines.stages.base import jobs
 
-    if size not in ("full", "small"):
-        raise BadInput("--size", "full or small", size, "correct it")
+    if size not in SIZES:
+        raise BadInput("--size", " or ".join(SIZES), size, "correct it")
     figures = check_corpus(size, seed, jobs())
     Console().print(as_text(figures))
     sound = np.asarray(
@@ -53,11 +55,13 @@ def check(
     raise typer.Exit(0 if sound.all() else 1)
 
 
-def _chosen(dataset: str) -> list[str]:
+def _chosen(dataset: str, profile: str) -> list[str]:
     from pipelines.lineage.manifests import read_manifest
 
-    committed = [read_manifest(path) for path in sorted(Path("manifests/embedded").glob("*.json"))]
+    committed = [read_manifest(path) for path in sorted(Path("manifests", profile).glob("*.json"))]
     generated = [item.dataset for item in committed if item.present and "size" in (item.recipe or {})]
-    if dataset and dataset not in generated:
-        raise MissingResource(f"there is no embedded corpus {dataset!r}; there are {', '.join(generated)}")
+    if not generated or (dataset and dataset not in generated):
+        raise MissingResource(
+            f"the profile {profile} has no corpus {dataset!r}; it has {', '.join(generated) or 'none'}"
+        )
     return [dataset] if dataset else generated

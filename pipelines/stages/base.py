@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 EMPTY = "empty.json"
 HAND = "hand"
+# embedded and study: made here, two corpora for two ends; own: the user's files.
+PROFILES = ("embedded", "study", "own")
 Settings = TypeVar("Settings")
 
 
@@ -100,8 +102,11 @@ def _registered_roots(path: Path) -> dict[str, str]:
 
 def raw_root(place: Place) -> Path:
     """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
-    if place.profile == "embedded":
-        root, remedy = place.generated_raw, f"write it again with `hoidata synth write {place.dataset}`"
+    if is_generated(place.manifest):
+        root, remedy = (
+            place.generated_raw,
+            f"write it again with `hoidata synth write {place.dataset} --profile {place.profile}`",
+        )
     else:
         root = own_root(place.dataset)
         remedy = f"set {root_variable(place.dataset)}, or run `hoidata raw scan {place.dataset} --root PATH`"
@@ -111,15 +116,20 @@ def raw_root(place: Place) -> Path:
 
 
 def load_hands(profile: str) -> "HandPair":
-    """The hand of the profile: the embedded one, or in ``own`` the user's MANO files where they are registered."""
+    """The hand of the profile: the user's MANO files where its manifest lists some, else the embedded one."""
     from hoidata.hands import load_embedded_hands, load_mano_hands
 
-    if profile == "embedded" or not hand_is_present(profile):
+    if is_generated(Place(profile).hand_manifest) or not hand_is_present(profile):
         return load_embedded_hands()
     root = own_root(HAND)
     if root is None or not root.is_dir():
         raise MissingResource(f"the MANO files are not at {root}; set {root_variable(HAND)} to their folder")
     return load_mano_hands(root)
+
+
+def is_generated(manifest: Path) -> bool:
+    """Whether a manifest is a recipe: its files are made by this project, whatever the profile is called."""
+    return manifest.is_file() and json.loads(manifest.read_text()).get("source") == "generated"
 
 
 def hand_is_present(profile: str) -> bool:

@@ -1,0 +1,199 @@
+"""What happens in the corpus ``study``: verbs crossed with objects, hands and regions, over disjoint subjects.
+
+Other than in the embedded corpora, neither object nor hand tells the verb, and verb, object and hand do not tell the
+region: only the sentence tells the verb, and nothing but the motion the region.
+"""
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hoidata.clips.clip import HandType
+from hoidata.synthetic.paths import Key, Motion, Swing
+from hoidata.synthetic.plan import DATASET_IDS
+from hoidata.synthetic.study_objects import STUDY_OBJECTS, Region, StudyObject
+
+StudySize = Literal["study", "study-small"]
+_UP = (0.0, 0.0, 0.17)
+
+
+@dataclass(frozen=True)
+class StudyVerb:
+    """intent: as GRAB files it. length: mean frames (30 fps) of firm contact. motion: of the object, hinge angles as
+    shares of the way; two_hands: where two hands do it otherwise. heading_deg: how far the path may be turned about up.
+    """
+
+    intent: str
+    length: float
+    motion: Motion
+    two_hands: Motion | None = None
+    heading_deg: float = 0.0
+
+    def motion_of(self, hand: HandType) -> Motion:
+        return self.two_hands if hand == "both" and self.two_hands is not None else self.motion
+
+
+def _there_and_back(*middle: Key, swing: Swing | None = None) -> Motion:
+    return Motion((Key(0), Key(0.08), *middle, Key(0.96), Key(1)), swing)
+
+
+def _moving_lid(start: float, stop: float) -> tuple[Motion, Motion]:
+    """On the table, and held up between two hands."""
+    up = (0.0, 0.0, 0.09)
+    on_table = (Key(0, hinge=start), Key(0.15, hinge=start), Key(0.85, hinge=stop), Key(1, hinge=stop))
+    held = (
+        Key(0, hinge=start), Key(0.1, hinge=start), Key(0.3, up, hinge=start), Key(0.72, up, hinge=stop),
+        Key(0.95, hinge=stop), Key(1, hinge=stop),
+    )  # fmt: skip
+    return Motion(on_table), Motion(held)
+
+
+_POURED, _DRUNK = Key(0.45, (-0.06, 0.05, 0.2), (0, -80, 0)), Key(0.44, (0, -0.18, 0.26), (42, 0, 0))
+_SHOWN = Key(0.2, (0, -0.1, 0.17))
+VERBS = {
+    "lift": StudyVerb("lift", 52, _there_and_back(Key(0.45, (0, 0, 0.2)), Key(0.6, (0, 0, 0.2)))),
+    "place": StudyVerb(
+        "place", 50,
+        Motion((Key(0), Key(0.1), Key(0.35, (0.05, 0.02, 0.07)), Key(0.65, (0.15, 0.06, 0.07)),
+                Key(0.92, (0.2, 0.07, 0)), Key(1, (0.2, 0.07, 0)))),
+        heading_deg=30,
+    ),
+    "push": StudyVerb("push", 42, Motion((Key(0), Key(0.15), Key(0.85, (0, 0.16, 0)), Key(1, (0, 0.16, 0)))),
+                      heading_deg=50),
+    "turn": StudyVerb("turn", 44, Motion((Key(0), Key(0.15), Key(0.85, turn=(0, 0, 70)), Key(1, turn=(0, 0, 70))))),
+    "pass": StudyVerb(
+        "pass", 54,
+        Motion((Key(0), Key(0.1), Key(0.42, (0, 0.1, 0.17)), Key(0.62, (0, 0.18, 0.17)), Key(0.93, (0, 0.25, 0)),
+                Key(1, (0, 0.25, 0)))),
+        heading_deg=20,
+    ),
+    "pour": StudyVerb(
+        "pour", 76, _there_and_back(Key(0.26, _UP), _POURED, _POURED._replace(phase=0.7), Key(0.84, (0, 0, 0.14)))
+    ),
+    "drink": StudyVerb(
+        "drink", 80,
+        _there_and_back(Key(0.28, (0, -0.12, 0.22)), _DRUNK, _DRUNK._replace(phase=0.66), Key(0.8, (0, -0.12, 0.2))),
+    ),
+    "shake": StudyVerb(
+        "shake", 72, _there_and_back(Key(0.22, _UP), Key(0.8, _UP), swing=Swing(0.22, 0.8, 4, (0, 0, 0.03)))
+    ),
+    "inspect": StudyVerb(
+        "inspect", 84,
+        _there_and_back(
+            _SHOWN, _SHOWN._replace(phase=0.38, turn=(12, 0, 60)), _SHOWN._replace(phase=0.62, turn=(12, 0, -60)),
+            _SHOWN._replace(phase=0.78),
+        ),
+    ),
+    "hand over": StudyVerb(
+        "offhand", 88,
+        Motion((Key(0), Key(0.08), Key(0.32, (-0.05, 0, 0.15)), Key(0.68, (-0.05, 0.02, 0.15)),
+                Key(0.92, (-0.14, 0.05, 0)), Key(1, (-0.14, 0.05, 0)))),
+        heading_deg=20,
+    ),
+    "open": StudyVerb("open", 54, *_moving_lid(0, 1)),
+    "close": StudyVerb("close", 50, *_moving_lid(1, 0)),
+}  # fmt: skip
+HANDOVER = "hand over"
+
+# Each object's verbs; every hand does them all, and two hands also hand over what has no lid and room for both.
+_VERBS_OF = {
+    "mug": "lift place push pass pour drink",
+    "waterbottle": "lift turn pass pour drink shake",
+    "teapot": "lift place push turn pour inspect",
+    "wineglass": "lift place pass pour drink inspect",
+    "fryingpan": "lift place push pour shake inspect",
+    "cylinderlarge": "lift push turn pass shake inspect",
+    "cubelarge": "place push turn pass shake inspect",
+    "flashlight": "place turn pass drink shake inspect",
+    "box": "open close lift push inspect",
+    "ketchup": "open close lift shake place",
+    "mixer": "open close lift push place",
+    "capsulemachine": "open close lift turn inspect",
+    "waffleiron": "open close lift turn shake",
+}
+
+_TOO_SHORT = {"cubelarge"}
+
+# Subjects and their numbers of clips. Test and validation are those of the named splits of both datasets.
+_SHARES = {
+    "grab": {**dict.fromkeys(("s1", "s2", "s3", "s4", "s5", "s8"), 74), "s6": 24, "s7": 24, "s9": 72, "s10": 192},
+    "arctic": {**dict.fromkeys(("s01", "s02", "s04", "s06", "s08", "s09"), 34), "s07": 24, "s05": 40, "s10": 96},
+}
+_SMALL_SHARES = {"grab": {"s1": 6, "s9": 2, "s10": 2}, "arctic": {"s01": 6, "s05": 2, "s10": 2}}
+_NOT_TRAINED_ON = {"s9", "s05", "s10"}
+_SMALL_OBJECTS = 2
+_HANDS: tuple[HandType, ...] = ("right", "left", "both")
+
+
+class StudyEntry(NamedTuple):
+    """One clip to make. thing: row of STUDY_OBJECTS. region: which of ``choices``. number: from 1, how many times this
+    subject did this verb with this object."""
+
+    subject: str
+    thing: int
+    verb: str
+    hand: HandType
+    region: int
+    number: int
+
+
+def shares(dataset: str, size: StudySize) -> dict[str, int]:
+    """The subjects of a corpus and how many clips each makes."""
+    return (_SHARES if size == "study" else _SMALL_SHARES)[dataset]
+
+
+def verbs_of(thing: StudyObject, hand: HandType) -> list[str]:
+    verbs = _VERBS_OF[thing.spec.name].split()
+    handed_over = hand == "both" and thing.spec.lid is None and thing.spec.name not in _TOO_SHORT
+    return [*verbs, HANDOVER] if handed_over else verbs
+
+
+def choices(thing: StudyObject, verb: str, hand: HandType) -> list[tuple[Region, ...]]:
+    """The ways to do it: one region, or for handing over that of the right hand and that of the left after it."""
+    if verb != HANDOVER:
+        return [(region,) for region in thing.regions(verb, 2 if hand == "both" else 1)]
+    return [(a, b) for a in thing.one for b in thing.one if a != b and thing.stands_alike(a, b)]
+
+
+def study_plan(dataset: str, size: StudySize) -> list[StudyEntry]:
+    """All clips in order. Each round does every verb with every object and hand once, in a new order, by the next of
+    its regions; subjects take turns."""
+    amounts = shares(dataset, size)
+    known = [name for name in amounts if name not in _NOT_TRAINED_ON]
+    entries: list[StudyEntry] = []
+    for part, names in enumerate((known, *([name] for name in amounts if name in _NOT_TRAINED_ON))):
+        order = _subjects_in_turn({name: amounts[name] for name in names})
+        entries += _numbered(zip(order, _rounds(dataset, size, part), strict=False))
+    return entries
+
+
+def _rounds(dataset: str, size: StudySize, part: int) -> Iterator[tuple[int, str, HandType, int]]:
+    """(object, verb, hand, region) without end."""
+    things = STUDY_OBJECTS[dataset][: _SMALL_OBJECTS if size == "study-small" else None]
+    actions = [
+        (row, verb, hand) for row, thing in enumerate(things) for hand in _HANDS for verb in verbs_of(thing, hand)
+    ]
+    rng = np.random.default_rng([part, DATASET_IDS[dataset]])
+    first = rng.integers(1000, size=len(actions))
+    done = 0
+    while True:
+        for index in rng.permutation(len(actions)):
+            row, verb, hand = actions[index]
+            yield row, verb, hand, int(first[index] + done) % len(choices(things[row], verb, hand))
+        done += 1
+
+
+def _subjects_in_turn(amounts: dict[str, int]) -> list[str]:
+    """Every name as often as its amount says, spread evenly."""
+    places = [((turn + 0.5) / count, name) for name, count in amounts.items() for turn in range(count)]
+    return [name for _, name in sorted(places)]
+
+
+def _numbered(pairs) -> Iterator[StudyEntry]:
+    done: Counter[tuple] = Counter()
+    for subject, (thing, verb, hand, region) in pairs:
+        done[subject, thing, verb] += 1
+        yield StudyEntry(subject, thing, verb, hand, region, done[subject, thing, verb])

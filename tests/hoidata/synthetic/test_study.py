@@ -1,0 +1,186 @@
+"""The corpus ``study``: its plan, the symmetry its left hands rest on, and a small one as a whole."""
+
+import tomllib
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hoidata.metrics
+from hoidata.clips.clip import SIDES
+from hoidata.files import sha256_file
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.objects.distance import signed_distance
+from hoidata.synthetic.catalogue import model_of
+from hoidata.synthetic.check import check_sequences
+from hoidata.synthetic.corpus import write_corpus
+from hoidata.synthetic.paths import follow_path
+from hoidata.synthetic.soundness import measure, vertex_distances_m
+from hoidata.synthetic.study_objects import STUDY_OBJECTS
+from hoidata.synthetic.study_plan import HANDOVER, VERBS, choices, shares, study_plan, verbs_of
+
+DATASETS = tuple(STUDY_OBJECTS)
+TEST, VALIDATION = {"s10"}, {"s9", "s05"}
+REGIONS = [
+    (dataset, row, region.name)
+    for dataset, things in STUDY_OBJECTS.items()
+    for row, thing in enumerate(things)
+    for region in thing.all_regions
+]
+
+
+def _plans():
+    return [(dataset, entry) for dataset in DATASETS for entry in study_plan(dataset, "study")]
+
+
+def test_there_are_enough_verbs_objects_and_clips_of_disjoint_subjects():
+    assert len(VERBS) >= 10
+    things = [thing for things in STUDY_OBJECTS.values() for thing in things]
+    assert len({thing.spec.name for thing in things}) == len(things) >= 12
+    assert sum(thing.spec.lid is not None for thing in things) >= 4
+    parts = Counter(
+        "test" if entry.subject in TEST else "validation" if entry.subject in VALIDATION else "train"
+        for _, entry in _plans()
+    )
+    assert parts["train"] >= 600
+    assert parts["validation"] >= 100
+    assert parts["test"] >= 256
+    for dataset in DATASETS:
+        done = Counter(entry.subject for entry in study_plan(dataset, "study"))
+        assert done == shares(dataset, "study")
+
+
+def test_neither_object_nor_hand_tells_the_verb_and_all_three_do_not_tell_the_region():
+    verbs, regions, hands = defaultdict(Counter), defaultdict(set), defaultdict(set)
+    for dataset, entry in _plans():
+        key = (dataset, entry.thing, entry.hand)
+        if entry.subject in TEST:
+            verbs[key][entry.verb] += 1
+        elif entry.subject not in VALIDATION:
+            regions[*key, entry.verb].add(entry.region)
+            hands[dataset, entry.thing, entry.verb].add(entry.hand)
+    usual = sum(max(counts.values()) for counts in verbs.values())
+    assert usual <= 0.5 * sum(sum(counts.values()) for counts in verbs.values())
+    assert all(len(counts) >= 3 for counts in verbs.values())
+    assert np.mean([len(found) >= 2 for found in regions.values()]) > 0.95
+    assert all(len(found) == 3 for (_, _, verb), found in hands.items() if verb != HANDOVER)
+
+
+def test_what_is_tested_was_also_trained_on_and_no_two_clips_have_one_name():
+    for dataset in DATASETS:
+        entries = study_plan(dataset, "study")
+        trained = {(e.thing, e.verb, e.hand) for e in entries if e.subject not in TEST | VALIDATION}
+        assert {(e.thing, e.verb, e.hand) for e in entries} == trained
+        names = [(entry.subject, entry.thing, entry.verb, entry.number) for entry in entries]
+        assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(("dataset", "row", "region"), REGIONS)
+def test_every_object_is_its_own_mirror_image_as_it_stands(dataset, row, region):
+    thing = STUDY_OBJECTS[dataset][row]
+    symmetry = thing.mirror(next(item for item in thing.all_regions if item.name == region))
+    assert np.linalg.det(symmetry) == pytest.approx(-1)
+    model = model_of(thing.spec)
+    for part in model.parts:
+        own = model.vertices_m[model.part == part]
+        away = signed_distance(model.vertices_m, model.faces_of(part), own @ symmetry.T).distance_m
+        assert np.abs(away).max() < 5e-4
+    if model.hinge is not None:  # a lid opened in the mirror is a lid opened as far
+        np.testing.assert_allclose(-symmetry @ model.hinge.axis, model.hinge.axis, atol=1e-9)
+
+
+def test_regions_of_an_object_have_names_of_their_own():
+    for things in STUDY_OBJECTS.values():
+        for thing in things:
+            names = [region.name for region in thing.all_regions]
+            assert len(set(names)) == len(names), thing.spec.name
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_paths_start_and_end_on_the_table_and_stay_calm(verb):
+    frames = np.arange(0, 140, 0.25)
+    for hand in ("right", "both"):
+        path = follow_path(VERBS[verb].motion_of(hand), frames, 30.0, 0.75 * VERBS[verb].length, False, 1.12, 1.12)
+        for end in (0, -1):
+            assert path.shift_m[end, 2] == pytest.approx(0.0, abs=1e-9)
+        assert np.linalg.norm(np.diff(path.shift_m, axis=0), axis=1).max() * 120 < 2.2
+
+
+def test_every_verb_has_limits_for_what_its_object_does():
+    limits = tomllib.loads((Path(hoidata.metrics.__file__).parent / "actions.toml").read_text())
+    assert set(limits) == set(VERBS)
+    for pairs in limits.values():
+        assert all(low < high for low, high in (pair for pair in pairs.values() if isinstance(pair, list)))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("study")
+    return {
+        dataset: (folder / dataset, write_corpus(dataset, folder / dataset, 1, "study-small", jobs=1))
+        for dataset in DATASETS
+    }
+
+
+def _digests(root) -> dict[str, str]:
+    return {str(path.relative_to(root)): sha256_file(path) for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(dataset, made, tmp_path):
+    write_corpus(dataset, tmp_path / "together", 1, "study-small", jobs=2)
+    assert _digests(made[dataset][0]) == _digests(tmp_path / "together")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_a_study_corpus_is_sound_and_its_controls_fail(dataset, made):
+    sequences = made[dataset][1]
+    assert [truth.hand_type for truth in sequences] == [entry.hand for entry in study_plan(dataset, "study-small")]
+    assert all(measure(truth, load_embedded_hands()).is_sound for truth in sequences)
+    figures = check_sequences(sequences).iloc[0]
+    assert figures["sequences"] == sum(shares(dataset, "study-small").values())
+    assert figures["pass %"] >= 98
+    assert figures["largest hand-object distance mm"] < 20
+    assert figures["largest penetration mm"] < 10
+    assert figures["pass % shifted 10 mm"] < 0.8 * figures["pass %"]
+    assert figures["pass % without contact"] < 1
+    pressed = [measure(truth, load_embedded_hands(), np.array([0.0, 0.0, 0.2])).is_sound for truth in sequences]
+    assert not any(pressed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dataset", DATASETS)
+def test_clips_begin_before_contact_and_end_after_it_with_fingers_that_close(dataset, made):
+    pair = load_embedded_hands()
+    for truth in made[dataset][1]:
+        clip = truth.take(truth.clip_frames)
+        for side in clip.acting_sides:
+            away = vertex_distances_m(clip.object, track_joints(clip.hands[side], pair[side]))
+            assert away[0].min() > 0.02
+            assert away[-1].min() > 0.02
+            pose = rotvec_to_rotmat(clip.hands[side].hand_pose.reshape(-1, 15, 3))
+            turned = np.einsum("fjab,jab->fj", pose, pose[len(pose) // 2])
+            assert np.rad2deg(np.arccos(np.clip((turned - 1) / 2, -1, 1))).max() >= 20
+
+
+def test_a_handover_goes_from_one_region_to_another_and_the_object_stands_the_same_for_both():
+    handed = [thing for thing in STUDY_OBJECTS["grab"] if HANDOVER in verbs_of(thing, "both")]
+    assert len(handed) >= 6
+    for thing in handed:
+        ways = choices(thing, HANDOVER, "both")
+        assert len(ways) >= 2
+        assert all(given.name != taken.name for given, taken in ways)
+
+
+@pytest.mark.slow
+def test_an_idle_hand_may_be_near_but_never_so_near_that_it_counts(made):
+    pair = load_embedded_hands()
+    for _, sequences in made.values():
+        for truth in sequences:
+            for side in set(SIDES) - set(truth.acting_sides):
+                joints = track_joints(truth.hands[side], pair[side])
+                assert vertex_distances_m(truth.object, joints).min() > 0.025
