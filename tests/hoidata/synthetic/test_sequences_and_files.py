@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.naive import READERS, NaiveHands
 from hoidata.clips import SIDES
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints
@@ -18,7 +19,6 @@ from hoidata.synthetic.generate import make_action, place_in_raw_sequences, task
 from hoidata.synthetic.grasps import closes_force
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
-from tests.bench.naive import READERS, NaiveHands
 
 ONE_ACTION = {"h2o": 0, "grab": 1, "arctic": 1}
 
