@@ -18,6 +18,7 @@ from hoidata.datasets import RawTree
 from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from tests.builders.formulas import chain, rest_points
 
 N_FRAMES = 30
 FIRST, LAST = 4, 26  # labelled frames, both inclusive
@@ -133,13 +134,13 @@ def joints(clip) -> dict[str, np.ndarray]:
 FRAMES = (4, 11, 26)
 
 
-def seen_right(formula, frame: int, **change) -> np.ndarray:
+def seen_right(frame: int, **change) -> np.ndarray:
     """(16, 3) joints of the right hand in the camera's frame; ``change`` turns one convention round."""
     shape = change.get("betas", betas(RIGHT_BETAS, frame))
-    rest = formula.rest_points(MODELS.right, shape)
+    rest = rest_points(MODELS.right, shape)
     fingers = np.zeros(45)
     fingers[36:39] = RIGHT_THUMB
-    return formula.chain(rest, RIGHT_ORIENT, fingers + change.get("added", 0.0), change.get("transl", RIGHT_T))
+    return chain(rest, RIGHT_ORIENT, fingers + change.get("added", 0.0), change.get("transl", RIGHT_T))
 
 
 def to_world(points: np.ndarray, frame: int) -> np.ndarray:
@@ -153,62 +154,62 @@ def check(found: dict, expected: Callable, wrong: Callable, frames=FRAMES) -> No
         assert np.linalg.norm(wrong(frame) - expected(frame), axis=1).max() > FAR_M
 
 
-def test_camera_files_are_camera_to_world_and_not_its_inverse(joints, formula):
+def test_camera_files_are_camera_to_world_and_not_its_inverse(joints):
     check(
         joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: (seen_right(formula, frame) - camera(frame)[:3, 3]) @ camera(frame)[:3, :3],
+        lambda frame: to_world(seen_right(frame), frame),
+        lambda frame: (seen_right(frame) - camera(frame)[:3, 3]) @ camera(frame)[:3, :3],
     )
 
 
-def test_camera_files_are_written_by_rows(joints, formula):
+def test_camera_files_are_written_by_rows(joints):
     check(
         joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: seen_right(formula, frame) @ camera(frame)[:3, :3] + camera(frame)[:3, 3],
+        lambda frame: to_world(seen_right(frame), frame),
+        lambda frame: seen_right(frame) @ camera(frame)[:3, :3] + camera(frame)[:3, 3],
     )
 
 
-def test_each_frame_has_the_camera_of_its_own_number(joints, formula):
+def test_each_frame_has_the_camera_of_its_own_number(joints):
     check(
         joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: to_world(seen_right(formula, frame), frame - 1),
+        lambda frame: to_world(seen_right(frame), frame),
+        lambda frame: to_world(seen_right(frame), frame - 1),
     )
 
 
-def test_the_translation_is_added_to_the_rest_wrist(joints, formula):
+def test_the_translation_is_added_to_the_rest_wrist(joints):
     def as_wrist(frame: int) -> np.ndarray:
-        rest_wrist = formula.rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
-        return to_world(seen_right(formula, frame, transl=np.array(RIGHT_T) - rest_wrist), frame)
+        rest_wrist = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
+        return to_world(seen_right(frame, transl=np.array(RIGHT_T) - rest_wrist), frame)
 
-    check(joints["right"], lambda frame: to_world(seen_right(formula, frame), frame), as_wrist)
+    check(joints["right"], lambda frame: to_world(seen_right(frame), frame), as_wrist)
 
 
-def test_a_change_of_frame_turns_the_wrist_and_not_the_translation_alone(joints, formula):
+def test_a_change_of_frame_turns_the_wrist_and_not_the_translation_alone(joints):
     def naive(frame: int) -> np.ndarray:
         """Turned hand at ``A t + b``, as if the model turned about its origin."""
-        rest = formula.rest_points(MODELS.right, betas(RIGHT_BETAS, frame))
-        turned = (seen_right(formula, frame) - RIGHT_T - rest[0]) @ camera(frame)[:3, :3].T
+        rest = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))
+        turned = (seen_right(frame) - RIGHT_T - rest[0]) @ camera(frame)[:3, :3].T
         return turned + rest[0] + camera(frame)[:3, :3] @ RIGHT_T + camera(frame)[:3, 3]
 
-    check(joints["right"], lambda frame: to_world(seen_right(formula, frame), frame), naive)
+    check(joints["right"], lambda frame: to_world(seen_right(frame), frame), naive)
 
 
-def test_fingers_are_absolute_and_the_mean_pose_is_not_added(joints, formula):
+def test_fingers_are_absolute_and_the_mean_pose_is_not_added(joints):
     check(
         joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: to_world(seen_right(formula, frame, added=MODELS.right.mean_pose), frame),
+        lambda frame: to_world(seen_right(frame), frame),
+        lambda frame: to_world(seen_right(frame, added=MODELS.right.mean_pose), frame),
     )
 
 
-def test_betas_are_read_in_every_frame(clip, joints, formula):
+def test_betas_are_read_in_every_frame(clip, joints):
     assert clip.hands["right"].betas.shape == (LAST - FIRST + 1, 10)
     check(
         joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: to_world(seen_right(formula, frame, betas=betas(RIGHT_BETAS, frame - 22)), frame),
+        lambda frame: to_world(seen_right(frame), frame),
+        lambda frame: to_world(seen_right(frame, betas=betas(RIGHT_BETAS, frame - 22)), frame),
         frames=(LAST,),
     )
     np.testing.assert_allclose(clip.hands["right"].betas[0], betas(RIGHT_BETAS, FIRST), atol=1e-6)
@@ -221,12 +222,12 @@ def left_vertices(model, frame: int) -> np.ndarray:
     return shaped - model.joint_regressor[0] @ shaped
 
 
-def test_left_betas_belong_to_the_shape_directions_as_released(clip, hands, formula):
+def test_left_betas_belong_to_the_shape_directions_as_released(clip, hands):
     """The wrist offset J0 of the left hand depends on them."""
     for frame in FRAMES:
         wrist = clip.hands["left"].wrist_m[frame - FIRST]
-        as_released = formula.rest_points(MODELS.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
-        corrected = formula.rest_points(hands.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
+        as_released = rest_points(MODELS.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
+        corrected = rest_points(hands.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
         np.testing.assert_allclose(wrist, to_world(as_released[None], frame)[0], atol=SAME_M)
         shapes = left_vertices(MODELS.left, frame), left_vertices(hands.left, frame)
         assert np.linalg.norm(shapes[0] - shapes[1], axis=1).max() > FAR_M
@@ -234,19 +235,19 @@ def test_left_betas_belong_to_the_shape_directions_as_released(clip, hands, form
     assert H2OAdapter().hand_convention.left_shape == "as released"
 
 
-def test_the_left_block_comes_first(clip, joints, formula):
+def test_the_left_block_comes_first(clip, joints):
     index = np.zeros(45)
     index[:3] = LEFT_INDEX
-    rest = {side: formula.rest_points(MODELS[side], betas(LEFT_BETAS, 11)) for side in ("left", "right")}
-    expected = to_world(formula.chain(rest["left"], LEFT_ORIENT, index, LEFT_T), 11)
+    rest = {side: rest_points(MODELS[side], betas(LEFT_BETAS, 11)) for side in ("left", "right")}
+    expected = to_world(chain(rest["left"], LEFT_ORIENT, index, LEFT_T), 11)
     np.testing.assert_allclose(joints["left"][11][:16], expected, atol=SAME_M)
     assert np.linalg.norm(joints["right"][11][:16] - expected, axis=1).min() > FAR_M
 
 
-def test_a_block_has_62_numbers_and_not_the_59_of_the_readme(clip, formula):
+def test_a_block_has_62_numbers_and_not_the_59_of_the_readme(clip):
     for frame in FRAMES:
         row = np.array(hand_row(frame))
-        rest_wrist = formula.rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
+        rest_wrist = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
         expected = to_world((rest_wrist + RIGHT_T)[None], frame)[0]
         np.testing.assert_allclose(clip.hands["right"].wrist_m[frame - FIRST], expected, atol=SAME_M)
         assert row[62:66].tolist() == [1.0, *RIGHT_T]

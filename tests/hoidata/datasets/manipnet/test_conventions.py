@@ -15,8 +15,8 @@ from hoidata.clips.clip import Clip
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import ManipNetAdapter, read_recording
 from hoidata.hands import load_embedded_hands, track_joints
+from tests.builders.formulas import EXACT_M, WRONG_M, agrees, off_m
 
-EXACT_M, WRONG_M = 2e-6, 0.005
 N_FRAMES = 480
 KEY = SequenceKey("manipnet", "manipnet", "wedge3")
 MIRROR = np.array([-1.0, 1.0, 1.0])
@@ -169,10 +169,6 @@ def object_dm(frame: int) -> np.ndarray:
     return between - turned(OBJECT_TURN) @ (WEDGE.mean(axis=0) * MIRROR)
 
 
-def off_m(found, other) -> float:
-    return float(np.linalg.norm(np.asarray(found) - np.asarray(other), axis=-1).max())
-
-
 def bvh(head: str, rows: list[list[float]], rates: Rates) -> str:
     lines = ["MOTION", f"Frames: {len(rows)}", f"Frame Time: {rates.text}"]
     return head + "\n".join(lines + [" ".join(f"{value:.7f}" for value in row) for row in rows]) + "\n"
@@ -223,8 +219,7 @@ FRAME = 30  # of the recording at 30 fps: source frame 120
 
 def test_the_world_is_seen_in_a_mirror_with_normal_x(right: np.ndarray) -> None:
     expected = world_m(keypoints(120))
-    assert off_m(right[FRAME], expected) < EXACT_M
-    assert off_m(right[FRAME], keypoints(120) / 10) > WRONG_M
+    agrees(right[FRAME], expected, keypoints(120) / 10)
 
 
 def test_joint_rotations_are_seen_in_the_mirror_too(right: np.ndarray) -> None:
@@ -232,8 +227,7 @@ def test_joint_rotations_are_seen_in_the_mirror_too(right: np.ndarray) -> None:
         """What mirroring positions and offsets alone would do: M R M in the place of R, undone by the last mirror."""
         return np.diag(MIRROR) @ turned(degrees) @ np.diag(MIRROR)
 
-    assert off_m(right[FRAME], world_m(keypoints(120))) < EXACT_M
-    assert off_m(right[FRAME], world_m(keypoints(120, left_handed_hand(120, not_turned_over)))) > WRONG_M
+    agrees(right[FRAME], world_m(keypoints(120)), world_m(keypoints(120, left_handed_hand(120, not_turned_over))))
 
 
 def test_a_unit_is_a_decimetre(right: np.ndarray, clip: Clip) -> None:
@@ -246,8 +240,7 @@ def test_a_unit_is_a_decimetre(right: np.ndarray, clip: Clip) -> None:
 
 
 def test_angles_turn_about_y_then_x_then_z_of_the_turned_frame(right: np.ndarray) -> None:
-    assert off_m(right[FRAME], world_m(keypoints(120))) < EXACT_M
-    assert off_m(right[FRAME], world_m(keypoints(120, left_handed_hand(120, other_order)))) > WRONG_M
+    agrees(right[FRAME], world_m(keypoints(120)), world_m(keypoints(120, left_handed_hand(120, other_order))))
 
 
 def test_the_ring_finger_comes_before_the_little_one_in_the_file_and_after_it_here(right: np.ndarray) -> None:
@@ -259,14 +252,12 @@ def test_the_ring_finger_comes_before_the_little_one_in_the_file_and_after_it_he
 
 def test_the_thumbs_first_joint_is_its_second_one_in_the_file(right: np.ndarray) -> None:
     one_too_early = keypoints(120, thumb=0)
-    assert off_m(right[FRAME, 13:16], world_m(keypoints(120))[13:16]) < EXACT_M
-    assert off_m(right[FRAME, 13:16], world_m(one_too_early)[13:16]) > WRONG_M
+    agrees(right[FRAME, 13:16], world_m(keypoints(120))[13:16], world_m(one_too_early)[13:16])
 
 
 def test_tips_are_the_ends_of_the_capsules_not_the_end_sites(right: np.ndarray) -> None:
     end_sites = keypoints(120, left_handed_hand(120, tips=False))
-    assert off_m(right[FRAME, 16:], world_m(keypoints(120))[16:]) < EXACT_M
-    assert off_m(right[FRAME, 16:], world_m(end_sites)[16:]) > WRONG_M
+    agrees(right[FRAME, 16:], world_m(keypoints(120))[16:], world_m(end_sites)[16:])
 
 
 def test_the_left_hands_tips_are_the_mirrored_capsule_ends(raw: RawTree, right: np.ndarray) -> None:
@@ -291,16 +282,14 @@ def test_meshes_are_right_handed_already(clip: Clip) -> None:
     placed = (clip.object.world_from_object @ clip.object.model.vertices_m)[at]
     expected = world_m(WEDGE * MIRROR @ turned(OBJECT_TURN).T + object_dm(120))
     mirrored_once_more = world_m(WEDGE @ turned(OBJECT_TURN).T + object_dm(120))
-    assert off_m(placed, expected) < EXACT_M
-    assert off_m(placed, mirrored_once_more) > WRONG_M
+    agrees(placed, expected, mirrored_once_more)
 
 
 def test_object_matrices_act_on_columns(clip: Clip) -> None:
     at = clip.source_frames.tolist().index(120)
     placed = (clip.object.world_from_object @ clip.object.model.vertices_m)[at]
     transposed = world_m(WEDGE * MIRROR @ turned(OBJECT_TURN) + object_dm(120))
-    assert off_m(placed, world_m(WEDGE * MIRROR @ turned(OBJECT_TURN).T + object_dm(120))) < EXACT_M
-    assert off_m(placed, transposed) > WRONG_M
+    agrees(placed, world_m(WEDGE * MIRROR @ turned(OBJECT_TURN).T + object_dm(120)), transposed)
 
 
 def test_the_source_is_read_at_120_hz_every_fourth_frame(right: np.ndarray, raw: RawTree) -> None:
@@ -308,8 +297,7 @@ def test_the_source_is_read_at_120_hz_every_fourth_frame(right: np.ndarray, raw:
     np.testing.assert_array_equal(recording.source_frames, np.arange(0, N_FRAMES, 4))
     wrists = np.array([wrist_dm(frame) for frame in range(0, N_FRAMES, 4)])
     every_frame = np.array([wrist_dm(frame) for frame in range(len(right))])
-    assert off_m(right[:, 0], world_m(wrists)) < EXACT_M
-    assert off_m(right[:, 0], world_m(every_frame)) > WRONG_M
+    agrees(right[:, 0], world_m(wrists), world_m(every_frame))
 
 
 def test_the_116_hz_file_is_read_by_its_own_clock(tmp_path: Path) -> None:
@@ -319,8 +307,7 @@ def test_the_116_hz_file_is_read_by_its_own_clock(tmp_path: Path) -> None:
     every_fourth = np.array([wrist_dm(4 * number) for number in range(len(nearest))])
     assert len(nearest) == int((N_FRAMES - 1) * HZ116.frame_time_s * 30) + 1
     np.testing.assert_array_equal(recording.source_frames, nearest)
-    assert off_m(recording.keypoints_m["right"][:, 0], world_m(wrists)) < EXACT_M
-    assert off_m(recording.keypoints_m["right"][:, 0], world_m(every_fourth)) > WRONG_M
+    agrees(recording.keypoints_m["right"][:, 0], world_m(wrists), world_m(every_fourth))
 
 
 def test_things_fall_along_minus_y(clip: Clip) -> None:
