@@ -1,4 +1,4 @@
-"""ARCTIC's conventions, one test each: numbers typed here, formulas of the publication, and the same with the
+"""ARCTIC's conventions, one test each: numbers typed by hand, formulas of the publication, and the same with the
 convention the other way round, which must be off by more than 5 mm (or by a frame). Neither our writer nor our engine
 is used."""
 
@@ -14,58 +14,23 @@ from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import RawTree
 from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.hands import HandPair, load_embedded_hands
+from tests.builders import arctic as recording
+from tests.builders.arctic import BOTTOM_MM, SHAPE, STORED, TOP_MM
 from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_stored, off_m, rest_points
 from tests.hoidata.datasets.contract import SeatedPersonContract
 
-N_FRAMES = 50
 AT = 30  # the frame that is looked at
-RANGE = "21-45"  # frames 20 to 44
-BOTTOM_MM = [[0.0, 0.0, 0.0], [180.0, 0.0, 0.0], [180.0, 120.0, 0.0], [0.0, 120.0, -30.0]]
-TOP_MM = [[5.0, 5.0, 20.0], [170.0, 5.0, 20.0], [170.0, 110.0, 25.0], [5.0, 110.0, 25.0]]
-PARTS = [1, 1, 1, 1, 0, 0, 0, 0]
-ANGLE, OBJECT_ORIENT, OBJECT_MM = 4.2, (0.4, -0.9, 1.3), (120.0, -340.0, 910.0)
-ORIENT = {"left": (0.7, -1.1, 0.4), "right": (-0.2, 1.5, 0.8)}
-TRANS = {"left": (0.22, -0.13, 0.97), "right": (-0.31, 0.08, 1.05)}
-SHAPE = {
-    "left": [1.5, -0.8, 1.2, 0.3, -0.9, 0.5, -0.4, 0.7, -0.2, 0.6],
-    "right": [-1.1, 0.9, -0.6, 1.4, 0.2, -0.7, 0.8, -0.3, 0.5, -0.5],
-}
-STORED = [0.1, -0.2, 0.4] + [0.0] * 6 + [4.6, 0.8, 0.3] + [0.0] * 33  # middle1 turned by more than pi
-HEAD_ORIENT, HEAD_SHIFT_M = (1.9, 0.4, -0.6), (0.15, -0.25, 1.6)  # world to camera
-INTRINSICS = [[1480.5, 0.0, 1402.25], [0.0, 1475.75, 998.5], [0.0, 0.0, 1.0]]
-IMAGE_OFFSET = 7
+ANGLE, OBJECT_ORIENT, OBJECT_MM = (array[AT] for array in (recording.ANGLE, recording.ORIENT, recording.TRANSLATION_MM))
+ORIENT, TRANS = recording.HAND_ORIENT, recording.HAND_TRANSL
+HEAD = recording.head()
+HEAD_TURN, HEAD_SHIFT_M = Rotation.from_matrix(HEAD["R_k_cam_np"][AT]), HEAD["T_k_cam_np"][AT, :, 0]  # world to camera
 
 
-def hand_block(side: str) -> dict:
-    rows = {"rot": ORIENT[side], "pose": STORED, "trans": TRANS[side]}
-    arrays = {name: np.tile(np.asarray(row, np.float32), (N_FRAMES, 1)) for name, row in rows.items()}
-    return {**arrays, "shape": np.array(SHAPE[side], np.float32), "fitting_err": np.zeros(N_FRAMES, np.float32)}
-
-
-def write(root: Path, description: str = f"{RANGE} open, right hand\n", egocam: bool = True) -> Path:
-    folder, words = root / "raw_seqs" / "s06", root / "description" / "s06" / "box_use_03"
-    template = root / "meta" / "object_vtemplates" / "box"
-    for place in (folder, words, template):
-        place.mkdir(parents=True, exist_ok=True)
-    sides = {"right": hand_block("right"), "left": hand_block("left")}
-    np.save(folder / "box_use_03.mano.npy", np.array(sides, dtype=object))
-    np.save(folder / "box_use_03.object.npy", np.tile((ANGLE, *OBJECT_ORIENT, *OBJECT_MM), (N_FRAMES, 1)))
-    (words / "description.txt").write_text(description)
-    lines = [f"v {x} {y} {z}" for x, y, z in BOTTOM_MM + TOP_MM] + ["f 1 2 3", "f 1 3 4", "f 5 6 7", "f 5 7 8"]
-    (template / "mesh.obj").write_text("\n".join(lines))
-    (template / "parts.json").write_text(json.dumps(PARTS))
+def write(root: Path, description: str = "21-45 open, right hand\n", egocam: bool = True) -> Path:
+    recording.write_root(root)
+    recording.write_sequence(root, lines=description)
     if egocam:
-        head = {
-            "R_k_cam_np": np.tile(Rotation.from_rotvec(HEAD_ORIENT).as_matrix(), (N_FRAMES, 1, 1)),
-            "T_k_cam_np": np.tile(np.reshape(HEAD_SHIFT_M, (3, 1)), (N_FRAMES, 1, 1)),
-            "intrinsics": np.array(INTRINSICS),
-            "ego_markers.ref": np.zeros((4, 3)),
-            "ego_markers.label": np.array(["a", "b", "c", "d"]),
-            "R0": np.eye(3),
-            "T0": np.zeros((3, 1)),
-            "dist8": np.zeros(8),
-        }
-        np.save(folder / "box_use_03.egocam.dist.npy", np.array(head, dtype=object))
+        recording.write_extra(root, "egocam.dist", HEAD)
     return root
 
 
@@ -196,8 +161,8 @@ class TestObject:
         agrees(found, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(-ANGLE)))
 
     def test_hinge_angles_are_not_wrapped(self, clip):
-        np.testing.assert_allclose(clip.object.hinge_rad, ANGLE, atol=EXACT_M)
-        assert abs(clip.object.hinge_rad[0] - (ANGLE - 2 * np.pi)) > 6
+        np.testing.assert_allclose(clip.object.hinge_rad, recording.ANGLE[clip.source_frames], atol=EXACT_M)
+        assert abs(clip.object.hinge_rad[at(clip)] - (ANGLE - 2 * np.pi)) > 6
 
 
 @pytest.mark.parametrize(
@@ -215,22 +180,22 @@ class TestHeadCamera:
 
     def test_the_file_takes_the_world_to_the_camera_and_the_clip_the_camera_to_the_world(self, clip):
         camera = clip.camera
-        seen = Rotation.from_rotvec(HEAD_ORIENT).apply(self.POINT_M) + HEAD_SHIFT_M
+        seen = HEAD_TURN.apply(self.POINT_M) + HEAD_SHIFT_M
         turn, place = Rotation.from_rotvec(camera.rotvec[at(clip)]), camera.position_m[at(clip)]
-        the_other_way = Rotation.from_rotvec(HEAD_ORIENT).apply(seen) + HEAD_SHIFT_M
+        the_other_way = HEAD_TURN.apply(seen) + HEAD_SHIFT_M
         agrees(turn.apply(seen) + place, self.POINT_M, the_other_way)
         assert off_m(place, HEAD_SHIFT_M) > WRONG_M
 
     def test_intrinsics_are_focal_lengths_centre_and_size_of_the_image(self, clip):
         assert clip.camera.name == "ego"
-        assert clip.camera.intrinsics.tolist() == [1480.5, 1475.75, 1402.25, 998.5, 2800.0, 2000.0]
+        assert clip.camera.intrinsics.tolist() == [1500.0, 1510.0, 1400.0, 1000.0, 2800.0, 2000.0]
 
     def test_images_are_numbered_like_frames_where_nothing_else_is_said(self, clip):
         assert clip.camera.images.tolist() == clip.source_frames.tolist()
 
     def test_images_are_numbered_later_by_the_subjects_offset(self, tmp_path, load_all):
         root = write(tmp_path)
-        offsets = {"s06": {"ioi_offset": IMAGE_OFFSET}, "s01": {"ioi_offset": 3}}
+        offsets = {"s04": {"ioi_offset": 7}, "s01": {"ioi_offset": 3}}
         (root / "meta" / "misc.json").write_text(json.dumps(offsets))
         (clip,) = load_all(ArcticAdapter(), root)
         assert clip.camera.images.tolist() == [frame + 7 for frame in clip.source_frames.tolist()]
@@ -259,12 +224,12 @@ class TestSeatedPerson(SeatedPersonContract):
             blocks = {}
             for side, (orient, angles, transl) in person.hands.items():
                 rows = {"rot": orient, "pose": angles, "trans": transl}
-                blocks[side] = hand_block(side) | {
-                    name: np.tile(np.float32(row), (N_FRAMES, 1)) for name, row in rows.items()
+                blocks[side] = recording.hand_params(side) | {
+                    name: np.tile(np.float32(row), (recording.N_FRAMES, 1)) for name, row in rows.items()
                 }
-            np.save(root / "raw_seqs/s06/box_use_03.mano.npy", np.array(blocks, dtype=object))
+            np.save(root / "raw_seqs/s04/box_grab_01.mano.npy", np.array(blocks, dtype=object))
             box = (0.0, *person.object_orient, *(OBJECT_MM * person.signs))
-            np.save(root / "raw_seqs/s06/box_use_03.object.npy", np.tile(box, (N_FRAMES, 1)))
+            np.save(root / "raw_seqs/s04/box_grab_01.object.npy", np.tile(box, (recording.N_FRAMES, 1)))
             (clip,) = load_all(ArcticAdapter(), root)
             points = clip_points(clip)
             return {side: hand_joints(clip, side, hands) for side in ("left", "right")}, points[1:4] - points[0]
