@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -111,6 +112,22 @@ def run(folder: Path, *command: str, **more: str) -> subprocess.CompletedProcess
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     return copy_project(tmp_path / "project")
+
+
+@pytest.fixture
+def stage_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict]:
+    """Call it with settings: the current folder gets manifests and params; the encoder is one that needs no weights."""
+    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
+    monkeypatch.chdir(tmp_path)
+    delivered = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    delivered["annotate"]["encoder"] = "hash"
+
+    def write(**settings: object) -> dict:
+        write_params(Path(), {**delivered, **settings})
+        return delivered
+
+    write()
+    return write
 
 
 @pytest.fixture(scope="session")
