@@ -19,6 +19,7 @@ from fuzz.structure import npy_bytes, npy_mutation, pickle_mutation, zip_mutatio
 from fuzz.targets import all_targets, scratch_folder
 from hoidata.errors import BadInput, HoidataError
 
+pytestmark = pytest.mark.first
 PROJECT = Path(__file__).parents[1]
 SECONDS_EACH = 2.0
 

@@ -10,7 +10,7 @@ import yaml
 
 from pipelines.lineage.provenance import read_checkpoint_metadata
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.first]
 MODELS = ("contact", "length", "diffusion", "refiner")
 
 
