@@ -21,6 +21,7 @@ from hoidata.synthetic.sequences import Person, _idle_hand
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
 
+pytestmark = pytest.mark.slow
 ONE_ACTION = {"h2o": 0, "grab": 1, "arctic": 1}
 
 
