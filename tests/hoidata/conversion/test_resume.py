@@ -25,6 +25,7 @@ from hoidata.files.atomic import exclusive
 from hoidata.store.store import open_store
 from pipelines.lineage.manifests import scan_files
 
+pytestmark = pytest.mark.first
 DRIVER = Path(__file__).with_name("killable.py")
 N_SEQUENCES = 24
 KILLS = int(os.environ.get("HOIDATA_KILLS", 3))
