@@ -34,7 +34,7 @@ test-fast: install-dev
 
 # 50,000 damaged files for each parser, over a million in all; inputs that fail are kept in .fuzz/.
 fuzz: install-dev
-	OMP_NUM_THREADS=1 python -m tests.fuzz --full --jobs 2 --executions 50000
+	OMP_NUM_THREADS=1 python -m fuzz --full --jobs 2 --executions 50000
 
 lint: install-dev
 	ruff check .
@@ -48,9 +48,9 @@ imports: install-dev
 
 check: lint types imports test
 
-# Figures beside baselines of the same run; about half an hour. One part: python -m tests.bench adapters
+# Figures beside baselines of the same run; about half an hour. One part: python -m bench adapters
 bench: install-dev
-	OMP_NUM_THREADS=1 python -m tests.bench
+	OMP_NUM_THREADS=1 python -m bench
 
 # Removes what the graph made and the generated raw data; your own raw files are never touched.
 clean:

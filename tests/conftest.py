@@ -1,4 +1,4 @@
-"""Fixtures shared by all tests; the builders behind them are in tests/builders."""
+"""Fixtures shared by all tests, whose builders are in tests/builders; and the order in which modules begin."""
 
 from collections.abc import Callable
 
@@ -6,6 +6,15 @@ import pytest
 
 from hoidata.clips import Clip
 from tests.builders.clips import build_clip
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """xdist would begin with the modules of many tests, and end with the few that take minutes."""
+    config.option.loadscopereorder = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    items.sort(key=lambda item: item.get_closest_marker("first") is None)
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ where it has not: results depend on no machine.
 
 Plain numba was measured and given up: without ``fused`` the float64 distances in annotation's hand_type.parquet lose
 the last bit they share with OpenBLAS. Eight squares in a plain loop give equal bits but take 1.4 times as long per
-frame for near points and 1.5 times for the nearest one (one thread, tests.bench.kernels' scene).
+frame for near points and 1.5 times for the nearest one (one thread, bench.kernels' scene).
 """
 
 from typing import Any

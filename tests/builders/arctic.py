@@ -14,12 +14,14 @@ TRANSLATION_MM = np.stack([100.0 + TIME, -50.0 + 0 * TIME, 900.0 - 2.0 * TIME], 
 BOTTOM_MM = [(0.0, 0.0, 0.0), (200.0, 0.0, 0.0), (200.0, 150.0, 0.0), (0.0, 150.0, -40.0)]
 TOP_MM = [(10.0, 5.0, 20.0), (190.0, 5.0, 20.0), (190.0, 140.0, 25.0), (10.0, 140.0, 25.0)]
 FACES = "f 1 2 3\nf 1 3 4\nf 5 6 7\nf 5 7 8\n"
-SHAPE = {"left": np.linspace(-0.6, 0.6, 10), "right": np.linspace(0.5, -0.5, 10)}
+SHAPE = {
+    "left": np.array([1.5, -0.8, 1.2, 0.3, -0.9, 0.5, -0.4, 0.7, -0.2, 0.6]),
+    "right": np.array([-1.1, 0.9, -0.6, 1.4, 0.2, -0.7, 0.8, -0.3, 0.5, -0.5]),
+}
 HAND_TRANSL = {"left": (0.2, -0.1, 0.8), "right": (-0.1, 0.1, 0.9)}
 HAND_ORIENT = {"left": (0.4, -1.0, 0.3), "right": (-0.7, 0.2, 1.9)}
-STORED = np.zeros(45)
-STORED[0:3] = (0.1, 0.0, 0.5)  # relative to the mean pose
-STORED[21:24] = (0.0, 0.0, 6.4)  # beyond 2 pi, as it occurs in the real files
+# Relative to the mean pose; the middle finger is turned by more than pi, as it occurs in the real files.
+STORED = np.array([0.1, -0.2, 0.4, *[0.0] * 6, 4.6, 0.8, 0.3, *[0.0] * 33])
 LINES = """1-20 grab, left hand
 
 15-44 lift, both hands
@@ -50,7 +52,7 @@ def write_sequence(root: Path, name: str = "box_grab_01", lines: str = LINES) ->
 
 def write_template(root: Path, name: str) -> None:
     folder = root / "meta" / "object_vtemplates" / name
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in BOTTOM_MM + TOP_MM)
     (folder / "mesh.obj").write_text(f"# a box\n{vertices}vt 0 0\nvn 0 0 1\n{FACES}")
     (folder / "parts.json").write_text(json.dumps([1, 1, 1, 1, 0, 0, 0, 0]))
@@ -79,6 +81,7 @@ def head() -> dict:
         "T_k_cam_np": shift[:, :, None],
         "intrinsics": np.array([[1500.0, 0.0, 1400.0], [0.0, 1510.0, 1000.0], [0.0, 0.0, 1.0]]),
         "dist8": np.zeros(8),
+        "ego_markers.label": np.array(["a", "b"]),
     }
 
 

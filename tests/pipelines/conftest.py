@@ -4,11 +4,13 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
+from filelock import FileLock
 
 PROJECT = Path(__file__).parents[2]
 PARTS = (
@@ -48,7 +50,8 @@ def copy_project(folder: Path) -> Path:
         source, target = PROJECT / part, folder / part
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("__pycache__"))
+            # Compiled code comes along: numba takes it where the source's time of change is the same.
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("*.tmp.*", "*.pyc.*"))
         else:
             shutil.copy(source, target)
     subprocess.run(["git", "init", "--quiet", str(folder)], check=True)
@@ -69,6 +72,21 @@ def make_small(folder: Path) -> None:
 
 def write_params(folder: Path, params: dict) -> None:
     (folder / "params.yaml").write_text(yaml.safe_dump(params, sort_keys=False))
+
+
+def make_narrow(folder: Path, datasets: list[str], families: list[str]) -> None:
+    """No other datasets and families than these in the graph."""
+    params = yaml.safe_load((folder / "params.yaml").read_text())
+    write_params(folder, {**params, "datasets": datasets, "families": families})
+    for path in folder.glob("models/*/dvc.yaml"):
+        graph = yaml.safe_load(path.read_text())
+        matrices = [stage["matrix"] for stage in graph["stages"].values() if "family" in stage["matrix"]]
+        for matrix in matrices:
+            matrix["family"] = [name for name in matrix["family"] if name in families]
+        if matrices and not any(matrix["family"] for matrix in matrices):
+            path.unlink()
+        else:
+            path.write_text(yaml.safe_dump(graph, sort_keys=False))
 
 
 def set_present(folder: Path, present: set[str]) -> None:
@@ -94,6 +112,44 @@ def run(folder: Path, *command: str, **more: str) -> subprocess.CompletedProcess
 @pytest.fixture
 def project(tmp_path: Path) -> Path:
     return copy_project(tmp_path / "project")
+
+
+@pytest.fixture
+def stage_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict]:
+    """Call it with settings: the current folder gets manifests and params; the encoder is one that needs no weights."""
+    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
+    monkeypatch.chdir(tmp_path)
+    delivered = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    delivered["annotate"]["encoder"] = "hash"
+
+    def write(**settings: object) -> dict:
+        write_params(Path(), {**delivered, **settings})
+        return delivered
+
+    write()
+    return write
+
+
+@pytest.fixture(scope="session")
+def built_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A project after ``dvc repro`` with GRAB present and ARCTIC not; built once for all workers, never changed."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "built"
+    with FileLock(f"{folder}.lock"):
+        if not folder.exists():
+            project = copy_project(folder.with_name("building"))
+            make_narrow(project, ["grab", "arctic"], ["text2hoi", "ground-truth"])
+            set_present(project, {"grab"})
+            result = run(project, "dvc", "repro")
+            assert result.returncode == 0, result.stdout + result.stderr
+            project.rename(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def built(built_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of ``built_once`` for the tests of one module."""
+    return shutil.copytree(built_once, tmp_path_factory.mktemp("built") / "project")
 
 
 @pytest.fixture(scope="session")

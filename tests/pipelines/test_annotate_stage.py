@@ -1,13 +1,11 @@
 """Stage annotate in the pipeline: every setting of params.yaml reaches the library."""
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import orjson
 import pandas as pd
 import pytest
-import yaml
 
 from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.errors import BadInput, MissingResource
@@ -16,53 +14,52 @@ from hoidata.store.store import write_store
 from pipelines.stages import annotate, contact, quality
 from pipelines.stages.base import Place
 
-PROJECT = Path(__file__).parents[2]
 PLACE = Place("embedded", "grab")
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch, make_clip):
-    """A clip with a verb and one without in the current folder; the encoder that needs no weights."""
-    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
-    shutil.copy(PROJECT / "params.yaml", tmp_path)
-    monkeypatch.chdir(tmp_path)
+def clips(stage_folder, make_clip):
+    """A clip with a verb and one without in the current folder."""
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
     write_store(PLACE.clips, [clips[0], replace(clips[1], verb=None)], generated_info("grab"))
     quality.run(PLACE)
     return clips
 
 
-def annotated_with(of_contact: dict | None = None, **settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
-    """Hand types and sentences by clip, and the facts, of a run with these settings."""
-    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    params |= {"annotate": {"encoder": "hash", **settings}, "contact": of_contact or {}}
-    Path("params.yaml").write_text(yaml.safe_dump(params))
-    contact.run(PLACE)
-    annotate.run(PLACE)
-    hands, text = (pd.read_parquet(PLACE.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
-    return hands.set_index("clip_id"), text, orjson.loads((PLACE.annotation / "info.json").read_bytes())
+@pytest.fixture
+def annotated_with(clips, stage_folder):
+    """Call it with settings: hand types and sentences by clip, and the facts, of a run with them."""
+
+    def run(of_contact: dict | None = None, **settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
+        stage_folder(annotate={"encoder": "hash", **settings}, contact=of_contact or {})
+        contact.run(PLACE)
+        annotate.run(PLACE)
+        hands, text = (pd.read_parquet(PLACE.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
+        return hands.set_index("clip_id"), text, orjson.loads((PLACE.annotation / "info.json").read_bytes())
+
+    return run
 
 
-def test_threshold_and_points_of_the_contact_stage_decide_which_hand_acts(project) -> None:
+def test_threshold_and_points_of_the_contact_stage_decide_which_hand_acts(annotated_with) -> None:
     hands, _, info = annotated_with({"threshold_m": 1e-6, "points": 64})
     assert (info["threshold_m"], info["points"]) == (1e-6, 64)
     assert hands["hand_type"].isna().all()
 
 
-def test_hand_types_may_have_a_threshold_of_their_own(project) -> None:
+def test_hand_types_may_have_a_threshold_of_their_own(annotated_with) -> None:
     hands, _, info = annotated_with({"threshold_m": 1e-6}, threshold_m=0.02)
     assert info["threshold_m"] == 0.02
     assert hands["hand_type"].notna().all()
 
 
-def test_the_contact_stage_has_to_run_first(project) -> None:
+def test_the_contact_stage_has_to_run_first(clips) -> None:
     with pytest.raises(MissingResource, match="run the stage 'contact'"):
         annotate.run(PLACE)
 
 
-def test_forms_are_those_asked_for(project) -> None:
+def test_forms_are_those_asked_for(clips, annotated_with) -> None:
     hands, text, info = annotated_with(forms="reference")
-    clip = project[0]
+    clip = clips[0]
     found = text[text["clip_id"] == clip.clip_id]["sentence"].tolist()
     assert found == list(reference_sentences(clip.verb, clip.object_words, hands.at[clip.clip_id, "hand_type"]))
     assert info["forms"] == "reference"
@@ -70,14 +67,14 @@ def test_forms_are_those_asked_for(project) -> None:
         annotated_with(forms="poem")
 
 
-def test_whose_word_counts_for_the_hand_is_written_down_where_it_is_not_the_distances(project) -> None:
+def test_whose_word_counts_for_the_hand_is_written_down_where_it_is_not_the_distances(annotated_with) -> None:
     rule = "annotated-else-proximity"
     assert [annotated_with(**chosen)[2].get("hand") for chosen in ({}, {"hand": rule})] == [None, rule]
     with pytest.raises(BadInput, match="hand"):
         annotated_with(hand="nearest")
 
 
-def test_as_many_variations_are_written_as_asked_for(project) -> None:
+def test_as_many_variations_are_written_as_asked_for(annotated_with) -> None:
     _, text, info = annotated_with(variations={"per_clip": 3, "adverbs": False})
     assert text.groupby("clip_id").size().tolist() == [7, 7]
     assert (info["variations"]["per_clip"], info["variations"]["adverbs"]) == (3, False)
@@ -85,7 +82,7 @@ def test_as_many_variations_are_written_as_asked_for(project) -> None:
         annotated_with(variations={"per_clip": -1, "adverbs": False})
 
 
-def test_verbs_from_motion_can_be_turned_off(project) -> None:
+def test_verbs_from_motion_can_be_turned_off(annotated_with) -> None:
     with_them, _, _ = annotated_with()
     assert with_them["verb_source"].tolist() == ["source", "derived"]
     without, plain, info = annotated_with(derive_verbs=False)
@@ -94,6 +91,6 @@ def test_verbs_from_motion_can_be_turned_off(project) -> None:
     assert info["counts"]["derived_verbs"] == 0
 
 
-def test_features_are_kept_where_they_are_said_to_be(project) -> None:
+def test_features_are_kept_where_they_are_said_to_be(annotated_with) -> None:
     annotated_with()
     assert len(list(Path(".hoidata/features").rglob("*.npz"))) == 1

@@ -1,4 +1,4 @@
-"""A dataset is a folder and a word: the stages run with one from outside the repository, and with TACO."""
+"""A dataset is a folder and a word: the stages run with one from outside the repository, and DVC with TACO."""
 
 import difflib
 import json
@@ -44,10 +44,8 @@ def hoidata(*words: str) -> str:
     return result.output
 
 
-def run_stages(place: Place) -> dict[str, int]:
-    """All stages up to the split; how many clips each part has."""
-    for stage in (raw, convert, quality, contact, annotate, split):
-        stage.run(place)
+def split_of(place: Place) -> dict[str, int]:
+    """How many clips each part has."""
     chosen = json.loads((place.splits / "info.json").read_text())["chosen"]
     assert chosen["name"] == "drawn"
     assert chosen["keeps_its_promises"]
@@ -72,13 +70,16 @@ def test_a_dataset_from_a_folder_outside_the_repository_takes_three_lines(here: 
     assert len(typed) <= 3
     assert "CC BY 4.0" in hoidata("raw", "scan", "kitchen", "--root", str(root))
     assert 'paths = ["../mine/kitchen"]' in Path("hoidata.toml").read_text()
-    assert run_stages(Place("own", "kitchen")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
+    for stage in (raw, convert, quality, contact, annotate, split):
+        stage.run(Place("own", "kitchen"))
+    assert split_of(Place("own", "kitchen")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
     raw.run(Place("embedded", "kitchen"))
     convert.run(Place("embedded", "kitchen"))
     assert empty_reason(Place("embedded", "kitchen").clips) == "kitchen is not present in the profile embedded"
 
 
-def test_taco_goes_through_the_stages_by_its_word(here: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_taco_goes_through_dvc_repro_by_its_word(here: Path, tmp_path: Path, project_tools) -> None:
     mano, root = tmp_path / "mano", taco.write_taco(tmp_path / "taco")
     mano.mkdir()
     for side in SIDES:
@@ -88,7 +89,9 @@ def test_taco_goes_through_the_stages_by_its_word(here: Path, tmp_path: Path) ->
     assert "no raw files were scanned" in CliRunner().invoke(app, ["raw", "verify", "taco"]).output
     hoidata("raw", "scan", "mano", "--root", str(mano))
     hoidata("raw", "scan", "taco", "--root", str(root))
-    assert run_stages(Place("own", "taco")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
+    built = project_tools.run(here, "dvc", "repro", "split@own-taco")
+    assert built.returncode == 0, built.stdout + built.stderr
+    assert split_of(Place("own", "taco")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
 
 
 def test_a_scan_keeps_what_else_stands_in_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

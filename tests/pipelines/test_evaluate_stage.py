@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,10 +20,8 @@ PLACE = Place("embedded", "grab", family="ours")
 
 
 @pytest.fixture
-def clips(tmp_path, monkeypatch, make_clip):
+def clips(stage_folder, make_clip):
     """An annotated dataset where the stage looks for it; its test clips."""
-    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
-    monkeypatch.chdir(tmp_path)
     return write_annotated_dataset(PLACE.data, make_clip)[1]
 
 

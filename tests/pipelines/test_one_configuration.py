@@ -1,17 +1,20 @@
 """One threshold, one copy of each default: what the contact stage is told reaches labels, masks, losses and pages."""
 
 import ast
+import json
 import shutil
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from scipy.spatial.transform import Rotation
 
 from hoidata.batches.dataset import HoiDataset, collate
 from hoidata.contact.settings import ContactSettings
+from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.info import generated_info
@@ -19,11 +22,13 @@ from hoidata.store.store import write_store
 from models.common import losses
 from pipelines.commands.settings import SECTIONS, settings_class
 from pipelines.pages.report import touch_words
-from pipelines.stages import annotate, contact, quality, split
+from pipelines.stages import annotate, contact, evaluate, quality, split
 from pipelines.stages.base import Place
 
 PROJECT = Path(__file__).parents[2]
 PLACE = Place("embedded", "grab")
+THRESHOLD_M = {"wide": 0.02, "narrow": 0.01}
+SHIFT_M = np.float32([0.006, 0.004, 0.004])
 RULE = {"by": "subject", "train": "rest", "validation": ["s9"], "test": ["s10"]}
 # Named for the user although the library's default is the same: readers look for it here.
 SHOWN_ON_PURPOSE = {"annotate.encoder"}
@@ -52,8 +57,8 @@ def annotated_at(folder: Path, threshold_m: float, make_clip, monkeypatch) -> An
 
 @pytest.fixture
 def wide_and_narrow(tmp_path, make_clip, monkeypatch) -> tuple[AnnotatedStore, AnnotatedStore]:
-    wide = annotated_at(tmp_path / "wide", 0.02, make_clip, monkeypatch)
-    return wide, annotated_at(tmp_path / "narrow", 0.01, make_clip, monkeypatch)
+    wide, narrow = (annotated_at(tmp_path / name, width, make_clip, monkeypatch) for name, width in THRESHOLD_M.items())
+    return wide, narrow
 
 
 def test_the_contact_threshold_changes_labels_hand_types_masks_and_words_alike(wide_and_narrow):
@@ -74,6 +79,37 @@ def test_the_losses_of_a_batch_use_the_threshold_it_was_made_with(wide_and_narro
     apart = torch.tensor([0.005, 0.015, -0.015, 0.025])
     touching = [losses.touching_joints(apart, batch.contact_threshold_m).tolist() for batch in batches]
     assert touching == [[True, True, True, False], [True, False, False, False]]
+
+
+def test_the_figures_of_evaluation_use_the_threshold_the_contact_stage_was_told(wide_and_narrow, tmp_path, monkeypatch):
+    place, found = replace(PLACE, family="ours"), {}
+    for name, store in zip(("wide", "narrow"), wide_and_narrow, strict=True):
+        monkeypatch.chdir(tmp_path / name)
+        [key] = store.ids("test")
+        true = store.clip(key)
+        made = replace(
+            true, hands={side: replace(hand, wrist_m=hand.wrist_m + SHIFT_M) for side, hand in true.hands.items()}
+        )
+        write_store(place.samples / "clips", [made], generated_info("ours"))
+        (place.samples / "diagnostics.json").write_text("{}")
+        evaluate.run(place)
+        found[name] = json.loads(place.metrics.read_text())
+        touched = [
+            touched_points(clip, store.points(store.object_key(key)).points_m, THRESHOLD_M[name])
+            for clip in (made, true)
+        ]
+        f1 = 2 * (touched[0] & touched[1]).sum() / (touched[0].sum() + touched[1].sum())
+        assert found[name]["figures"]["contact_f1"] == pytest.approx(f1, abs=1e-6)
+    values = [found[name]["counts"]["contact_distance_mm"]["values"] for name in ("narrow", "wide")]
+    assert 0 < values[0] < values[1]
+
+
+def touched_points(clip, points_m: np.ndarray, threshold_m: float) -> np.ndarray:
+    """(point,) bool: of a rigid object's points, by all distances to the right hand's joints in the object's frame."""
+    world = track_joints(clip.hands["right"], load_embedded_hands().right)
+    turns = Rotation.from_rotvec(clip.object.rotvec).as_matrix()
+    joints = np.einsum("fji,fkj->fki", turns, world - clip.object.translation_m[:, None])
+    return (np.linalg.norm(joints[:, :, None] - points_m, axis=-1) < threshold_m).any(axis=(0, 1))
 
 
 def test_params_repeat_no_default_of_the_library():

@@ -10,6 +10,7 @@ import pytest
 from pipelines.prefect_names import only_one, wrap_lookup
 from tests.pipelines.prefect_up import hoidata_up
 
+pytestmark = pytest.mark.first
 FINISHED = {"Completed", "Failed", "Crashed", "Cancelled"}
 
 

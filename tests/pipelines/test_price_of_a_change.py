@@ -141,7 +141,7 @@ def up_to_date_project(folder: Path) -> Iterator[Path]:
         cwd=PROJECT, check=True, capture_output=True, text=True,
     )  # fmt: skip
     for name in filter(None, listed.stdout.split("\0")):
-        if not name.startswith("tests/") and (PROJECT / name).is_file():
+        if not name.startswith(("tests/", "bench/", "fuzz/")) and (PROJECT / name).is_file():
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_bytes((PROJECT / name).read_bytes())
     set_params(folder, profile="embedded", datasets=DATASETS)

@@ -1,13 +1,10 @@
 """Stage quality in the pipeline: its settings are the library's, and what fails is not annotated."""
 
-import shutil
-from dataclasses import asdict, replace
-from pathlib import Path
+from dataclasses import asdict
 
 import orjson
 import pandas as pd
 import pytest
-import yaml
 
 from hoidata.errors import BadInput
 from hoidata.quality.thresholds import DEFAULT_LIMITS
@@ -15,32 +12,14 @@ from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.stages import annotate, contact, quality
 from pipelines.stages.base import Place, empty_reason, write_empty
+from tests.builders.clips import jumping
 
-PROJECT = Path(__file__).parents[2]
 PLACE = Place("embedded", "grab")
 
 
-@pytest.fixture
-def project(tmp_path, monkeypatch):
-    """Params and hand manifest in the current folder; the encoder that needs no weights."""
-    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    params["annotate"]["encoder"] = "hash"
-    write(tmp_path, params)
-    (tmp_path / "manifests").mkdir()
-    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
-    monkeypatch.chdir(tmp_path)
-    return params
-
-
-def write(folder: Path, params: dict) -> None:
-    (folder / "params.yaml").write_text(yaml.safe_dump(params))
-
-
-def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(project, make_clip):
+def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(stage_folder, make_clip):
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
-    place = clips[1].object.translation_m.copy()
-    place[20:] += 0.5
-    clips[1] = replace(clips[1], object=replace(clips[1].object, translation_m=place))
+    clips[1] = jumping(clips[1], 20, 0.5)
     write_store(PLACE.clips, clips, generated_info("grab"))
     quality.run(PLACE)
     contact.run(PLACE)
@@ -51,10 +30,9 @@ def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(project, ma
     assert hands.at["test/s1/1", "reason"].startswith("left out by quality control: largest sudden step of a corner")
 
 
-def test_params_decide_what_is_left_out(project, make_clip):
+def test_params_decide_what_is_left_out(stage_folder, make_clip):
     write_store(PLACE.clips, [make_clip(40, seed=3)], generated_info("grab"))
-    project["quality"] = {"limits": {"size_m": {"leave_out": 0.05}}}
-    write(Path(), project)
+    stage_folder(quality={"limits": {"size_m": {"leave_out": 0.05}}})
     quality.run(PLACE)
     rows = pd.read_parquet(PLACE.quality / "clips.parquet")
     limits = orjson.loads((PLACE.quality / "info.json").read_bytes())["thresholds"]["limits"]
@@ -63,7 +41,7 @@ def test_params_decide_what_is_left_out(project, make_clip):
     assert rows["reasons"].tolist() == ["object box: longest side of the bounding box: 0.1 m, above 0.05 m"]
 
 
-def test_empty_dataset_passes_through(project):
+def test_empty_dataset_passes_through(stage_folder):
     write_empty(PLACE.clips, "grab is not present")
     quality.run(PLACE)
     assert empty_reason(PLACE.quality) == "grab is not present"
@@ -71,11 +49,11 @@ def test_empty_dataset_passes_through(project):
     assert empty_reason(PLACE.annotation) == "grab is not present"
 
 
-def test_unknown_setting_and_unknown_measure_are_named(project, make_clip):
+def test_unknown_setting_and_unknown_measure_are_named(stage_folder, make_clip):
     write_store(PLACE.clips, [make_clip(40)], generated_info("grab"))
-    write(Path(), {**project, "quality": {"too_deep_mm": 10}})
+    stage_folder(quality={"too_deep_mm": 10})
     with pytest.raises(BadInput, match="too_deep_mm"):
         quality.run(PLACE)
-    write(Path(), {**project, "quality": {"limits": {"jerk": {"warn": 1, "leave_out": 2}}}})
+    stage_folder(quality={"limits": {"jerk": {"warn": 1, "leave_out": 2}}})
     with pytest.raises(BadInput, match="jerk"):
         quality.run(PLACE)

@@ -1,11 +1,8 @@
 """Stage surface in the pipeline: its settings, what quality control left out, and turning it off."""
 
 import shutil
-from dataclasses import replace
-from pathlib import Path
 
 import pytest
-import yaml
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.store.info import generated_info
@@ -13,31 +10,23 @@ from hoidata.store.store import write_store
 from hoidata.surface.store import open_surface
 from pipelines.stages import contact, quality, surface
 from pipelines.stages.base import Place, empty_reason, write_empty
+from tests.builders.clips import jumping
 
-PROJECT = Path(__file__).parents[2]
 PLACE = Place("embedded", "grab")
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch):
-    """Params and hand manifest in the current folder; few points."""
-    params = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    params["contact"] = {"points": 64}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(params))
-    shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
-    monkeypatch.chdir(tmp_path)
-    return params
+def with_surface(stage_folder):
+    """Call it with settings of the stage; few points."""
+    stage_folder(contact={"points": 64})
+    return lambda **settings: stage_folder(contact={"points": 64}, surface=settings)
 
 
-def with_surface(params: dict, **settings) -> None:
-    Path("params.yaml").write_text(yaml.safe_dump({**params, "surface": settings}))
-
-
-def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_its_reason(project, make_clip, capsys):
+def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_its_reason(
+    with_surface, make_clip, capsys
+):
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
-    place = clips[1].object.translation_m.copy()
-    place[20:] += 0.5
-    clips[1] = replace(clips[1], object=replace(clips[1].object, translation_m=place))
+    clips[1] = jumping(clips[1], 20, 0.5)
     write_store(PLACE.clips, clips, generated_info("grab"))
     quality.run(PLACE)
     contact.run(PLACE)
@@ -50,7 +39,7 @@ def test_clips_are_measured_and_those_quality_control_left_out_are_listed_with_i
     assert "2 clips, 1 left_out, 40 frames" in capsys.readouterr().out
 
 
-def test_contact_and_quality_control_have_to_run_first(project, make_clip):
+def test_contact_and_quality_control_have_to_run_first(with_surface, make_clip):
     write_store(PLACE.clips, [make_clip(4)], generated_info("grab"))
     with pytest.raises(MissingResource, match="run the stage 'contact'"):
         surface.run(PLACE)
@@ -59,24 +48,24 @@ def test_contact_and_quality_control_have_to_run_first(project, make_clip):
         surface.run(PLACE)
 
 
-def test_empty_dataset_passes_through_and_the_stage_can_be_turned_off(project, make_clip):
+def test_empty_dataset_passes_through_and_the_stage_can_be_turned_off(with_surface, make_clip):
     write_empty(PLACE.clips, "grab is not present")
     surface.run(PLACE)
     assert empty_reason(PLACE.surface) == "grab is not present"
     shutil.rmtree(PLACE.clips)
     write_store(PLACE.clips, [make_clip(4)], generated_info("grab"))
-    with_surface(project, enabled=False)
+    with_surface(enabled=False)
     surface.run(PLACE)
     assert empty_reason(PLACE.surface) == "surface.enabled is false in params.yaml"
 
 
-def test_unknown_setting_is_named_and_a_threshold_of_nothing_refused(project, make_clip):
+def test_unknown_setting_is_named_and_a_threshold_of_nothing_refused(with_surface, make_clip):
     write_store(PLACE.clips, [make_clip(40)], generated_info("grab"))
-    with_surface(project, touch_mm=5)
+    with_surface(touch_mm=5)
     with pytest.raises(BadInput, match="touch_mm"):
         surface.run(PLACE)
     quality.run(PLACE)
     contact.run(PLACE)
-    with_surface(project, touch_m=0)
+    with_surface(touch_m=0)
     with pytest.raises(BadInput, match=r"surface\.touch_m"):
         surface.run(PLACE)

@@ -1,16 +1,25 @@
 """A model family is a folder and a row: one that learns is added to a copy of the project, and everything serves it."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import pytest
-import yaml
 
 from pipelines.lineage.provenance import read_checkpoint_metadata
 
 pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).with_name("toy_family")
+OWN_STAGES = [
+    name
+    for dataset in ("grab", "arctic")
+    for name in (
+        f"models/toy/dvc.yaml:train@embedded-{dataset}",
+        f"models/toy/dvc.yaml:sample@embedded-{dataset}",
+        f"evaluate@embedded-{dataset}-toy",
+    )
+]
 
 
 def add_line(path: Path, before: str, line: str) -> None:
@@ -20,12 +29,8 @@ def add_line(path: Path, before: str, line: str) -> None:
     path.write_text("".join([*lines[:at], line + "\n", *lines[at:]]))
 
 
-def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(project: Path, project_tools) -> None:
-    params = project / "params.yaml"
-    # One dataset and none of Text2HOI's stages, only so that the test is quick.
-    values = yaml.safe_load(params.read_text()) | {"datasets": ["grab"], "families": ["ground-truth"]}
-    project_tools.write_params(project, values)
-    (project / "models" / "text2hoi" / "dvc.yaml").unlink()
+def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(built: Path, project_tools) -> None:
+    project, params = built, built / "params.yaml"
     shutil.copytree(FOLDER, project / "models" / "toy", ignore=shutil.ignore_patterns("__pycache__"))
     (project / "models" / "toy" / "__init__.py").touch()
     # Under its own name DVC would take the file for one of this project's.
@@ -42,6 +47,7 @@ def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(project: Pa
 
     result = project_tools.run(project, "dvc", "repro", PYTHONPATH=str(project))
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
+    assert set(re.findall(r"Running stage '([^']+)'", result.stdout)) == {"code", "report@embedded", *OWN_STAGES}
 
     metadata = read_checkpoint_metadata(project / "checkpoints/embedded/grab/toy/model.safetensors")
     assert metadata["provenance"]["datasets"] == {"grab": 4}

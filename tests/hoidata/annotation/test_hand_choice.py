@@ -1,5 +1,6 @@
 """Which hand a prompt asks for: every template, hard sentences of many kinds, and never an invented hand."""
 
+import numpy as np
 import pytest
 
 from hoidata.annotation.encoders import HashEncoder
@@ -102,6 +103,22 @@ def test_similarity_decides_only_by_a_margin_and_says_so() -> None:
     choice = select_hand(text, HashEncoder())
     assert (choice.hand, choice.source) == ("left", "embedding")
     assert choice.confidence >= 0.05
+
+
+class LeaningLeft:
+    """Finds every text most like the left hand's phrase, by a lead in cosine similarity."""
+
+    def __init__(self, lead: float) -> None:
+        cosines = np.array([1, 0.9, 0.9 - lead, 0.9 - lead])
+        self.features = np.stack([cosines, np.sqrt(1 - cosines**2)], axis=1)
+
+    def encode(self, texts: list[str]) -> np.ndarray:
+        return self.features
+
+
+@pytest.mark.parametrize(("lead", "hand"), [(0.04, None), (0.06, "left")])
+def test_a_lead_below_the_margin_is_a_guess_and_not_taken(lead: float, hand: str | None) -> None:
+    assert select_hand("the hand that is left with the left one", LeaningLeft(lead)).hand == hand
 
 
 def test_a_prior_answers_last_and_is_named() -> None:

@@ -17,10 +17,10 @@ from hoidata.clips.hand_parameters import (
 )
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, load_mano_hands
+from tests.builders.formulas import joints_as_stored
 from tests.builders.mano import write_mano_pickle
 
 N_FRAMES = 7
-PARENT = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
 PLAIN = HandConvention("transl", "absolute", "betas per sequence", "as released")
 
 
@@ -45,21 +45,6 @@ def wrist_of(model, betas, template_m=None) -> np.ndarray:
     """J0 of one frame: the wrist row of the regressor on the shaped rest mesh."""
     template = model.template_m if template_m is None else template_m
     return sum(model.joint_regressor[0, v] * (template[v] + model.shape_directions[v] @ betas) for v in range(778))
-
-
-def joints_of(model, track, frame: int) -> np.ndarray:
-    """(16, 3) joints of one frame of a track, bone by bone."""
-    betas = track.betas[0 if len(track.betas) == 1 else frame].astype(np.float64)
-    template = model.template_m if track.template_m is None else track.template_m
-    rest = model.joint_regressor @ (template + model.shape_directions @ betas)
-    pose = np.concatenate((track.global_orient[frame], track.hand_pose[frame])).reshape(16, 3)
-    turn = [Rotation.from_rotvec(one) for one in pose.astype(np.float64)]
-    places, totals = [track.wrist_m[frame].astype(np.float64)], [turn[0]]
-    for joint in range(1, 16):
-        parent = PARENT[joint]
-        places.append(places[parent] + totals[parent].apply(rest[joint] - rest[parent]))
-        totals.append(totals[parent] * turn[joint])
-    return np.array(places)
 
 
 def source_hand(seed: int = 0, columns: int = 45, betas: str = "sequence", template_m=None) -> SourceHand:
@@ -167,8 +152,8 @@ class TestFrame:
         for frame in range(N_FRAMES):
             row = 0 if rows == 1 else frame
             rotation, shift = change.rotation[row], change.translation_m[row]
-            expected = joints_of(model, before, frame) @ rotation.T + shift
-            np.testing.assert_allclose(joints_of(model, after, frame), expected, atol=3e-6)
+            expected = joints_as_stored(before, model, frame) @ rotation.T + shift
+            np.testing.assert_allclose(joints_as_stored(after, model, frame), expected, atol=3e-6)
         np.testing.assert_array_equal(before.hand_pose, after.hand_pose)
 
     def test_a_turn_without_a_shift_leaves_the_origin(self):
@@ -242,5 +227,5 @@ class TestLeftShape:
             track = to_track(source, PLAIN, left)
             expected = wrist_of(left, source.betas[0]) + source.translation_m
             np.testing.assert_allclose(track.wrist_m, expected, atol=1e-6)
-            joints[flag] = joints_of(left, track, 0)
+            joints[flag] = joints_as_stored(track, left, 0)
         assert np.linalg.norm(joints["corrected"] - joints["as released"], axis=1).max() > 0.005

@@ -10,11 +10,13 @@ from hoidata.clips import SIDES, Clip, ObjectTrack
 from hoidata.contact.hands import acting_hands
 from hoidata.contact.maps import contact_maps, distance_entries, touched_frames
 from hoidata.contact.proximity import ProximityIndex
+from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints
 from tests.builders.clips import MIRROR, clip_of, in_another_world, mirror_image, with_hand
 from tests.builders.objects import sampled
+from tests.builders.stores import write_clips
 
 FRAMES, POINTS = 12, 300
 Joints = dict[str, np.ndarray]
@@ -181,3 +183,13 @@ def test_a_clip_too_long_to_count_is_refused(plane) -> None:
     long = replace(clip, source_frames=np.zeros(40_000, np.int32))
     with pytest.raises(BadInput, match="at most 32767 frames"):
         distance_entries(long, {}, ProximityIndex(points))
+
+
+def test_a_clip_that_either_hand_touches_counts_as_touched(make_clip, tmp_path) -> None:
+    left, right, neither = (
+        make_clip(4, hand, clip_id=f"toy/s1/{n}") for n, hand in enumerate(("left", "right", "left"))
+    )
+    neither = with_hand(neither, "left", wrist_m=neither.hands["left"].wrist_m + np.float32(1))
+    clips = write_clips(tmp_path / "clips", [left, right, neither])
+    counts = contact_store(clips, tmp_path / "contact", points=64)
+    assert (counts["clips"], counts["clips_without_contact"]) == (3, 1)

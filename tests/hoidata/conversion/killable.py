@@ -29,6 +29,13 @@ IS_WORKER = __name__ == "__mp_main__"  # how a spawned process names the program
 
 def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES, fps: int = 120) -> None:
     """Sequences of two subjects and two objects in GRAB's format, in turn; the touch begins at frame 12."""
+    write_meshes(root, hands)
+    for number in range(n_sequences):
+        name = f"s{number % 2 + 1}/{('mug', 'bowl')[number % 2]}_lift_{number:03d}"
+        write_sequence(root, name, number, n_frames, fps)
+
+
+def write_meshes(root: Path, hands) -> None:
     meshes = root / "tools" / "meshes"
     meshes.mkdir(parents=True)
     for side in ("left", "right"):
@@ -38,13 +45,14 @@ def write_grab(root: Path, hands, n_sequences: int, n_frames: int = N_FRAMES, fp
     for name, size in (("mug", 0.1), ("bowl", 0.2)):
         corners = f"v 0 0 0\nv {size} 0 0\nv 0 {size} 0\nv 0 0 {size}\n"
         (meshes / f"{name}.obj").write_text(corners + "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
-    for number in range(n_sequences):
-        write_sequence(root, number, n_frames, fps)
 
 
-def write_sequence(root: Path, number: int, n_frames: int, fps: int) -> None:
-    rng, mesh = np.random.default_rng(number), ("mug", "bowl")[number % 2]
-    path = root / "grab" / f"s{number % 2 + 1}" / f"{mesh}_lift_{number:03d}.npz"
+def write_sequence(
+    root: Path, name: str, seed: int, n_frames: int = N_FRAMES, fps: int = 120, first_touched: int = 12
+) -> None:
+    """name: subject/object_intent, as GRAB has it. Numbers are drawn from the seed."""
+    rng, path = np.random.default_rng(seed), root / "grab" / f"{name}.npz"
+    mesh, intent = path.stem.split("_")[:2]
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = {"global_orient": 3, "transl": 3, "fullpose": 45}
     blocks: dict = {
@@ -53,10 +61,10 @@ def write_sequence(root: Path, number: int, n_frames: int, fps: int) -> None:
     }
     blocks["rhand"]["vtemp"], blocks["lhand"]["vtemp"] = "tools/meshes/right.obj", "tools/meshes/left.obj"
     blocks["object"]["object_mesh"] = f"tools/meshes/{mesh}.obj"
-    touched = np.arange(n_frames) >= 12
+    touched = np.arange(n_frames) >= first_touched
     blocks["contact"] = {"object": np.repeat(touched[:, None], 4, axis=1).astype(np.int8)}
     objects = {key: np.array(block, dtype=object) for key, block in blocks.items()}
-    np.savez(path, obj_name=mesh, motion_intent="lift", framerate=fps, n_frames=n_frames, **objects)
+    np.savez(path, obj_name=mesh, motion_intent=intent, framerate=fps, n_frames=n_frames, **objects)
 
 
 @dataclass(frozen=True)

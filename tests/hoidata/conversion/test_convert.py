@@ -19,39 +19,15 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.store.store import open_store
 from hoidata.synthetic.corpus import write_corpus
 from pipelines.lineage.manifests import scan_files
-
-N_FRAMES = 40
-
-
-def write_grab(root: Path, hands) -> None:
-    """Three sequences of two subjects, seven sizes of numbers; every file valid."""
-    meshes = root / "tools" / "meshes"
-    meshes.mkdir(parents=True)
-    for side in ("left", "right"):
-        lines = [f"v {x} {y} {z}" for x, y, z in hands[side].template_m]
-        faces = [f"f {a} {b} {c}" for a, b, c in hands[side].faces + 1]
-        (meshes / f"{side}.obj").write_text("\n".join(lines + faces))
-    (meshes / "mug.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n")
-    for number, name in enumerate(("s1/mug_drink_1", "s1/mug_lift", "s2/mug_pass_1")):
-        rng = np.random.default_rng(number)
-        path = root / "grab" / f"{name}.npz"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        blocks = {member: _params(rng) for member in ("lhand", "rhand", "object")}
-        blocks["rhand"]["vtemp"], blocks["lhand"]["vtemp"] = "tools/meshes/right.obj", "tools/meshes/left.obj"
-        blocks["object"]["object_mesh"] = "tools/meshes/mug.obj"
-        blocks["contact"] = {"object": np.ones((N_FRAMES, 4), np.int8)}
-        objects = {key: np.array(block, dtype=object) for key, block in blocks.items()}
-        np.savez(path, obj_name="mug", motion_intent="drink", framerate=120, n_frames=N_FRAMES, **objects)
-
-
-def _params(rng) -> dict:
-    columns = {"global_orient": 3, "transl": 3, "fullpose": 45}
-    return {"params": {name: rng.normal(size=(N_FRAMES, width)) for name, width in columns.items()}}
+from tests.hoidata.conversion.killable import write_meshes, write_sequence
 
 
 @pytest.fixture
 def root(tmp_path, hands) -> Path:
-    write_grab(tmp_path / "raw", hands)
+    """Three sequences of two subjects; every file valid."""
+    write_meshes(tmp_path / "raw", hands)
+    for seed, name in enumerate(("s1/mug_drink_1", "s1/mug_lift", "s2/mug_pass_1")):
+        write_sequence(tmp_path / "raw", name, seed, first_touched=0)
     return tmp_path / "raw"
 
 

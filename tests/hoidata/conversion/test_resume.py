@@ -24,26 +24,15 @@ from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive
 from hoidata.store.store import open_store
 from pipelines.lineage.manifests import scan_files
+from tests.hoidata.conversion import killable
 
+pytestmark = pytest.mark.first
 DRIVER = Path(__file__).with_name("killable.py")
 N_SEQUENCES = 24
 KILLS = int(os.environ.get("HOIDATA_KILLS", 3))
 # What to die at, and when: as a share of all renames or writes of a run, or counted back from the last one (-1).
 IN_A_WRITE = (("rename", 0.1), ("write", 0.05), ("write", 0.25), ("write", 0.5), ("renamed", 0.6), ("write", -1))
 AT_THE_END = (("rename", -3), ("rename", -2), ("renamed", -2), ("rename", -1), ("renamed", -1))
-
-
-def load_driver():
-    spec = importlib.util.spec_from_file_location("killable", DRIVER)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["killable"] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-killable = load_driver()
 
 
 def digests(folder: Path) -> dict[str, str]:

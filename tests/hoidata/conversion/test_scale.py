@@ -1,6 +1,5 @@
 """Memory of a conversion does not grow with the dataset: one sequence per worker, one shard of the store."""
 
-import importlib.util
 import os
 import subprocess
 import sys
@@ -9,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hoidata.store.shards import FRAMES_PER_SHARD
+from tests.hoidata.conversion.killable import write_grab
 
 FRAMES = 1000
 CONVERT = """
@@ -27,13 +27,7 @@ if __name__ == "__main__":
 
 def write_repeated(root: Path, hands, n_sequences: int) -> None:
     """As many sequences as asked for, the first two linked under further names."""
-    spec = importlib.util.spec_from_file_location("killable", Path(__file__).with_name("killable.py"))
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["killable"] = module
-    spec.loader.exec_module(module)
-    module.write_grab(root, hands, 2, FRAMES, 30)
+    write_grab(root, hands, 2, FRAMES, 30)
     written = sorted((root / "grab").glob("*/*.npz"))
     for number in range(2, n_sequences):
         source = written[number % 2]

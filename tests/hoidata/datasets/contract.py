@@ -23,6 +23,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.splits.definitions import definitions_for
 from hoidata.splits.published import published
 from hoidata.store.store import open_store
+from tests.builders.formulas import has_its_own_side, seated_person, sits_as_described
 from tests.builders.spoilt import CANARY, Spoil
 
 HERE = Path(__file__).parent
@@ -167,6 +168,24 @@ class AdapterContract:
         assert not CANARY.exists()
         assert further_row.where in caught.value.where
         assert further_row.says in str(caught.value)
+
+
+class SeatedPersonContract:
+    """Numbers of a known person, and of her mirror image, as a source would write them.
+
+    A subclass has the fixture ``look``: of a ``seated_person`` the joints of both hands and three edges in the world.
+    """
+
+    edges_seen = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+
+    def test_each_hands_numbers_bend_a_hand_of_that_side(self, look):
+        assert has_its_own_side(look(seated_person())[0])
+        assert not has_its_own_side(look(seated_person(swapped=True))[0])
+
+    @pytest.mark.parametrize("axis", [0, 1, 2])
+    def test_the_world_is_not_seen_in_a_mirror(self, look, axis):
+        assert sits_as_described(*look(seated_person()), self.edges_seen)
+        assert not sits_as_described(*look(seated_person(mirrored=axis)), self.edges_seen)
 
 
 def fingerprint(value: Any) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.naive import READERS, NaiveHands
 from hoidata.clips import SIDES
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints
@@ -16,10 +17,11 @@ from hoidata.synthetic.check import sequence_figures
 from hoidata.synthetic.corpus import write_raw_sequence, write_shared_files
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.grasps import closes_force
+from hoidata.synthetic.sequences import Person, _idle_hand
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
-from tests.bench.naive import READERS, NaiveHands
 
+pytestmark = pytest.mark.slow
 ONE_ACTION = {"h2o": 0, "grab": 1, "arctic": 1}
 
 
@@ -80,6 +82,23 @@ def test_while_held_the_hand_does_not_move_against_the_object(truths, dataset):
     for side in truth.acting_sides:
         local = rotation.inv().apply(truth.hands[side].wrist_m[frames] - track.translation_m[frames])
         assert np.abs(local - local[0]).max() < 1e-9
+
+
+@pytest.mark.parametrize("dataset", ONE_ACTION)
+def test_contact_lasts_from_the_frame_in_which_the_hand_is_closed_to_the_last_before_it_opens(truths, dataset):
+    truth = truths[dataset]
+    for side in truth.acting_sides:
+        pose = truth.hands[side].hand_pose
+        closed = np.abs(pose - pose[sum(truth.contact) // 2]).max(axis=1) < 1e-12
+        np.testing.assert_array_equal(np.flatnonzero(closed), np.arange(*truth.contact))
+
+
+def test_an_idle_left_hand_is_the_mirror_image_of_a_right_one():
+    person, pair = Person("s1", np.zeros(10), None), load_embedded_hands()
+    left, right = (
+        track_joints(_idle_hand(side, person, 3, np.random.default_rng(0), True), pair[side]) for side in SIDES
+    )
+    np.testing.assert_allclose(left, right * (-1.0, 1.0, 1.0), atol=1e-6)
 
 
 @pytest.mark.parametrize("dataset", ONE_ACTION)

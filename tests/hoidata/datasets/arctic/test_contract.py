@@ -80,7 +80,7 @@ class TestArctic(AdapterContract):
     }
     conventions = {  # noqa: RUF012
         "unit": "test_the_translation_is_in_millimetres",
-        "handedness of the world": "test_the_world_is_not_seen_in_a_mirror",
+        "handedness of the world": "contract.py::test_the_world_is_not_seen_in_a_mirror",
         "meshes": "test_the_mesh_is_in_millimetres",
         "object rotation": "test_it_is_turned_as_column_vectors",
         "hand translation": "test_the_hand_turns_about_its_shaped_rest_wrist_and_is_moved_by_trans",
@@ -88,7 +88,7 @@ class TestArctic(AdapterContract):
         "angles beyond pi": "test_angles_beyond_pi_gain_the_mean_as_they_are",
         "shape": "test_one_row_of_betas_holds_for_the_whole_sequence",
         "left shape directions": "test_left_betas_belong_to_the_shape_directions_as_mano_released_them",
-        "left and right": "test_each_hands_numbers_bend_a_hand_of_that_side",
+        "left and right": "contract.py::test_each_hands_numbers_bend_a_hand_of_that_side",
         "parts": "test_part_0_of_the_file_is_the_top_and_moves",
         "hinge": "test_the_hinge_turns_about_minus_z",
         "camera": "test_the_file_takes_the_world_to_the_camera_and_the_clip_the_camera_to_the_world",

@@ -1,4 +1,4 @@
-"""ARCTIC's conventions, one test each: numbers typed here, formulas of the publication, and the same with the
+"""ARCTIC's conventions, one test each: numbers typed by hand, formulas of the publication, and the same with the
 convention the other way round, which must be off by more than 5 mm (or by a frame). Neither our writer nor our engine
 is used."""
 
@@ -14,57 +14,23 @@ from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import RawTree
 from hoidata.datasets.arctic.adapter import ArcticAdapter
 from hoidata.hands import HandPair, load_embedded_hands
+from tests.builders import arctic as recording
+from tests.builders.arctic import BOTTOM_MM, SHAPE, STORED, TOP_MM
+from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_stored, off_m, rest_points
+from tests.hoidata.datasets.contract import SeatedPersonContract
 
-EXACT_M, WRONG_M = 1e-6, 0.005
-N_FRAMES = 50
 AT = 30  # the frame that is looked at
-RANGE = "21-45"  # frames 20 to 44
-BOTTOM_MM = [[0.0, 0.0, 0.0], [180.0, 0.0, 0.0], [180.0, 120.0, 0.0], [0.0, 120.0, -30.0]]
-TOP_MM = [[5.0, 5.0, 20.0], [170.0, 5.0, 20.0], [170.0, 110.0, 25.0], [5.0, 110.0, 25.0]]
-PARTS = [1, 1, 1, 1, 0, 0, 0, 0]
-ANGLE, OBJECT_ORIENT, OBJECT_MM = 4.2, (0.4, -0.9, 1.3), (120.0, -340.0, 910.0)
-ORIENT = {"left": (0.7, -1.1, 0.4), "right": (-0.2, 1.5, 0.8)}
-TRANS = {"left": (0.22, -0.13, 0.97), "right": (-0.31, 0.08, 1.05)}
-SHAPE = {
-    "left": [1.5, -0.8, 1.2, 0.3, -0.9, 0.5, -0.4, 0.7, -0.2, 0.6],
-    "right": [-1.1, 0.9, -0.6, 1.4, 0.2, -0.7, 0.8, -0.3, 0.5, -0.5],
-}
-STORED = [0.1, -0.2, 0.4] + [0.0] * 6 + [4.6, 0.8, 0.3] + [0.0] * 33  # middle1 turned by more than pi
-HEAD_ORIENT, HEAD_SHIFT_M = (1.9, 0.4, -0.6), (0.15, -0.25, 1.6)  # world to camera
-INTRINSICS = [[1480.5, 0.0, 1402.25], [0.0, 1475.75, 998.5], [0.0, 0.0, 1.0]]
-IMAGE_OFFSET = 7
+ANGLE, OBJECT_ORIENT, OBJECT_MM = (array[AT] for array in (recording.ANGLE, recording.ORIENT, recording.TRANSLATION_MM))
+ORIENT, TRANS = recording.HAND_ORIENT, recording.HAND_TRANSL
+HEAD = recording.head()
+HEAD_TURN, HEAD_SHIFT_M = Rotation.from_matrix(HEAD["R_k_cam_np"][AT]), HEAD["T_k_cam_np"][AT, :, 0]  # world to camera
 
 
-def hand_block(side: str) -> dict:
-    rows = {"rot": ORIENT[side], "pose": STORED, "trans": TRANS[side]}
-    arrays = {name: np.tile(np.asarray(row, np.float32), (N_FRAMES, 1)) for name, row in rows.items()}
-    return {**arrays, "shape": np.array(SHAPE[side], np.float32), "fitting_err": np.zeros(N_FRAMES, np.float32)}
-
-
-def write(root: Path, description: str = f"{RANGE} open, right hand\n", egocam: bool = True) -> Path:
-    folder, words = root / "raw_seqs" / "s06", root / "description" / "s06" / "box_use_03"
-    template = root / "meta" / "object_vtemplates" / "box"
-    for place in (folder, words, template):
-        place.mkdir(parents=True, exist_ok=True)
-    sides = {"right": hand_block("right"), "left": hand_block("left")}
-    np.save(folder / "box_use_03.mano.npy", np.array(sides, dtype=object))
-    np.save(folder / "box_use_03.object.npy", np.tile((ANGLE, *OBJECT_ORIENT, *OBJECT_MM), (N_FRAMES, 1)))
-    (words / "description.txt").write_text(description)
-    lines = [f"v {x} {y} {z}" for x, y, z in BOTTOM_MM + TOP_MM] + ["f 1 2 3", "f 1 3 4", "f 5 6 7", "f 5 7 8"]
-    (template / "mesh.obj").write_text("\n".join(lines))
-    (template / "parts.json").write_text(json.dumps(PARTS))
+def write(root: Path, description: str = "21-45 open, right hand\n", egocam: bool = True) -> Path:
+    recording.write_root(root)
+    recording.write_sequence(root, lines=description)
     if egocam:
-        head = {
-            "R_k_cam_np": np.tile(Rotation.from_rotvec(HEAD_ORIENT).as_matrix(), (N_FRAMES, 1, 1)),
-            "T_k_cam_np": np.tile(np.reshape(HEAD_SHIFT_M, (3, 1)), (N_FRAMES, 1, 1)),
-            "intrinsics": np.array(INTRINSICS),
-            "ego_markers.ref": np.zeros((4, 3)),
-            "ego_markers.label": np.array(["a", "b", "c", "d"]),
-            "R0": np.eye(3),
-            "T0": np.zeros((3, 1)),
-            "dist8": np.zeros(8),
-        }
-        np.save(folder / "box_use_03.egocam.dist.npy", np.array(head, dtype=object))
+        recording.write_extra(root, "egocam.dist", HEAD)
     return root
 
 
@@ -78,56 +44,46 @@ def at(clip) -> int:
     return clip.source_frames.tolist().index(AT)
 
 
-def off_m(found, other) -> float:
-    return float(np.linalg.norm(np.asarray(found) - np.asarray(other), axis=-1).max())
-
-
 def absolute(hands, side: str) -> np.ndarray:
     return np.array(STORED) + hands[side].mean_pose
 
 
-def hand_joints(clip, side: str, hands, formula) -> np.ndarray:
-    """(16, 3) joints of the frame looked at, from what the clip says: wrist, turn, bends, betas."""
-    track, frame = clip.hands[side], at(clip)
-    rest = formula.rest_points(hands[side], track.betas[0 if len(track.betas) == 1 else frame].astype(np.float64))
-    transl = track.wrist_m[frame] - rest[0]
-    return formula.chain(rest, track.global_orient[frame], track.hand_pose[frame].astype(np.float64), transl)
+def hand_joints(clip, side: str, hands) -> np.ndarray:
+    """(16, 3) joints of the frame looked at, from what the clip says."""
+    return joints_as_stored(clip.hands[side], hands[side], at(clip))
 
 
-def arctic_joints(side: str, hands, formula, bends=None, betas=None) -> np.ndarray:
+def arctic_joints(side: str, hands, bends=None, betas=None) -> np.ndarray:
     """(16, 3) joints as ARCTIC means its numbers: betas, bends that gain the mean, turned about J0, then moved."""
-    rest = formula.rest_points(hands[side], SHAPE[side] if betas is None else betas)
-    return formula.chain(rest, ORIENT[side], absolute(hands, side) if bends is None else bends, TRANS[side])
+    rest = rest_points(hands[side], SHAPE[side] if betas is None else betas)
+    return chain(rest, ORIENT[side], absolute(hands, side) if bends is None else bends, TRANS[side])
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 class TestHands:
-    def test_fingers_are_relative_to_the_mean_pose(self, clip, hands, formula, side):
+    def test_fingers_are_relative_to_the_mean_pose(self, clip, hands, side):
         np.testing.assert_allclose(clip.hands[side].hand_pose[at(clip)], absolute(hands, side), atol=EXACT_M)
-        found = hand_joints(clip, side, hands, formula)
-        assert off_m(found, arctic_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, arctic_joints(side, hands, formula, bends=np.array(STORED))) > WRONG_M
+        found = hand_joints(clip, side, hands)
+        agrees(found, arctic_joints(side, hands), arctic_joints(side, hands, bends=np.array(STORED)))
 
-    def test_angles_beyond_pi_gain_the_mean_as_they_are(self, clip, hands, formula, side):
-        found = hand_joints(clip, side, hands, formula)
+    def test_angles_beyond_pi_gain_the_mean_as_they_are(self, clip, hands, side):
+        found = hand_joints(clip, side, hands)
         wrapped = Rotation.from_rotvec(np.reshape(STORED, (15, 3))).as_rotvec().ravel()
         assert np.abs(wrapped - STORED).max() > 1
-        assert off_m(found, arctic_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, arctic_joints(side, hands, formula, bends=wrapped + hands[side].mean_pose)) > WRONG_M
+        agrees(found, arctic_joints(side, hands), arctic_joints(side, hands, bends=wrapped + hands[side].mean_pose))
 
-    def test_the_hand_turns_about_its_shaped_rest_wrist_and_is_moved_by_trans(self, clip, hands, formula, side):
-        rest = formula.rest_points(hands[side], SHAPE[side])
-        found = hand_joints(clip, side, hands, formula)
+    def test_the_hand_turns_about_its_shaped_rest_wrist_and_is_moved_by_trans(self, clip, hands, side):
+        rest = rest_points(hands[side], SHAPE[side])
+        found = hand_joints(clip, side, hands)
         assert off_m(clip.hands[side].wrist_m[at(clip)], rest[0] + TRANS[side]) < EXACT_M
-        assert off_m(found, arctic_joints(side, hands, formula) - rest[0]) > WRONG_M
+        assert off_m(found, arctic_joints(side, hands) - rest[0]) > WRONG_M
         about_origin = Rotation.from_rotvec(ORIENT[side]).apply(rest[0]) + TRANS[side]
         assert off_m(clip.hands[side].wrist_m[at(clip)], about_origin) > WRONG_M
 
-    def test_one_row_of_betas_holds_for_the_whole_sequence(self, clip, hands, formula, side):
+    def test_one_row_of_betas_holds_for_the_whole_sequence(self, clip, hands, side):
         np.testing.assert_allclose(clip.hands[side].betas, [SHAPE[side]], atol=EXACT_M)
-        found = hand_joints(clip, side, hands, formula)
-        assert off_m(found, arctic_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, arctic_joints(side, hands, formula, betas=np.zeros(10))) > WRONG_M
+        found = hand_joints(clip, side, hands)
+        agrees(found, arctic_joints(side, hands), arctic_joints(side, hands, betas=np.zeros(10)))
 
     def test_left_is_left(self, clip, side):
         other = {"left": "right", "right": "left"}[side]
@@ -136,7 +92,7 @@ class TestHands:
         assert off_m(clip.hands[side].wrist_m[at(clip)], clip.hands[other].wrist_m[at(clip)]) > WRONG_M
 
 
-def test_left_betas_belong_to_the_shape_directions_as_mano_released_them(tmp_path, formula):
+def test_left_betas_belong_to_the_shape_directions_as_mano_released_them(tmp_path):
     """A pair like MANO's: x of the left shape directions has the right hand's sign."""
     hands = load_embedded_hands()
     right_directions = hands.right.shape_directions.copy()
@@ -152,10 +108,9 @@ def test_left_betas_belong_to_the_shape_directions_as_mano_released_them(tmp_pat
     adapter, raw = ArcticAdapter(), RawTree(write(tmp_path))
     used = hands_for(adapter.hand_convention, released)
     (clip,) = adapter.load(raw, adapter.sequences(raw.root)[0], used)
-    found = hand_joints(clip, "left", used, formula)
-    assert off_m(found, arctic_joints("left", released, formula)) < EXACT_M
+    found = hand_joints(clip, "left", used)
     corrected = replace(released, left=replace(released.left, shape_directions=mended))
-    assert off_m(found, arctic_joints("left", corrected, formula)) > WRONG_M
+    agrees(found, arctic_joints("left", released), arctic_joints("left", corrected))
 
 
 def canonical_mm(angle: float, moving: tuple[int, ...] = (4, 5, 6, 7)) -> np.ndarray:
@@ -182,37 +137,32 @@ def clip_points(clip) -> np.ndarray:
 
 class TestObject:
     def test_the_mesh_is_in_millimetres(self, clip):
-        assert off_m(clip.object.model.vertices_m, np.array(BOTTOM_MM + TOP_MM) / 1000) < EXACT_M
-        assert off_m(clip.object.model.vertices_m, np.array(BOTTOM_MM + TOP_MM)) > WRONG_M
+        agrees(clip.object.model.vertices_m, np.array(BOTTOM_MM + TOP_MM) / 1000, np.array(BOTTOM_MM + TOP_MM))
 
     def test_the_translation_is_in_millimetres(self, clip):
-        assert off_m(clip.object.translation_m[at(clip)], np.array(OBJECT_MM) / 1000) < EXACT_M
-        assert off_m(clip.object.translation_m[at(clip)], OBJECT_MM) > WRONG_M
+        agrees(clip.object.translation_m[at(clip)], np.array(OBJECT_MM) / 1000, OBJECT_MM)
 
-    def test_hands_are_in_metres_all_the_same(self, clip, hands, formula):
-        rest = formula.rest_points(hands.left, SHAPE["left"])
+    def test_hands_are_in_metres_all_the_same(self, clip, hands):
+        rest = rest_points(hands.left, SHAPE["left"])
         assert off_m(clip.hands["left"].wrist_m[at(clip)], rest[0] + np.array(TRANS["left"]) / 1000) > WRONG_M
 
     def test_it_is_turned_as_column_vectors(self, clip):
         found = clip_points(clip)
-        assert off_m(found, in_world_m(canonical_mm(ANGLE))) < EXACT_M
         as_rows = (canonical_mm(ANGLE) @ Rotation.from_rotvec(OBJECT_ORIENT).as_matrix() + OBJECT_MM) / 1000
-        assert off_m(found, as_rows) > WRONG_M
+        agrees(found, in_world_m(canonical_mm(ANGLE)), as_rows)
 
     def test_part_0_of_the_file_is_the_top_and_moves(self, clip):
         found = clip_points(clip)
-        assert off_m(found, in_world_m(canonical_mm(ANGLE))) < EXACT_M
-        assert off_m(found, in_world_m(canonical_mm(ANGLE, moving=(0, 1, 2, 3)))) > WRONG_M
+        agrees(found, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(ANGLE, moving=(0, 1, 2, 3))))
         assert clip.object.model.part.tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
 
     def test_the_hinge_turns_about_minus_z(self, clip):
         found = clip_points(clip)
-        assert off_m(found, in_world_m(canonical_mm(ANGLE))) < EXACT_M
-        assert off_m(found, in_world_m(canonical_mm(-ANGLE))) > WRONG_M
+        agrees(found, in_world_m(canonical_mm(ANGLE)), in_world_m(canonical_mm(-ANGLE)))
 
     def test_hinge_angles_are_not_wrapped(self, clip):
-        np.testing.assert_allclose(clip.object.hinge_rad, ANGLE, atol=EXACT_M)
-        assert abs(clip.object.hinge_rad[0] - (ANGLE - 2 * np.pi)) > 6
+        np.testing.assert_allclose(clip.object.hinge_rad, recording.ANGLE[clip.source_frames], atol=EXACT_M)
+        assert abs(clip.object.hinge_rad[at(clip)] - (ANGLE - 2 * np.pi)) > 6
 
 
 @pytest.mark.parametrize(
@@ -230,23 +180,22 @@ class TestHeadCamera:
 
     def test_the_file_takes_the_world_to_the_camera_and_the_clip_the_camera_to_the_world(self, clip):
         camera = clip.camera
-        seen = Rotation.from_rotvec(HEAD_ORIENT).apply(self.POINT_M) + HEAD_SHIFT_M
+        seen = HEAD_TURN.apply(self.POINT_M) + HEAD_SHIFT_M
         turn, place = Rotation.from_rotvec(camera.rotvec[at(clip)]), camera.position_m[at(clip)]
-        assert off_m(turn.apply(seen) + place, self.POINT_M) < EXACT_M
-        the_other_way = Rotation.from_rotvec(HEAD_ORIENT).apply(seen) + HEAD_SHIFT_M
-        assert off_m(turn.apply(seen) + place, the_other_way) > WRONG_M
+        the_other_way = HEAD_TURN.apply(seen) + HEAD_SHIFT_M
+        agrees(turn.apply(seen) + place, self.POINT_M, the_other_way)
         assert off_m(place, HEAD_SHIFT_M) > WRONG_M
 
     def test_intrinsics_are_focal_lengths_centre_and_size_of_the_image(self, clip):
         assert clip.camera.name == "ego"
-        assert clip.camera.intrinsics.tolist() == [1480.5, 1475.75, 1402.25, 998.5, 2800.0, 2000.0]
+        assert clip.camera.intrinsics.tolist() == [1500.0, 1510.0, 1400.0, 1000.0, 2800.0, 2000.0]
 
     def test_images_are_numbered_like_frames_where_nothing_else_is_said(self, clip):
         assert clip.camera.images.tolist() == clip.source_frames.tolist()
 
     def test_images_are_numbered_later_by_the_subjects_offset(self, tmp_path, load_all):
         root = write(tmp_path)
-        offsets = {"s06": {"ioi_offset": IMAGE_OFFSET}, "s01": {"ioi_offset": 3}}
+        offsets = {"s04": {"ioi_offset": 7}, "s01": {"ioi_offset": 3}}
         (root / "meta" / "misc.json").write_text(json.dumps(offsets))
         (clip,) = load_all(ArcticAdapter(), root)
         assert clip.camera.images.tolist() == [frame + 7 for frame in clip.source_frames.tolist()]
@@ -261,43 +210,28 @@ def test_things_fall_along_minus_z(clip):
     assert clip.gravity.tolist() == [0.0, 0.0, -1.0]
 
 
-EDGES_SEEN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+class TestSeatedPerson(SeatedPersonContract):
+    @pytest.fixture
+    def look(self, tmp_path, hands, load_all):
+        """Joints of both hands and three edges of the box in the world, of a person whose numbers are given."""
 
+        def of(person):
+            root = write(tmp_path)
+            edges_mm = np.array([[-100.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 50.0]]) * person.signs
+            corners = np.concatenate((np.zeros((1, 3)), edges_mm, np.array(TOP_MM) * person.signs))
+            lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f 1 2 3", "f 1 3 4", "f 5 6 7", "f 5 7 8"]
+            (root / "meta/object_vtemplates/box/mesh.obj").write_text("\n".join(lines))
+            blocks = {}
+            for side, (orient, angles, transl) in person.hands.items():
+                rows = {"rot": orient, "pose": angles, "trans": transl}
+                blocks[side] = recording.hand_params(side) | {
+                    name: np.tile(np.float32(row), (recording.N_FRAMES, 1)) for name, row in rows.items()
+                }
+            np.save(root / "raw_seqs/s04/box_grab_01.mano.npy", np.array(blocks, dtype=object))
+            box = (0.0, *person.object_orient, *(OBJECT_MM * person.signs))
+            np.save(root / "raw_seqs/s04/box_grab_01.object.npy", np.tile(box, (recording.N_FRAMES, 1)))
+            (clip,) = load_all(ArcticAdapter(), root)
+            points = clip_points(clip)
+            return {side: hand_joints(clip, side, hands) for side in ("left", "right")}, points[1:4] - points[0]
 
-@pytest.fixture
-def look(tmp_path, hands, formula, load_all):
-    """Joints of both hands and three edges of the box in the world, of a person whose numbers are given."""
-
-    def of(person):
-        root = write(tmp_path)
-        edges_mm = np.array([[-100.0, 0.0, 0.0], [0.0, 80.0, 0.0], [0.0, 0.0, 50.0]]) * person.signs
-        corners = np.concatenate((np.zeros((1, 3)), edges_mm, np.array(TOP_MM) * person.signs))
-        lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f 1 2 3", "f 1 3 4", "f 5 6 7", "f 5 7 8"]
-        (root / "meta/object_vtemplates/box/mesh.obj").write_text("\n".join(lines))
-        blocks = {}
-        for side, (orient, angles, transl) in person.hands.items():
-            rows = {"rot": orient, "pose": angles, "trans": transl}
-            blocks[side] = hand_block(side) | {
-                name: np.tile(np.float32(row), (N_FRAMES, 1)) for name, row in rows.items()
-            }
-        np.save(root / "raw_seqs/s06/box_use_03.mano.npy", np.array(blocks, dtype=object))
-        box = (0.0, *person.object_orient, *(OBJECT_MM * person.signs))
-        np.save(root / "raw_seqs/s06/box_use_03.object.npy", np.tile(box, (N_FRAMES, 1)))
-        (clip,) = load_all(ArcticAdapter(), root)
-        points = clip_points(clip)
-        return {side: hand_joints(clip, side, hands, formula) for side in ("left", "right")}, points[1:4] - points[0]
-
-    return of
-
-
-def test_each_hands_numbers_bend_a_hand_of_that_side(look, seated):
-    joints, _ = look(seated.person())
-    swapped, _ = look(seated.person(swapped=True))
-    assert seated.own_side(joints)
-    assert not seated.own_side(swapped)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_world_is_not_seen_in_a_mirror(look, seated, axis):
-    assert seated.as_described(*look(seated.person()), EDGES_SEEN)
-    assert not seated.as_described(*look(seated.person(mirrored=axis)), EDGES_SEEN)
+        return of

@@ -73,14 +73,14 @@ class TestGrab(AdapterContract):
     }
     conventions = {  # noqa: RUF012
         "unit": "test_meshes_and_places_are_metres",
-        "handedness of the world": "test_the_world_is_not_seen_in_a_mirror",
+        "handedness of the world": "contract.py::test_the_world_is_not_seen_in_a_mirror",
         "meshes": "test_objects_turn_about_the_origin_of_their_mesh_not_its_middle",
         "object rotation": "test_objects_are_turned_as_row_vectors",
         "hand translation": "test_the_hand_turns_about_its_rest_wrist_and_is_moved_by_transl",
         "finger angles": "test_fingers_are_absolute",
         "principal components": "test_components_are_weights_of_the_models_first_rows_without_the_mean",
         "shape": "test_the_rest_mesh_is_the_subjects_own_and_there_are_no_betas",
-        "left and right": "test_each_hands_numbers_bend_a_hand_of_that_side",
+        "left and right": "contract.py::test_each_hands_numbers_bend_a_hand_of_that_side",
         "frames": "test_every_fourth_frame_counts_from_the_first_of_the_file_and_both_ends_of_the_contact_stay",
         "gravity": "test_things_fall_along_minus_z",
     }

@@ -9,8 +9,9 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.datasets.grab.adapter import GrabAdapter
+from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_stored, off_m, rest_points
+from tests.hoidata.datasets.contract import SeatedPersonContract
 
-EXACT_M, WRONG_M = 1e-6, 0.005
 N_FRAMES = 81  # 120 Hz; frames 0, 4, ..., 80 are those of 30 Hz
 FIRST_TOUCH, LAST_TOUCH = 22, 56  # no multiple of 4, and one: 24 to 56 are kept
 AT = 36  # the frame that is looked at; it is the clip's fourth
@@ -112,23 +113,15 @@ def placed(track, frame: int) -> np.ndarray:
     return rotation.apply(track.model.vertices_m) + track.translation_m[frame]
 
 
-def hand_joints(clip, side: str, hands, formula) -> np.ndarray:
-    """(16, 3) joints of the frame looked at, from what the clip says: wrist, turn, bends, mesh, betas."""
-    track, frame = clip.hands[side], at(clip)
-    betas = track.betas[0 if len(track.betas) == 1 else frame]
-    rest = formula.rest_points(hands[side], betas, track.template_m)
-    transl = track.wrist_m[frame] - rest[0]
-    return formula.chain(rest, track.global_orient[frame], track.hand_pose[frame].astype(np.float64), transl)
+def hand_joints(clip, side: str, hands) -> np.ndarray:
+    """(16, 3) joints of the frame looked at, from what the clip says."""
+    return joints_as_stored(clip.hands[side], hands[side], at(clip))
 
 
-def grab_joints(side: str, hands, formula, bends=None, mesh=None, orient=None) -> np.ndarray:
+def grab_joints(side: str, hands, bends=None, mesh=None, orient=None) -> np.ndarray:
     """(16, 3) joints as GRAB means its numbers: the subject's own mesh, absolute bends, turned about J0, then moved."""
-    rest = formula.rest_points(hands[side], template_m=personal_mesh(hands, side) if mesh is None else mesh)
-    return formula.chain(rest, ORIENT[side], fingers() if bends is None else bends, TRANSL[side])
-
-
-def off_m(found: np.ndarray, other: np.ndarray) -> float:
-    return float(np.linalg.norm(found - other, axis=-1).max())
+    rest = rest_points(hands[side], template_m=personal_mesh(hands, side) if mesh is None else mesh)
+    return chain(rest, ORIENT[side], fingers() if bends is None else bends, TRANSL[side])
 
 
 def row_vectors(points, orient, place) -> np.ndarray:
@@ -137,39 +130,35 @@ def row_vectors(points, orient, place) -> np.ndarray:
 
 def test_objects_are_turned_as_row_vectors(load):
     found = placed(load().object, 3)
-    assert off_m(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE)) < EXACT_M
     as_columns = Rotation.from_rotvec(MUG_ORIENT).apply(MUG_M) + MUG_PLACE
-    assert off_m(found, as_columns) > WRONG_M
+    agrees(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), as_columns)
 
 
 def test_objects_turn_about_the_origin_of_their_mesh_not_its_middle(load):
     found, middle = placed(load().object, 3), np.mean(MUG_M, axis=0)
     about_middle = row_vectors(np.array(MUG_M) - middle, MUG_ORIENT, MUG_PLACE) + middle
-    assert off_m(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE)) < EXACT_M
-    assert off_m(found, about_middle) > WRONG_M
+    agrees(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), about_middle)
 
 
 def test_the_table_is_turned_as_row_vectors(load):
     (table,) = load().other_objects
     assert table.model.name == "table"
     found = placed(table, 3)
-    assert off_m(found, row_vectors(TABLE_M, TABLE_ORIENT, TABLE_PLACE)) < EXACT_M
     as_columns = Rotation.from_rotvec(TABLE_ORIENT).apply(TABLE_M) + TABLE_PLACE
-    assert off_m(found, as_columns) > WRONG_M
+    agrees(found, row_vectors(TABLE_M, TABLE_ORIENT, TABLE_PLACE), as_columns)
 
 
 @pytest.mark.parametrize("side", ["left", "right"])
 class TestHands:
-    def test_fingers_are_absolute(self, load, hands, formula, side):
+    def test_fingers_are_absolute(self, load, hands, side):
         clip = load()
         np.testing.assert_allclose(clip.hands[side].hand_pose[at(clip)], fingers(), atol=EXACT_M)
-        found = hand_joints(clip, side, hands, formula)
-        assert off_m(found, grab_joints(side, hands, formula)) < EXACT_M
-        with_mean = grab_joints(side, hands, formula, bends=fingers() + hands[side].mean_pose)
-        assert off_m(found, with_mean) > WRONG_M
+        found = hand_joints(clip, side, hands)
+        with_mean = grab_joints(side, hands, bends=fingers() + hands[side].mean_pose)
+        agrees(found, grab_joints(side, hands), with_mean)
 
     @pytest.mark.parametrize("count", [1, 6, 24, 45])
-    def test_components_are_weights_of_the_models_first_rows_without_the_mean(self, load, hands, formula, side, count):
+    def test_components_are_weights_of_the_models_first_rows_without_the_mean(self, load, hands, side, count):
         weights = np.array((WEIGHTS * 2)[:count]) * (1.5 if count == 1 else 1)
 
         def only_components(data):
@@ -177,14 +166,15 @@ class TestHands:
             del params["fullpose"]
             params["hand_pose"] = np.tile(weights, (N_FRAMES, 1))
 
-        found = hand_joints(load(only_components), side, hands, formula)
+        found = hand_joints(load(only_components), side, hands)
         bends = sum(weight * row for weight, row in zip(weights, hands[side].components, strict=False))
-        assert off_m(found, grab_joints(side, hands, formula, bends=bends)) < EXACT_M
-        assert off_m(found, grab_joints(side, hands, formula, bends=bends + hands[side].mean_pose)) > WRONG_M
+        agrees(
+            found, grab_joints(side, hands, bends=bends), grab_joints(side, hands, bends=bends + hands[side].mean_pose)
+        )
         columns = hands[side].components[:, :count] @ weights
-        assert off_m(found, grab_joints(side, hands, formula, bends=columns)) > WRONG_M
+        assert off_m(found, grab_joints(side, hands, bends=columns)) > WRONG_M
         as_angles = np.concatenate((weights, np.zeros(45 - count)))
-        assert off_m(found, grab_joints(side, hands, formula, bends=as_angles)) > WRONG_M
+        assert off_m(found, grab_joints(side, hands, bends=as_angles)) > WRONG_M
 
     def test_fullpose_wins_over_components(self, load, side):
         def both(data):
@@ -193,30 +183,28 @@ class TestHands:
         clip = load(both)
         np.testing.assert_allclose(clip.hands[side].hand_pose[at(clip)], fingers(), atol=EXACT_M)
 
-    def test_the_rest_mesh_is_the_subjects_own_and_there_are_no_betas(self, load, hands, formula, side):
+    def test_the_rest_mesh_is_the_subjects_own_and_there_are_no_betas(self, load, hands, side):
         clip = load()
         np.testing.assert_allclose(clip.hands[side].template_m, personal_mesh(hands, side), atol=EXACT_M)
         assert clip.hands[side].betas.tolist() == [[0.0] * 10]
-        found = hand_joints(clip, side, hands, formula)
-        assert off_m(found, grab_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, grab_joints(side, hands, formula, mesh=hands[side].template_m)) > WRONG_M
+        found = hand_joints(clip, side, hands)
+        agrees(found, grab_joints(side, hands), grab_joints(side, hands, mesh=hands[side].template_m))
 
-    def test_the_hand_turns_about_its_rest_wrist_and_is_moved_by_transl(self, load, hands, formula, side):
+    def test_the_hand_turns_about_its_rest_wrist_and_is_moved_by_transl(self, load, hands, side):
         clip = load()
-        rest = formula.rest_points(hands[side], template_m=personal_mesh(hands, side))[:16]
-        found = hand_joints(clip, side, hands, formula)
+        rest = rest_points(hands[side], template_m=personal_mesh(hands, side))[:16]
+        found = hand_joints(clip, side, hands)
         assert off_m(clip.hands[side].wrist_m[at(clip)], rest[0] + TRANSL[side]) < EXACT_M
-        wrist_at_transl = grab_joints(side, hands, formula) - rest[0]
+        wrist_at_transl = grab_joints(side, hands) - rest[0]
         assert off_m(found, wrist_at_transl) > WRONG_M
         about_origin = Rotation.from_rotvec(ORIENT[side]).apply(rest[0]) + TRANSL[side]
         assert off_m(clip.hands[side].wrist_m[at(clip)], about_origin) > WRONG_M
 
-    def test_hands_turn_as_column_vectors_unlike_objects(self, load, hands, formula, side):
-        found = hand_joints(load(), side, hands, formula)
-        rest = formula.rest_points(hands[side], template_m=personal_mesh(hands, side))
-        turned_back = formula.chain(rest, -np.array(ORIENT[side]), fingers(), TRANSL[side])
-        assert off_m(found, grab_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, turned_back) > WRONG_M
+    def test_hands_turn_as_column_vectors_unlike_objects(self, load, hands, side):
+        found = hand_joints(load(), side, hands)
+        rest = rest_points(hands[side], template_m=personal_mesh(hands, side))
+        turned_back = chain(rest, -np.array(ORIENT[side]), fingers(), TRANSL[side])
+        agrees(found, grab_joints(side, hands), turned_back)
 
     def test_left_is_left(self, load, hands, side):
         other = {"left": "right", "right": "left"}[side]
@@ -263,38 +251,27 @@ def test_things_fall_along_minus_z(load):
 
 # Half a turn about z puts them to her right, towards her, and up.
 MUG_EDGES = [[-0.1, 0.0, 0.0], [0.0, 0.08, 0.0], [0.0, 0.0, 0.05]]
-EDGES_SEEN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
-@pytest.fixture
-def look(root, hands, formula, load_all, seated):
-    """Joints of both hands and the mug's three edges in the world, of a person whose numbers are given."""
+class TestSeatedPerson(SeatedPersonContract):
+    @pytest.fixture
+    def look(self, root, hands, load_all):
+        """Joints of both hands and the mug's three edges in the world, of a person whose numbers are given."""
 
-    def of(person):
-        data = recording()
-        for side, (orient, angles, transl) in person.hands.items():
-            params = {"global_orient": orient, "transl": transl, "fullpose": angles}
-            data[f"{side[0]}hand"]["params"] = {name: every_frame(row) for name, row in params.items()}
-            data[f"{side[0]}hand"]["vtemp"] = f"tools/subject_meshes/female/s8_{person.named[side][0]}hand.ply"
-        data["object"]["params"] = thing_block("mug", person.object_orient, np.array(MUG_PLACE) * person.signs)
-        write(root, data)
-        mesh = trimesh.Trimesh([np.zeros(3), *(MUG_EDGES * person.signs), (0.02, 0.02, 0.02)], MUG_FACES, process=False)
-        mesh.export(root / "tools/object_meshes/contact_meshes/mug.ply")
-        (clip,) = load_all(GrabAdapter(), root)
-        corners = placed(clip.object, at(clip))
-        return {side: hand_joints(clip, side, hands, formula) for side in ("left", "right")}, corners[1:4] - corners[0]
+        def of(person):
+            data = recording()
+            for side, (orient, angles, transl) in person.hands.items():
+                params = {"global_orient": orient, "transl": transl, "fullpose": angles}
+                data[f"{side[0]}hand"]["params"] = {name: every_frame(row) for name, row in params.items()}
+                data[f"{side[0]}hand"]["vtemp"] = f"tools/subject_meshes/female/s8_{person.named[side][0]}hand.ply"
+            data["object"]["params"] = thing_block("mug", person.object_orient, np.array(MUG_PLACE) * person.signs)
+            write(root, data)
+            mesh = trimesh.Trimesh(
+                [np.zeros(3), *(MUG_EDGES * person.signs), (0.02, 0.02, 0.02)], MUG_FACES, process=False
+            )
+            mesh.export(root / "tools/object_meshes/contact_meshes/mug.ply")
+            (clip,) = load_all(GrabAdapter(), root)
+            corners = placed(clip.object, at(clip))
+            return {side: hand_joints(clip, side, hands) for side in ("left", "right")}, corners[1:4] - corners[0]
 
-    return of
-
-
-def test_each_hands_numbers_bend_a_hand_of_that_side(look, seated):
-    joints, _ = look(seated.person())
-    swapped, _ = look(seated.person(swapped=True))
-    assert seated.own_side(joints)
-    assert not seated.own_side(swapped)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_world_is_not_seen_in_a_mirror(look, seated, axis):
-    assert seated.as_described(*look(seated.person()), EDGES_SEEN)
-    assert not seated.as_described(*look(seated.person(mirrored=axis)), EDGES_SEEN)
+        return of

@@ -18,36 +18,17 @@ from hoidata.datasets import RawTree
 from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from tests.builders.formulas import agrees, chain, rest_points
+from tests.builders.h2o import camera, object_in_camera, write_text
 
 N_FRAMES = 30
 FIRST, LAST = 4, 26  # labelled frames, both inclusive
 SAME_M, FAR_M = 1e-6, 5e-3
-# A camera-to-world matrix by rows: looks down at a table from 1.4 m, not square to any axis.
-CAMERA = """ 0.9362934 -0.1537920 0.3157748 0.31  -0.2750959 -0.8710660 0.4069431 -0.52
-            0.2124765 -0.4678879 -0.8578648 1.37  0 0 0 1"""
 LEFT_T, RIGHT_T = (0.061, -0.083, 0.472), (-0.137, 0.022, 0.391)
 LEFT_ORIENT, RIGHT_ORIENT = (0.41, -0.93, 0.57), (-0.33, 1.21, 0.18)
 LEFT_BETAS = (1.7, -0.9, 0.4, 0.0, 0.8, 0.0, 0.0, -0.6, 0.0, 0.3)
 RIGHT_BETAS = (-1.3, 0.7, 0.2, 0.9, 0.0, -0.5, 0.0, 0.0, 0.4, 0.0)
 LEFT_INDEX, RIGHT_THUMB = (0.05, -0.12, 0.83), (0.31, 0.22, 0.47)  # first joint of each; all other fingers are flat
-OBJECT_T = (0.021, 0.067, 0.448)
-OBJECT_TURN = (0.37, 0.81, -0.52)
-
-
-def camera(frame: int) -> np.ndarray:
-    """The matrix above made a rotation, walking and turning a little with every frame."""
-    matrix = np.array(CAMERA.split(), dtype=float).reshape(4, 4)
-    left, _, right = np.linalg.svd(matrix[:3, :3])
-    matrix[:3, :3] = left @ right @ Rotation.from_rotvec((0.01 * frame, 0.02 * frame, 0)).as_matrix()
-    matrix[:3, 3] += (0.004 * frame, 0.0, -0.003 * frame)
-    return matrix
-
-
-def object_in_camera(frame: int) -> np.ndarray:
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_rotvec(np.add(OBJECT_TURN, (0, 0, 0.03 * frame))).as_matrix()
-    matrix[:3, 3] = np.add(OBJECT_T, (0.003 * frame, 0, 0))
-    return matrix
 
 
 def betas(base: tuple[float, ...], frame: int) -> np.ndarray:
@@ -74,11 +55,6 @@ def joints_row(left_flag: float = 1.0) -> list[float]:
     return [left_flag, *left.ravel().tolist(), 1.0, *right.ravel().tolist()]
 
 
-def write(path: Path, numbers) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(" ".join(repr(float(number)) for number in np.ravel(numbers)) + "\n")
-
-
 @pytest.fixture(scope="module")
 def root(tmp_path_factory) -> Path:
     """The left hand is not annotated in frame 9; "grab chips" (label 7) in frames 4 to 26."""
@@ -86,11 +62,11 @@ def root(tmp_path_factory) -> Path:
     folder = root / "subject1" / "o2" / "5" / "cam4"
     for frame in range(N_FRAMES):
         name = f"{frame:06d}.txt"
-        write(folder / "cam_pose" / name, camera(frame))
-        write(folder / "hand_pose_mano" / name, hand_row(frame, 0.0 if frame == 9 else 1.0))
-        write(folder / "hand_pose" / name, joints_row(0.0 if frame == 9 else 1.0))
-        write(folder / "obj_pose_rt" / name, [7, *object_in_camera(frame).ravel()])
-        write(folder / "action_label" / name, [7 if FIRST <= frame <= LAST else 0])
+        write_text(folder / "cam_pose" / name, camera(frame))
+        write_text(folder / "hand_pose_mano" / name, hand_row(frame, 0.0 if frame == 9 else 1.0))
+        write_text(folder / "hand_pose" / name, joints_row(0.0 if frame == 9 else 1.0))
+        write_text(folder / "obj_pose_rt" / name, [7, *object_in_camera(frame).ravel()])
+        write_text(folder / "action_label" / name, [7 if FIRST <= frame <= LAST else 0])
     mesh = root / "object" / "chips" / "chips.obj"
     mesh.parent.mkdir(parents=True)
     mesh.write_text(
@@ -133,82 +109,64 @@ def joints(clip) -> dict[str, np.ndarray]:
 FRAMES = (4, 11, 26)
 
 
-def seen_right(formula, frame: int, **change) -> np.ndarray:
+def seen_right(frame: int, **change) -> np.ndarray:
     """(16, 3) joints of the right hand in the camera's frame; ``change`` turns one convention round."""
     shape = change.get("betas", betas(RIGHT_BETAS, frame))
-    rest = formula.rest_points(MODELS.right, shape)
+    rest = rest_points(MODELS.right, shape)
     fingers = np.zeros(45)
     fingers[36:39] = RIGHT_THUMB
-    return formula.chain(rest, RIGHT_ORIENT, fingers + change.get("added", 0.0), change.get("transl", RIGHT_T))
+    return chain(rest, RIGHT_ORIENT, fingers + change.get("added", 0.0), change.get("transl", RIGHT_T))
 
 
 def to_world(points: np.ndarray, frame: int) -> np.ndarray:
     return points @ camera(frame)[:3, :3].T + camera(frame)[:3, 3]
 
 
-def check(found: dict, expected: Callable, wrong: Callable, frames=FRAMES) -> None:
-    """Every joint is where the formula says, and some joint of the other convention is more than 5 mm off."""
+def check(joints: dict[str, dict], wrong: Callable, frames=FRAMES) -> None:
+    """The right hand is where the formula says, and with the other convention more than 5 mm off."""
     for frame in frames:
-        np.testing.assert_allclose(found[frame][:16], expected(frame), atol=SAME_M)
-        assert np.linalg.norm(wrong(frame) - expected(frame), axis=1).max() > FAR_M
+        agrees(joints["right"][frame][:16], to_world(seen_right(frame), frame), wrong(frame))
 
 
-def test_camera_files_are_camera_to_world_and_not_its_inverse(joints, formula):
-    check(
-        joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: (seen_right(formula, frame) - camera(frame)[:3, 3]) @ camera(frame)[:3, :3],
-    )
+def test_camera_files_are_camera_to_world_and_not_its_inverse(joints):
+    check(joints, lambda frame: (seen_right(frame) - camera(frame)[:3, 3]) @ camera(frame)[:3, :3])
 
 
-def test_camera_files_are_written_by_rows(joints, formula):
-    check(
-        joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: seen_right(formula, frame) @ camera(frame)[:3, :3] + camera(frame)[:3, 3],
-    )
+def test_camera_files_are_written_by_rows(joints):
+    check(joints, lambda frame: seen_right(frame) @ camera(frame)[:3, :3] + camera(frame)[:3, 3])
 
 
-def test_each_frame_has_the_camera_of_its_own_number(joints, formula):
-    check(
-        joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: to_world(seen_right(formula, frame), frame - 1),
-    )
+def test_each_frame_has_the_camera_of_its_own_number(joints):
+    check(joints, lambda frame: to_world(seen_right(frame), frame - 1))
 
 
-def test_the_translation_is_added_to_the_rest_wrist(joints, formula):
+def test_the_translation_is_added_to_the_rest_wrist(joints):
     def as_wrist(frame: int) -> np.ndarray:
-        rest_wrist = formula.rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
-        return to_world(seen_right(formula, frame, transl=np.array(RIGHT_T) - rest_wrist), frame)
+        rest_wrist = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
+        return to_world(seen_right(frame, transl=np.array(RIGHT_T) - rest_wrist), frame)
 
-    check(joints["right"], lambda frame: to_world(seen_right(formula, frame), frame), as_wrist)
+    check(joints, as_wrist)
 
 
-def test_a_change_of_frame_turns_the_wrist_and_not_the_translation_alone(joints, formula):
+def test_a_change_of_frame_turns_the_wrist_and_not_the_translation_alone(joints):
     def naive(frame: int) -> np.ndarray:
         """Turned hand at ``A t + b``, as if the model turned about its origin."""
-        rest = formula.rest_points(MODELS.right, betas(RIGHT_BETAS, frame))
-        turned = (seen_right(formula, frame) - RIGHT_T - rest[0]) @ camera(frame)[:3, :3].T
+        rest = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))
+        turned = (seen_right(frame) - RIGHT_T - rest[0]) @ camera(frame)[:3, :3].T
         return turned + rest[0] + camera(frame)[:3, :3] @ RIGHT_T + camera(frame)[:3, 3]
 
-    check(joints["right"], lambda frame: to_world(seen_right(formula, frame), frame), naive)
+    check(joints, naive)
 
 
-def test_fingers_are_absolute_and_the_mean_pose_is_not_added(joints, formula):
-    check(
-        joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: to_world(seen_right(formula, frame, added=MODELS.right.mean_pose), frame),
-    )
+def test_fingers_are_absolute_and_the_mean_pose_is_not_added(joints):
+    check(joints, lambda frame: to_world(seen_right(frame, added=MODELS.right.mean_pose), frame))
 
 
-def test_betas_are_read_in_every_frame(clip, joints, formula):
+def test_betas_are_read_in_every_frame(clip, joints):
     assert clip.hands["right"].betas.shape == (LAST - FIRST + 1, 10)
     check(
-        joints["right"],
-        lambda frame: to_world(seen_right(formula, frame), frame),
-        lambda frame: to_world(seen_right(formula, frame, betas=betas(RIGHT_BETAS, frame - 22)), frame),
+        joints,
+        lambda frame: to_world(seen_right(frame, betas=betas(RIGHT_BETAS, frame - 22)), frame),
         frames=(LAST,),
     )
     np.testing.assert_allclose(clip.hands["right"].betas[0], betas(RIGHT_BETAS, FIRST), atol=1e-6)
@@ -221,12 +179,12 @@ def left_vertices(model, frame: int) -> np.ndarray:
     return shaped - model.joint_regressor[0] @ shaped
 
 
-def test_left_betas_belong_to_the_shape_directions_as_released(clip, hands, formula):
+def test_left_betas_belong_to_the_shape_directions_as_released(clip, hands):
     """The wrist offset J0 of the left hand depends on them."""
     for frame in FRAMES:
         wrist = clip.hands["left"].wrist_m[frame - FIRST]
-        as_released = formula.rest_points(MODELS.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
-        corrected = formula.rest_points(hands.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
+        as_released = rest_points(MODELS.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
+        corrected = rest_points(hands.left, betas(LEFT_BETAS, frame))[0] + LEFT_T
         np.testing.assert_allclose(wrist, to_world(as_released[None], frame)[0], atol=SAME_M)
         shapes = left_vertices(MODELS.left, frame), left_vertices(hands.left, frame)
         assert np.linalg.norm(shapes[0] - shapes[1], axis=1).max() > FAR_M
@@ -234,19 +192,19 @@ def test_left_betas_belong_to_the_shape_directions_as_released(clip, hands, form
     assert H2OAdapter().hand_convention.left_shape == "as released"
 
 
-def test_the_left_block_comes_first(clip, joints, formula):
+def test_the_left_block_comes_first(clip, joints):
     index = np.zeros(45)
     index[:3] = LEFT_INDEX
-    rest = {side: formula.rest_points(MODELS[side], betas(LEFT_BETAS, 11)) for side in ("left", "right")}
-    expected = to_world(formula.chain(rest["left"], LEFT_ORIENT, index, LEFT_T), 11)
+    rest = {side: rest_points(MODELS[side], betas(LEFT_BETAS, 11)) for side in ("left", "right")}
+    expected = to_world(chain(rest["left"], LEFT_ORIENT, index, LEFT_T), 11)
     np.testing.assert_allclose(joints["left"][11][:16], expected, atol=SAME_M)
     assert np.linalg.norm(joints["right"][11][:16] - expected, axis=1).min() > FAR_M
 
 
-def test_a_block_has_62_numbers_and_not_the_59_of_the_readme(clip, formula):
+def test_a_block_has_62_numbers_and_not_the_59_of_the_readme(clip):
     for frame in FRAMES:
         row = np.array(hand_row(frame))
-        rest_wrist = formula.rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
+        rest_wrist = rest_points(MODELS.right, betas(RIGHT_BETAS, frame))[0]
         expected = to_world((rest_wrist + RIGHT_T)[None], frame)[0]
         np.testing.assert_allclose(clip.hands["right"].wrist_m[frame - FIRST], expected, atol=SAME_M)
         assert row[62:66].tolist() == [1.0, *RIGHT_T]
@@ -261,7 +219,7 @@ def test_everything_is_in_metres(clip, joints):
     assert ((bones > 0.01) & (bones < 0.08)).all()
     assert np.ptp(clip.object.model.vertices_m[:, 2]) == pytest.approx(0.23)
     in_camera = camera(11)[:3, :3].T @ (clip.object.translation_m[11 - FIRST] - camera(11)[:3, 3])
-    np.testing.assert_allclose(in_camera, np.add(OBJECT_T, (0.033, 0, 0)), atol=SAME_M)
+    np.testing.assert_allclose(in_camera, object_in_camera(11)[:3, 3], atol=SAME_M)
 
 
 def test_the_object_goes_from_its_frame_through_the_camera_to_the_world(clip):

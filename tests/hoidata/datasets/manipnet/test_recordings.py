@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from bench.manipnet_fits import measure_fits
 from hoidata.hands import load_embedded_hands
-from tests.bench.manipnet_fits import measure_fits
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from bench.manipnet_hands import N_CAPSULES, read_source_hands
 from hoidata.clips.clip import SIDES
 from hoidata.datasets import RawTree
 from hoidata.datasets.manipnet.adapter import HAND_JOINTS
 from hoidata.errors import BadInput
 from hoidata.physics.realism import VARIANTS, score, smoothness_m_s2
-from tests.bench.manipnet_hands import N_CAPSULES, read_source_hands
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 FRAMES = 40

@@ -50,14 +50,14 @@ class TestTaco(AdapterContract):
     bad_settings = {"margin_frames": (-1, "0 or more")}  # noqa: RUF012
     conventions = {  # noqa: RUF012
         "unit": "test_meshes_are_in_centimetres_and_motion_in_metres",
-        "handedness of the world": "test_the_world_is_not_seen_in_a_mirror",
+        "handedness of the world": "contract.py::test_the_world_is_not_seen_in_a_mirror",
         "meshes": "test_meshes_are_in_centimetres_and_motion_in_metres",
         "object rotation": "test_object_matrices_act_on_columns",
         "hand translation": "test_the_translation_is_the_wrist_and_not_added_to_the_rest_wrist",
         "finger angles": "test_fingers_are_absolute",
         "shape": "test_each_side_has_its_own_shape",
         "left shape directions": "test_left_shape_directions_stay_as_released",
-        "left and right": "test_each_hands_numbers_bend_a_hand_of_that_side",
+        "left and right": "contract.py::test_each_hands_numbers_bend_a_hand_of_that_side",
         "frames": "test_frame_keys_are_sorted_as_numbers",
         "gravity": "test_gravity_is_unknown_with_its_reason",
     }

@@ -15,8 +15,9 @@ from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.taco.adapter import TacoAdapter
 from hoidata.hands import load_embedded_hands
+from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_stored, off_m, rest_points
+from tests.hoidata.datasets.contract import SeatedPersonContract
 
-EXACT_M, WRONG_M = 2e-6, 0.005
 KEY = SequenceKey("taco", "20231105", "(stir, spoon, pan)/20231105_007")
 N_FRAMES = 12
 AT = 9
@@ -75,62 +76,46 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     return clip
 
 
-def off_m(found, other) -> float:
-    return float(np.linalg.norm(np.asarray(found) - np.asarray(other), axis=-1).max())
-
-
-def clip_joints(clip: Clip, side: str, hands, formula) -> np.ndarray:
-    """(16, 3) joints of the frame looked at, from what the clip says."""
-    track = clip.hands[side]
-    rest = formula.rest_points(hands[side], track.betas[0].astype(np.float64))
-    transl = track.wrist_m[AT] - rest[0]
-    return formula.chain(rest, track.global_orient[AT], track.hand_pose[AT].astype(np.float64), transl)
-
-
-def taco_joints(side: str, hands, formula, bends=BENT, betas=None, added_to_rest: bool = False) -> np.ndarray:
+def taco_joints(side: str, hands, bends=BENT, betas=None, added_to_rest: bool = False) -> np.ndarray:
     """(16, 3) joints as TACO means its numbers: the wrist is put at the origin, the hand turned, then moved."""
-    rest = formula.rest_points(hands[side], SHAPE[side] if betas is None else betas)
+    rest = rest_points(hands[side], SHAPE[side] if betas is None else betas)
     translation = np.array(WRIST_M[side]) + AT * np.array([STEP_M, 0, 0])
-    joints = formula.chain(rest, ORIENT[side], np.array(bends), np.zeros(3))
+    joints = chain(rest, ORIENT[side], np.array(bends), np.zeros(3))
     return joints - (0 if added_to_rest else rest[0]) + translation
 
 
 @pytest.mark.parametrize("side", SIDES)
 class TestHands:
-    def test_the_translation_is_the_wrist_and_not_added_to_the_rest_wrist(self, clip, hands, formula, side):
-        found = clip_joints(clip, side, hands, formula)
-        assert off_m(found, taco_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, taco_joints(side, hands, formula, added_to_rest=True)) > WRONG_M
+    def test_the_translation_is_the_wrist_and_not_added_to_the_rest_wrist(self, clip, hands, side):
+        found = joints_as_stored(clip.hands[side], hands[side], AT)
+        agrees(found, taco_joints(side, hands), taco_joints(side, hands, added_to_rest=True))
 
-    def test_fingers_are_absolute(self, clip, hands, formula, side):
-        found = clip_joints(clip, side, hands, formula)
-        relative = taco_joints(side, hands, formula, bends=BENT + hands[side].mean_pose)
-        assert off_m(found, taco_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, relative) > WRONG_M
+    def test_fingers_are_absolute(self, clip, hands, side):
+        found = joints_as_stored(clip.hands[side], hands[side], AT)
+        relative = taco_joints(side, hands, bends=BENT + hands[side].mean_pose)
+        agrees(found, taco_joints(side, hands), relative)
 
-    def test_each_side_has_its_own_shape(self, clip, hands, formula, side):
-        found = clip_joints(clip, side, hands, formula)
-        other = taco_joints(side, hands, formula, betas=SHAPE["right" if side == "left" else "left"])
-        assert off_m(found, taco_joints(side, hands, formula)) < EXACT_M
-        assert off_m(found, other) > WRONG_M
+    def test_each_side_has_its_own_shape(self, clip, hands, side):
+        found = joints_as_stored(clip.hands[side], hands[side], AT)
+        other = taco_joints(side, hands, betas=SHAPE["right" if side == "left" else "left"])
+        agrees(found, taco_joints(side, hands), other)
 
     def test_frame_keys_are_sorted_as_numbers(self, clip, hands, side):
         """In the file's order, and in that of text, 12 comes before 2."""
         places = np.array(WRIST_M[side]) + np.arange(N_FRAMES)[:, None] * (STEP_M, 0, 0)
         as_text = places[sorted(range(N_FRAMES), key=lambda number: str(number + 1))]
-        assert off_m(clip.hands[side].wrist_m, places) < EXACT_M
-        assert off_m(clip.hands[side].wrist_m, as_text) > WRONG_M
+        agrees(clip.hands[side].wrist_m, places, as_text)
 
 
-def test_left_shape_directions_stay_as_released(hands, formula):
+def test_left_shape_directions_stay_as_released(hands):
     """With the released sign, as TACO's loader reads the file; the corrected one moves the joints."""
     released = np.array(hands.left.shape_directions)
     released[:, 0] *= -1  # the embedded hand is right already: turn it into a file as released
     as_released = hands_like(hands, released)
     chosen = hands_for(TacoAdapter().hand_convention, as_released)
-    expected = formula.rest_points(as_released.left, SHAPE["left"])
-    corrected = formula.rest_points(hands.left, SHAPE["left"])
-    assert off_m(formula.rest_points(chosen.left, SHAPE["left"]), expected) < EXACT_M
+    expected = rest_points(as_released.left, SHAPE["left"])
+    corrected = rest_points(hands.left, SHAPE["left"])
+    assert off_m(rest_points(chosen.left, SHAPE["left"]), expected) < EXACT_M
     assert off_m(expected, corrected) > WRONG_M
 
 
@@ -151,15 +136,17 @@ SPOON_AT = np.array(SPOON_M) + AT * np.array([STEP_M, 0, 0])
 
 def test_meshes_are_in_centimetres_and_motion_in_metres(clip):
     found = corners(clip.object)
-    assert off_m(found, expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT)) < EXACT_M
-    assert off_m(found, expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT, scale=0.001)) > WRONG_M
-    assert off_m(found, expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT / 100)) > WRONG_M
+    agrees(
+        found,
+        expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT),
+        expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT, scale=0.001),
+        expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT / 100),
+    )
 
 
 def test_object_matrices_act_on_columns(clip):
     transposed = expected_corners(SPOON_CM, -np.array(SPOON_TURN), SPOON_AT)
-    assert off_m(corners(clip.object), expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT)) < EXACT_M
-    assert off_m(corners(clip.object), transposed) > WRONG_M
+    agrees(corners(clip.object), expected_corners(SPOON_CM, SPOON_TURN, SPOON_AT), transposed)
 
 
 def test_the_tool_is_the_object_and_the_target_the_other_one(clip):
@@ -182,9 +169,6 @@ def test_gravity_is_unknown_with_its_reason(clip):
     assert (TacoAdapter().frame.up_axis, TacoAdapter().frame.gravity) == (None, "unknown")
 
 
-EDGES_SEEN = np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
-
-
 def write_seated(root: Path, person) -> RawTree:
     """The recording with other hands, and with a spoon of three straight edges at the right wrist."""
     poses, things = root / "Hand_Poses" / KEY.name, root / "Object_Poses" / KEY.name
@@ -199,28 +183,16 @@ def write_seated(root: Path, person) -> RawTree:
     return RawTree(root)
 
 
-@pytest.fixture
-def look(tmp_path, hands, formula):
-    """Joints of both hands and the spoon's three edges in the world, of a person whose numbers are given."""
+class TestSeatedPerson(SeatedPersonContract):
+    @pytest.fixture
+    def look(self, tmp_path, hands):
+        """Joints of both hands and the spoon's three edges in the world, of a person whose numbers are given."""
 
-    def of(person):
-        (seen,) = TacoAdapter(margin_frames=N_FRAMES).load(write_seated(tmp_path, person), KEY, hands)
-        assert isinstance(seen, Clip)
-        spoon = corners(seen.object)
-        return {side: clip_joints(seen, side, hands, formula) for side in SIDES}, spoon[1:4] - spoon[0]
+        def of(person):
+            (seen,) = TacoAdapter(margin_frames=N_FRAMES).load(write_seated(tmp_path, person), KEY, hands)
+            assert isinstance(seen, Clip)
+            spoon = corners(seen.object)
+            return {side: joints_as_stored(seen.hands[side], hands[side], AT) for side in SIDES}, spoon[1:4] - spoon[0]
 
-    write(tmp_path)
-    return of
-
-
-def test_each_hands_numbers_bend_a_hand_of_that_side(look, seated):
-    joints, _ = look(seated.person())
-    swapped, _ = look(seated.person(swapped=True))
-    assert seated.own_side(joints)
-    assert not seated.own_side(swapped)
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_the_world_is_not_seen_in_a_mirror(look, seated, axis):
-    assert seated.as_described(*look(seated.person()), EDGES_SEEN)
-    assert not seated.as_described(*look(seated.person(mirrored=axis)), EDGES_SEEN)
+        write(tmp_path)
+        return of

@@ -1,6 +1,6 @@
 """A corpus of the papers' size: time, memory and bytes of conversion, annotation and contact, and how they grow.
 
-``python -m tests.bench.scale [SHARE ...]`` (0.01, 0.1 and 1 when none is given). The raw files are those of the
+``python -m bench.scale [SHARE ...]`` (0.01, 0.1 and 1 when none is given). The raw files are those of the
 embedded corpora, repeated (see ``corpus``); nothing is read from a manifest. Each stage runs in processes of its own,
 so that its memory can be told apart; conversion on HOIDATA_BENCH_JOBS workers (2 if not given), the others on one
 process, as the graph runs them. "checksums and files": digests of the raw files and reading them, done once more by
@@ -18,11 +18,11 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from bench.corpus import PAPER, embedded_root, replicate
+from bench.growth import show_growth
+from bench.harness import TreeMemory, show
 from hoidata.store.mapped import map_npz
 from hoidata.store.store import open_store
-from tests.bench.corpus import PAPER, embedded_root, replicate
-from tests.bench.growth import show_growth
-from tests.bench.harness import TreeMemory, show
 
 MEBI = 1 << 20
 MEMORY = ("peak_at_once", "own_at_once", "sum_of_peaks")
@@ -83,7 +83,7 @@ STAGES: dict[str, Callable[[str, Path, Path], None]] = {
 
 def measured(stage: str, name: str, raw: Path, out: Path) -> Measured:
     """Run one stage of one dataset in a process of its own."""
-    command = [sys.executable, "-m", "tests.bench.scale", "--stage", stage, name, str(raw), str(out)]
+    command = [sys.executable, "-m", "bench.scale", "--stage", stage, name, str(raw), str(out)]
     before, start = os.times(), time.perf_counter()
     process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=sys.stderr)
     with TreeMemory(process.pid) as memory:

@@ -1,19 +1,19 @@
 """Physical realism: non-negative least squares beside a loop over SciPy's, and the cost of one scored frame.
 
-``python -m tests.bench.physics`` with OMP_NUM_THREADS=1. The systems are contacts all round a
+``python -m bench.physics`` with OMP_NUM_THREADS=1. The systems are contacts all round a
 ball of 5 cm, a third of them on one side only, so that about two in three frames are feasible.
 """
 
 import numpy as np
 from scipy.optimize import nnls
 
+from bench.harness import Times, medians, show
+from bench.realism import embedded_clips, embedded_hands
 from hoidata.physics.capsules import capsule_contacts
 from hoidata.physics.contact_forces import RESIDUAL_LIMIT, wrench_columns
 from hoidata.physics.nnls import wrench_residuals
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits
-from tests.bench.harness import Times, medians, show
-from tests.bench.realism import embedded_clips, embedded_hands
 
 RUNS = 7
 FRAMES = 1000

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from tests.bench.harness import show
+from bench.harness import show
 
 ALLOWED = 0.2  # of a straight line
 PER_CLIPS = 1000

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.bench.growth import growth
+from bench.growth import growth
 
 CLIPS = [66, 660, 6592]
 

@@ -1,6 +1,6 @@
 """Which hands act: against what the embedded corpora know, and recording by recording on real clips.
 
-``python -m tests.bench.hands [FOLDER ...]``: folders of datasets as the stages write them (``data/own/manipnet``) with
+``python -m bench.hands [FOLDER ...]``: folders of datasets as the stages write them (``data/own/manipnet``) with
 ``clips`` and ``annotation`` in them; those of this project by default. For the embedded corpora the known hand is that
 of the action table the corpora are made from, and every stored sentence must name exactly it. For every dataset a row
 per recording: the test at the stage's threshold against sampled points and against the surface itself.
@@ -17,6 +17,7 @@ import numpy as np
 import orjson
 import pandas as pd
 
+from bench.harness import show
 from hoidata.annotation.derived import derive_verb
 from hoidata.clips import SIDES, Clip, HandType, Side
 from hoidata.contact.hands import acting_hands
@@ -26,7 +27,6 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.store import Store, open_store
 from hoidata.synthetic.actions import ACTIONS
-from tests.bench.harness import show
 
 NAMED = {
     "left": re.compile(r"\bleft hand\b", re.I),

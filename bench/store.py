@@ -1,6 +1,6 @@
 """Store against one NPZ per clip: a million frames, opened and fetched at random, in one run.
 
-``python -m tests.bench.store [FRAMES]``. Clips are random arrays of 150 frames; the NPZ holds every array of the clip,
+``python -m bench.store [FRAMES]``. Clips are random arrays of 150 frames; the NPZ holds every array of the clip,
 written by ``numpy.savez``, and all are read. Runs of both layouts alternate, each with other clips; figures are
 medians. The page cache is warm.
 """

@@ -1,4 +1,4 @@
-"""``python -m tests.bench [NAME ...]``: the benchmarks named (see ``BENCHMARKS``), or all, one after another.
+"""``python -m bench [NAME ...]``: the benchmarks named (see ``BENCHMARKS``), or all, one after another.
 
 Every figure stands beside a named baseline of the same run; variants take turns and medians of at least five runs are
 shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder with the embedded raw corpora.
@@ -6,7 +6,7 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from tests.bench import adapters, evaluate, kernels, physics, realism, scale, store, surface, text
+from bench import adapters, evaluate, kernels, physics, realism, scale, store, surface, text
 
 BENCHMARKS = {
     "adapters": adapters.main,

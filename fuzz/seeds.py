@@ -11,8 +11,8 @@ from functools import cache
 
 import numpy as np
 
+from fuzz.structure import npy_bytes
 from hoidata.hands import load_embedded_hands
-from tests.fuzz.structure import npy_bytes
 
 HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
 

@@ -12,14 +12,15 @@ from pathlib import Path
 
 import pytest
 
+from fuzz.__main__ import problems
+from fuzz.coverage import lines_of, lines_reached
+from fuzz.engine import Target, check_call, fuzz
+from fuzz.structure import npy_bytes, npy_mutation, pickle_mutation, zip_mutation
+from fuzz.targets import all_targets, scratch_folder
 from hoidata.errors import BadInput, HoidataError
-from tests.fuzz.__main__ import problems
-from tests.fuzz.coverage import lines_of, lines_reached
-from tests.fuzz.engine import Target, check_call, fuzz
-from tests.fuzz.structure import npy_bytes, npy_mutation, pickle_mutation, zip_mutation
-from tests.fuzz.targets import all_targets, scratch_folder
 
-PROJECT = Path(__file__).parents[2]
+pytestmark = pytest.mark.first
+PROJECT = Path(__file__).parents[1]
 SECONDS_EACH = 2.0
 
 
@@ -113,7 +114,7 @@ def run_python(*words: str) -> subprocess.CompletedProcess:
 @pytest.mark.slow
 def test_a_minute_of_fuzzing_finds_nothing(tmp_path: Path):
     options = ("--seconds", str(SECONDS_EACH), "--executions", "50000", "--seed", "1", "--folder", str(tmp_path))
-    done = run_python("-m", "tests.fuzz", *options)
+    done = run_python("-m", "fuzz", *options)
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-2000:]
     assert done.stdout.count("no fault") == len(all_targets())
 
@@ -129,7 +130,7 @@ def test_the_parsers_named_by_the_issue_are_all_there():
 
 
 def test_zips_are_put_together_again_with_sums_that_fit():
-    from tests.fuzz import seeds
+    from fuzz import seeds
 
     change = zip_mutation(lambda _, content: content)
     whole = seeds.npz_files(False)[0]

@@ -1,6 +1,6 @@
 """Sentences, prompts read back and text features of all three datasets, in one run on one thread.
 
-``python -m tests.bench.text``. Every distinct prompt of H2O, GRAB and ARCTIC in the paper's four forms and three hand
+``python -m bench.text``. Every distinct prompt of H2O, GRAB and ARCTIC in the paper's four forms and three hand
 types: all verbs with all objects of a dataset, which holds every real pair. The default encoder goes through all of
 them once; everything else takes turns on a sample. CLIP, where installed, has random weights of ViT-B/32's size.
 """
@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.harness import Times, medians, show
 from hoidata.annotation.encoders import CachedEncoder, HashEncoder, TextEncoder, UniversalSentenceEncoder
 from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.grammar import default_grammar
@@ -23,7 +24,6 @@ from hoidata.annotation.prompts import Lexicon, grammar_lexicon
 from hoidata.annotation.sentences import four_sentences
 from hoidata.datasets.grab.words import INTENTS, OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
-from tests.bench.harness import Times, medians, show
 from tests.builders.words import ARCTIC_OBJECTS, ARCTIC_VERBS
 
 RUNS, SAMPLE, CLIP_SAMPLE = 7, 400, 16

@@ -1,6 +1,6 @@
 """Adapters beside naive readers: frames per second to joints and object poses, H2O's text, bytes per frame.
 
-``python -m tests.bench.adapters``. Both sides read the same sequences and give world joints of both hands and object
+``python -m bench.adapters``. Both sides read the same sequences and give world joints of both hands and object
 poses of every frame of the clips; the values are compared. The adapters also digest every file, and read the frames
 around the clips.
 """
@@ -13,6 +13,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from bench.corpus import embedded_root
+from bench.harness import Times, medians, show
+from bench.naive import READERS, NaiveHands, Poses
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import Adapter, RawTree, SequenceKey, get_adapter
@@ -22,9 +25,6 @@ from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.store.info import generated_info
 from hoidata.store.mapped import map_npz
 from hoidata.store.store import write_store
-from tests.bench.corpus import embedded_root
-from tests.bench.harness import Times, medians, show
-from tests.bench.naive import READERS, NaiveHands, Poses
 
 SEQUENCES = {"h2o": 1, "grab": 3, "arctic": 2}
 TOLERANCE_M = 2e-6  # half of float32's step at some metres, over a chain of joints

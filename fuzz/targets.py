@@ -13,6 +13,17 @@ from typing import Any
 
 import yaml
 
+from fuzz import seeds
+from fuzz.coverage import functions_of
+from fuzz.engine import Target
+from fuzz.structure import (
+    LONGEST,
+    mutate,
+    npy_mutation,
+    pickle_mutation,
+    storage_mutation,
+    zip_mutation,
+)
 from hoidata.clips.clip import SourceFile
 from hoidata.datasets.arctic import files as arctic_files
 from hoidata.datasets.base import RawTree
@@ -35,17 +46,6 @@ from hoidata.store import mapped, store, versions
 from pipelines.lineage import manifests
 from pipelines.stages import base
 from pipelines.stages.adapters import ConvertSettings
-from tests.fuzz import seeds
-from tests.fuzz.coverage import functions_of
-from tests.fuzz.engine import Target
-from tests.fuzz.structure import (
-    LONGEST,
-    mutate,
-    npy_mutation,
-    pickle_mutation,
-    storage_mutation,
-    zip_mutation,
-)
 
 ABSENT = b"absent"  # stands for a file that is not there
 GLOBALS = (

@@ -1,8 +1,8 @@
-"""Fuzz every parser: ``python -m tests.fuzz`` (``make fuzz``). Results and inputs that failed lie in ``.fuzz/``.
+"""Fuzz every parser: ``python -m fuzz`` (``make fuzz``). Results and inputs that failed lie in ``.fuzz/``.
 
-python -m tests.fuzz --jobs 2 --executions 50000            the whole run
-python -m tests.fuzz --only obj --seconds 10                one parser for ten seconds
-python -m tests.fuzz --replay obj .fuzz/obj/crash-0123      one input that failed, with its traceback
+python -m fuzz --jobs 2 --executions 50000            the whole run
+python -m fuzz --only obj --seconds 10                one parser for ten seconds
+python -m fuzz --replay obj .fuzz/obj/crash-0123      one input that failed, with its traceback
 """
 
 import argparse
@@ -12,8 +12,8 @@ import time
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
-from tests.fuzz.engine import Outcome, check_call, fuzz
-from tests.fuzz.targets import all_targets, scratch_folder
+from fuzz.engine import Outcome, check_call, fuzz
+from fuzz.targets import all_targets, scratch_folder
 
 LEAST_LINES = 0.9
 MOST_MIB = 1024
@@ -44,7 +44,7 @@ def main() -> int:
 
 
 def _arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(prog="python -m fuzz", description=__doc__.splitlines()[0])
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--executions", type=int, default=50_000, help="of each parser")
@@ -65,7 +65,7 @@ def problems(outcome: Outcome, full: bool) -> list[str]:
     """Why a parser fails its part; with ``full``, lines that were not reached count."""
     found = []
     if outcome.fault:
-        found.append(f"{outcome.fault}  ->  python -m tests.fuzz --replay {outcome.name} {outcome.input_path}")
+        found.append(f"{outcome.fault}  ->  python -m fuzz --replay {outcome.name} {outcome.input_path}")
     if full and outcome.lines - len(outcome.missing) < LEAST_LINES * outcome.lines:
         found.append(f"lines not reached: {' '.join(outcome.missing)}")
     if outcome.peak_mib > MOST_MIB:

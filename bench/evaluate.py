@@ -1,6 +1,6 @@
 """What evaluation costs: every metric of the registry, in processor time per motion, and 256 clips x 20 motions of it.
 
-``python -m tests.bench evaluate``. The annotated dataset of HOIDATA_BENCH_DATA (data/embedded/grab if not given); its
+``python -m bench evaluate``. The annotated dataset of HOIDATA_BENCH_DATA (data/embedded/grab if not given); its
 test clips stand in for predictions, HOIDATA_BENCH_SAMPLES (20 if not given) of each, every one a little off.
 """
 
@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.harness import show
 from hoidata.clips.clip import Clip
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.registry import METRICS
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import write_store
-from tests.bench.harness import show
 
 CLIPS, REPETITIONS, LIMIT_MS = 256, 20, 230  # E6 of the issue: 10 minutes on two cores
 

@@ -1,6 +1,6 @@
 """The controls of physical realism: what a score says when hands are moved or taken away.
 
-``python -m tests.bench.realism``. Embedded GRAB and ARCTIC clips (H2O's do not say where down is) of
+``python -m bench.realism``. Embedded GRAB and ARCTIC clips (H2O's do not say where down is) of
 HOIDATA_BENCH_CORPORA, HOIDATA_BENCH_CLIPS of each (12 if not given, 0 for all), and with HOIDATA_MANIPNET the real
 recordings of HOIDATA_BENCH_SEQUENCES (cyl_med3 if not given): the source hands at 120 Hz, and beside them the clips
 whose hands were fitted to them.
@@ -14,6 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.corpus import embedded_root
+from bench.harness import show
+from bench.manipnet_hands import HandMotion, read_source_hands
 from hoidata.clips.clip import Clip
 from hoidata.datasets.base import RawTree, SequenceKey
 from hoidata.datasets.registry import get_adapter
@@ -25,9 +28,6 @@ from hoidata.physics.mano_capsules import THUMB_CAPSULES, world_rotmats
 from hoidata.physics.realism import Realism, Variant, has_acceleration, score, smoothness_m_s2
 from hoidata.physics.scene import Scene, clip_scene
 from hoidata.physics.standard_units import StandardUnits
-from tests.bench.corpus import embedded_root
-from tests.bench.harness import show
-from tests.bench.manipnet_hands import HandMotion, read_source_hands
 
 N_CAPSULES = 19
 SOURCE_THUMB = (4, 5, 6)

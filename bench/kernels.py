@@ -1,6 +1,6 @@
 """Distance maps, joints and farthest points beside the plain way of each, in one run.
 
-``python -m tests.bench.kernels``. One thread. A turn of a variant is a batch of clips, as a corpus comes; variants take
+``python -m bench.kernels``. One thread. A turn of a variant is a batch of clips, as a corpus comes; variants take
 turns, and figures are medians of the processor's time. Building an index is shown apart, and so is compiling: the first
 call of a process that finds nothing compiled, less its second. Errors are against float64 brute force.
 """
@@ -22,6 +22,7 @@ import numpy as np
 import torch
 import trimesh
 
+from bench.harness import Times, medians, show
 from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
@@ -30,7 +31,6 @@ from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints, sample_points
-from tests.bench.harness import Times, medians, show
 from tests.builders.mano import write_mano_pickle
 
 RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21
@@ -202,7 +202,7 @@ def compiling_s() -> dict[str, float]:
     """Seconds of compiling by operation, in a process of its own with an empty cache."""
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        command = [sys.executable, "-m", "tests.bench.kernels", "--first-calls"]
+        command = [sys.executable, "-m", "bench.kernels", "--first-calls"]
         done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
     return json.loads(done.stdout.splitlines()[-1])
 

@@ -23,10 +23,10 @@ from typing import Any
 
 import atheris
 
+from fuzz.coverage import code_objects, lines_of, lines_reached
+from fuzz.structure import LONGEST, NUMBERS, Bytes
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import sha256_bytes
-from tests.fuzz.coverage import code_objects, lines_of, lines_reached
-from tests.fuzz.structure import LONGEST, NUMBERS, Bytes
 
 SLOWEST_S = 1.0
 HANG_S = 30

@@ -1,6 +1,6 @@
 """Exact contact labels, distances and depths of hand vertices beside libigl's, and the volume of a hand in an object.
 
-``python -m tests.bench.surface``. One thread, libigl's own included. The vertices of a hand that wanders about the
+``python -m bench.surface``. One thread, libigl's own included. The vertices of a hand that wanders about the
 object for 60 frames; variants take turns, figures are medians of the processor's time. Compiling, trees and grids are
 shown apart. With HOIDATA_MANIPNET also some of its released meshes.
 """
@@ -18,6 +18,7 @@ import igl
 import numpy as np
 import trimesh
 
+from bench.harness import Times, medians, show
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.distance_grid import distance_grid
@@ -27,7 +28,6 @@ from hoidata.objects.solid import Solid
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.objects.triangle_tree import triangle_tree
 from hoidata.surface.solid_overlap import SolidOverlap
-from tests.bench.harness import Times, medians, show
 
 RUNS, FRAMES, TOUCH_M = 7, 60, 0.005
 MANIPNET_MESHES = ("Dining/cup1", "Dining/mug1", "Dining/mug2", "Dining/teapot2", "Primitive/cube_med")
