@@ -185,22 +185,20 @@ def _chart(metric: AnyMetric, found: _Found) -> Chart | None:
     column = found.column(metric)
     if len(column) < 2:
         return None
-    spreads = {name: [found.interval(name, metric, kind) for kind in ("clips", "repetitions")] for name in column}
-    reach = [*column.values(), *(end for ends in spreads.values() for pair in ends if pair for end in pair)]
-    low, high = min(0.0, *reach), max(reach)
+    spreads = {kind: {name: found.interval(name, metric, kind) for name in column} for kind in INTERVALS}
+    ends = [end for by_name in spreads.values() for pair in by_name.values() if pair for end in pair]
+    low, high = min(0.0, *column.values(), *ends), max(*column.values(), *ends)
     width = (high - low) or 1.0
 
     def percent(value: float) -> float:
         return round(100 * (value - low) / width, 2)
 
+    def span(kind: str, name: str) -> tuple[float, float] | None:
+        pair = spreads[kind][name]
+        return (percent(pair[0]), percent(pair[1])) if pair else None
+
     bars = [
-        Bar(
-            name,
-            found.kind(name),
-            percent(value),
-            *((percent(ends[0]), percent(ends[1])) if ends else None for ends in spreads[name]),
-            number(value),
-        )
+        Bar(name, found.kind(name), percent(value), span("clips", name), span("repetitions", name), number(value))
         for name, value in column.items()
     ]
     unit = f", {metric.unit}" if metric.unit else ""
