@@ -1,8 +1,14 @@
 """Fixtures shared by all tests, whose builders are in tests/builders; and the order in which modules begin."""
 
+import os
+import pickle
+import shutil
 from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from filelock import FileLock
 
 from hoidata.clips import Clip
 from tests.builders.clips import build_clip
@@ -21,3 +27,45 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 def make_clip() -> Callable[..., Clip]:
     """See ``build_clip``."""
     return build_clip
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """Call it with a name and a function that fills a folder: filled once for all workers. Tests change only copies."""
+    base = tmp_path_factory.getbasetemp()
+    shared = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def make(name: str, fill: Callable[[Path], object]) -> Path:
+        folder, partial = shared / name, shared / f"{name}.part"
+        with FileLock(f"{folder}.lock"):
+            if not folder.exists():
+                shutil.rmtree(partial, ignore_errors=True)
+                partial.mkdir()
+                fill(partial)
+                partial.rename(folder)
+        return folder
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def small_corpus(made_once) -> Callable[[str], SimpleNamespace]:
+    """Call it with a dataset's name: its small embedded corpus (raw), converted (clips), and what it was made from."""
+    from hoidata.conversion.convert import convert_dataset
+    from hoidata.datasets import get_adapter
+    from hoidata.hands import load_embedded_hands
+    from hoidata.synthetic.corpus import write_corpus
+
+    def of(name: str) -> SimpleNamespace:
+        def fill(folder: Path) -> None:
+            truths = write_corpus(name, folder / "raw", seed=0, size="small", jobs=1)
+            (folder / "truths.pkl").write_bytes(pickle.dumps(truths))
+            adapter, hands = get_adapter(name), load_embedded_hands()
+            summary = convert_dataset(adapter, folder / "raw", hands, folder / "clips", progress=False, synthetic=True)
+            assert summary.left_out == ()
+
+        folder = made_once(f"small-{name}", fill)
+        truths = pickle.loads((folder / "truths.pkl").read_bytes())
+        return SimpleNamespace(raw=folder / "raw", clips=folder / "clips", truths=truths)
+
+    return of

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 import yaml
-from filelock import FileLock
 
 PROJECT = Path(__file__).parents[2]
 PARTS = (
@@ -131,19 +130,17 @@ def stage_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..
 
 
 @pytest.fixture(scope="session")
-def built_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A project after ``dvc repro`` with GRAB present and ARCTIC not; built once for all workers, never changed."""
-    base = tmp_path_factory.getbasetemp()
-    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "built"
-    with FileLock(f"{folder}.lock"):
-        if not folder.exists():
-            project = copy_project(folder.with_name("building"))
-            make_narrow(project, ["grab", "arctic"], ["text2hoi", "ground-truth"])
-            set_present(project, {"grab"})
-            result = run(project, "dvc", "repro")
-            assert result.returncode == 0, result.stdout + result.stderr
-            project.rename(folder)
-    return folder
+def built_once(made_once) -> Path:
+    """A project after ``dvc repro`` with GRAB present and ARCTIC not."""
+
+    def build(folder: Path) -> None:
+        copy_project(folder)
+        make_narrow(folder, ["grab", "arctic"], ["text2hoi", "ground-truth"])
+        set_present(folder, {"grab"})
+        result = run(folder, "dvc", "repro")
+        assert result.returncode == 0, result.stdout + result.stderr
+
+    return made_once("built", build)
 
 
 @pytest.fixture(scope="module")

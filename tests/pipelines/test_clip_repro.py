@@ -73,7 +73,8 @@ def test_words_and_models_are_made_again_and_the_parts_stay_the_same(before_and_
     models = ("contact", "length", "diffusion", "refiner")
     assert changed >= {"data/embedded/grab/annotation", *(f"checkpoints/embedded/grab/{model}" for model in models)}
     assert changed <= {"data/embedded/grab/annotation", *(f"checkpoints/embedded/grab/{model}" for model in models),
-                       "metrics/embedded/grab.json", "report/embedded"}  # fmt: skip
+                       "samples/embedded/grab/text2hoi", "metrics/embedded/grab/text2hoi.json",
+                       "report/embedded"}  # fmt: skip
 
 
 def test_features_and_checkpoints_say_that_they_are_clips(before_and_after) -> None:

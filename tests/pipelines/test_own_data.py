@@ -12,7 +12,6 @@ from typer.testing import CliRunner, Result
 
 from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
-from hoidata.synthetic.corpus import write_corpus
 from pipelines.cli import app
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
@@ -84,13 +83,13 @@ def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, projec
 
 @pytest.mark.slow
 def test_scanning_a_dataset_leaves_the_work_tree_clean_and_dvc_builds_the_users_profile(
-    project, tmp_path, project_tools
+    project, small_corpus, project_tools
 ):
     make_plain_params(project)
     commit(project, project_tools)
-    write_corpus("grab", tmp_path / "grab", 0, "small", 1)
     write_manifest(project / "manifests/own/hand.json", replace(ABSENT_HAND, present=True))
-    scanned = project_tools.run(project, "hoidata", "raw", "scan", "grab", "--root", str(tmp_path / "grab"))
+    raw = small_corpus("grab").raw
+    scanned = project_tools.run(project, "hoidata", "raw", "scan", "grab", "--root", str(raw))
     assert scanned.returncode == 0, scanned.stderr
     assert yaml.safe_load((project / "params.yaml").read_text())["profile"] == "own"
     assert is_clean(project, project_tools)

@@ -11,18 +11,15 @@ from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import get_adapter
 from hoidata.hands import load_embedded_hands
 from hoidata.store.store import open_store
-from hoidata.synthetic.corpus import write_corpus
 from hoidata.synthetic.truth import TruthSequence
 
 pytestmark = pytest.mark.slow
 NAMED = {"left": r"\bleft hand\b", "right": r"\bright hand\b", "both": r"\bboth hands\b"}
 
 
-def annotated(dataset: str, raw: Path, out: Path, **settings) -> tuple[pd.DataFrame, pd.Series]:
-    """Hand types and sentences by clip id, of the raw corpus read with these settings of its adapter."""
-    adapter = get_adapter(dataset, **settings)
-    convert_dataset(adapter, raw, load_embedded_hands(), out / "clips", progress=False, synthetic=True)
-    annotate_store(out / "clips", out / "annotation", encoder="hash")
+def annotated(clips: Path, out: Path) -> tuple[pd.DataFrame, pd.Series]:
+    """Hand types and sentences by clip id."""
+    annotate_store(clips, out / "annotation", encoder="hash")
     text = pd.read_parquet(out / "annotation" / "text.parquet").groupby("clip_id")["sentence"].agg(list)
     return pd.read_parquet(out / "annotation" / "hand_type.parquet").set_index("clip_id"), text
 
@@ -34,10 +31,10 @@ def by_clip(sequences: list[TruthSequence], clips: Path) -> dict[str, TruthSeque
 
 
 @pytest.mark.parametrize("dataset", ["h2o", "grab", "arctic"])
-def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str, tmp_path: Path) -> None:
-    sequences = write_corpus(dataset, tmp_path / "raw", seed=0, size="small", jobs=1)
-    hands, text = annotated(dataset, tmp_path / "raw", tmp_path)
-    truths = by_clip(sequences, tmp_path / "clips")
+def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str, small_corpus, tmp_path: Path) -> None:
+    made = small_corpus(dataset)
+    hands, text = annotated(made.clips, tmp_path)
+    truths = by_clip(made.truths, made.clips)
     assert set(truths) == set(hands.index) == set(text.index)
     assert len(truths) >= 8
     for clip_id, truth in truths.items():
@@ -48,18 +45,19 @@ def test_the_known_hand_is_found_and_every_sentence_names_it_alone(dataset: str,
             assert [name for name, form in NAMED.items() if re.search(form, sentence, re.I)] == [truth.hand_type]
 
 
-def test_arctic_without_descriptions_gets_verb_and_hand_from_the_motion(tmp_path: Path) -> None:
+def test_arctic_without_descriptions_gets_verb_and_hand_from_the_motion(small_corpus, tmp_path: Path) -> None:
     """Whole sequences have neither word nor hand; those with one action only are named for it."""
-    sequences = write_corpus("arctic", tmp_path / "raw", seed=0, size="small", jobs=1)
-    hands, text = annotated("arctic", tmp_path / "raw", tmp_path / "whole", clips="whole")
+    made, adapter = small_corpus("arctic"), get_adapter("arctic", clips="whole")
+    convert_dataset(adapter, made.raw, load_embedded_hands(), tmp_path / "clips", progress=False, synthetic=True)
+    hands, text = annotated(tmp_path / "clips", tmp_path)
     assert hands["labelled_hand"].isna().all()
     assert set(hands["verb_source"]) == {"derived"}
     assert hands["verb_evidence"].notna().all()
     for clip_id, row in hands.iterrows():
-        within = [truth for truth in sequences if f"arctic/{truth.source_key}" == clip_id]
+        within = [truth for truth in made.truths if f"arctic/{truth.source_key}" == clip_id]
         sides = {side for truth in within for side in truth.acting_sides}
         assert row["hand_type"] == ("both" if len(sides) == 2 else min(sides))
         if len(within) == 1:
             assert row["verb"] == within[0].verb
         assert text[clip_id][0].lower().startswith(row["verb"])
-    assert any(sum(f"arctic/{truth.source_key}" == clip_id for truth in sequences) == 1 for clip_id in hands.index)
+    assert any(sum(f"arctic/{truth.source_key}" == clip_id for truth in made.truths) == 1 for clip_id in hands.index)

@@ -20,7 +20,6 @@ from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.synthetic.corpus import write_corpus
 from tests.builders import kitchen
 
 HANDS = load_embedded_hands()
@@ -35,19 +34,6 @@ def kitchen_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def example(tmp_path_factory: pytest.TempPathFactory) -> type:
     """The walk-through's adapter class."""
     return kitchen.import_example(tmp_path_factory.mktemp("package")).KitchenAdapter
-
-
-@pytest.fixture(scope="module")
-def corpus(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The small embedded corpus of a dataset, written once."""
-    folder = tmp_path_factory.mktemp("corpora")
-
-    def written(name: str) -> Path:
-        if not (folder / name).is_dir():
-            write_corpus(name, folder / name, 0, "small", 1)
-        return folder / name
-
-    return written
 
 
 def check(adapter, root: Path, **options) -> list[Finding]:
@@ -113,8 +99,8 @@ def partial_run(site: Path) -> Callable[..., subprocess.CompletedProcess]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["arctic", "grab", "h2o"])
-def test_a_built_in_adapter_keeps_every_rule_on_its_embedded_corpus(name: str, corpus) -> None:
-    findings = check_adapter(get_adapter(name), corpus(name), HANDS)
+def test_a_built_in_adapter_keeps_every_rule_on_its_embedded_corpus(name: str, small_corpus) -> None:
+    findings = check_adapter(get_adapter(name), small_corpus(name).raw, HANDS)
     assert not_passed(findings) == {}
     assert {item.rule for item in findings if item.outcome == "skip"} <= {"held objects turn with the hand"}
 
@@ -226,18 +212,18 @@ def test_a_mistake_in_clips_is_caught(mistake: str, example: type, kitchen_root:
     ],
 )
 @pytest.mark.slow
-def test_a_wrong_convention_shows_on_the_embedded_corpora(base, name, change, words, corpus) -> None:
-    found = not_passed(check(changed(base, change), corpus(name), sequences=8))
+def test_a_wrong_convention_shows_on_the_embedded_corpora(base, name, change, words, small_corpus) -> None:
+    found = not_passed(check(changed(base, change), small_corpus(name).raw, sequences=8))
     assert words in str(found)
 
 
 @pytest.mark.slow
-def test_exchanged_parts_of_an_object_show_on_arctic(corpus) -> None:
+def test_exchanged_parts_of_an_object_show_on_arctic(small_corpus) -> None:
     def exchanged(clip: Clip) -> Clip:
         model = replace(clip.object.model, part=(1 - clip.object.model.part).astype(np.uint8))
         return replace(clip, object=replace(clip.object, model=model))
 
-    found = not_passed(check(changed(ArcticAdapter, exchanged), corpus("arctic"), sequences=8))
+    found = not_passed(check(changed(ArcticAdapter, exchanged), small_corpus("arctic").raw, sequences=8))
     assert "with the object's parts exchanged" in str(found)
 
 

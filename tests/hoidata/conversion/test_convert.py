@@ -17,7 +17,6 @@ from hoidata.datasets.base import Adapter
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput, MissingResource
 from hoidata.store.store import open_store
-from hoidata.synthetic.corpus import write_corpus
 from pipelines.lineage.manifests import scan_files
 from tests.hoidata.conversion.killable import write_meshes, write_sequence
 
@@ -251,8 +250,8 @@ def test_a_frame_file_that_is_a_link_out_of_the_raw_folder_is_refused(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["h2o", "grab", "arctic"])
-def test_a_manifest_scanned_by_parts_lists_every_file_a_conversion_reads(name, hands, tmp_path):
-    write_corpus(name, tmp_path / "raw", 0, "small", 1)
+def test_a_manifest_scanned_by_parts_lists_every_file_a_conversion_reads(name, hands, small_corpus, tmp_path):
+    shutil.copytree(small_corpus(name).raw, tmp_path / "raw")
     adapter = get_adapter(name)
     (tmp_path / "raw" / "notes.json").write_text("{}")
     listed = scan_files(tmp_path / "raw", adapter.parts)

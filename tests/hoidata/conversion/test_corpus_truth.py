@@ -17,24 +17,16 @@ from hoidata.files import load_npy, load_npz_objects
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.sampling import sample_points
 from hoidata.store.store import open_store
-from hoidata.synthetic.corpus import write_corpus
 
 TOLERANCE = 1e-4  # metres, radians
-DATASETS = ("h2o", "grab", "arctic")
 
 
-@pytest.fixture(scope="module", params=DATASETS)
-def corpus(request, tmp_path_factory):
+@pytest.fixture(scope="module", params=["h2o", "grab", "arctic"])
+def corpus(request, small_corpus):
     """(truths by sequence and first source frame, store) of one dataset's small corpus."""
-    dataset, folder = request.param, tmp_path_factory.mktemp(request.param)
-    sequences = write_corpus(dataset, folder / "raw", seed=0, size="small", jobs=1)
-    hands = load_embedded_hands()
-    summary = convert_dataset(
-        get_adapter(dataset), folder / "raw", hands, folder / "clips", progress=False, synthetic=True
-    )
-    assert summary.left_out == ()
-    truths = {(truth.source_key, int(truth.source_frames[0])): truth for truth in sequences}
-    return truths, open_store(folder / "clips")
+    made = small_corpus(request.param)
+    truths = {(truth.source_key, int(truth.source_frames[0])): truth for truth in made.truths}
+    return truths, open_store(made.clips)
 
 
 @pytest.fixture

@@ -23,7 +23,6 @@ from hoidata.quality.stage import quality_store
 from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds
 from hoidata.quality.verdicts import left_out_reasons
 from hoidata.store.store import open_store
-from hoidata.synthetic.corpus import write_corpus
 from tests.builders.clips import in_another_world, jumping
 from tests.builders.stores import write_clips
 
@@ -183,24 +182,20 @@ def late_hands(clip: Clip, late: int) -> Clip:
     return replace(clip.take(slice(max(0, late), frames - max(0, -late))), hands=hands)
 
 
-@pytest.fixture(scope="module", params=["h2o", "grab", "arctic"])
-def corpus(request, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp(request.param)
-    write_corpus(request.param, folder / "raw", seed=0, size="small", jobs=1)
-    hands = load_embedded_hands()
-    convert_dataset(get_adapter(request.param), folder / "raw", hands, folder / "clips", progress=False)
-    return folder
+@pytest.fixture(params=["h2o", "grab", "arctic"])
+def corpus(request, small_corpus) -> Path:
+    return small_corpus(request.param).clips
 
 
 @pytest.mark.slow
 def test_no_clip_of_a_generated_corpus_is_left_out(corpus, tmp_path):
-    assert quality_store(corpus / "clips", tmp_path / "quality", progress=False)["left_out"] == 0
+    assert quality_store(corpus, tmp_path / "quality", progress=False)["left_out"] == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("late", [-3, 0, 3])
 def test_lag_planted_into_a_generated_corpus_is_found_within_a_frame(corpus, tmp_path, late):
-    store = open_store(corpus / "clips")
+    store = open_store(corpus)
     clips = [late_hands(store.clip(clip_id), late) for clip_id in store.ids]
     write_clips(tmp_path / "clips", clips)
     quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)

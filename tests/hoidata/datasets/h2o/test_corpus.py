@@ -5,20 +5,12 @@ import pytest
 
 from hoidata.datasets.h2o.adapter import H2OAdapter
 from hoidata.hands import track_joints
-from hoidata.synthetic.corpus import write_corpus
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory):
-    root = tmp_path_factory.mktemp("h2o") / "raw"
-    write_corpus("h2o", root, seed=0, size="small", jobs=1)
-    return root
-
-
-def test_gravity_is_straight_down_where_it_is_known_and_says_how_it_was_found(root, load_all):
-    clips = load_all(H2OAdapter(), root)
+def test_gravity_is_straight_down_where_it_is_known_and_says_how_it_was_found(small_corpus, load_all):
+    clips = load_all(H2OAdapter(), small_corpus("h2o").raw)
     known = [clip for clip in clips if clip.gravity is not None]
     assert len(known) >= 0.7 * len(clips)
     for clip in known:
@@ -28,8 +20,11 @@ def test_gravity_is_straight_down_where_it_is_known_and_says_how_it_was_found(ro
         assert clip.gravity is not None or clip.gravity_note.startswith("unknown: ")
 
 
-def test_hands_fitted_to_the_joints_are_those_of_the_parameters(root, load_all, hands):
-    fitted, given = load_all(H2OAdapter(hands="keypoints"), root), load_all(H2OAdapter(), root)
+def test_hands_fitted_to_the_joints_are_those_of_the_parameters(small_corpus, load_all, hands):
+    fitted, given = (
+        load_all(H2OAdapter(hands="keypoints"), small_corpus("h2o").raw),
+        load_all(H2OAdapter(), small_corpus("h2o").raw),
+    )
     assert [clip.clip_id for clip in fitted] == [clip.clip_id for clip in given]
     for ours, theirs in zip(fitted, given, strict=True):
         np.testing.assert_array_equal(ours.source_frames, theirs.source_frames)
