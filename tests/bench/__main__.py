@@ -6,7 +6,7 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from tests.bench import adapters, kernels, physics, realism, scale, store, surface, text
+from tests.bench import adapters, evaluator, kernels, physics, realism, scale, store, surface, text
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -17,6 +17,7 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
+    "evaluator": evaluator.main,
 }
 
 
