@@ -6,7 +6,7 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from bench import adapters, evaluate, kernels, physics, realism, scale, store, surface, text
+from bench import adapters, evaluate, evaluator, kernels, physics, realism, scale, store, surface, text
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -17,7 +17,7 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
-    "evaluate": evaluate.main,
+from bench import adapters, evaluate, evaluator, kernels, physics, realism, scale, store, surface, text
 }
 
 

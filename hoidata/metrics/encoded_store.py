@@ -8,6 +8,7 @@ from hoidata.metrics.encoded import Asked, Encoder, encode_sets, recorded, store
 from hoidata.metrics.feature_measures import confusion
 from hoidata.metrics.feature_metrics import FeatureFigure, feature_figures
 from hoidata.metrics.pair import acting_sides
+from hoidata.metrics.paths import PathEncoder
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
 
@@ -23,10 +24,12 @@ def encoder_summary(
     """Figures of features of the clips in ``samples``: reference id to number and id of each of its predictions.
 
     Gives figures, intervals, counts and notes by name of the figure, and evaluators: by name the digest of its weights
-    and, of a classifier, its labels with how many motions of each were taken for which.
+    ("path" learnt
+    nothing) and, of a classifier, its labels with how many motions of each were taken for which.
     """
     found: dict[str, Any] = {"figures": {}, "intervals": {}, "counts": {}, "notes": {}, "evaluators": {}}
     clips, train = list(samples), annotated.ids("train")
+    encoders = [*encoders, PathEncoder()]
     predicted = encode_sets(encoders, _predicted(annotated, store, samples), annotated, clips)
     reference = encode_sets(encoders, recorded(annotated, clips), annotated, clips)
     learnt = encode_sets(encoders, recorded(annotated, train), annotated, train) or [None] * len(encoders)
@@ -54,7 +57,7 @@ def _predicted(
 
 def _add(found: dict[str, Any], name: str, figure: FeatureFigure) -> None:
     if figure.value is not None:
-        found["figures"][name] = round(figure.value, DIGITS)
+        found["figures"][name] = round(figure.value, DIGITS) + 0.0  # no minus zero
         found["counts"][name] = figure.counts
     intervals = {"repetitions": figure.repetitions, "clips": figure.bootstrap}
     if known := {kind: [round(end, DIGITS) for end in ends] for kind, ends in intervals.items() if ends is not None}:

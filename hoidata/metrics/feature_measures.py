@@ -19,7 +19,6 @@ from hoidata.metrics.feature_distances import (
     fid_paired,
     frechet_distance,
     gaussian,
-    kid,
     mean_of_pairs,
     mean_with_itself,
 )
@@ -118,17 +117,16 @@ def floor(distance: Callable[[np.ndarray, np.ndarray], float | None]) -> Measure
 
 
 def kernel_distance(comparison: Comparison) -> FeatureFigure | None:
-    true = comparison.reference.take(rows_of(comparison.clips, comparison.reference)).features
-    runs = [kid(run.features, true[np.searchsorted(comparison.clips, run.clip)]) for run in comparison.repetitions]
-    within = mean_matrix(comparison, lambda run: cubic_kernel(run.features, run.features))
-    of_clips = lambda run: true[np.searchsorted(comparison.clips, run.clip)]  # noqa: E731
-    across = mean_matrix(comparison, lambda run: cubic_kernel(run.features, of_clips(run)))
-    same = within + cubic_kernel(true, true)
+    """Over pairs of different clips alone, as each prediction belongs to one recorded clip (Gretton et al. 2012)."""
+    true = comparison.reference.features[rows_of(comparison.clips, comparison.reference)]
 
-    def again(both: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        return mean_of_pairs(both, weights) - 2 * mean_with_itself(across, weights)
+    def pairs(run: EncodedSet) -> np.ndarray:
+        own = true[np.searchsorted(comparison.clips, run.clip)]
+        across = cubic_kernel(run.features, own)
+        return cubic_kernel(run.features, run.features) + cubic_kernel(own, own) - across - across.T
 
-    return set_figure(comparison, runs, same, again)
+    runs = [mean_of_pairs(pairs(run), np.ones((1, len(run))))[0] for run in comparison.repetitions]
+    return set_figure(comparison, runs, mean_matrix(comparison, pairs), mean_of_pairs)
 
 
 def diversity(comparison: Comparison) -> FeatureFigure | None:

@@ -12,11 +12,12 @@ from hoidata.clips.clip import Side
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.metrics.encoded import Encoding
 from hoidata.metrics.pair import Motion
+from hoidata.metrics.paths import even_frames, joints_and_presence
 from hoidata.settings import plain_config
 from models.common.checkpoints import FILE_NAME, load_checkpoint
 from models.common.family import StoredNetwork
 from models.evaluator.examples import padded
-from models.evaluator.inputs import corrected_input, even_frames, joints_and_presence, paper_input
+from models.evaluator.inputs import corrected_input, paper_input
 from models.evaluator.networks import EncoderConfig, MotionEncoder
 
 

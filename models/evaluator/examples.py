@@ -10,8 +10,9 @@ from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.metrics.action import verb_of
 from hoidata.metrics.encoded import UNKNOWN, label_words, recorded
+from hoidata.metrics.paths import FRAMES, even_frames, joints_and_presence
 from hoidata.store.annotated import AnnotatedStore
-from models.evaluator.inputs import corrected_input, drawn_frames, even_frames, joints_and_presence, paper_input
+from models.evaluator.inputs import corrected_input, drawn_frames, paper_input
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ class Examples:
         if trunk == "recurrent":
             return self.whole(trunk, rows)
         found = [self.joints[row] for row in rows]
-        shares = torch.rand(len(found), 15, generator=generator, dtype=torch.float64).numpy()
+        shares = torch.rand(len(found), FRAMES, generator=generator, dtype=torch.float64).numpy()
         frames = [drawn_frames(len(own[0]), share) for own, share in zip(found, shares, strict=True)]
         return padded([paper_input(*own, chosen) for own, chosen in zip(found, frames, strict=True)])
 

@@ -11,11 +11,10 @@ import numpy as np
 from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.features import object_features, upright
 from hoidata.metrics.pair import Motion
+from hoidata.metrics.paths import FRAMES, JOINTS, joints_and_presence
 from hoidata.objects.surface_index import surface_index
 
-JOINTS = 42  # 21 of the left hand, then 21 of the right
-PAPER_FRAMES = 15
-MOST_FRAMES, EVERY = 150, 3
+EVERY = 3
 FAR_M = 0.10
 PAPER_SIZE = JOINTS * 3
 OBJECT = slice(PAPER_SIZE, PAPER_SIZE + 10)  # position 3, 6D 6, hinge 1
@@ -23,25 +22,9 @@ CORRECTED_SIZE = OBJECT.stop + JOINTS
 MOTIONS_KEPT = 128
 
 
-def joints_and_presence(motion: Motion, sides: tuple[Side, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """(frame, 42, 3) float64 world joints turned upright, metres, and (frame, 42) whether the hand acts and is seen.
-
-    Of longer motions the first 150 frames, as generators make no more.
-    """
-    clip = motion.clip
-    joints = np.concatenate([motion.joints_m[side][:MOST_FRAMES] for side in SIDES], axis=1).astype(np.float64)
-    seen = [clip.hands[side].valid[:MOST_FRAMES] & (side in sides) for side in SIDES]
-    return joints @ upright(clip.gravity).T, np.repeat(np.stack(seen, axis=1), JOINTS // 2, axis=1)
-
-
-def even_frames(n_frames: int) -> np.ndarray:
-    """(15,) frames evenly over a clip, its first and last among them."""
-    return np.linspace(0, n_frames - 1, PAPER_FRAMES).astype(np.int64)
-
-
 def drawn_frames(n_frames: int, shares: np.ndarray) -> np.ndarray:
     """(15,) one frame of each of 15 groups in a row. shares: (15,) where in its group, from 0 to below 1."""
-    edges = np.linspace(0, n_frames, PAPER_FRAMES + 1)
+    edges = np.linspace(0, n_frames, FRAMES + 1)
     return np.minimum(edges[:-1] + shares * np.diff(edges), n_frames - 1).astype(np.int64)
 
 

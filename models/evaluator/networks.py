@@ -12,8 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pack_padded_sequence
 
+from hoidata.metrics.paths import JOINTS
 from models.common.features import scaled_text
-from models.evaluator.inputs import CORRECTED_SIZE, FAR_M, JOINTS, OBJECT, PAPER_SIZE
+from models.evaluator.inputs import CORRECTED_SIZE, FAR_M, OBJECT, PAPER_SIZE
 
 PLANES = ((0, 1), (0, 2))  # of x, y, z
 PLANAR_SCALE = 0.1

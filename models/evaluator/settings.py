@@ -18,4 +18,4 @@ class EvaluatorSettings:
     labels: Literal["verb", "verb_object"] = "verb"
     seeds: tuple[int, ...] = (0,)
     paper_loss: Literal["sigmoid", "softmax"] = "sigmoid"
-    most_steps: int = 3_000
+    most_steps: int = 1_500

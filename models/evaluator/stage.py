@@ -44,7 +44,7 @@ def train_evaluators(
     hands: HandPair | None = None,
     *,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
-    threads: int = 2,
+    threads: int = 1,
 ) -> dict[str, Any] | str:
     """Write ``out/<network>/model.safetensors`` and ``out/info.json``; what stands there, or why nothing was written.
 

@@ -233,6 +233,7 @@ def test_figures_of_features_stand_beside_the_others_with_the_digests_of_the_wei
     write_store(tmp_path / "truth", predicted, generated_info("truth"))
     encoders = load_evaluators(trained)
     found = evaluate_store(tmp_path / "truth", annotated_root, encoders=encoders)
+    assert found["evaluators"].pop("path")
     assert {name: known["digest"] for name, known in found["evaluators"].items()} == {
         one.name: one.digest for one in encoders
     }
@@ -240,7 +241,7 @@ def test_figures_of_features_stand_beside_the_others_with_the_digests_of_the_wei
     assert figures["fid_paired_paper"] == figures["fid_paired_corrected"] == 0
     assert found["notes"]["fid_frechet_corrected"] == "N too small"
     assert "fid_frechet_corrected" not in figures
-    assert {name for name in figures if name.endswith(("_paper", "_corrected", "_text_motion"))} <= known
+    assert {name for name in figures if name.endswith(("_paper", "_corrected", "_text_motion", "_path"))} <= known
     assert figures["joint_error_mm"] == 0
     assert np.sum(found["evaluators"]["corrected"]["confusion"]) == 4
     json.dumps(found, allow_nan=False)

@@ -108,6 +108,8 @@ def test_the_kernel_distance_is_the_unbiased_double_sum():
     within = [np.mean([kernel(a, b) for i, a in enumerate(s) for j, b in enumerate(s) if i != j]) for s in (one, other)]
     across = np.mean([kernel(a, b) for a in one for b in other])
     assert kid(one, other) == pytest.approx(sum(within) - 2 * across)
+    truth = encoded(one)
+    assert feature_figures(truth, truth)["kid_corrected"].value == 0
     draws = np.array([kid(normal(20, 3, 2 * seed), normal(20, 3, 2 * seed + 1)) for seed in range(400)])
     assert abs(draws.mean()) < 3 * draws.std() / 20
     assert (draws < 0).any()
@@ -206,10 +208,10 @@ def test_hard_groups_hold_sentences_about_the_same_object():
 
 def test_motions_that_are_training_clips_are_memorised_and_the_truth_is_not():
     train, truth = normal(CLIPS, 4), normal(CLIPS, 4, seed=1)
-    known, test = encoded(train), encoded(truth)
-    name = "memorised_share_corrected"
+    known, test = encoded(train, encoder="path"), encoded(truth, encoder="path")
+    name = "memorised_share_path"
     assert feature_figures(test, test, known)[name].value == 0
-    assert feature_figures(encoded(train + 1e-3), test, known)[name].value > 0.9
+    assert feature_figures(encoded(train + 1e-3, encoder="path"), test, known)[name].value > 0.9
     assert name not in feature_figures(test, test)
 
 
