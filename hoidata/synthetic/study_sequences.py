@@ -48,6 +48,8 @@ _RESTING_M, _PASSING_M = (0.035, 0.08), (0.035, 0.055)
 _RESTS, _PASSES = 0.45, 0.15
 _PASS_FRAMES = 18.0
 _FAR_M = 0.5
+# A resting hand drifts by this share of what a far one does.
+_DRIFT = 0.3
 # A hand that does nothing rests on the table, not in it.
 _RAISED_M = np.array([0.0, 0.0, 0.1])
 
@@ -171,7 +173,7 @@ def _idle_hand(
     if kind >= _RESTS:
         retreat = 0.28 * (1 - minimum_jerk(1 - np.abs(times - middle) / _PASS_FRAMES))
         here = here + np.array([0.0, 0.0, rng.uniform(0.0, 0.12)])
-    path = here + retreat[:, None] * away
+    path = here + retreat[:, None] * away + _DRIFT * (far.wrist_m - far.wrist_m[0])
     near = hand_track(person, "left", path, orient, far.hand_pose, True)
     reach = _clear_reach(near, away, track, acting, pair, target)
     return replace(near, wrist_m=path + reach * away)

@@ -15,7 +15,7 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import Place, load_settings
+from pipelines.stages.base import Place, load_hands, load_settings, raw_root
 from pipelines.stages.train import TrainParams
 
 PROJECT = Path(__file__).parents[2]
@@ -112,6 +112,8 @@ def test_the_chosen_profile_is_kept_from_git_and_survives_a_change_of_params_by_
     project_tools.run(here, "git", "checkout", "--quiet", "params.yaml")
     assert yaml.safe_load(params.read_text())["profile"] == "own"
     assert "seed: 0" in params.read_text()
+    assert hoidata("profile", "study").stdout == "study\n"
+    assert is_clean(here, project_tools)
     assert hoidata("profile", "embedded").stdout == hoidata("profile").stdout == "embedded\n"
     assert is_clean(here, project_tools)
     assert isinstance(hoidata("profile", "mine").exception, BadInput)
@@ -217,6 +219,14 @@ def test_places_of_two_profiles_never_meet():
     data = ("clips", "annotation", "contact", "splits")
     for name in (*data, "checkpoint", "metrics", "report", "manifest", "hand_manifest"):
         assert getattr(embedded, name) != getattr(own, name)
+
+
+def test_any_profile_whose_manifests_are_recipes_has_generated_files_and_the_embedded_hand(project, monkeypatch):
+    monkeypatch.chdir(project)
+    shutil.copytree(project / "manifests" / "embedded", project / "manifests" / "mine", dirs_exist_ok=True)
+    assert load_hands("mine").name == "embedded"
+    with pytest.raises(MissingResource, match="hoidata synth write grab --profile mine"):
+        raw_root(Place("mine", "grab"))
 
 
 def test_outside_of_a_project_the_command_says_so(tmp_path, project_tools):
