@@ -10,9 +10,9 @@ from typing import Literal
 
 from hoidata.errors import HoidataError
 from pipelines.lineage.manifests import Manifest
-from pipelines.params import read_params
+from pipelines.params import PROFILES, read_params
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import HAND, PROFILES, Place, load_hands, load_settings, own_root, root_variable
+from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 

@@ -8,7 +8,8 @@ import yaml
 from hoidata.errors import BadInput
 from hoidata.settings import refuse_unknown
 
-PROFILES = ("embedded", "own", "study")
+# embedded and study: made here, two corpora for two ends; own: the user's files.
+PROFILES = ("embedded", "study", "own")
 # dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
 TEMPLATED = ("profile", "profiles", "datasets", "families", "train.size")
 

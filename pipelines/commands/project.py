@@ -8,8 +8,7 @@ import tomllib
 from pathlib import Path
 
 from hoidata.errors import MissingResource
-from pipelines.params import read_params
-from pipelines.stages.base import PROFILES
+from pipelines.params import PROFILES, read_params
 
 PROFILE = re.compile("^profile: .*", re.MULTILINE)
 FILTER = "hoidata-profile"

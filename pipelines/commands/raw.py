@@ -7,7 +7,7 @@ import typer
 
 from hoidata.errors import BadInput, MissingResource
 from pipelines.commands.project import current_profile, enter_project, remember_root, set_profile
-from pipelines.params import read_params
+from pipelines.params import PROFILES, read_params
 
 app = typer.Typer(no_args_is_help=True)
 Dataset = Annotated[str, typer.Argument(help="A dataset of params.yaml, or `mano` for the hand files.")]
@@ -48,8 +48,6 @@ def profile(
 ) -> None:
     """Say which data this copy of the project works on, or choose it; git does not see the choice."""
     enter_project()
-    from pipelines.stages.base import PROFILES
-
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")
     if name:

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 EMPTY = "empty.json"
 HAND = "hand"
-# embedded and study: made here, two corpora for two ends; own: the user's files.
-PROFILES = ("embedded", "study", "own")
 Settings = TypeVar("Settings")
 
 
