@@ -1,5 +1,6 @@
 """The list of metrics as README.md beside this file: ``python -m hoidata.metrics.describe > .../README.md``."""
 
+from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric
 
 _HEAD = """# Metrics
@@ -29,9 +30,25 @@ To add a metric: a function of (pair, every) that gives the values of one motion
 """
 
 
+_FEATURES = """
+## Figures of features
+
+What the networks of `models/evaluator` see; generated from `feature_metrics.py`. They are handed to `evaluate_store`
+as `encoders`, trained on recorded clips of the training part alone, and every file of figures names the digest of
+their weights: rows of different digests are not compared. *paper*: 42 joints, no object, as Text2HOI left it;
+*corrected*: the object's motion and how near it is, not its shape; *text-motion*: sentences and motions in one space.
+Every figure is that of one motion per clip, the mean over repetitions. Besides a Student interval over repetitions
+there is one over clips: whole source sequences drawn again 2,000 times, the networks as they are.
+
+| name | figure | better | reduction | thresholds | source | note |
+|---|---|---|---|---|---|---|
+"""
+
+
 def readme() -> str:
     """The text of README.md."""
-    return _HEAD + "".join(f"| {' | '.join(_cells(metric))} |\n" for metric in METRICS)
+    tables = (_HEAD, map(_cells, METRICS)), (_FEATURES, map(_feature_cells, FEATURE_METRICS))
+    return "".join(head + "".join(f"| {' | '.join(cells)} |\n" for cells in rows) for head, rows in tables)
 
 
 def _cells(metric: Metric) -> tuple[str, ...]:
@@ -39,7 +56,7 @@ def _cells(metric: Metric) -> tuple[str, ...]:
         f"`{metric.name}`",
         metric.title,
         metric.unit or "-",
-        f"floor of `{metric.floor_of}`" if metric.floor_of else metric.direction,
+        _direction(metric),
         metric.reduction,
         metric.frames,
         str(metric.every),
@@ -48,6 +65,15 @@ def _cells(metric: Metric) -> tuple[str, ...]:
         metric.thresholds or "-",
         metric.source,
     )
+
+
+def _feature_cells(metric: FeatureMetric) -> tuple[str, ...]:
+    texts = (metric.reduction, metric.thresholds or "-", metric.source, metric.note or "-")
+    return f"`{metric.name}`", metric.title, _direction(metric), *texts
+
+
+def _direction(metric: Metric | FeatureMetric) -> str:
+    return f"floor of `{metric.floor_of}`" if metric.floor_of else metric.direction
 
 
 if __name__ == "__main__":

@@ -24,6 +24,8 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.metrics.action import Actions, training_actions, verb_of
 from hoidata.metrics.asked import read_asked
+from hoidata.metrics.encoded import Encoder
+from hoidata.metrics.encoded_store import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
 from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count
@@ -73,18 +75,20 @@ def evaluate_store(
     *,
     split: str = "test",
     metrics: tuple[Metric, ...] = METRICS,
+    encoders: Sequence[Encoder] = (),
     jobs: int = 1,
     progress: bool = False,
 ) -> dict[str, Any]:
     """Figures of the store ``predicted`` against the annotated dataset ``reference``.
 
     reference: a folder with clips, annotation, contact and splits (``load_annotated``). hands: as in ``open_store``, of
-    both. split: the part of the chosen split that is asked for. jobs: worker processes, used from
-    ``WORKERS_PAY_FROM`` motions on; they change no figure. progress: a bar on stderr.
+    both. split: the part of the chosen split that is asked for. encoders: whose features are compared too. jobs: worker
+    processes, used from ``WORKERS_PAY_FROM`` motions on; they change no figure. progress: a bar on stderr.
     Gives held_out_clips, motions, synthetic, length ("given" or "own"), figures (one number per metric that has any
     value), intervals (95 %, over repetitions and over clips drawn by source sequence, where there are two or more),
     counts (how many clips, motions and values went into each), actions (where the limits of verbs come from) and
-    left_out (clip id and reason). Raises BadInput where no clip of the two stores can be compared.
+    left_out (clip id and reason); with encoders also notes and evaluators (``encoder_summary``). Raises BadInput where
+    no clip of the two stores can be compared.
     """
     annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
     asked = annotated.ids(split)
@@ -103,12 +107,19 @@ def evaluate_store(
         why = f"; {left_out[0].clip_id}: {left_out[0].reason}" if left_out else ""
         remedy = "name them so, in the world and with the frames of their reference"
         raise BadInput(predicted, f"clips named <id>~<k> after the {split} clips of {reference}", got + why, remedy)
+    summary = _summary(metrics, measured)
+    if encoders:
+        left = {item.clip_id for item in left_out}
+        ids = ((clip_id, samples[clip_id]) for clip_id in asked if found[clip_id].samples)
+        kept = {clip_id: [(_number(own, clip_id), own) for own in row if own not in left] for clip_id, row in ids}
+        learnt = encoder_summary(encoders, annotated, store, kept)
+        summary = learnt | {name: summary[name] | learnt[name] for name in summary}
     return {
         "held_out_clips": len(asked),
         "motions": sum(len(own.samples) for own in measured),
         "synthetic": bool(annotated.store.sequences.loc[asked, "synthetic"].any()),
         "length": "own" if bench.own_length else "given",
-        **_summary(metrics, measured),
+        **summary,
         "actions": bench.actions.facts,
         "left_out": [item._asdict() for item in left_out],
     }

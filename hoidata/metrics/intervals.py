@@ -44,12 +44,14 @@ def bootstrap_interval(
     statistic: Statistic = weighted_mean,
     draws: int = DRAWS,
     seed: int = SEED,
+    about: float | None = None,
 ) -> Interval | None:
     """Percentile interval of a figure when whole groups of clips are drawn again with replacement; None for one group.
 
     values_by_clip: (clip, ...) of any shape the statistic knows; no NaN: a clip without a value is left out before.
     groups: (clip,) labels, the source sequence of each; all samples of a clip belong to its group. statistic: of these
     values and of (draw, clip) weights, how often each clip was drawn; gives (draw,) figures, NaN where it has none.
+    about: the figure itself, to move the middle of the draws there, where drawing again adds to any figure.
     """
     values, (names, group) = np.asarray(values_by_clip), np.unique(np.asarray(groups), return_inverse=True)
     if len(names) < 2:
@@ -61,5 +63,6 @@ def bootstrap_interval(
     figures = figures[np.isfinite(figures)]
     if not len(figures):
         return None
-    low, high = np.quantile(figures, ((1 - LEVEL) / 2, (1 + LEVEL) / 2))
-    return Interval(float(low), float(high))
+    low, middle, high = np.quantile(figures, ((1 - LEVEL) / 2, 0.5, (1 + LEVEL) / 2))
+    shift = 0.0 if about is None else about - middle
+    return Interval(float(low + shift), float(high + shift))

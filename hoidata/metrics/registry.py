@@ -5,7 +5,7 @@ To add one: a function of (pair, every) that gives the values of one motion as a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -218,7 +218,16 @@ def sum_and_count(metric: Metric, samples: list[np.ndarray]) -> tuple[float, int
     return sum(means), len(means)
 
 
-def is_better(metric: Metric, value: float, other: float, truth: float | None) -> bool | None:
+class Judged(Protocol):
+    """What telling the better of two figures needs of a metric of either list."""
+
+    @property
+    def direction(self) -> Direction: ...
+    @property
+    def floor_of(self) -> str: ...
+
+
+def is_better(metric: Judged, value: float, other: float, truth: float | None) -> bool | None:
     """Whether ``value`` is better than ``other``; None where the truth is not known or the metric is a floor."""
     if metric.floor_of:
         return None

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from hoidata.errors import BadInput
 from hoidata.files import atomic_file, canonical_json
 from hoidata.settings import build_config, plain_config
-from models.common.family import Network
+from models.common.family import StoredNetwork
 from models.common.features import Normaliser
 
 FORMAT = 1
@@ -71,7 +71,7 @@ def read_info(path: str | Path) -> dict[str, Any]:
     return info
 
 
-def load_checkpoint(folder: str | Path, network: Network, device: torch.device | str = "cpu") -> Checkpoint:
+def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.device | str = "cpu") -> Checkpoint:
     """The checkpoint of ``network`` in ``folder``, or of a file. Raises BadInput where there is none, or of another."""
     path = Path(folder) if str(folder).endswith(".safetensors") else Path(folder) / FILE_NAME
     if not path.is_file():

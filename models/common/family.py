@@ -63,18 +63,23 @@ class Setup:
 
 
 @dataclass(frozen=True)
-class Network:
-    """One network of a family, trained by one stage.
+class StoredNetwork:
+    """What reading a checkpoint needs. name: that it says of itself. config: a frozen dataclass; build: to a module."""
 
-    name: of its checkpoint folder, unique over all families. config: its frozen dataclass; build: config to module.
+    name: str
+    config: type
+    build: Callable[[Any], nn.Module]
+
+
+@dataclass(frozen=True)
+class Network(StoredNetwork):
+    """One network of a family, trained by one stage; ``name`` is that of its checkpoint folder, unique over all.
+
     objective: how it is trained, with the normalisation it is trained in or None. loss: config of the objective.
     needs: names of the networks that must be trained before. crop: of training clips that are too long.
     results: what else is found on validation clips and kept in the checkpoint.
     """
 
-    name: str
-    config: type
-    build: Callable[[Any], nn.Module]
     objective: Callable[[Setup], tuple[Objective, Normaliser | None]]
     loss: type | None = None
     needs: tuple[str, ...] = ()

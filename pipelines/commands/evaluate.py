@@ -28,6 +28,9 @@ def evaluate(
     store: Store,
     reference: Reference,
     out: Annotated[Path | None, typer.Option(help="Also write the figures as JSON.", resolve_path=True)] = None,
+    evaluators: Annotated[
+        Path | None, typer.Option(help="Its trained evaluator, such as evaluators/study/study.", exists=True)
+    ] = None,
     split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
 ) -> None:
     """Measure every clip of a store against the clip it was made for, and print the table of metrics."""
@@ -38,7 +41,13 @@ def evaluate(
     from pipelines.pages.metrics_table import printed_table
     from pipelines.stages.base import jobs
 
-    found = evaluate_store(store, reference, _hands(reference), split=split, jobs=jobs(), progress=True)
+    encoders = []
+    if evaluators is not None:
+        from models.evaluator.encoders import load_evaluators
+
+        encoders = load_evaluators(evaluators)
+    hands = _hands(reference)
+    found = evaluate_store(store, reference, hands, split=split, encoders=encoders, jobs=jobs(), progress=True)
     Console(width=None if sys.stdout.isatty() else 120).print(printed_table(found))
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")

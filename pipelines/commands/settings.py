@@ -15,6 +15,7 @@ SECTIONS = {
     "contact": "hoidata.contact.settings:ContactSettings",
     "annotate": "hoidata.annotation.settings:AnnotationSettings",
     "surface": "hoidata.surface.stage:SurfaceSettings",
+    "evaluator": "models.evaluator.settings:EvaluatorSettings",
 }
 
 

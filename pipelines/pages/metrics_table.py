@@ -1,4 +1,4 @@
-"""What evaluation found, as tables: rows are families, columns the metrics of the registry."""
+"""What evaluation found, as tables: rows are families, columns the metrics of both lists, of geometry and features."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -9,8 +9,11 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
+from hoidata.errors import BadInput
+from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
 
+COLUMNS: tuple[Metric | FeatureMetric, ...] = (*METRICS, *FEATURE_METRICS)
 TRUTH, LOOKUP = "ground-truth", "nearest-clip"
 NO_FIGURE = "-"
 INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
@@ -56,7 +59,8 @@ def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
     folder = Path(folder)
     found = {family: _read(folder / f"{family}.json") for family in families}
     figures = {family: values["figures"] for family, values in found.items() if "figures" in values}
-    shown = [metric for metric in METRICS if any(metric.name in values for values in figures.values())]
+    _refuse_other_evaluators(folder, found)
+    shown = [metric for metric in COLUMNS if any(metric.name in values for values in figures.values())]
     columns = [(metric.title, metric.unit, _better(metric)) for metric in shown]
     return MetricsTable(columns, [_row(family, found[family], shown, figures) for family in families])
 
@@ -65,14 +69,31 @@ def _read(path: Path) -> dict[str, Any]:
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"empty": "not evaluated"}
 
 
-def _row(family: str, values: dict[str, Any], shown: list[Metric], figures: Mapping[str, Mapping[str, float]]) -> Row:
+def _refuse_other_evaluators(folder: Path, found: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise BadInput where two rows have figures of the same network with other weights: they say nothing together."""
+    digests: dict[str, dict[str, list[str]]] = {}
+    for family, values in found.items():
+        for name, known in values.get("evaluators", {}).items():
+            digests.setdefault(name, {}).setdefault(known["digest"], []).append(family)
+    for name, families in digests.items():
+        if len(families) > 1:
+            got = "; ".join(f"{digest[:8]} of {', '.join(rows)}" for digest, rows in families.items())
+            raise BadInput(folder, f"one {name} evaluator behind all rows", got, "evaluate them again with one")
+
+
+def _row(
+    family: str,
+    values: dict[str, Any],
+    shown: Sequence[Metric | FeatureMetric],
+    figures: Mapping[str, Mapping[str, float]],
+) -> Row:
     if "figures" not in values:
         return Row(family, empty=str(values["empty"]))
     cells, loses = [], []
     for metric in shown:
         column = {name: own[metric.name] for name, own in figures.items() if metric.name in own}
         if family not in column:
-            cells.append(Cell(NO_FIGURE))
+            cells.append(Cell(values.get("notes", {}).get(metric.name, NO_FIGURE)))
             continue
         worse = loses_to_lookup(metric, family, column)
         loses += [metric.title] if worse else []
@@ -85,7 +106,7 @@ def _row(family: str, values: dict[str, Any], shown: list[Metric], figures: Mapp
     return Row(family, cells, loses, note=note, diagnostics=diagnostics)
 
 
-def best_families(metric: Metric, column: Mapping[str, float]) -> list[str]:
+def best_families(metric: Metric | FeatureMetric, column: Mapping[str, float]) -> list[str]:
     """Families that no other beats in a metric; the truth itself does not compete."""
     truth = column.get(TRUTH)
     rivals = {name: value for name, value in column.items() if name != TRUTH}
@@ -98,7 +119,7 @@ def best_families(metric: Metric, column: Mapping[str, float]) -> list[str]:
     ]
 
 
-def loses_to_lookup(metric: Metric, family: str, column: Mapping[str, float]) -> bool:
+def loses_to_lookup(metric: Metric | FeatureMetric, family: str, column: Mapping[str, float]) -> bool:
     """Whether looking up the nearest training clip gives a better figure than this family."""
     if family in (TRUTH, LOOKUP) or LOOKUP not in column:
         return False
@@ -112,7 +133,7 @@ def printed_table(found: Mapping[str, Any]) -> Table:
     table.add_column("metric", min_width=32)
     for name in ("figure", *INTERVALS.values(), "unit", "better", "clips"):
         table.add_column(name, justify="left" if name in ("unit", "better") else "right")
-    for metric in METRICS:
+    for metric in COLUMNS:
         if metric.name in found["figures"]:
             clips, spread = found["counts"][metric.name]["clips"], found["intervals"].get(metric.name, {})
             ends = [" to ".join(map(number, spread.get(name, ()))) for name in INTERVALS]
@@ -122,7 +143,7 @@ def printed_table(found: Mapping[str, Any]) -> Table:
     return table
 
 
-def _better(metric: Metric) -> str:
+def _better(metric: Metric | FeatureMetric) -> str:
     if metric.floor_of:
         return "a floor"
     return metric.direction if metric.direction == "nearer the truth" else f"{metric.direction} is better"

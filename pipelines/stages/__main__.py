@@ -14,6 +14,7 @@ STAGES = (
     "contact",
     "surface",
     "split",
+    "evaluator",
     "train",
     "sample",
     "evaluate",

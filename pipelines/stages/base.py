@@ -84,6 +84,10 @@ class Place:
         return self.checkpoints / self.model
 
     @property
+    def evaluators(self) -> Path:
+        return Path("evaluators", self.profile, self.dataset)
+
+    @property
     def samples(self) -> Path:
         return Path("samples", self.profile, self.dataset, self.family)
 

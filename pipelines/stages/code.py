@@ -84,7 +84,7 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
     for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
     every |= _families([family_module(family) for family in params["families"]])
-    return found | {stage: _start(stage, every) for stage in ("evaluate", "report")}
+    return found | {stage: _start(stage, every) for stage in ("evaluator", "evaluate", "report")}
 
 
 def _families(modules: list[str]) -> dict[str, list[Choice]]:

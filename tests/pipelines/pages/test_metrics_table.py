@@ -5,6 +5,7 @@ import json
 import jinja2
 import pytest
 
+from hoidata.errors import BadInput
 from hoidata.metrics.registry import metric
 from pipelines.pages.metrics_table import NO_FIGURE, best_families, loses_to_lookup, metrics_tables, number
 
@@ -80,3 +81,25 @@ def test_the_page_says_it_and_escapes_what_it_is_given(folder):
 
 def test_numbers_keep_three_digits():
     assert [number(value) for value in (1234567, 0.01234, 11.0, None, "x")] == ["1,234,567", "0.0123", "11.0", "", "x"]
+
+
+def with_evaluator(folder, family, digest, **notes):
+    path = folder / f"{family}.json"
+    values = json.loads(path.read_text()) | {"evaluators": {"corrected": {"digest": digest}}, "notes": notes}
+    values["figures"] |= {} if notes else {"fid_frechet_corrected": 0.25}
+    path.write_text(json.dumps(values))
+
+
+def test_a_figure_that_must_not_be_given_says_why(folder):
+    with_evaluator(folder, "ours", "aa", fid_frechet_corrected="N too small")
+    with_evaluator(folder, "nearest-clip", "aa")
+    table = table_of(folder)
+    column = [title for title, *_ in table.columns].index("Frechet distance, corrected")
+    assert [row.cells[column].text for row in table.rows if row.cells] == ["N too small", "0.250", NO_FIGURE]
+
+
+def test_rows_of_evaluators_with_other_weights_are_not_compared(folder):
+    with_evaluator(folder, "ours", "aaaaaaaaaa")
+    with_evaluator(folder, "nearest-clip", "bbbbbbbbbb")
+    with pytest.raises(BadInput, match=r"one corrected evaluator.*aaaaaaaa of ours; bbbbbbbb of nearest-clip"):
+        table_of(folder)

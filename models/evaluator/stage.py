@@ -1,0 +1,158 @@
+"""The evaluator of one dataset: every network trained, weighed on recorded clips, and written with what is known."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from hoidata.files import atomic_file
+from hoidata.files.digest import canonical_json
+from hoidata.hands import HandPair
+from hoidata.metrics.encoded import UNKNOWN
+from hoidata.metrics.majority import majority_rows
+from hoidata.store.annotated import AnnotatedStore, load_annotated
+from models.common.checkpoints import save_checkpoint
+from models.common.training import make_repeatable
+from models.evaluator.encoders import stored_network, weights_digest
+from models.evaluator.examples import Examples
+from models.evaluator.networks import EncoderConfig, MotionEncoder
+from models.evaluator.settings import EvaluatorSettings
+from models.evaluator.training import RECIPES, Classification, Pairing, Task, fit, held_out_loss, logits_of
+
+SPLITS = ("train", "validation", "test")
+PAPER_FEATURES, SHARED = 128, 64
+FEATURES, FEATURES_OF_FEW, FEW_CLIPS = 32, 16, 256
+DIGITS = 4
+Figures = dict[str, Any]
+
+
+class Trained(NamedTuple):
+    """One training. chosen_by: on the held-out clips, higher is better."""
+
+    seed: int
+    network: MotionEncoder
+    chosen_by: float
+    figures: Figures
+
+
+def train_evaluators(
+    annotated_root: str | Path,
+    out: str | Path,
+    settings: EvaluatorSettings,
+    hands: HandPair | None = None,
+    *,
+    provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+    threads: int = 2,
+) -> dict[str, Any] | str:
+    """Write ``out/<network>/model.safetensors`` and ``out/info.json``; what stands there, or why nothing was written.
+
+    annotated_root: clips, annotation, contact and splits of one dataset. provenance: from facts to what is stored. Each
+    network is trained once per seed on the training part and chosen on validation; test clips are only weighed.
+    """
+    annotated = load_annotated(annotated_root, hands)
+    parts = {split: Examples.of(annotated, split) for split in SPLITS}
+    if reason := _why_not(parts["train"], settings):
+        return reason
+    info: dict[str, Any] = {
+        "label_kind": settings.labels,
+        "labels": list(Classification.of(parts["train"], settings.labels, "softmax").labels),
+        "clips": {split: len(examples) for split, examples in parts.items()},
+        "majority": majority_rows(*(_known(parts[split], settings.labels) for split in ("train", "test"))),
+        "evaluators": {},
+    }
+    for name in settings.networks:
+        trainings = [_trained(name, seed, parts, settings, threads) for seed in settings.seeds]
+        kept = sorted(trainings, key=lambda one: (one.chosen_by, -one.seed))[len(trainings) // 2]
+        by_seed = {str(one.seed): one.figures for one in trainings}
+        facts = _facts(name, kept, parts, settings, annotated, info["labels"])
+        stored = {"facts": facts, "results": kept.figures, "provenance": provenance(facts) if provenance else {}}
+        save_checkpoint(Path(out) / name, stored_network(name).name, kept.network, None, stored)
+        info["evaluators"][name] = {
+            "digest": weights_digest(kept.network),
+            "parameters": sum(weight.numel() for weight in kept.network.parameters()),
+            "seed": kept.seed,
+            **kept.figures,
+            "by_seed": by_seed,
+        }
+    with atomic_file(Path(out) / "info.json") as part:
+        part.write_text(canonical_json(info) + "\n")
+    return info
+
+
+def _why_not(train: Examples, settings: EvaluatorSettings) -> str | None:
+    labels = {word for word in train.label_words(settings.labels) if word}
+    return (
+        None
+        if len(labels) > 1
+        else f"training clips: {len(train)}, labels among them: {len(labels)}; nothing to tell apart"
+    )
+
+
+def _trained(name: str, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings, threads: int) -> Trained:
+    make_repeatable(seed, threads)
+    train = parts["train"]
+    held_out = parts["validation"] if len(parts["validation"]) else train
+    task, network = _task(name, train, settings), MotionEncoder(config_of(name, train, settings.labels))
+    fit(network, task, train, held_out, RECIPES[name], seed, settings.most_steps)
+    if isinstance(task, Classification):
+        found = {split: _accuracies(network, task, examples) for split, examples in parts.items() if len(examples)}
+        chosen_by = _accuracies(network, task, held_out)["top1"]
+        return Trained(seed, network, chosen_by, {"accuracy": found})
+    losses = {split: held_out_loss(network, task, examples) for split, examples in parts.items() if len(examples)}
+    rounded = {split: round(loss, DIGITS) for split, loss in losses.items()}
+    return Trained(seed, network, -held_out_loss(network, task, held_out), {"loss": rounded})
+
+
+def config_of(name: str, train: Examples, label_kind: str) -> EncoderConfig:
+    """Sizes of a network for these clips: fewer features where there are few clips."""
+    features = FEATURES_OF_FEW if len(train) < FEW_CLIPS else FEATURES
+    if name == "text-motion":
+        return EncoderConfig("recurrent", SHARED, features, text=train.text.shape[-1])
+    labels = len({word for word in train.label_words(label_kind) if word})
+    if name == "paper":
+        return EncoderConfig("planar", labels, PAPER_FEATURES)
+    return EncoderConfig("recurrent", labels, features)
+
+
+def _task(name: str, train: Examples, settings: EvaluatorSettings) -> Task:
+    if name == "text-motion":
+        return Pairing()
+    return Classification.of(train, settings.labels, settings.paper_loss if name == "paper" else "softmax")
+
+
+@torch.no_grad()
+def _accuracies(network: MotionEncoder, task: Classification, examples: Examples) -> dict[str, float]:
+    """top1 and top3 of clips whose label was learnt."""
+    (labels,) = task.targets(examples)
+    known = labels != UNKNOWN
+    logits, labels = logits_of(network, examples)[known], labels[known]
+    rank: Tensor = (logits > logits.gather(1, labels[:, None])).sum(1)
+    return {f"top{k}": round(float((rank < k).double().mean()), DIGITS) for k in (1, 3)}
+
+
+def _known(examples: Examples, label_kind: str) -> list[tuple[str, str, str]]:
+    """Label, object and hand of each clip that has a label."""
+    rows = zip(examples.label_words(label_kind), examples.objects, examples.hands, strict=True)
+    return [(label, noun, hand) for label, noun, hand in rows if label]
+
+
+def _facts(
+    name: str,
+    kept: Trained,
+    parts: dict[str, Examples],
+    settings: EvaluatorSettings,
+    annotated: AnnotatedStore,
+    labels: Sequence[str],
+) -> dict[str, Any]:
+    """What the checkpoint says of itself."""
+    return {
+        "model": stored_network(name).name,
+        "seed": kept.seed,
+        "label_kind": "" if name == "text-motion" else settings.labels,
+        "labels": [] if name == "text-motion" else list(labels),
+        "clips": {split: parts[split].ids for split in ("train", "validation")},
+        "synthetic": bool(annotated.info["synthetic"]),
+        "encoder": annotated.encoder_identity,
+    }

@@ -1,0 +1,37 @@
+"""Stage evaluator: the networks that tell what a motion shows, trained on recorded clips of one dataset."""
+
+from pathlib import Path
+
+from hoidata.files.atomic import atomic_folder
+from models.evaluator.settings import EvaluatorSettings
+from pipelines.lineage.graph import producers, read_graph
+from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, note_empty, write_empty
+
+OFF = "off: params.yaml names no networks under evaluator"
+
+
+def run(place: Place) -> None:
+    """Train all of them; a dataset without clips or labels, or none asked for, gives an empty output."""
+    settings = load_settings(EvaluatorSettings, "evaluator")
+    folders = (place.clips, place.annotation, place.contact, place.splits)
+    reason = next(filter(None, map(empty_reason, folders)), None) if settings.networks else OFF
+    if reason:
+        write_empty(place.evaluators, reason)
+        return
+    from models.evaluator.stage import train_evaluators
+    from pipelines.lineage.provenance import build_provenance
+
+    stage = producers(read_graph(Path()))[place.evaluators.as_posix()].name
+    with atomic_folder(place.evaluators) as part:
+        found = train_evaluators(
+            place.data,
+            part,
+            settings,
+            load_hands(place.profile),
+            provenance=lambda facts: build_provenance(Path(), stage, facts),
+        )
+        if isinstance(found, str):
+            note_empty(part, found)
+            return
+    for name, known in found["evaluators"].items():
+        print(f"{place}: {name}: {known.get('accuracy') or known['loss']}")

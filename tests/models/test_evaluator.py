@@ -1,0 +1,263 @@
+"""The evaluator: its inputs and networks against the definitions written anew, what it must not see, its training."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips import SIDES, Clip
+from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.metrics.evaluate import evaluate_store
+from hoidata.metrics.feature_metrics import FEATURE_METRICS
+from hoidata.metrics.pair import Motion
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from models.evaluator.encoders import MotionEvaluator, load_evaluators, weights_digest
+from models.evaluator.examples import Examples, padded
+from models.evaluator.inputs import CORRECTED_SIZE, corrected_input, drawn_frames
+from models.evaluator.networks import EncoderConfig, MotionEncoder, turned
+from models.evaluator.settings import EvaluatorSettings
+from models.evaluator.stage import train_evaluators
+from models.evaluator.training import Classification, Pairing
+from tests.builders.clips import build_clip, in_another_world, with_hand, with_object
+from tests.builders.objects import box_model
+
+PAPER, CORRECTED = EncoderConfig("planar", 11, 128), EncoderConfig("recurrent", 11, 16)
+PAIR = EncoderConfig("recurrent", 64, 16, text=512)
+LABELS = tuple(f"verb {number}" for number in range(11))
+
+
+def motion_of(clip: Clip) -> Motion:
+    hands = load_embedded_hands()
+    return Motion(clip, {side: track_joints(clip.hands[side], hands[side]) for side in SIDES}, hands)
+
+
+def evaluator(config: EncoderConfig) -> MotionEvaluator:
+    torch.manual_seed(0)
+    return MotionEvaluator("toy", MotionEncoder(config).eval(), LABELS, "verb", "")
+
+
+def of(config: EncoderConfig, *clips: Clip, sides=("right",)) -> np.ndarray:
+    found = evaluator(config).encode([motion_of(clip) for clip in clips], [sides] * len(clips))
+    return np.concatenate((found.features, found.logits), axis=1)
+
+
+def paper_input_by_the_sheet(clip: Clip, sides: tuple[str, ...]) -> np.ndarray:
+    """Facts sheet 3.2 with loops, for a clip in which gravity is -z."""
+    joints, last = motion_of(clip).joints_m, clip.n_frames - 1
+    frames = [int(number * last / 14) for number in range(15)]
+    first = "right" if "right" in sides else "left"
+    wrist = joints[first][frames[0]][0].astype(np.float64)
+    out = np.zeros((15, 42, 3))
+    for row, frame in enumerate(frames):
+        for number, side in enumerate(("left", "right")):
+            for joint in range(21) if side in sides else ():
+                out[row, 21 * number + joint] = joints[side][frame][joint] - wrist
+    return out
+
+
+def paper_network_by_the_sheet(network: MotionEncoder, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Facts sheet 3.1 step by step: features and logits of (15, 42, 3) joints."""
+    weights = {name: tensor.double().numpy() for name, tensor in network.state_dict().items()}
+    sigmoid = lambda x: 1 / (1 + np.exp(-x))  # noqa: E731
+    total = np.zeros(128)
+    for view, plane in enumerate(([0, 1], [0, 2])):
+        steps = list(joints[:, :, plane].reshape(15, 84))
+        for layer in range(2):
+            at = lambda kind: weights[f"trunk.views.{view}.{kind}_l{layer}"]  # noqa: E731, B023
+            hidden, cell, outputs = np.zeros(128), np.zeros(128), []
+            for step in steps:
+                gates = at("weight_ih") @ step + at("bias_ih") + at("weight_hh") @ hidden + at("bias_hh")
+                enter, forget, new, leave = np.split(gates, 4)
+                cell = sigmoid(forget) * cell + sigmoid(enter) * np.tanh(new)
+                hidden = sigmoid(leave) * np.tanh(cell)
+                outputs.append(hidden)
+            steps = outputs
+        kernel, bias = weights[f"trunk.mixers.{view}.weight"][0, 0], weights[f"trunk.mixers.{view}.bias"][0]
+        wide = np.pad(steps[-1], 1)
+        total += [kernel @ wide[unit : unit + 3] + bias for unit in range(128)]
+    return 0.1 * np.tanh(total), weights["head.weight"] @ total + weights["head.bias"]
+
+
+@pytest.mark.parametrize(("hand", "frames"), [("right", 30), ("left", 47), ("both", 15), ("both", 9)])
+def test_paper_is_what_the_facts_sheet_says(hand, frames):
+    clip = build_clip(frames, hand)
+    sides = SIDES if hand == "both" else (hand,)
+    own = evaluator(PAPER)
+    found = own.encode([motion_of(clip)], [sides])
+    feature, logits = paper_network_by_the_sheet(own.network, paper_input_by_the_sheet(clip, sides))
+    assert found.features[0] == pytest.approx(feature, abs=1e-5)
+    assert found.logits[0] == pytest.approx(logits, abs=1e-5)
+
+
+@pytest.mark.parametrize(("config", "count"), [(PAPER, 484_755), (CORRECTED, 63_627)])
+def test_the_networks_have_the_parameters_of_the_facts_sheet(config, count):
+    assert sum(weight.numel() for weight in MotionEncoder(config).parameters()) == count
+
+
+@pytest.mark.parametrize("config", [PAPER, CORRECTED, PAIR])
+def test_a_motion_has_the_same_numbers_alone_in_a_batch_and_in_any_order(config):
+    clips = [build_clip(frames, seed=frames) for frames in (9, 30, 61, 200)]
+    together = of(config, *clips)
+    assert together == pytest.approx(np.concatenate([of(config, clip) for clip in clips]), abs=1e-6)
+    assert together == pytest.approx(of(config, *clips[::-1])[::-1], abs=1e-6)
+    assert np.array_equal(together, of(config, *clips))
+
+
+@pytest.mark.parametrize("config", [PAPER, CORRECTED, PAIR])
+def test_numbers_of_a_hand_that_was_never_asked_for_change_nothing(config):
+    clip = build_clip()
+    other = with_hand(clip, "left", wrist_m=clip.hands["left"].wrist_m + 7, valid=~clip.hands["left"].valid)
+    assert np.array_equal(of(config, clip), of(config, other))
+    unseen = clip.hands["right"].valid.copy()
+    unseen[10:13] = False
+    moved = clip.hands["right"].wrist_m.copy()
+    moved[10:13] += 3
+    missing = with_hand(clip, "right", valid=unseen)
+    assert np.array_equal(of(config, missing), of(config, with_hand(clip, "right", valid=unseen, wrist_m=moved)))
+
+
+def test_an_object_moved_aside_is_the_same_to_paper_bit_for_bit_and_not_to_corrected():
+    clip = build_clip(40)
+    moved = with_object(clip, translation_m=clip.object.translation_m + np.float32([0.1, 0, 0]))
+    assert np.array_equal(of(PAPER, clip), of(PAPER, moved))
+    assert np.abs(of(CORRECTED, clip) - of(CORRECTED, moved)).max() > 1e-2
+
+
+def test_the_shape_of_an_object_far_from_the_hands_is_not_seen():
+    clip = build_clip(30)
+    away = with_hand(clip, "right", wrist_m=clip.hands["right"].wrist_m + np.float32([0, 0, 1]))
+    other = with_object(away, model=box_model((0.3, 0.02, 0.1)))
+    assert np.array_equal(of(CORRECTED, away), of(CORRECTED, other))
+
+
+def test_a_random_turn_in_training_is_a_clip_turned_about_gravity():
+    clip, angle = build_clip(30, "both", articulated=True), 0.8
+    world = in_another_world(clip, Rotation.from_euler("z", angle), np.array([0.4, -0.2, 0.1]))
+    inputs = [corrected_input(motion_of(own), SIDES) for own in (clip, world)]
+    found = turned(torch.from_numpy(inputs[0])[None], torch.tensor([angle]))[0]
+    assert found.shape == (10, CORRECTED_SIZE)
+    assert found.numpy() == pytest.approx(inputs[1], abs=1e-5)
+
+
+def test_a_tilted_world_is_turned_upright():
+    clip = build_clip(30)
+    tilted = in_another_world(clip, Rotation.from_euler("x", 0.7), np.zeros(3))
+    for config in (PAPER, CORRECTED):
+        assert of(config, tilted) == pytest.approx(of(config, clip), abs=1e-4)
+
+
+def test_training_draws_one_frame_of_each_of_fifteen_groups():
+    low, high = drawn_frames(45, np.zeros(15)), drawn_frames(45, np.full(15, 0.999))
+    assert low.tolist() == list(range(0, 45, 3))
+    assert high.tolist() == list(range(2, 45, 3))
+    assert drawn_frames(9, np.full(15, 0.999)).max() == 8
+
+
+def test_clips_of_the_same_prompt_are_no_negatives_of_each_other():
+    network, prompts = evaluator(PAIR).network, [0, 0, 1, 2]
+    logits, text = torch.randn(4, 64), torch.randn(4, 4, 512)
+    loss = Pairing().loss(network, logits, (text, torch.tensor(prompts)), None)
+    motions, sentences = torch.nn.functional.normalize(logits, dim=-1), network.of_text(text[:, 0])
+    alike = (motions @ sentences.T / 0.07).detach().double().numpy()
+    wrong = []
+    for table in (alike, alike.T):
+        for own in range(4):
+            rivals = [table[own, other] for other in range(4) if other == own or prompts[other] != prompts[own]]
+            wrong.append(np.log(np.exp(rivals).sum()) - table[own, own])
+    assert loss.item() == pytest.approx(np.mean(wrong), rel=1e-5)
+
+
+def test_classes_that_are_rare_weigh_more_and_labels_never_learnt_nothing(annotated):
+    train = Examples.of(annotated, "train")
+    task = Classification.of(train, "verb", "softmax")
+    assert task.labels == ("lift", "open", "pass")
+    assert task.weights.tolist() == [1, 1, 1]
+    network, logits = evaluator(CORRECTED).network, torch.randn(3, 3)
+    some = task.loss(network, logits[:2], (torch.tensor([0, 2]),), None)
+    assert task.loss(network, logits, (torch.tensor([0, 2, -1]),), None) == some
+
+
+@pytest.fixture(scope="module")
+def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("evaluators")
+    settings = EvaluatorSettings(("paper", "corrected", "text-motion"), seeds=(0, 1, 2), most_steps=8)
+    train_evaluators(annotated_root, out, settings, threads=1)
+    return out
+
+
+@pytest.mark.slow
+def test_the_stage_writes_what_the_networks_reach_on_recorded_clips(trained):
+    info = json.loads((trained / "info.json").read_text())
+    assert info["labels"] == ["lift", "open", "pass"]
+    assert info["clips"] == {"train": 3, "validation": 2, "test": 2}
+    assert set(info["evaluators"]) == {"paper", "corrected", "text-motion"}
+    for name, known in info["evaluators"].items():
+        assert set(known["by_seed"]) == {"0", "1", "2"}
+        assert (trained / name / "model.safetensors").is_file()
+    assert {one.name: one.digest for one in load_evaluators(trained)} == {
+        name: known["digest"] for name, known in info["evaluators"].items()
+    }
+    assert set(info["majority"]) == {"nothing", "object", "hand", "object and hand"}
+
+
+@pytest.mark.slow
+def test_equal_trainings_give_equal_bytes_and_another_seed_other_weights(annotated_root, tmp_path):
+    def files(folder, seed):
+        settings = EvaluatorSettings(("corrected",), seeds=(seed,), most_steps=3)
+        train_evaluators(annotated_root, tmp_path / folder, settings, threads=1)
+        return (tmp_path / folder / "corrected" / "model.safetensors").read_bytes()
+
+    assert files("one", 0) == files("again", 0) != files("other", 1)
+
+
+def test_nothing_is_written_where_there_is_nothing_to_tell_apart(tmp_path, make_clip):
+    from tests.builders.annotated import write_annotated_dataset
+
+    root, _ = write_annotated_dataset(tmp_path / "one-verb", make_clip)
+    reason = train_evaluators(root, tmp_path / "out", EvaluatorSettings(("corrected",)))
+    assert reason == "training clips: 1, labels among them: 1; nothing to tell apart"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_figures_of_features_stand_beside_the_others_with_the_digests_of_the_weights(
+    trained, annotated_root, annotated, tmp_path
+):
+    clips = [annotated.clip(clip_id) for clip_id in annotated.ids("test")]
+    predicted = [replace(clip, clip_id=f"{clip.clip_id}~{number}") for clip in clips for number in range(2)]
+    write_store(tmp_path / "truth", predicted, generated_info("truth"))
+    encoders = load_evaluators(trained)
+    found = evaluate_store(tmp_path / "truth", annotated_root, encoders=encoders)
+    assert found["evaluators"].pop("path")
+    assert {name: known["digest"] for name, known in found["evaluators"].items()} == {
+        one.name: one.digest for one in encoders
+    }
+    figures, known = found["figures"], {item.name for item in FEATURE_METRICS}
+    assert figures["fid_paired_paper"] == figures["fid_paired_corrected"] == 0
+    assert found["notes"]["fid_frechet_corrected"] == "N too small"
+    assert "fid_frechet_corrected" not in figures
+    assert {name for name in figures if name.endswith(("_paper", "_corrected", "_text_motion", "_path"))} <= known
+    assert figures["joint_error_mm"] == 0
+    assert np.sum(found["evaluators"]["corrected"]["confusion"]) == 4
+    json.dumps(found, allow_nan=False)
+
+
+def test_the_digest_is_of_weights_and_configuration():
+    one, other = evaluator(CORRECTED).network, evaluator(CORRECTED).network
+    assert weights_digest(one) == weights_digest(other)
+    with torch.no_grad():
+        other.head.bias[0] += 1e-6
+    assert weights_digest(one) != weights_digest(other)
+
+
+def test_padding_counts_nothing():
+    motion, lengths = padded([np.ones((4, CORRECTED_SIZE)), np.ones((9, CORRECTED_SIZE))])
+    network, changed = evaluator(CORRECTED).network, motion.clone()
+    changed[0, 4:] = 5
+    with torch.no_grad():
+        assert torch.equal(network(motion, lengths)[0], network(changed, lengths)[0])

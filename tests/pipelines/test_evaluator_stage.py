@@ -1,0 +1,78 @@
+"""The evaluator as a stage: off it costs nothing, on it stands in the figures of every family."""
+
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from pipelines.stages import evaluate, evaluator
+from pipelines.stages.base import Place, empty_reason
+from pipelines.stages.code import write_code
+from tests.builders.clips import build_clip
+from tests.builders.stores import write_annotated
+
+PROJECT = Path(__file__).parents[2]
+PLACE = Place("embedded", "grab", family="ours")
+IMPORTED = """
+import sys
+from pipelines.stages import evaluator
+from pipelines.stages.base import Place
+evaluator.run(Place("embedded", "grab"))
+print("torch" in sys.modules)
+"""
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch) -> Path:
+    """A project of one dataset with two verbs, in which no stage has an entry but those of dvc.yaml."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("dvc.yaml", "params.yaml"):
+        (tmp_path / name).write_text((PROJECT / name).read_text())
+    (tmp_path / "manifests").symlink_to(PROJECT / "manifests")
+    return tmp_path
+
+
+def choose(project: Path, **settings) -> None:
+    params = yaml.safe_load((project / "params.yaml").read_text())
+    (project / "params.yaml").write_text(yaml.safe_dump({**params, "evaluator": settings}))
+
+
+def test_off_it_writes_the_reason_without_loading_torch(project):
+    choose(project, networks=[])
+    command = [sys.executable, "-c", IMPORTED]
+    done = subprocess.run(command, env={"PYTHONPATH": str(PROJECT)}, check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "False"
+    assert empty_reason(PLACE.evaluators) == "off: params.yaml names no networks under evaluator"
+
+
+@pytest.mark.slow
+def test_on_its_figures_and_digests_stand_in_the_metrics_of_a_family(project):
+    plans = [("s1", "lift"), ("s1", "open"), ("s2", "lift"), ("s3", "lift"), ("s3", "open")]
+    clips = [
+        build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
+        for seed, (subject, verb) in enumerate(plans)
+    ]
+    write_annotated(PLACE.data, clips)
+    subprocess.run(["git", "init", "-q"], check=True)
+    subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], check=True)
+    choose(project, networks=["corrected", "text-motion"], most_steps=2)
+    write_code(Path())
+    evaluator.run(PLACE)
+    predicted = [replace(clip, clip_id=f"{clip.clip_id}~0") for clip in clips[3:]]
+    write_store(PLACE.samples / "clips", predicted, generated_info("ours"))
+    (PLACE.samples / "diagnostics.json").write_text("{}")
+    evaluate.run(PLACE)
+    found = json.loads(PLACE.metrics.read_text())
+    info = json.loads((PLACE.evaluators / "info.json").read_text())
+    assert found["evaluators"].pop("path")
+    assert {name: known["digest"] for name, known in found["evaluators"].items()} == {
+        name: known["digest"] for name, known in info["evaluators"].items()
+    }
+    assert found["figures"]["accuracy_top1_corrected"] == info["evaluators"]["corrected"]["accuracy"]["test"]["top1"]
+    assert found["notes"]["fid_frechet_corrected"] == "N too small"
