@@ -53,7 +53,7 @@ PROMISES: tuple[Promise, ...] = (
     *_promises("be equal", "object-moved", *(item.name for item in FEATURE_METRICS if item.encoder == "paper")),
     *_promises("fall", "object-moved", "accuracy_top1_corrected", "contact_f1", "adherence", "realism_si"),
     *_promises("fall", "static", *ACCURACY, "action_followed"),
-    *_promises("fall", "reversed", *ACCURACY),
+    *_promises("fall", "reversed", *ACCURACY, "action_followed"),
     *_promises("rise", "reversed", *(f"{CONFUSED} {name}" for name in ("paper", "corrected"))),
     *_promises("fall", "hands-away", "contact_f1", "adherence", "realism_si"),
     *_promises("rise", "pressed", "penetration_mm", "penetration_volume_cm3"),
