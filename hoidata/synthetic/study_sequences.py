@@ -48,6 +48,8 @@ _RESTING_M, _PASSING_M = (0.035, 0.08), (0.035, 0.055)
 _RESTS, _PASSES = 0.45, 0.15
 _PASS_FRAMES = 18.0
 _FAR_M = 0.5
+# From an object to the wrist of a flat hand over it, before that is moved aside; how far a passing hand comes from.
+_HAND_BEHIND_M, _PASSING_BY_M = np.array([0.0, -0.09, 0.0]), 0.28
 # A resting hand drifts by this share of what a far one does.
 _DRIFT = 0.3
 # A hand that does nothing rests on the table, not in it.
@@ -166,17 +168,14 @@ def _idle_hand(
     middle, height = contact[0] + rng.uniform(0.3, 0.7) * (contact[1] - contact[0]), rng.uniform(0.035, 0.06)
     if kind >= _RESTS + _PASSES:
         return far
-    orient = rotmat_to_rotvec(yaw @ rotvec_to_rotmat(far.global_orient))
     away = np.array([np.cos(angle), np.sin(angle), 0.0])
-    here = np.array([*track.translation_m[0, :2], height]) + np.array([0.0, -0.09, 0.0])
-    retreat = np.zeros(len(times))
+    path = np.array([*track.translation_m[0, :2], height]) + _HAND_BEHIND_M + _DRIFT * (far.wrist_m - far.wrist_m[0])
     if kind >= _RESTS:
-        retreat = 0.28 * (1 - minimum_jerk(1 - np.abs(times - middle) / _PASS_FRAMES))
-        here = here + np.array([0.0, 0.0, rng.uniform(0.0, 0.12)])
-    path = here + retreat[:, None] * away + _DRIFT * (far.wrist_m - far.wrist_m[0])
+        here = minimum_jerk(1 - np.abs(times - middle) / _PASS_FRAMES)
+        path = path + _PASSING_BY_M * (1 - here)[:, None] * away + [0.0, 0.0, rng.uniform(0.0, 0.12)]
+    orient = rotmat_to_rotvec(yaw @ rotvec_to_rotmat(far.global_orient))
     near = hand_track(person, "left", path, orient, far.hand_pose, True)
-    reach = _clear_reach(near, away, track, acting, pair, target)
-    return replace(near, wrist_m=path + reach * away)
+    return replace(near, wrist_m=path + _clear_reach(near, away, track, acting, pair, target) * away)
 
 
 def _clear_reach(
