@@ -10,7 +10,7 @@ from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
 from pipelines.params import read_params
 from pipelines.stages.adapters import ensure_manifests
-from pipelines.stages.base import Place, is_generated, raw_root
+from pipelines.stages.base import Place, raw_root
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
@@ -37,12 +37,12 @@ def preflight() -> None:
     ensure_manifests(params["profile"], params["datasets"])
     present = [place for place in places if read_manifest(place.manifest).present]
     for place in present:
-        if not is_generated(place.manifest):
+        if not place.is_generated:
             require_hand(place)
     unreadable = [place for place in present if not _is_readable(place)]
     stale = _stale_stages([f"{stage}@{place}" for place in unreadable for stage in ("raw", "convert")])
     for place in unreadable:
-        if not is_generated(place.manifest):
+        if not place.is_generated:
             if {f"raw@{place}", f"convert@{place}"} & stale:
                 raw_root(place)
         elif f"raw@{place}" not in stale and f"convert@{place}" in stale:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 EMPTY = "empty.json"
 HAND = "hand"
+OWN = "own"
 Settings = TypeVar("Settings")
 
 
@@ -58,6 +59,11 @@ class Place:
     samples = _At("samples/{profile}/{dataset}/{family}")
     metrics = _At("metrics/{profile}/{dataset}/{family}.json")
     report = _At("report/{profile}")
+
+    @property
+    def is_generated(self) -> bool:
+        """Whether the raw files are made by this project, with the embedded hand."""
+        return self.profile != OWN
 
     def __str__(self) -> str:
         return "-".join(filter(None, (self.profile, self.dataset, self.model, self.family)))
@@ -100,11 +106,9 @@ def _registered_roots(path: Path) -> dict[str, str]:
 
 def raw_root(place: Place) -> Path:
     """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
-    if is_generated(place.manifest):
-        root, remedy = (
-            place.generated_raw,
-            f"write it again with `hoidata synth write {place.dataset} --profile {place.profile}`",
-        )
+    if place.is_generated:
+        root = place.generated_raw
+        remedy = f"write it again with `hoidata synth write {place.dataset} --profile {place.profile}`"
     else:
         root = own_root(place.dataset)
         remedy = f"set {root_variable(place.dataset)}, or run `hoidata raw scan {place.dataset} --root PATH`"
@@ -117,17 +121,12 @@ def load_hands(profile: str) -> "HandPair":
     """The hand of the profile: the user's MANO files where its manifest lists some, else the embedded one."""
     from hoidata.hands import load_embedded_hands, load_mano_hands
 
-    if is_generated(Place(profile).hand_manifest) or not hand_is_present(profile):
+    if Place(profile).is_generated or not hand_is_present(profile):
         return load_embedded_hands()
     root = own_root(HAND)
     if root is None or not root.is_dir():
         raise MissingResource(f"the MANO files are not at {root}; set {root_variable(HAND)} to their folder")
     return load_mano_hands(root)
-
-
-def is_generated(manifest: Path) -> bool:
-    """Whether a manifest is a recipe: its files are made by this project, whatever the profile is called."""
-    return manifest.is_file() and json.loads(manifest.read_text()).get("source") == "generated"
 
 
 def hand_is_present(profile: str) -> bool:
