@@ -15,7 +15,6 @@ from hoidata.synthetic.pools import GRASPS_PER_PAIR, search_pool
 from hoidata.synthetic.sequences import Person, draw_length, make_person, make_sequence
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
-from hoidata.workers import in_workers
 
 _ATTEMPTS = 18
 _PERSON_STREAM, _POOL_STREAM = 1_000_001, 1_000_002
@@ -27,15 +26,6 @@ class _Task(NamedTuple):
     size: Size
     action: int
     entries: list[tuple[int, Entry]]
-
-
-def generate_sequences(dataset: str, seed: int, size: Size = "full", jobs: int = 1) -> list[TruthSequence]:
-    """All actions of a corpus as truth, in plan order; equal for equal arguments, whatever ``jobs`` is.
-
-    Raises HoidataError where an action cannot be made sound.
-    """
-    made = in_workers(make_action, tasks_of(dataset, seed, size), jobs)
-    return place_in_raw_sequences(dataset, [pair for _, pairs in made for pair in pairs])
 
 
 def tasks_of(dataset: str, seed: int, size: Size) -> list[_Task]:
