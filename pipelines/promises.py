@@ -64,7 +64,7 @@ PROMISES: tuple[Promise, ...] = (
     *_promises("fall", "other-verb", *ACCURACY, "r_precision_top1_text_motion"),
     *_promises("be zero", "mean-pose", "multimodality_by_prompt_corrected"),
     *_promises("fall", "mean-pose", "diversity_corrected"),
-    *_promises("rise", "prompt-lookup", "memorised_share_corrected"),
+    *_promises("rise", "prompt-lookup", "memorised_share_path"),
     *_promises("fall", "other-prompt", "accuracy_top1_corrected", beside="text2hoi"),
     *_promises("fall", "other-contact", "adherence", beside="text2hoi"),
     *_promises("fall", "one-call", "multimodality_by_prompt_corrected", beside="text2hoi"),

@@ -21,7 +21,7 @@ UP_AXES = {
     sign + letter: np.eye(3)[axis] * float(f"{sign}1") for axis, letter in enumerate("xyz") for sign in ("", "-")
 }
 METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
-NEAR_GROUND = 0.02  # of the height: vertices this low carry the object
+NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
 CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
 
 

@@ -227,7 +227,7 @@ def loses_to(lookup: str, metric: AnyMetric, family: str, column: Mapping[str, f
 
 def printed_table(found: Mapping[str, Any]) -> Table:
     """One system's figures for a terminal. found: what ``evaluate_store`` gives."""
-    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips, {found['length']} length"
+    title = f"{found['motions']:,} motions of {found['held_out_clips']:,} clips, {found.get('length', 'given')} length"
     table = Table(title=title + (", synthetic" if found["synthetic"] else ""), box=box.SIMPLE)
     table.add_column("metric", min_width=32)
     for name in ("figure", *INTERVALS.values(), "unit", "better", "clips"):

@@ -59,7 +59,7 @@ def test_an_empty_section_of_an_overlay_says_nothing(plain):
 @pytest.mark.parametrize(
     ("profiles", "message"),
     [
-        ({"studdy": {}}, "profiles: expected keys among: embedded, own, study, got studdy"),
+        ({"studdy": {}}, "profiles: expected keys among: embedded, study, own, got studdy"),
         ({"study": {"anotate": {}}}, "profiles.study: expected keys among: .*annotate.*, got anotate"),
         ({"study": {"annotate": "hash"}}, "profiles.study.annotate: expected keys with values, got 'hash'"),
         ({"study": ["annotate"]}, "profiles.study: expected keys with values"),

@@ -75,7 +75,7 @@ def test_whatever_opens_the_annotated_store_depends_on_its_split(pytestconfig):
         out = f"data/embedded/{name}/splits"
         assert made[out].name == f"split@embedded-{name}"
         readers = {stage.name.rpartition(":")[2].split("@")[0] for stage in graph.values() if out in stage.deps}
-        assert readers == {"train", "train-diffusion", "train-refiner", "sample", "evaluate"}
+        assert readers == {"train", "train-diffusion", "train-refiner", "sample", "evaluate", "evaluator", "controls"}
 
 
 def test_the_project_chooses_a_split_each_dataset_has(pytestconfig):
