@@ -44,6 +44,7 @@ app.command("share")(share.share)
 app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
+app.command("table")(evaluate.table)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)
 

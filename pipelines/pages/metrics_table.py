@@ -9,6 +9,7 @@ from typing import Any
 from rich import box
 from rich.table import Table
 
+from hoidata.errors import BadInput
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
 
@@ -131,15 +132,40 @@ class _Found:
 
 def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
     """``folder/<family>.json``, families in the order given, then ``folder/controls``; empty topics are left out."""
-    folder = Path(folder)
+    found = _found(Path(folder), families)
+    shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in found.values)]
+    titles = dict.fromkeys(metric.topic for metric in shown)
+    topics = [_topic(title, [metric for metric in shown if metric.topic == title], found) for title in titles]
+    return MetricsTable([_row(name, found, shown) for name in found.values], topics)
+
+
+def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
+    """The metrics ``names`` of every row that has one, as Markdown; what loses to a lookup says so in its cell.
+
+    Raises BadInput for a name no metric has.
+    """
+    found, known = _found(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
+    if unknown := [name for name in names if name not in known]:
+        raise BadInput("metric", f"one of {', '.join(known)}", ", ".join(unknown), "correct the name")
+    metrics = [known[name] for name in names]
+    heads = [f"{own.title}{', ' * bool(own.unit)}{own.unit} ({_better(own)})" for own in metrics]
+    lines = [f"| row | {' | '.join(heads)} |", "|---" * (len(metrics) + 1) + "|"]
+    for name in found.values:
+        cells = [_cell(name, metric, found) for metric in metrics]
+        if any(cell.text != NO_FIGURE for cell in cells):
+            lines.append(f"| {name} | {' | '.join(_marked(cell, found.kind(name)) for cell in cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _marked(cell: Cell, kind: str) -> str:
+    return f"{cell.text} (loses)" if cell.mark == "bad" and kind == "family" else cell.text
+
+
+def _found(folder: Path, families: Sequence[str]) -> _Found:
     controls = sorted(path.stem for path in (folder / CONTROLS).glob("*.json") if path.stem != "empty")
     paths = {name: folder / f"{name}.json" for name in families}
     paths |= {name: folder / CONTROLS / f"{name}.json" for name in controls if name not in paths}
-    found = _Found({name: _read(path) for name, path in paths.items()}, frozenset(controls))
-    shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in paths)]
-    titles = dict.fromkeys(metric.topic for metric in shown)
-    topics = [_topic(title, [metric for metric in shown if metric.topic == title], found) for title in titles]
-    return MetricsTable([_row(name, found, shown) for name in paths], topics)
+    return _Found({name: _read(path) for name, path in paths.items()}, frozenset(controls))
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -5,12 +5,14 @@ import json
 import jinja2
 import pytest
 
+from hoidata.errors import BadInput
 from hoidata.metrics.registry import metric
 from pipelines.pages.metrics_table import (
     NO_FIGURE,
     OTHER_EVALUATOR,
     best_families,
     loses_to,
+    markdown_table,
     metrics_tables,
     number,
     printed_table,
@@ -136,6 +138,17 @@ def test_the_page_says_it_and_escapes_what_it_is_given(folder):
     assert "What ours says of its own networks" in text
     assert 'title="0.400 to 0.700"' in text
     assert text.count("<svg") == 5
+
+
+def test_markdown_marks_in_words_what_loses(folder):
+    lines = markdown_table(folder, FAMILIES, ["joint_error_mm", "contact_f1"]).splitlines()
+    assert lines[0].startswith("| row | joint error of the best sample, mm (lower is better) |")
+    assert lines[2:] == [
+        "| ours | 30.0 | 0.500 (loses) |", "| nearest-clip | 40.0 | 0.600 |", "| ground-truth | 0.00 | 1.00 |",
+        "| static | - | 0.200 |",
+    ]  # fmt: skip
+    with pytest.raises(BadInput, match="contact_f1"):
+        markdown_table(folder, FAMILIES, ["contact_f2"])
 
 
 def test_the_terminal_shows_intervals_and_reasons():
