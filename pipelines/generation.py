@@ -13,9 +13,10 @@ from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.sampling import SamplerConfig
 from models.common.training import make_repeatable
-from models.common.vocabulary import Vocabulary, read_sentence
+from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
 from models.text2hoi.generation import Generator, Wish
+from models.text2hoi.sentences import read_sentence
 from pipelines.pages.generation_page import write_generation
 from pipelines.stages.base import Place, empty_reason, load_hands, load_settings
 

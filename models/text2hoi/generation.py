@@ -25,9 +25,10 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, Checkpoint
 from models.common.sampling import SamplerConfig
-from models.common.vocabulary import Vocabulary, read_sentence
+from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi, Text2HoiMotion
+from models.text2hoi.sentences import read_sentence, unseen_words
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class Generator:
             "text": text,
             "seed": wish.seed,
             "hand": asdict(choice),
-            "unseen": self.vocabulary.unseen(text, verb, object_words or thing, choice.hand, self.encoder),
+            "unseen": self._unseen(text, verb, object_words or thing, choice.hand),
             "trained_on": self.model.facts["datasets"],
             "synthetic": bool(self.model.facts["synthetic"]),
             "contact_threshold_m": self.model.facts["contact_threshold_m"],
@@ -128,6 +129,9 @@ class Generator:
         motions = [_started_at_origin(self.model.motions([request])[0]) for request in requests]
         made = zip(requests, motions, strict=True)
         return [self._generated(request, motion, points, evidence) for request, motion in made]
+
+    def _unseen(self, text: str, verb: str | None, thing: str | None, hand: HandType) -> list[str]:
+        return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)
 
     def _hand(self, text: str, wish: Wish) -> HandChoice:
         """The hand asked for; else by the rules, and where the text names none by the share among training clips."""

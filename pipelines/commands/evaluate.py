@@ -61,9 +61,7 @@ def _hands(reference: Path) -> "HandPair":
 
 def table(
     folder: Annotated[Path, typer.Argument(help="Metrics of one dataset, such as metrics/study/grab.", exists=True)],
-    metrics: Annotated[
-        str, typer.Option(help="Names, comma between, of hoidata/metrics/README.md.")
-    ],
+    metrics: Annotated[str, typer.Option(help="Names, comma between, of hoidata/metrics/README.md.")],
 ) -> None:
     """Figures of every family and control as Markdown; what loses to a training clip looked up says so."""
     from pipelines.pages.metrics_table import markdown_table

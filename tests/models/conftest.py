@@ -20,6 +20,13 @@ torch.set_num_threads(1)
 GRASP_HEIGHT_M = 0.01
 
 
+@pytest.fixture(autouse=True)
+def _usual_arithmetic():
+    """Training sets precision and algorithms for the whole process; no test is to notice which ran before it."""
+    torch.use_deterministic_algorithms(False)
+    torch.set_float32_matmul_precision("highest")
+
+
 BOX, FOLDER = box_model((0.06, 0.06, 0.1)), notebook(0.02)
 
 

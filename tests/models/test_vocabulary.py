@@ -4,7 +4,8 @@ import pytest
 
 from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput
-from models.common.vocabulary import Vocabulary, is_english, read_sentence
+from models.common.vocabulary import Vocabulary
+from models.text2hoi.sentences import is_english, read_sentence, unseen_words
 
 KNOWN = Vocabulary({("lift", "mug", "right"): 5, ("pour", "teapot", "right"): 3, ("lift", "teapot", "left"): 2})
 
@@ -42,11 +43,11 @@ def test_english_is_read_even_where_no_table_has_its_words():
     ],
 )
 def test_combinations_that_training_never_had_are_said(verb, thing, hand, says):
-    assert KNOWN.unseen("", verb, thing, hand, load_encoder("hash")) == says
+    assert unseen_words(KNOWN, "", verb, thing, hand, load_encoder("hash")) == says
 
 
 def test_unknown_words_come_with_the_nearest_known():
-    said = KNOWN.unseen("Juggle a vase.", None, "vase", "right", load_encoder("hash"))
+    said = unseen_words(KNOWN, "Juggle a vase.", None, "vase", "right", load_encoder("hash"))
     assert said[0].startswith("the verb 'juggle' was never in training; nearest that were: ")
     assert {"lift", "pour"} == set(said[0].split(": ")[1].split(", "))
     assert "'vase'" in said[1]

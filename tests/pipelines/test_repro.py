@@ -132,7 +132,7 @@ def test_the_same_seed_generates_the_same_bytes_on_a_mesh_of_the_users(built, pr
 
 def test_generation_says_which_objects_there_are_and_which_meshes_cannot_be_meant(built, project_tools, tmp_path):
     trimesh.creation.box((60, 80, 100)).export(tmp_path / "millimetres.obj")
-    for object_name, message in ((str(tmp_path / "millimetres.obj"), "scale the mesh to metres"), ("ufo", "one of:")):
+    for object_name, message in ((str(tmp_path / "millimetres.obj"), "--unit mm makes it 10 cm"), ("ufo", "one of:")):
         result = project_tools.run(
             built, "hoidata", "generate", "Lift it.", "--object", object_name, "--out", str(tmp_path / "out")
         )

@@ -17,7 +17,7 @@ from hoidata.synthetic.check import sequence_figures
 from hoidata.synthetic.corpus import write_raw_sequence, write_shared_files
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.grasps import closes_force
-from hoidata.synthetic.sequences import Person, _idle_hand
+from hoidata.synthetic.sequences import Person, idle_hand
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.truth import TruthSequence
 
@@ -96,7 +96,7 @@ def test_contact_lasts_from_the_frame_in_which_the_hand_is_closed_to_the_last_be
 def test_an_idle_left_hand_is_the_mirror_image_of_a_right_one():
     person, pair = Person("s1", np.zeros(10), None), load_embedded_hands()
     left, right = (
-        track_joints(_idle_hand(side, person, 3, np.random.default_rng(0), True), pair[side]) for side in SIDES
+        track_joints(idle_hand(side, person, 3, np.random.default_rng(0), True), pair[side]) for side in SIDES
     )
     np.testing.assert_allclose(left, right * (-1.0, 1.0, 1.0), atol=1e-6)
 
