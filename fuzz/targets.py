@@ -43,6 +43,7 @@ from hoidata.hands import mano, model
 from hoidata.objects import mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
+from pipelines import params
 from pipelines.lineage import manifests
 from pipelines.stages import base
 from pipelines.stages.adapters import ConvertSettings
@@ -419,7 +420,7 @@ def _settings() -> list[Target]:
             "params-yaml",
             lambda: [text],
             on_disk("params.yaml", _params),
-            (base.load_settings, base._sections),
+            (base.load_settings, params.read_file),
             (b"convert: ", b"- ", b"!!python/object/apply:os.system ", b"&a ", b"*a", b"<<: *a\n", b"{", b"]", b"? "),
         ),
     ]
