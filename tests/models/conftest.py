@@ -16,13 +16,13 @@ from tests.builders.objects import box_model, notebook
 from tests.builders.stores import write_annotated
 from tests.models.toy import PARAMS, train
 
-torch.set_num_threads(1)
 GRASP_HEIGHT_M = 0.01
 
 
 @pytest.fixture(autouse=True)
 def _usual_arithmetic():
-    """Training sets precision and algorithms for the whole process; no test is to notice which ran before it."""
+    """Training sets threads, precision and algorithms of the process; no test is to notice which ran before it."""
+    torch.set_num_threads(1)
     torch.use_deterministic_algorithms(False)
     torch.set_float32_matmul_precision("highest")
 
