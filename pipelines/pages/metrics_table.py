@@ -70,14 +70,16 @@ class Topic:
 
 @dataclass(frozen=True)
 class Row:
-    """One family. kind: "truth", "lookup", "control" or "family". words: where it loses to which lookup.
+    """One family. kind: "truth", "lookup", "control" or "family". words: how often it loses to which lookup.
 
-    empty: why it has no figures. diagnostics: what the family says of its own networks, as (name, value).
+    lost: by lookup, titles of the metrics in which it loses, in words. empty: why it has no figures.
+    diagnostics: what the family says of its own networks, as (name, value).
     """
 
     family: str
     kind: str = "family"
     words: str = ""
+    lost: list[str] = field(default_factory=list)
     empty: str = ""
     note: str = ""
     diagnostics: list[tuple[str, str]] = field(default_factory=list)
@@ -178,13 +180,16 @@ def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:
         return Row(family, kind, empty=str(values["empty"]))
     columns = [(metric, found.column(metric)) for metric in shown]
     lost = {name: [own.title for own, column in columns if loses_to(name, own, family, column)] for name in LOOKUPS}
-    words = [f"loses to {lookup}: {', '.join(titles)}" for lookup, titles in lost.items() if titles]
+    lost = {name: titles for name, titles in lost.items() if titles and kind == "family"}
+    own = {name: sum(family in column and name in column for _, column in columns) for name in lost}
+    words = [f"loses to {name} in {len(titles)} of {own[name]} figures" for name, titles in lost.items()]
+    told = [f"to {name}: {', '.join(titles)}" for name, titles in lost.items()]
     diagnostics = [(name, number(value)) for name, value in _flat(values.get("diagnostics", {})).items()]
     left_out = len(values.get("left_out", []))
     note = f"{values['motions']:,} motions of {values['held_out_clips']:,} clips"
     note += f", {left_out:,} left out" if left_out else ""
     note += ", of lengths it chose itself" if values.get("length") == "own" else ""
-    return Row(family, kind, "; ".join(words) if kind == "family" else "", "", note, diagnostics)
+    return Row(family, kind, "; ".join(words), told, "", note, diagnostics)
 
 
 def _topic(title: str, metrics: list[AnyMetric], found: _Found) -> Topic:

@@ -89,7 +89,8 @@ def test_the_best_family_is_marked_and_one_that_loses_to_the_lookup_said_in_word
     assert (marks["nearest-clip"][joints], marks["nearest-clip"][contact]) == ("", "good")
     assert not any(marks["ground-truth"].values())
     words = {row.family: row.words for row in table.rows}
-    assert words["ours"] == f"loses to nearest-clip: {contact}, {jitter}"
+    assert words["ours"] == "loses to nearest-clip in 2 of 4 figures"
+    assert next(row.lost for row in table.rows if row.family == "ours") == [f"to nearest-clip: {contact}, {jitter}"]
     assert not words["nearest-clip"]
     assert not words["static"]  # a control is there to lose
 
@@ -132,7 +133,8 @@ def test_the_page_says_it_and_escapes_what_it_is_given(folder):
     text = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}').render(
         table=table_of(folder)
     )
-    assert f"<b>ours</b> loses to nearest-clip: {title('contact_f1')}" in text
+    assert "<b>ours</b> loses to nearest-clip in 2 of 4 figures." in text
+    assert f"to nearest-clip: {title('contact_f1')}" in text
     assert '<td class="number good">30.0</td>' in text
     assert "untrained: not evaluated, not trained: &lt;length&gt;" in text
     assert "What ours says of its own networks" in text
