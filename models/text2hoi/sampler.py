@@ -11,15 +11,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hoidata.batches.requests import Request, collate_requests
+from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
-from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.hands import HandPair
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.sampling import SamplerConfig, draw_each
-from models.text2hoi.contact import ContactModel
 from models.text2hoi.contact_training import contact_threshold
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import motion_generator
@@ -27,6 +25,7 @@ from models.text2hoi.length import LengthModel
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.refiner import RefinerModel, refine
 from models.text2hoi.surface import Surface
+from models.text2hoi.thresholds import ContactNetwork
 
 AT_ONCE = 256
 
@@ -108,11 +107,13 @@ class Text2Hoi:
     def _batch_motions(self, requests: Sequence[Request], surface: Surface | None) -> list[Text2HoiMotion]:
         batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
-        contact_maps = self._contact_maps(batch.points_m, batch.text, batch.active_hands, generators)
+        contact = self._contact(batch, generators)
         generator = motion_generator(self.trained["diffusion"])
-        condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact_maps)
-        noise = draw_each(HAND_FEATURES, OBJECT_FEATURES, batch.frames.shape[1], generators)
+        condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact)
+        code = generator.network.code
+        noise = draw_each(code.largest, code.sizes(batch.frames.shape[1]), generators)
         coarse, objects = generator.sample(condition, self.config.sampler, noise, generators)
+        contact_maps = contact.amax(1)
         refined = coarse
         if surface is not None:
             network = self.trained["refiner"].network
@@ -124,13 +125,12 @@ class Text2Hoi:
             for (before, after, thing, contact_map), n in zip(parts, batch.lengths.tolist(), strict=True)
         ]
 
-    def _contact_maps(
-        self, points_m: Tensor, text: Tensor, active_hands: Tensor, generators: Sequence[torch.Generator]
-    ) -> Tensor:
-        """(B, N) one drawn contact map each, 0 or 1; the likeliest points where none reaches the threshold."""
+    def _contact(self, batch: RequestBatch, generators: Sequence[torch.Generator]) -> Tensor:
+        """(B, 2, N) one drawn map for each hand, 0 or 1; the likeliest points where none reaches the threshold."""
         network = self.trained["contact"].network
-        assert isinstance(network, ContactModel)
+        assert isinstance(network, ContactNetwork)
         latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1).to(self.device)
-        probability = network.sample(points_m, text, active_hands, latents)[:, 0]
+        probability = network.sample(batch.points_m, batch.text, batch.active_hands, latents)[:, 0]
         limit = torch.tensor(contact_threshold(self.trained["contact"]), device=self.device)
-        return (probability >= torch.minimum(probability.amax(1, keepdim=True), limit)).float()
+        touched = probability >= torch.minimum(probability.amax(-1, keepdim=True), limit)
+        return (touched & batch.active_hands[..., None]).float()
