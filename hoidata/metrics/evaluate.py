@@ -1,11 +1,16 @@
 """A predicted store beside an annotated one: every metric of the registry over the clips of one part of the split.
 
 A predicted clip is called ``<reference id>~<k>``, k = 0, 1, ... for several motions of one reference, or just by the
-reference's id. It lies in the reference's world and has its frames, or some of them in a row: those that its
-``source_frames`` name. Predictions that cannot be compared are left out, counted and listed with the reason.
+reference's id: motion k of every clip is repetition k of the experiment. It lies in the reference's world and has its
+frames, or some of them in a row: those that its ``source_frames`` name. Where ``meta/info.json`` says ``"length":
+"own"``, the family chose how long every motion is; then nothing is compared frame by frame, hands are looked at where
+the prediction has them, and the length itself is measured. A store is all of one kind, so no row mixes the two. Beside
+the clips may lie the contact maps that were asked for (``hoidata.metrics.asked``). Predictions that cannot be compared
+are left out, counted and listed with the reason.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,17 +22,21 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
+from hoidata.metrics.action import Actions, training_actions, verb_of
+from hoidata.metrics.asked import read_asked
+from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
-from hoidata.metrics.registry import METRICS, Metric, reduced
+from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.scene import clip_scene
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.distances import DistanceEntries
 from hoidata.store.store import Store, open_store
+from hoidata.workers import in_workers
 
 SAME_MESH_M = 1e-5  # float32 of a metre, with room
 DIGITS = 6
-Values = dict[str, np.ndarray]
+WORKERS_PAY_FROM = 500  # motions: a worker needs as long to start as a hundred of them
 
 
 class Unlike(NamedTuple):
@@ -37,6 +46,26 @@ class Unlike(NamedTuple):
     reason: str
 
 
+class Sample(NamedTuple):
+    """One motion that was measured: its number among those of the clip, and its values by metric."""
+
+    number: int
+    values: dict[str, np.ndarray]
+
+
+class Measured(NamedTuple):
+    """What was found of one clip. group: the source sequence it was cut from."""
+
+    group: str
+    samples: list[Sample]
+    left_out: list[Unlike]
+
+    def of(self, metric: Metric, number: int | None = None) -> list[np.ndarray]:
+        """The values of one metric, one array per motion it looked at, or those of one number."""
+        chosen = [own.values for own in self.samples if number is None or own.number == number]
+        return [values[metric.name] for values in chosen if metric.name in values]
+
+
 def evaluate_store(
     predicted: str | Path,
     reference: str | Path,
@@ -44,46 +73,81 @@ def evaluate_store(
     *,
     split: str = "test",
     metrics: tuple[Metric, ...] = METRICS,
+    jobs: int = 1,
     progress: bool = False,
 ) -> dict[str, Any]:
     """Figures of the store ``predicted`` against the annotated dataset ``reference``.
 
     reference: a folder with clips, annotation, contact and splits (``load_annotated``). hands: as in ``open_store``, of
-    both. split: the part of the chosen split that is asked for. progress: a bar on stderr.
-    Gives held_out_clips, motions, synthetic, figures (one number per metric that has any value), counts (how many
-    clips, motions and values went into each) and left_out (clip id and reason).
-    Raises BadInput where no clip of the two stores can be compared.
+    both. split: the part of the chosen split that is asked for. jobs: worker processes, used from
+    ``WORKERS_PAY_FROM`` motions on; they change no figure. progress: a bar on stderr.
+    Gives held_out_clips, motions, synthetic, length ("given" or "own"), figures (one number per metric that has any
+    value), intervals (95 %, over repetitions and over clips drawn by source sequence, where there are two or more),
+    counts (how many clips, motions and values went into each), actions (where the limits of verbs come from) and
+    left_out (clip id and reason). Raises BadInput where no clip of the two stores can be compared.
     """
     annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
     asked = annotated.ids(split)
     samples, left_out = matched(store.ids, asked)
-    bench, measured = _Bench(annotated, store, metrics), list[list[Values]]()
+    bench = _Bench(annotated, store, metrics, samples, read_asked(predicted), training_actions(annotated))
+    jobs = jobs if sum(map(len, samples.values())) >= WORKERS_PAY_FROM else 1
+    found = dict[str, Measured]()
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
-        for clip_id in bar.track(asked, description="evaluate"):
-            found, others = bench.measure(clip_id, samples.get(clip_id, []))
-            left_out += others
-            measured += [found] if found else []
+        for clip_id, own in bar.track(in_workers(bench.measure, asked, jobs), len(asked), description="evaluate"):
+            found[clip_id] = own
+    clips = [found[clip_id] for clip_id in asked]
+    left_out += [item for own in clips for item in own.left_out]
+    measured = [own for own in clips if own.samples]
     if not measured:
         got = f"{len(store)} clips, none of which can be compared"
         why = f"; {left_out[0].clip_id}: {left_out[0].reason}" if left_out else ""
         remedy = "name them so, in the world and with the frames of their reference"
         raise BadInput(predicted, f"clips named <id>~<k> after the {split} clips of {reference}", got + why, remedy)
-    figures = {item.name: reduced(item, [_of(item, found) for found in measured]) for item in metrics}
-    known = {name: figure for name, figure in figures.items() if figure is not None}
-    rows = annotated.store.sequences.loc[asked, "synthetic"]
     return {
         "held_out_clips": len(asked),
-        "motions": sum(map(len, measured)),
-        "synthetic": bool(rows.any()),
-        "figures": {name: round(figure.value, DIGITS) for name, figure in known.items()},
-        "counts": {name: figure.counts for name, figure in known.items()},
+        "motions": sum(len(own.samples) for own in measured),
+        "synthetic": bool(annotated.store.sequences.loc[asked, "synthetic"].any()),
+        "length": "own" if bench.own_length else "given",
+        **_summary(metrics, measured),
+        "actions": bench.actions.facts,
         "left_out": [item._asdict() for item in left_out],
     }
 
 
-def _of(metric: Metric, found: list[Values]) -> list[np.ndarray]:
-    """The values of one metric, one array per motion it looked at."""
-    return [values[metric.name] for values in found if metric.name in values]
+def _summary(metrics: Sequence[Metric], measured: list[Measured]) -> dict[str, dict[str, Any]]:
+    """figures, intervals and counts of the metrics that have any value."""
+    figures, intervals, counts = dict[str, float](), dict[str, dict[str, list[float]]](), dict[str, dict[str, int]]()
+    for metric in metrics:
+        figure = reduced(metric, [own.of(metric) for own in measured])
+        if figure is not None:
+            figures[metric.name] = round(figure.value, DIGITS)
+            counts[metric.name] = figure.counts
+            if spread := _intervals(metric, measured):
+                intervals[metric.name] = spread
+    return {"figures": figures, "intervals": intervals, "counts": counts}
+
+
+def _intervals(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
+    """repetitions and clips: ends of the 95 % intervals of a figure; none where there are fewer than two to compare.
+
+    The best of all repetitions has no spread over them.
+    """
+    numbers = sorted({own.number for clip in measured for own in clip.samples})
+    numbers = [] if metric.reduction == "best of a clip's samples" else numbers
+    repeated = [reduced(metric, [clip.of(metric, number) for clip in measured]) for number in numbers]
+    parts = [(sum_and_count(metric, clip.of(metric)), clip.group) for clip in measured]
+    known = [(part, group) for part, group in parts if part[1]]
+    found = {
+        "repetitions": t_interval([figure.value for figure in repeated if figure is not None]),
+        "clips": bootstrap_interval([part for part, _ in known], [group for _, group in known], _ratio),
+    }
+    return {name: [round(end, DIGITS) for end in ends] for name, ends in found.items() if ends is not None}
+
+
+def _ratio(parts: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(draw,) figures: sums over counts, parts (clip, 2), under weights (draw, clip)."""
+    total, count = (weights @ parts).T
+    return total / count
 
 
 def matched(predicted_ids: list[str], asked: list[str]) -> tuple[dict[str, list[str]], list[Unlike]]:
@@ -108,57 +172,94 @@ class _Reference:
     sides: tuple[Side, ...]
     entries: DistanceEntries
     index: ProximityIndex
+    part: np.ndarray
     threshold_m: float
     table_m: float | None
+    verb: str | None
 
-    def beside(self, predicted: Motion, start: int, stop: int) -> Pair:
-        """The pair over the frames ``start`` to ``stop`` (exclusive) of the reference."""
+    def cut(self, start: int, stop: int) -> tuple[Motion, TrueContact]:
+        """The recorded motion and its contact from frame ``start`` to ``stop`` (exclusive)."""
         whole = self.motion
         joints: dict[Side, np.ndarray] = {side: whole.joints_m[side][start:stop] for side in SIDES}
         touched = np.zeros(self.index.count, dtype=bool)
         near = self.entries.window(start, stop)
         touched[near.point[np.isin(near.side, [SIDES.index(side) for side in self.sides])]] = True
-        contact = TrueContact(self.index, touched, self.threshold_m)
         own = Motion(whole.clip.take(slice(start, stop)), joints, whole.hands)
-        return Pair(predicted, own, self.sides, contact, self.table_m)
+        return own, TrueContact(self.index, self.part, touched, self.threshold_m)
 
 
+@dataclass
 class _Bench:
-    """Both stores, and what is built once per object."""
+    """Both stores, and what is built once per object. samples: predicted ids by reference; asked: maps by motion id."""
 
-    def __init__(self, annotated: AnnotatedStore, store: Store, metrics: tuple[Metric, ...]) -> None:
-        self.annotated, self.store, self.metrics = annotated, store, metrics
-        self.indices: dict[str, ProximityIndex] = {}
+    annotated: AnnotatedStore
+    store: Store
+    metrics: tuple[Metric, ...]
+    samples: dict[str, list[str]]
+    asked: dict[str, np.ndarray]
+    actions: Actions
+    indices: dict[str, ProximityIndex] = field(default_factory=dict)
 
-    def measure(self, clip_id: str, samples: list[str]) -> tuple[list[Values], list[Unlike]]:
-        """Of every sample that can be compared the values of the metrics that look at it; and the others."""
-        if not samples:
-            return [], [Unlike(clip_id, "no prediction of this clip")]
-        reference, found, left_out = self._reference(clip_id), list[Values](), list[Unlike]()
-        for sample in samples:
-            predicted = _motion(self.store, sample)
-            window = window_of(predicted.clip, reference.motion.clip, reference.sides)
-            if isinstance(window, str):
-                left_out.append(Unlike(sample, window))
+    @property
+    def own_length(self) -> bool:
+        return self.store.info.get("length") == "own"
+
+    def measure(self, clip_id: str) -> Measured:
+        """The values of every sample that can be compared, of the metrics that look at it; and the others."""
+        group = str(self.annotated.store.sequences.at[clip_id, "sequence"])
+        if clip_id not in self.samples:
+            return Measured(group, [], [Unlike(clip_id, "no prediction of this clip")])
+        reference, found, left_out = self._reference(clip_id), list[Sample](), list[Unlike]()
+        for sample in self.samples[clip_id]:
+            pair = self._pair(reference, sample)
+            if isinstance(pair, str):
+                left_out.append(Unlike(sample, pair))
                 continue
-            pair, number = reference.beside(predicted, *window), len(found)
-            looking = [metric for metric in self.metrics if metric.samples is None or number < metric.samples]
-            found.append({metric.name: metric.measure(pair, metric.every) for metric in looking})
-        return found, left_out
+            looking = [
+                metric
+                for metric in self.metrics
+                if (metric.samples is None or len(found) < metric.samples) and (pair.aligned or not metric.aligned)
+            ]
+            values = {metric.name: metric.measure(pair, metric.every) for metric in looking}
+            found.append(Sample(_number(sample, clip_id), values))
+        return Measured(group, found, left_out)
+
+    def _pair(self, reference: _Reference, sample: str) -> Pair | str:
+        """A prediction beside its reference, or why it cannot be compared."""
+        predicted, asked = _motion(self.store, sample), self.asked.get(sample)
+        check = own_window_of if self.own_length else window_of
+        window = check(predicted.clip, reference.motion.clip, reference.sides)
+        if isinstance(window, str):
+            return window
+        if asked is not None and asked.shape != reference.part.shape:
+            return f"the contact map asked for has {len(asked)} points, {len(reference.part)} expected"
+        own, contact = reference.cut(*window)
+        aligned = not self.own_length
+        return Pair(
+            predicted, own, reference.sides, contact, reference.table_m, aligned, asked, reference.verb, self.actions
+        )
 
     def _reference(self, clip_id: str) -> _Reference:
         annotated, motion = self.annotated, _motion(self.annotated.store, clip_id)
         name = annotated.object_key(clip_id)
+        points = annotated.points(name)
         if name not in self.indices:
-            self.indices[name] = ProximityIndex(annotated.points(name))
+            self.indices[name] = ProximityIndex(points)
         return _Reference(
             motion,
             acting_sides(annotated.hand_type(clip_id)),
             annotated.distances(clip_id),
             self.indices[name],
-            float(annotated.contact_info["threshold_m"]),
+            points.part,
+            annotated.contact_threshold_m,
             None if motion.clip.gravity is None else clip_scene(motion.clip, motion.hands).table_height_m,
+            verb_of(annotated, clip_id),
         )
+
+
+def _number(sample: str, clip_id: str) -> int:
+    """Of a predicted clip: k of ``<reference id>~<k>``, 0 for the bare id."""
+    return int(sample.removeprefix(clip_id).lstrip("~") or 0)
 
 
 def _motion(store: Store, clip_id: str) -> Motion:
@@ -166,10 +267,18 @@ def _motion(store: Store, clip_id: str) -> Motion:
     return Motion(store.clip(clip_id, motion_only=True), joints, store.hand_pair())
 
 
+def own_window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
+    """All frames of the reference, for a prediction of a length its family chose; or why it cannot be compared."""
+    if why := _other_object(predicted, reference):
+        return why
+    absent = [side for side in sides if not predicted.hands[side].valid.any()]
+    return f"the {absent[0]} hand acts and is never valid" if absent else (0, reference.n_frames)
+
+
 def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:
     """First and one past the last frame of the reference that a prediction is of; or why it cannot be compared."""
-    if not _is_same(predicted.object.model, reference.object.model):
-        return f"its object {predicted.object.model.name!r} has another mesh, parts or hinge than the reference's"
+    if why := _other_object(predicted, reference):
+        return why
     start = 0
     if predicted.n_frames != reference.n_frames:
         start = _start_of(predicted.source_frames, reference.source_frames)
@@ -181,6 +290,12 @@ def window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tupl
         if (reference.hands[side].valid[slice(*window)] & ~predicted.hands[side].valid).any():
             return f"the {side} hand acts and is not valid in all frames in which the reference has it"
     return window
+
+
+def _other_object(predicted: Clip, reference: Clip) -> str:
+    name = predicted.object.model.name
+    same = _is_same(predicted.object.model, reference.object.model)
+    return "" if same else f"its object {name!r} has another mesh, parts or hinge than the reference's"
 
 
 def _start_of(part: np.ndarray, whole: np.ndarray) -> int:

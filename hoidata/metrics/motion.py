@@ -1,9 +1,16 @@
-"""How far joints are from the truth, and how smoothly they move. Each function gives the values of one motion."""
+"""How far joints are from the truth, how smoothly they move, what the object does, how long it all takes.
+
+Each function gives the values of one motion.
+"""
+
+from functools import lru_cache
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, Side
+from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.metrics.action import action_numbers
 from hoidata.metrics.pair import Pair
+from hoidata.metrics.touch import made_entries
 from hoidata.physics.mano_capsules import world_rotmats
 from hoidata.physics.realism import has_acceleration, smoothness_m_s2
 
@@ -40,10 +47,47 @@ def jitter_m_s3(pair: Pair, every: int) -> np.ndarray:
     return _joined(each)
 
 
+def length_error_frames(pair: Pair, every: int) -> np.ndarray:
+    """(1,) by how many frames the length a family chose is wrong, either way; none where the length was given."""
+    del every
+    wrong = abs(pair.predicted.clip.n_frames - pair.reference.clip.n_frames)
+    return np.zeros(0) if pair.aligned else np.array([float(wrong)])
+
+
+def length_error_share(pair: Pair, every: int) -> np.ndarray:
+    """(1,) the same as a share of the true length."""
+    return length_error_frames(pair, every) / pair.reference.clip.n_frames
+
+
+def action_followed(pair: Pair, every: int) -> np.ndarray:
+    """(1,) 1 where the object does what the verb says, else 0; none where nothing is known of the verb."""
+    del every
+    followed = None if pair.actions is None else pair.actions.followed(pair.verb, _action(pair))
+    return np.zeros(0) if followed is None else np.array([float(followed)])
+
+
+def action_named(pair: Pair, every: int) -> np.ndarray:
+    """(1,) 1 where the verb whose training clips move the object most alike is the one asked for, else 0."""
+    del every
+    if pair.actions is None or pair.verb not in pair.actions.centroids:
+        return np.zeros(0)
+    named = pair.actions.named(_action(pair))
+    return np.zeros(0) if named is None else np.array([float(named == pair.verb)])
+
+
+@lru_cache(maxsize=1)
+def _action(pair: Pair) -> dict[str, float]:
+    """What the object of the prediction does, in numbers."""
+    clip = pair.predicted.clip
+    touching = np.zeros((len(SIDES), clip.n_frames), bool)
+    for side, near in made_entries(pair).items():
+        touching[SIDES.index(side), near["frame"]] = True
+    return action_numbers(clip.object, pair.reference.clip.gravity, touching)
+
+
 def _seen(pair: Pair, side: Side) -> np.ndarray:
     """(frame, 21, 3) float64 predicted joints, NaN in frames without the hand."""
-    valid = pair.reference.clip.hands[side].valid
-    return np.where(valid[:, None, None], pair.predicted.joints_m[side].astype(np.float64), np.nan)
+    return np.where(pair.valid(side)[:, None, None], pair.predicted.joints_m[side].astype(np.float64), np.nan)
 
 
 def _joined(each: list[np.ndarray]) -> np.ndarray:

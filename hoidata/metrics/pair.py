@@ -9,6 +9,7 @@ import numpy as np
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
+from hoidata.metrics.action import Actions
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene
 
@@ -37,21 +38,24 @@ class Motion:
 class TrueContact:
     """The contact map a clip was recorded with, as the contact stage made it.
 
-    index: over the sampled points of the object. touched: (point,) bool, nearer to a joint of an acting hand than
-    ``threshold_m`` (metres) in any frame of the pair.
+    index: over the sampled points of the object; part: (point,) the part each of them belongs to. touched: (point,)
+    bool, nearer to a joint of an acting hand than ``threshold_m`` (metres) in any frame of the pair.
     """
 
     index: ProximityIndex
+    part: np.ndarray
     touched: np.ndarray
     threshold_m: float
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """Frame ``i`` of both motions is the same moment; both are in the world of the reference clip.
+    """Two motions in the world of the reference clip.
 
-    sides: the hands that act in the reference clip; the prediction has them wherever the reference has (``frames``).
-    table_m: height of the table the object of the whole reference clip rests on; None where gravity is not known.
+    sides: the hands that act in the reference clip. table_m: height of the table the object of the whole reference clip
+    rests on; None where gravity is not known. aligned: frame ``i`` of both is the same moment, and the prediction has
+    its hands wherever the reference has; else the family chose its own length. asked: (point,) bool, the contact map
+    the prediction was made for, or None. verb: of the reference clip; actions: what verbs ask of a motion.
     """
 
     predicted: Motion
@@ -59,10 +63,18 @@ class Pair:
     sides: tuple[Side, ...]
     contact: TrueContact
     table_m: float | None
+    aligned: bool = True
+    asked: np.ndarray | None = None
+    verb: str | None = None
+    actions: Actions | None = None
+
+    def valid(self, side: Side) -> np.ndarray:
+        """(frame,) bool: the frames of the prediction in which this hand is looked at."""
+        return (self.reference if self.aligned else self.predicted).clip.hands[side].valid
 
     def frames(self, side: Side, every: int = 1) -> np.ndarray:
-        """Every n-th of the frames in which the reference has this hand."""
-        return np.flatnonzero(self.reference.clip.hands[side].valid)[::every]
+        """Every n-th of the frames in which this hand is looked at."""
+        return np.flatnonzero(self.valid(side))[::every]
 
     @cached_property
     def scene(self) -> Scene | None:
@@ -78,8 +90,8 @@ class Pair:
         return clip_scene(replace(clip, hands=hands, gravity=gravity), self.predicted.hands, self.table_m)
 
     def _present(self, side: Side) -> np.ndarray:
-        """(frame,) bool: the hand acts and the reference has it."""
-        valid = self.reference.clip.hands[side].valid
+        """(frame,) bool: the hand acts and is looked at."""
+        valid = self.valid(side)
         return valid if side in self.sides else np.zeros_like(valid)
 
 

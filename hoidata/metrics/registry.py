@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from hoidata.metrics import forces, motion, touch
+from hoidata.metrics import forces, motion, touch, two_hands
 from hoidata.metrics.pair import Pair
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
@@ -31,6 +31,7 @@ class Metric:
     frames: which frames count, in words. every: of these, look at every n-th. samples: motions per clip that are looked
     at; None: all. thresholds: in words. source: where the definition comes from.
     floor_of: the metric of which this is what it gives for nothing; no figure of a floor is better than another.
+    aligned: compares frame by frame, so there is no figure for motions of a length their family chose.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Metric:
     samples: int | None = None
     thresholds: str = ""
     floor_of: str = ""
+    aligned: bool = False
 
 
 class Figure(NamedTuple):
@@ -75,6 +77,7 @@ METRICS: tuple[Metric, ...] = (
         "joint_error_mm", "joint error of the best sample", "mm", "lower", motion.joint_error_mm,
         "best of a clip's samples", HANDS,
         "mean distance of 21 joints (MPJPE), best of several samples as in Petrovich et al. 2022 (TEMOS), Sec. 4",
+        aligned=True,
     ),
     Metric(
         "contact_f1", "F1 of the contact map made", "", "higher", touch.contact_f1,
@@ -82,9 +85,24 @@ METRICS: tuple[Metric, ...] = (
         thresholds=CONTACT,
     ),
     Metric(
+        "contact_precision", "precision of the contact map made", "", "higher", touch.contact_precision,
+        "mean over motions", f"{HANDS}, all of them together", "this project: half of `contact_f1`",
+        thresholds=CONTACT,
+    ),
+    Metric(
+        "contact_recall", "recall of the contact map made", "", "higher", touch.contact_recall,
+        "mean over motions", f"{HANDS}, all of them together", "this project: the other half of `contact_f1`",
+        thresholds=CONTACT,
+    ),
+    Metric(
+        "adherence", "F1 of the contact map asked for and the one made", "", "higher", touch.adherence,
+        "mean over motions", f"{HANDS}, all of them together", "this project: `asked.npz` beside the clips",
+        thresholds=CONTACT,
+    ),
+    Metric(
         "contact_distance_mm", "distance of joints that touch in the truth", "mm", "nearer the truth",
         touch.contact_distance_mm, "mean over motions", f"{HANDS} and a joint touches in the true clip",
-        "this project; Text2HOI Sec. 3.5 refines it", every=3, samples=2, thresholds=CONTACT,
+        "this project; Text2HOI Sec. 3.5 refines it", every=3, samples=2, thresholds=CONTACT, aligned=True,
     ),
     Metric(
         "penetration_mm", "penetration", "mm", "lower", touch.penetration_mm, "mean over motions", HANDS,
@@ -94,6 +112,22 @@ METRICS: tuple[Metric, ...] = (
     Metric(
         "deep_share", f"share of frames deeper than {touch.DEEP_MM:g} mm", "", "lower", touch.deep_share,
         "mean over motions", HANDS, "this project", every=3, samples=2, thresholds=f"{touch.DEEP_MM:g} mm",
+    ),
+    Metric(
+        "penetration_volume_cm3", "volume that hand and object share", "cm3", "lower", touch.penetration_volume_cm3,
+        "mean over motions", HANDS, "DiffH2O (Christen et al. 2024), intersection volume; of solids, not voxels",
+        every=3, samples=2, thresholds=f"lines {1000 * touch.CELL_M:g} mm apart",
+    ),
+    Metric(
+        "hand_hand_mm", "penetration of one hand by the other", "mm", "lower", two_hands.hand_hand_mm,
+        "mean over motions", f"{HANDS}, both hands", "this project: depth of the deepest of 19 x 19 capsules",
+        every=3, samples=2,
+    ),
+    Metric(
+        "slip_cm_s", "slip of touching joints on the moving object", "cm/s", "lower", touch.slip_cm_s,
+        "mean over motions", f"{HANDS}, a joint touches in two in a row, and the part under it moves",
+        "this project: speed in the frame of the part touched",
+        thresholds=f"{CONTACT}; moving: {touch.MOVING_CM_S:g} cm/s",
     ),
     Metric(
         "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,
@@ -126,6 +160,24 @@ METRICS: tuple[Metric, ...] = (
         "jitter_m_s3", "jitter of joints in the world", "m/s3", "nearer the truth", motion.jitter_m_s3,
         "mean over motions", f"{HANDS}, four in a row", "mean jerk, TransPose (Yi et al. 2021), Sec. 5.2",
     ),
+    Metric(
+        "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,
+        "mean over motions", "all", "this project: limits of height, way, tilt, hinge and hands (`action.py`)",
+        thresholds="`actions.toml`, or the verb's own training clips: 1st to 99th percentile and half a deviation",
+    ),
+    Metric(
+        "action_named", "the object moves most like the verb's training clips", "", "higher", motion.action_named,
+        "mean over motions", "all", "this project: nearest centroid of the standardised numbers of `action.py`",
+    ),
+    Metric(
+        "length_error_frames", "error of the length a family chose", "frames", "lower", motion.length_error_frames,
+        "mean over motions", "all; only stores whose info says `length: own`", "this project",
+    ),
+    Metric(
+        "length_error_share", "error of the length a family chose, of the true one", "", "lower",
+        motion.length_error_share, "mean over motions", "all; only stores whose info says `length: own`",
+        "this project",
+    ),
 )  # fmt: skip
 
 
@@ -153,6 +205,17 @@ def reduced(metric: Metric, clips: list[list[np.ndarray]]) -> Figure | None:
     else:
         value = np.mean(every if metric.reduction == "mean over frames" else np.concatenate(means))
     return Figure(float(value), len(motions), sum(map(len, means)), len(every))
+
+
+def sum_and_count(metric: Metric, samples: list[np.ndarray]) -> tuple[float, int]:
+    """What one clip brings to a figure: sums over all clips, divided by counts, are the figure."""
+    known = [values for values in samples if len(values)]
+    if metric.reduction == "mean over frames":
+        return float(sum(values.sum() for values in known)), sum(map(len, known))
+    means = [float(values.mean()) for values in known]
+    if metric.reduction == "best of a clip's samples" and means:
+        means = [max(means) if metric.direction == "higher" else min(means)]
+    return sum(means), len(means)
 
 
 def is_better(metric: Metric, value: float, other: float, truth: float | None) -> bool | None:

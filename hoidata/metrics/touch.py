@@ -1,7 +1,7 @@
-"""Hands against the object: contact, penetration. Each function gives the values of one motion.
+"""Hands against the object: contact, slip, penetration. Each function gives the values of one motion.
 
 Penetration has one meaning everywhere: the depth of a hand's deepest vertex inside the solid the object's mesh
-encloses, by the exact surface (``hoidata.objects.surface_index``).
+encloses, by the exact surface (``hoidata.objects.surface_index``); penetrating volume is what both fill.
 """
 
 from dataclasses import replace
@@ -9,30 +9,104 @@ from functools import lru_cache
 
 import numpy as np
 
-from hoidata.clips.clip import Side
+from hoidata.clips.clip import FPS, Side
+from hoidata.errors import BadInput
+from hoidata.hands.model import N_JOINTS
 from hoidata.metrics.pair import Motion, Pair
-from hoidata.objects.surface_index import surface_index
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
+from hoidata.surface.solid_overlap import SolidOverlap
 
 DEEP_MM = 10.0
+MOVING_CM_S = 2.0
+CELL_M = 0.002  # of the lattice of lines that volumes are measured along: off by 1 % of the volume
 
 
 def contact_f1(pair: Pair, every: int) -> np.ndarray:
     """(1,) F1 of the contact map the motion makes against that of the reference; 1 where both are empty."""
     del every  # a map is over all frames
+    return _f1(touched_points(pair), pair.contact.touched)
+
+
+def contact_precision(pair: Pair, every: int) -> np.ndarray:
+    """(1,) of the points the motion touches the share that the reference touches; as ``contact_f1`` where one is empty.
+
+    So it is 0, not unknown, for a motion that touches nothing though the reference does.
+    """
+    del every
     made, true = touched_points(pair), pair.contact.touched
+    return _share(made & true, made, true)
+
+
+def contact_recall(pair: Pair, every: int) -> np.ndarray:
+    """(1,) of the points the reference touches the share that the motion touches, as in ``contact_precision``."""
+    del every
+    made, true = touched_points(pair), pair.contact.touched
+    return _share(made & true, true, made)
+
+
+def adherence(pair: Pair, every: int) -> np.ndarray:
+    """(1,) F1 of the contact map the motion makes against the one it was asked for; none where none was asked for."""
+    del every
+    return np.zeros(0) if pair.asked is None else _f1(touched_points(pair), pair.asked)
+
+
+def _f1(made: np.ndarray, true: np.ndarray) -> np.ndarray:
     total = int(made.sum()) + int(true.sum())
     return np.array([2 * int((made & true).sum()) / total if total else 1.0])
 
 
+def _share(hits: np.ndarray, of: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return np.array([hits.sum() / of.sum() if of.any() else float(not other.any())])
+
+
 def touched_points(pair: Pair) -> np.ndarray:
     """(point,) bool: nearer than the contact threshold to a joint of an acting hand of the prediction in any frame."""
+    touched = np.zeros(pair.contact.index.count, dtype=bool)
+    for near in made_entries(pair).values():
+        touched[near["point"]] = True
+    return touched
+
+
+@lru_cache(maxsize=1)
+def made_entries(pair: Pair) -> dict[Side, np.ndarray]:
+    """By acting hand, ``ENTRY`` rows of every joint of the prediction near a sampled point. Kept for one pair."""
     contact, motion = pair.contact, pair.predicted
-    touched = np.zeros(contact.index.count, dtype=bool)
-    for side in pair.sides:
-        valid = pair.reference.clip.hands[side].valid
-        entries = contact.index.entries(motion.joints_m[side], valid, motion.clip.object, contact.threshold_m)
-        touched[entries["point"]] = True
+    return {
+        side: contact.index.entries(motion.joints_m[side], pair.valid(side), motion.clip.object, contact.threshold_m)
+        for side in pair.sides
+    }
+
+
+def slip_cm_s(pair: Pair, every: int) -> np.ndarray:
+    """(joint and frame,) speed of a touching joint over the part it touches, while that moves there, cm/s.
+
+    A joint counts from a frame to the next where it touches the same part in both, and that part's own motion carries
+    the point under the joint by more than ``MOVING_CM_S``.
+    """
+    del every  # a speed needs every frame
+    clip, each = pair.predicted.clip, [np.zeros(0)]
+    for side, near in made_entries(pair).items():
+        touched = _touched_part(near, pair.contact.part, clip.n_frames)
+        for part in clip.object.model.parts:
+            world_from_part = clip.object.world_from_object @ clip.object.model.object_from_part(
+                part, clip.object.hinge_rad
+            )
+            local = world_from_part.inverse() @ pair.predicted.joints_m[side].astype(np.float64)
+            carried = world_from_part[1:] @ local[:-1] - world_from_part[:-1] @ local[:-1]
+            slipped = np.diff(local, axis=0)
+            speed, slip = (100 * FPS * np.linalg.norm(way, axis=-1) for way in (carried, slipped))
+            touching = touched == part
+            each.append(slip[touching[1:] & touching[:-1] & (speed > MOVING_CM_S)])
+    return np.concatenate(each)
+
+
+def _touched_part(near: np.ndarray, part: np.ndarray, n_frames: int) -> np.ndarray:
+    """(frame, 21) the part of the sampled point nearest to each joint, -1 where none is near."""
+    touched = np.full((n_frames, N_JOINTS), -1)
+    if part.any():  # of several entries of a joint the last one stays: the nearest
+        near = near[np.argsort(-near["distance_m"], kind="stable")]
+    touched[near["frame"], near["joint"]] = part[near["point"]]
     return touched
 
 
@@ -56,16 +130,41 @@ def deep_share(pair: Pair, every: int) -> np.ndarray:
     return (penetration_mm(pair, every) > DEEP_MM).astype(np.float64)
 
 
+def penetration_volume_cm3(pair: Pair, every: int) -> np.ndarray:
+    """(hand and frame,) volume that the hand and the solid object both fill, cubic centimetres.
+
+    None for an object without an inside, or too large for a lattice of ``CELL_M``.
+    """
+    overlap = _overlap(surface_index(pair.predicted.clip.object.model))
+    if overlap is None:
+        return np.zeros(0)
+    hands = _hands(pair, every)
+    return 1e6 * np.concatenate(
+        [np.zeros(0)] + [overlap.volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad) for hand in hands]
+    )
+
+
 @lru_cache(maxsize=1)
 def _deepest_m(pair: Pair, every: int) -> np.ndarray:
     """Kept for one pair: two metrics ask for it, and meshes are what costs."""
-    clip, each = pair.predicted.clip, [np.zeros(0)]
-    index = surface_index(clip.object.model)
-    for side in pair.sides if index.is_solid else ():
-        frames = pair.frames(side, every)
-        hand = _at(placed_hand(clip, side, pair.predicted.hands), frames)
-        each.append(deepest_m(hand, index)[frames])
-    return np.concatenate(each)
+    index = surface_index(pair.predicted.clip.object.model)
+    hands = _hands(pair, every) if index.is_solid else []
+    return np.concatenate([np.zeros(0)] + [deepest_m(hand, index)[hand.frames] for hand in hands])
+
+
+@lru_cache(maxsize=1)
+def _hands(pair: Pair, every: int) -> list[PlacedHand]:
+    """The acting hands in every n-th frame in which they are looked at."""
+    clip = pair.predicted.clip
+    return [_at(placed_hand(clip, side, pair.predicted.hands), pair.frames(side, every)) for side in pair.sides]
+
+
+@lru_cache(maxsize=64)
+def _overlap(index: SurfaceIndex) -> SolidOverlap | None:
+    try:
+        return SolidOverlap(index, CELL_M) if index.is_solid else None
+    except BadInput:  # a lattice of millimetres over metres
+        return None
 
 
 def _at(hand: PlacedHand, frames: np.ndarray) -> PlacedHand:

@@ -5,8 +5,9 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from rich.progress import track
 
@@ -15,6 +16,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.files import atomic_file, atomic_folder
 from hoidata.hands import HandPair
+from hoidata.metrics.asked import write_asked
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
@@ -32,6 +34,15 @@ class PredictionConfig:
     seed: int = 0
 
 
+@runtime_checkable
+class AsksContact(Protocol):
+    """A family ready to answer that decides where the object is to be touched, and can say so."""
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        """As ``Sampler.sample``, and (point,) bool of each motion: the sampled points it was asked to touch."""
+        ...
+
+
 def sample_family(
     family: Family,
     annotated_root: str | Path,
@@ -45,6 +56,7 @@ def sample_family(
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
+    A family that is :class:`AsksContact` also gets ``out/asked.npz`` (``hoidata.metrics.asked``).
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
     params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th motion for a clip is named
     ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a model takes the first frames.
@@ -61,7 +73,10 @@ def sample_family(
     sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        counts = write_store(partial / "clips", _motions(family.load(sources), test, config), info)
+        asked = dict[str, np.ndarray]()
+        counts = write_store(partial / "clips", _motions(family.load(sources), test, config, asked), info)
+        if asked:
+            write_asked(partial, asked)
         with atomic_file(partial / "diagnostics.json") as file:
             file.write_text(json.dumps(family.diagnose(sources), indent=2, sort_keys=True) + "\n")
     return counts
@@ -89,11 +104,20 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
     ]
 
 
-def _motions(sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig) -> Iterator[Clip]:
+def _motions(
+    sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig, asked: dict[str, np.ndarray]
+) -> Iterator[Clip]:
+    """The clips in order; ``asked`` is filled with the contact map of each, where the family has them."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
     for start in track(starts, description="sampling", transient=True):
-        requests = [asked for sample in test[start : start + CLIPS_AT_ONCE] for asked in requests_for(sample, config)]
-        yield from sampler.sample(requests)
+        chosen = test[start : start + CLIPS_AT_ONCE]
+        requests = [request for sample in chosen for request in requests_for(sample, config)]
+        if isinstance(sampler, AsksContact):
+            clips, maps = sampler.sample_asked(requests)
+            asked |= {clip.clip_id: contact_map for clip, contact_map in zip(clips, maps, strict=True)}
+        else:
+            clips = sampler.sample(requests)
+        yield from clips
 
 
 def _seed(seed: int, clip_id: str, number: int) -> int:

@@ -29,8 +29,10 @@ class BeforeRefiner:
     model: Text2Hoi
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        motions = self.model.motions(requests, refined=False)
-        return self.model.clips(requests, motions, refined=False)
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.model.sample_asked(requests, refined=False)
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,10 @@ class OtherPrompt:
     other: dict[str, np.ndarray]
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
-        return self.model.sample([replace(request, text=self.other[request.clip_id]) for request in requests])
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
+        return self.model.sample_asked([replace(request, text=self.other[request.clip_id]) for request in requests])
 
 
 def other_prompts(sources: Sources) -> dict[str, np.ndarray]:

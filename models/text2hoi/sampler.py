@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -79,7 +80,12 @@ class Text2Hoi:
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         """Refined motions."""
-        return self.clips(requests, self.motions(requests), refined=True)
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request], refined: bool = True) -> tuple[list[Clip], list[np.ndarray]]:
+        """Motions, and the contact map (N,) bool each of them was drawn for."""
+        motions = self.motions(requests, refined)
+        return self.clips(requests, motions, refined), [motion.contact_map.numpy() > 0 for motion in motions]
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:
         """Motions as clips, after refinement or before it."""

@@ -36,8 +36,9 @@ def evaluate(
     from hoidata.files import atomic_file
     from hoidata.metrics.evaluate import evaluate_store
     from pipelines.pages.metrics_table import printed_table
+    from pipelines.stages.base import jobs
 
-    found = evaluate_store(store, reference, _hands(reference), split=split, progress=True)
+    found = evaluate_store(store, reference, _hands(reference), split=split, jobs=jobs(), progress=True)
     Console(width=None if sys.stdout.isatty() else 120).print(printed_table(found))
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")

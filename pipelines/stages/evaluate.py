@@ -2,7 +2,7 @@
 
 import json
 
-from pipelines.stages.base import Place, empty_reason, load_hands, write_json
+from pipelines.stages.base import Place, empty_reason, jobs, load_hands, write_json
 
 
 def run(place: Place) -> None:
@@ -13,6 +13,7 @@ def run(place: Place) -> None:
         return
     from hoidata.metrics.evaluate import evaluate_store
 
-    found = evaluate_store(place.samples / "clips", place.data, load_hands(place.profile), progress=True)
+    hands = load_hands(place.profile)
+    found = evaluate_store(place.samples / "clips", place.data, hands, jobs=jobs(), progress=True)
     diagnostics = json.loads((place.samples / "diagnostics.json").read_text(encoding="utf-8"))
     write_json(place.metrics, found | {"diagnostics": diagnostics})

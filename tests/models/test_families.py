@@ -12,10 +12,11 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.metrics.asked import read_asked
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.common.family import Sources, motion_clip
-from models.common.predicting import PredictionConfig, requests_for, sample_family
+from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
 from models.text2hoi.family import other_prompts
@@ -160,6 +161,9 @@ def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
     store = open_store(tmp_path / "a" / "clips", HANDS)
     assert store.ids == ["toy/s3/5~0", "toy/s3/5~1", "toy/s3/6~0", "toy/s3/6~1"]
     assert store.clip("toy/s3/6~1").n_frames == 33
+    asked = read_asked(tmp_path / "a" / "clips")
+    assert list(asked) == store.ids
+    assert all(contact_map.shape == (1024,) and contact_map.any() for contact_map in asked.values())
     figures = json.loads((tmp_path / "a" / "diagnostics.json").read_text())
     assert {"f1", "f1_mean_map", "f1_mean_map_by_index", "f1_mean_map_by_position"} <= set(figures["contact"])
     # Training lengths 24, 32, 28 with mean 28; test lengths 24 and 33.
@@ -170,6 +174,21 @@ def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
     for path in sorted((tmp_path / "a").rglob("*")):
         if path.is_file():
             assert path.read_bytes() == (tmp_path / "b" / path.relative_to(tmp_path / "a")).read_bytes(), path
+
+
+def test_the_contact_map_a_motion_was_drawn_for_is_told_by_families_that_draw_one(
+    sources: Sources, annotated_root: Path, trained: Path, tmp_path: Path
+) -> None:
+    requests = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=2))
+    model = load_family("text2hoi").load(sources)
+    assert isinstance(model, Text2Hoi)
+    told = [motion.contact_map.numpy() == 1 for motion in model.motions(requests, refined=False)]
+    for family in ("text2hoi", "text2hoi-coarse"):
+        sampler = load_family(family).load(sources)
+        assert isinstance(sampler, AsksContact)
+        np.testing.assert_array_equal(sampler.sample_asked(requests)[1], told)
+    sample_family(load_family("nearest-clip"), annotated_root, trained, tmp_path / "a", {"samples": 1}, HANDS)
+    assert read_asked(tmp_path / "a" / "clips") == {}
 
 
 def test_a_family_that_cannot_answer_says_why(annotated_root: Path, trained: Path, tmp_path: Path) -> None:

@@ -30,11 +30,12 @@ def build_pair(
         Motion(clip, {side: track_joints(clip.hands[side], hands[side]) for side in SIDES}, hands)
         for clip in (predicted, reference)
     ]
-    index, sides = ProximityIndex(sample_points(reference.object.model, 256)), acting_sides(hand_type)
+    points, sides = sample_points(reference.object.model, 256), acting_sides(hand_type)
+    index = ProximityIndex(points)
     entries = distance_entries(reference, motions[1].joints_m, index, threshold_m)
     maps = contact_maps(entries, index.count)
     touched = np.logical_or.reduce([maps[side] > 0 for side in sides])
-    return Pair(*motions, sides, TrueContact(index, touched, threshold_m), table_m)
+    return Pair(*motions, sides, TrueContact(index, points.part, touched, threshold_m), table_m)
 
 
 @pytest.fixture

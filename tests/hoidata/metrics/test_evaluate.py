@@ -166,6 +166,11 @@ def test_every_metric_is_registered_once_and_floors_have_their_metric():
     directions = {item.name: item.direction for item in METRICS if item.direction != "lower" and not item.floor_of}
     assert directions == {
         "contact_f1": "higher",
+        "contact_precision": "higher",
+        "contact_recall": "higher",
+        "adherence": "higher",
+        "action_followed": "higher",
+        "action_named": "higher",
         "realism_si": "higher",
         "realism_released": "higher",
         "contact_distance_mm": "nearer the truth",

@@ -1,0 +1,212 @@
+"""What an object does in a clip, in numbers, and whether that is what a verb says.
+
+``actions.toml`` beside this file holds what a verb asks of a motion, one table per verb, ``number = [least, most]``;
+a motion follows the verb when all of them hold. A table counts for a dataset when nine in ten of the verb's own
+training clips follow it; for every other verb the limits are learnt from those clips.
+"""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, ObjectTrack
+from hoidata.errors import BadInput
+from hoidata.geometry.intervals import runs
+from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.store.annotated import AnnotatedStore
+
+TABLE = Path(__file__).with_name("actions.toml")
+NUMBERS = {
+    "rise_m": "greatest height of the object's middle over that of the first frame",
+    "end_rise_m": "the same in the last frame",
+    "sideways_m": "greatest horizontal distance of the middle from where it was first",
+    "end_sideways_m": "the same in the last frame",
+    "tilt_deg": "greatest angle between the object's first upright direction and the upright",
+    "end_tilt_deg": "the same in the last frame",
+    "turn_deg": "greatest turn about the upright, either way, full turns added up",
+    "path_m": "length of the middle's path",
+    "reversals_per_s": "how often the middle turns back: 2 mm or more in 0.1 s, and as much the other way",
+    "hinge_net_deg": "hinge angle of the last frame less that of the first; 0 for a rigid object",
+    "hinge_max_deg": "greatest change of the hinge angle since the first frame, either way; 0 for a rigid object",
+    "hand_changes": "hands that touch in the first touched frame and not in the last, or the reverse: 0, 1 or 2",
+    "first_left": "1 where the left hand touches in the first touched frame, else 0",
+    "first_right": "1 where the right hand does",
+    "last_left": "1 where the left hand touches in the last touched frame, else 0",
+    "last_right": "1 where the right hand does",
+}
+OF_GIVEN_HANDS = ("first_left", "first_right", "last_left", "last_right")  # asked for in words, so no part of a verb
+LEARNT = tuple(name for name in NUMBERS if name not in OF_GIVEN_HANDS)
+LEAST_CLIPS = 3  # of a verb to learn its limits from
+SHARE_THAT_FOLLOWS = 0.9
+MARGIN = 0.5  # standard deviations over all training clips, added to the 1st and 99th percentile of the verb's own
+_TURN_FRAMES, _TURN_M = 3, 0.002
+Limits = dict[str, tuple[float, float]]
+
+
+def action_numbers(track: ObjectTrack, gravity: np.ndarray | None, touching: np.ndarray) -> dict[str, float]:
+    """``NUMBERS`` of one motion; NaN for what needs gravity where that is not known.
+
+    gravity: (3,) unit vector in the world, or None. touching: (2, frame) bool, whether the left and the right hand
+    touch the object.
+    """
+    model, degrees = track.model, np.zeros(track.n_frames)
+    if track.hinge_rad is not None:
+        degrees = np.degrees(track.hinge_rad - track.hinge_rad[0], dtype=np.float64)
+    base = model.vertices_m[np.unique(model.faces_of(0))]
+    middle_m = (track.world_from_object @ ((base.min(axis=0) + base.max(axis=0)) / 2)[None])[:, 0]
+    nothing = dict.fromkeys(NUMBERS, float("nan"))
+    return nothing | _upright(track, middle_m, gravity) | _touching(touching) | {
+        "path_m": float(np.linalg.norm(np.diff(middle_m, axis=0), axis=1).sum()),
+        "reversals_per_s": _reversals(middle_m) * FPS / track.n_frames,
+        "hinge_net_deg": float(degrees[-1]),
+        "hinge_max_deg": float(np.abs(degrees).max()),
+    }  # fmt: skip
+
+
+def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | None) -> dict[str, float]:
+    """What is measured against gravity. middle_m: (frame, 3) world."""
+    if gravity is None:
+        return {}
+    up = -np.asarray(gravity, np.float64)
+    way = middle_m - middle_m[0]
+    rise, sideways = way @ up, np.linalg.norm(way - (way @ up)[:, None] * up, axis=1)
+    rotation = track.world_from_object.rotation
+    since_first = rotation @ rotation[0].T
+    tilt = np.degrees(np.arccos(np.clip((since_first @ up) @ up, -1, 1)))
+    steps = rotmat_to_rotvec(rotation[1:] @ rotation[:-1].swapaxes(1, 2)) @ up
+    turn = np.degrees(np.abs(np.cumsum(steps)).max(initial=0.0))
+    return {
+        "rise_m": float(rise.max()),
+        "end_rise_m": float(rise[-1]),
+        "sideways_m": float(sideways.max()),
+        "end_sideways_m": float(sideways[-1]),
+        "tilt_deg": float(tilt.max()),
+        "end_tilt_deg": float(tilt[-1]),
+        "turn_deg": float(turn),
+    }
+
+
+def _reversals(middle_m: np.ndarray) -> int:
+    """How often a path (frame, 3) turns back on itself."""
+    step = middle_m[_TURN_FRAMES:] - middle_m[:-_TURN_FRAMES]
+    before, after = step[:-_TURN_FRAMES], step[_TURN_FRAMES:]
+    length = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    back = (before * after).sum(axis=1) < -0.5 * length[0] * length[1]
+    return len(runs(back & (np.minimum(*length) >= _TURN_M)))
+
+
+def _touching(touching: np.ndarray) -> dict[str, float]:
+    frames = np.flatnonzero(touching.any(axis=0))
+    first, last = (touching[:, frames[end]] if len(frames) else np.zeros(2, bool) for end in (0, -1))
+    sides = {f"{name}_{side}": float(own[row]) for name, own in (("first", first), ("last", last))
+             for row, side in enumerate(SIDES)}  # fmt: skip
+    return sides | {"hand_changes": float((first != last).sum())}
+
+
+@dataclass(frozen=True)
+class Actions:
+    """What the verbs of a dataset ask of a motion.
+
+    limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
+    other verbs have theirs from ``actions.toml``. centroids: by verb, the mean of its training clips' standardised
+    numbers. scale: of each of these numbers its mean and standard deviation over all training clips.
+    """
+
+    limits: Mapping[str, Limits]
+    learnt: Mapping[str, int]
+    centroids: Mapping[str, np.ndarray]
+    scale: Mapping[str, tuple[float, float]]
+
+    def followed(self, verb: str | None, numbers: Mapping[str, float]) -> bool | None:
+        """Whether a motion does what the verb says; None where nothing is known of the verb or of its numbers."""
+        limits = self.limits.get(verb or "")
+        return None if limits is None else _within(numbers, limits)
+
+    def named(self, numbers: Mapping[str, float]) -> str | None:
+        """The verb whose centroid is nearest; None where a number is not known or no verb has a centroid."""
+        asked = _standardised(numbers, self.scale)
+        if not self.centroids or np.isnan(asked).any():
+            return None
+        return min(self.centroids, key=lambda verb: float(np.linalg.norm(self.centroids[verb] - asked)))
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """Where each verb's limits come from, for the file of figures."""
+        return {"limits": sorted(set(self.limits) - set(self.learnt)), "learnt": dict(sorted(self.learnt.items()))}
+
+
+def training_actions(annotated: AnnotatedStore) -> Actions:
+    """The actions of an annotated dataset: of its training part alone, and of ``actions.toml``."""
+    numbers: dict[str, list[dict[str, float]]] = {}
+    for clip_id in annotated.ids("train"):
+        if verb := verb_of(annotated, clip_id):
+            clip = annotated.store.clip(clip_id, motion_only=True)
+            near = annotated.distances(clip_id)
+            touching = np.zeros((len(SIDES), clip.n_frames), bool)
+            touching[near.side, near.frame] = True
+            numbers.setdefault(verb, []).append(action_numbers(clip.object, clip.gravity, touching))
+    return learn_actions(numbers, written_limits())
+
+
+def verb_of(annotated: AnnotatedStore, clip_id: str) -> str | None:
+    """The verb of a clip, as it was annotated."""
+    verb = annotated.hand_types.at[clip_id, "verb"]
+    return verb if isinstance(verb, str) and verb else None
+
+
+def learn_actions(
+    numbers: Mapping[str, list[dict[str, float]]], written: Mapping[str, Limits] | None = None
+) -> Actions:
+    """Actions of clips' numbers by verb. written: limits that take the place of learnt ones where the clips follow."""
+    every = [row for rows in numbers.values() for row in rows]
+    scale = {}
+    for name in LEARNT:
+        column = np.array([row[name] for row in every])
+        if len(column) and np.isfinite(column).all() and column.std() > 0:
+            scale[name] = float(column.mean()), float(column.std())
+    limits, learnt = dict[str, Limits](), dict[str, int]()
+    for verb, rows in numbers.items():
+        known = (written or {}).get(verb)
+        if known is not None and np.mean([_within(row, known) is True for row in rows]) >= SHARE_THAT_FOLLOWS:
+            limits[verb] = known
+        elif len(rows) >= LEAST_CLIPS:
+            limits[verb], learnt[verb] = _bands(rows, scale), len(rows)
+    centroids = {verb: np.mean([_standardised(row, scale) for row in rows], axis=0) for verb, rows in numbers.items()}
+    return Actions(limits, learnt, centroids, scale)
+
+
+def _bands(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> Limits:
+    bands = {}
+    for name, (_, deviation) in scale.items():
+        low, high = np.percentile([row[name] for row in rows], (1, 99))
+        bands[name] = float(low - MARGIN * deviation), float(high + MARGIN * deviation)
+    return bands
+
+
+def _within(numbers: Mapping[str, float], limits: Limits) -> bool | None:
+    if any(np.isnan(numbers[name]) for name in limits):
+        return None
+    return all(least <= numbers[name] <= most for name, (least, most) in limits.items())
+
+
+def _standardised(numbers: Mapping[str, float], scale: Mapping[str, tuple[float, float]]) -> np.ndarray:
+    return np.array([(numbers[name] - mean) / deviation for name, (mean, deviation) in scale.items()])
+
+
+@lru_cache(maxsize=1)
+def written_limits(path: Path = TABLE) -> dict[str, Limits]:
+    """The limits of ``actions.toml`` by verb; none without the file. Raises BadInput for anything else in it."""
+    tables = tomllib.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    for verb, table in tables.items():
+        for name, limits in table.items():
+            if name not in NUMBERS or len(limits) != 2 or not limits[0] <= limits[1]:
+                expected = f"[least, most] of one of {', '.join(NUMBERS)}"
+                raise BadInput(f"{path.name}: {verb}", expected, f"{name} = {limits}", "correct the table")
+    return {
+        verb: {name: (float(low), float(high)) for name, (low, high) in own.items()} for verb, own in tables.items()
+    }
