@@ -161,7 +161,8 @@ class TestText2Hoi:
             object=torch.zeros(1, 1024),
             points_m=torch.rand(1, 1024, 3),
             normals=torch.rand(1, 1024, 3),
-            contact_map=torch.zeros(1, 1024),
+            part=torch.zeros(1, 1024, dtype=torch.long),
+            contact=torch.zeros(1, 2, 1024),
             active_hands=torch.ones(1, 2, dtype=torch.bool),
             frames=torch.ones(1, 150, dtype=torch.bool),
         )

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 # Keeps control points determined where few frames, or none, say what they are.
-STIFFNESS = 1e-4
+STIFFNESS = 1e-6
 
 
 def intervals_of(n_frames: int, knot_frames: int) -> int:

@@ -16,7 +16,9 @@ from models.common.point_net import PointNet, normalised_points
 from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
 
 SIDES = 2
-ANCHOR_FEATURES = 5
+ANCHOR_FEATURES = 8
+WAVES = (1.0, 2.0, 4.0)
+REACHES = (0.1, 0.2, 0.4)
 Cloud = tuple[Tensor, Tensor, Tensor]
 
 
@@ -29,7 +31,7 @@ class AnchoredContact(nn.Module):
         local, _, overall = config.point_net.widths
         self.object_net = PointNet(3, config.point_net)
         first, second, third = config.decoder_widths
-        self.from_point = nn.Linear(local + 3 + SIDES * ANCHOR_FEATURES, first)
+        self.from_point = nn.Linear(local + 3 + 6 * len(WAVES) + SIDES * ANCHOR_FEATURES, first)
         self.from_clip = nn.Sequential(
             nn.Linear(overall + 1 + config.text + HAND_FLAGS, first), nn.GELU(), nn.Linear(first, first)
         )
@@ -56,8 +58,11 @@ class AnchoredContact(nn.Module):
         at = points.gather(1, anchors[..., None].expand(-1, -1, 3))
         offset = points[:, :, None] - at[:, None]
         flags = known[:, None, :, None].expand(*offset.shape[:3], 1).to(points.dtype)
-        near = torch.cat((offset, offset.norm(dim=-1, keepdim=True), torch.ones_like(flags)), -1) * flags
-        mixed = self.from_point(torch.cat((local, points, near.flatten(2)), -1)) + clip[:, None]
+        distance = offset.norm(dim=-1, keepdim=True)
+        bells = [torch.exp(-0.5 * (distance / reach).square()) for reach in REACHES]
+        near = torch.cat((offset, distance, torch.ones_like(flags), *bells), -1) * flags
+        waves = [wave(points * (torch.pi * rate)) for rate in WAVES for wave in (torch.sin, torch.cos)]
+        mixed = self.from_point(torch.cat((local, points, *waves, near.flatten(2)), -1)) + clip[:, None]
         touch, contact = self.rest(mixed).transpose(1, 2).split(SIDES, 1)
         return touch, contact
 
@@ -73,11 +78,13 @@ class AnchoredContact(nn.Module):
         draw = torch.rand(len(contact), SIDES, generator=generator).to(contact.device)
         anchors = picked(contact, draw)
         wanted = contact / contact.sum(-1, keepdim=True).clamp_min(1)
-        touch, before = contact.new_zeros(()), torch.zeros_like(known)
-        for side in range(SIDES):
-            told = self.logits(cloud, anchors, before)[0][:, side].log_softmax(-1)
-            touch = touch - ((wanted[:, side] * told).sum(-1) * known[:, side]).sum() / known.sum().clamp_min(1)
-            before = torch.stack((known[:, 0], torch.zeros_like(known[:, 1])), 1)
+        told = self.logits(cloud, anchors, torch.zeros_like(known))[0].log_softmax(-1)
+        both = known.all(-1).nonzero()[:, 0]
+        if len(both):
+            left_only = torch.tensor([[True, False]], device=known.device).expand(len(both), -1)
+            after = self.logits((cloud[0][both], cloud[1][both], cloud[2][both]), anchors[both], left_only)[0]
+            told = torch.stack((told[:, 0], told[:, 1].index_copy(0, both, after[:, 1].log_softmax(-1))), 1)
+        touch = -((wanted * told).sum(-1) * known).sum() / known.sum().clamp_min(1)
         return touch, self.logits(cloud, anchors, known)[1]
 
     @torch.no_grad()

@@ -18,10 +18,10 @@ class ContactConfig:
 
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
     decoder_widths: tuple[int, int, int] = (512, 256, 128)
-    drawn_by: Literal["latent", "anchor"] = "latent"
     latent: int = 64
     text: int = 512
     dropout: float = 0.0
+    drawn_by: Literal["latent", "anchor"] = "latent"
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ Text2HOI Sec. 3 and 4.1. The motion is a :class:`Clip` of dataset "generated" in
 zero in the first frame. Everything is drawn from one seed: the same seed gives the same bytes.
 """
 
+import hashlib
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -115,8 +116,10 @@ def _chosen_hand(text: str, encoder: TextEncoder, counts: dict[HandType, int], m
 
 
 def _length(model: Text2Hoi, request: Request) -> int:
+    """Frames drawn from the seed and the sentence, so that other words are another draw."""
     text, active_hands = (torch.from_numpy(values)[None] for values in (request.text, request.active_hands))
-    return model.sample_lengths(text, active_hands, torch.Generator().manual_seed(request.seed))[0]
+    seed = int.from_bytes(hashlib.sha256(f"{request.seed} {request.clip_id}".encode()).digest()[:7])
+    return model.sample_lengths(text, active_hands, torch.Generator().manual_seed(seed))[0]
 
 
 def _started_at_origin(motion: Text2HoiMotion) -> Text2HoiMotion:
