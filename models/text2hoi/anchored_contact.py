@@ -78,12 +78,8 @@ class AnchoredContact(nn.Module):
         draw = torch.rand(len(contact), SIDES, generator=generator).to(contact.device)
         anchors = picked(contact, draw)
         wanted = contact / contact.sum(-1, keepdim=True).clamp_min(1)
-        told = self.logits(cloud, anchors, torch.zeros_like(known))[0].log_softmax(-1)
-        both = known.all(-1).nonzero()[:, 0]
-        if len(both):
-            left_only = torch.tensor([[True, False]], device=known.device).expand(len(both), -1)
-            after = self.logits((cloud[0][both], cloud[1][both], cloud[2][both]), anchors[both], left_only)[0]
-            told = torch.stack((told[:, 0], told[:, 1].index_copy(0, both, after[:, 1].log_softmax(-1))), 1)
+        first = self.touches(cloud, anchors, torch.zeros_like(known))
+        told = self.knowing_left(cloud, first, anchors, known)
         touch = -((wanted * told).sum(-1) * known).sum() / known.sum().clamp_min(1)
         return touch, self.logits(cloud, anchors, known)[1]
 
@@ -91,14 +87,25 @@ class AnchoredContact(nn.Module):
     def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
         """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2), even draws from 0 to 1."""
         cloud, maps = self.see(points_m, text, active_hands), []
+        first = self.touches(cloud, torch.zeros_like(active_hands, dtype=torch.long), torch.zeros_like(active_hands))
         for draw in latents:
-            anchors, known = torch.zeros_like(active_hands, dtype=torch.long), torch.zeros_like(active_hands)
-            for side in range(SIDES):
-                probability = self.logits(cloud, anchors, known)[0].softmax(-1)
-                anchors[:, side] = picked(probability, draw)[:, side]
-                known[:, side] = active_hands[:, side]
-            maps.append(self.logits(cloud, anchors, known)[1].sigmoid() * active_hands[..., None])
+            anchors = picked(first.exp(), draw)
+            anchors[:, 1] = picked(self.knowing_left(cloud, first, anchors, active_hands).exp(), draw)[:, 1]
+            maps.append(self.logits(cloud, anchors, active_hands)[1].sigmoid() * active_hands[..., None])
         return torch.stack(maps, 1)
+
+    def touches(self, cloud: Cloud, anchors: Tensor, known: Tensor) -> Tensor:
+        """(B, 2, N) log-probability of each hand's next touch; arguments as in ``logits``."""
+        return self.logits(cloud, anchors, known)[0].log_softmax(-1)
+
+    def knowing_left(self, cloud: Cloud, first: Tensor, anchors: Tensor, known: Tensor) -> Tensor:
+        """``first``, touches without any anchor, but the right hand's told the left's anchor where both act."""
+        both = known.all(-1).nonzero()[:, 0]
+        if not len(both):
+            return first
+        left_only = torch.tensor([[True, False]], device=known.device).expand(len(both), -1)
+        after = self.touches((cloud[0][both], cloud[1][both], cloud[2][both]), anchors[both], left_only)
+        return torch.stack((first[:, 0], first[:, 1].index_copy(0, both, after[:, 1])), 1)
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
         """(count, clip, 2) draws that choose the touches."""

@@ -40,7 +40,7 @@ class ContactObjective:
     def validation(self, network: nn.Module) -> float:
         assert isinstance(network, ContactModel | AnchoredContact)
         held = self.held_out
-        latents = network.draw_latents(8, len(held), torch.Generator().manual_seed(0)).to(self.device)
+        latents = network.draw_latents(4, len(held), torch.Generator().manual_seed(0)).to(self.device)
         probability = network.sample(held.points_m, held.text[:, 0], held.active_hands, latents).amax(2).mean(1)
         return float(nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map))
 

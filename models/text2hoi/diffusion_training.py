@@ -202,6 +202,12 @@ class DiffusionObjective:
             true, touching = (losses.take_frames(part, chosen, 2) for part in (target.joints_m, target.touching))
             found["joints"] = losses.joint_loss(joints, true, present, 1 + weights.touch_weight * touching)
         hands = code.in_world(own, moved)
+        if weights.distance_weight:
+            given = batch.entries, batch.entry_distance_m, chosen, batch.frames.shape[1], weights.entries, generator
+            listed, distance = losses.entries_of_frames(*given)
+            joints, points = self.hands.joints(hands, batch.betas, batch.template_m), place_points(batch, moved)
+            scale_m = batch.contact_threshold_m
+            found["distance_map"] = losses.distance_map_loss(joints, points, listed, distance, scale_m)
         if weights.orientation_weight:
             true = losses.take_frames(batch.hands, chosen, 2), losses.take_frames(batch.object, chosen, 1)
             turns = [rot6d_to_rotmat(part[..., GLOBAL_ORIENT_6D]) for part in (hands, true[0])]
@@ -209,12 +215,6 @@ class DiffusionObjective:
             found["relative_orientation"] = losses.relative_orientation_loss(
                 turns[0], bodies[0], turns[1], bodies[1], present
             )
-        if weights.distance_weight:
-            given = batch.entries, batch.entry_distance_m, chosen, batch.frames.shape[1], weights.entries, generator
-            listed, distance = losses.entries_of_frames(*given)
-            joints, points = self.hands.joints(hands, batch.betas, batch.template_m), place_points(batch, moved)
-            scale_m = batch.contact_threshold_m
-            found["distance_map"] = losses.distance_map_loss(joints, points, listed, distance, scale_m)
         return found
 
 
