@@ -7,7 +7,6 @@ Text2HOI: 1,000 steps, cosine schedule (Nichol and Dhariwal 2021), x0-prediction
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import torch
@@ -18,7 +17,6 @@ from torch import Tensor
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 
 TRAIN_STEPS = 1000
-WHITE_SHARE = 0.02  # of the variance of correlated noise: what moves fast has to start from something too
 Motion = tuple[Tensor, Tensor]
 Denoise = Callable[[Tensor, Tensor, Tensor], Motion]
 
@@ -55,17 +53,10 @@ def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, signal: Tensor) -> Te
     return share.sqrt() * clean + (1 - share).sqrt() * noise
 
 
-def draw_motion(
-    hands_shape: tuple[int, ...],
-    object_shape: tuple[int, ...],
-    generator: torch.Generator,
-    device: torch.device | str = "cpu",
-) -> Motion:
+def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], generator: torch.Generator) -> Motion:
     """Noise of the given shapes (B, ...) from one generator, a row after the other."""
     sizes = [math.prod(shape[1:]) for shape in (hands_shape, object_shape)]
-    return _unflatten(
-        torch.randn(hands_shape[0], sum(sizes), generator=generator).to(device), hands_shape, object_shape
-    )
+    return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
 
 
 def draw_each(longest: tuple[int, int], rows: tuple[int, int], generators: Sequence[torch.Generator]) -> Motion:
@@ -81,17 +72,6 @@ def draw_each(longest: tuple[int, int], rows: tuple[int, int], generators: Seque
         for generator in generators
     ]
     return torch.stack([hands for hands, _ in drawn]), torch.stack([objects for _, objects in drawn])
-
-
-@lru_cache(maxsize=64)
-def noise_factor(rows: int, reach: float) -> Tensor:
-    """(rows, rows) lower-triangular factor that gives white noise a Gaussian correlation over ``reach`` rows.
-
-    The first rows of a longer factor are those of a shorter one, so padding never reaches a motion.
-    """
-    place = torch.arange(rows, dtype=torch.float64)
-    near = torch.exp(-0.5 * ((place[:, None] - place) / reach).square())
-    return torch.linalg.cholesky((1 - WHITE_SHARE) * near + WHITE_SHARE * torch.eye(rows, dtype=torch.float64)).float()
 
 
 @torch.no_grad()

@@ -17,7 +17,7 @@ from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES, OBJECT_POSITION, WRIST
 from models.common.features import Normaliser, proper_hands, proper_object, scaled_text
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
-from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, draw_motion, sample_motion
+from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
 from models.common.transformer import (
     Encoder,
     TransformerConfig,
@@ -259,13 +259,7 @@ class MotionGenerator:
         """
         denoise = guided(self.network, condition, sampler.guidance)
         device = condition.text.device
-        code = self.network.code
-
-        def denoise_white(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
-            return code.whitened(denoise(*code.coloured((hands, objects)), timesteps))
-
-        white = sample_motion(denoise_white, (noise[0].to(device), noise[1].to(device)), sampler, generator)
-        coded = code.coloured(white)
+        coded = sample_motion(denoise, (noise[0].to(device), noise[1].to(device)), sampler, generator)
         hands, objects = self._features(coded, condition)
         shift = objects[:, :1, OBJECT_POSITION].clone()
         hands[..., WRIST] -= shift[:, None]
@@ -278,8 +272,10 @@ class MotionGenerator:
     ) -> Motion:
         """Normalised rows of motions, noised to ``timesteps`` (B,) and denoised by a single call."""
         signal = alphas_cumprod(timesteps.device)
-        noise = self.network.code.coloured(draw_motion(hands.shape, objects.shape, generator, hands.device))
-        noised = [add_noise(clean, add, timesteps, signal) for clean, add in zip((hands, objects), noise, strict=True)]
+        noised = []
+        for clean in (hands, objects):
+            noise = torch.randn(clean.shape, generator=generator)
+            noised.append(add_noise(clean, noise.to(clean.device), timesteps, signal))
         return self._features(self.network(noised[0], noised[1], timesteps, condition), condition)
 
     def _features(self, coded: Motion, condition: Condition) -> Motion:

@@ -25,7 +25,7 @@ from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
-from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod, draw_motion
+from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
 from models.text2hoi.contact_training import CONTACT
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
@@ -164,7 +164,7 @@ class DiffusionObjective:
         keep: Tensor | None,
     ) -> Motion:
         clean = target.hands, target.object
-        noise = self.network.code.coloured(draw_motion(clean[0].shape, clean[1].shape, generator, self.device))
+        noise = [torch.randn(part.shape, generator=generator).to(self.device) for part in clean]
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
         condition = Condition.of(batch, self._object_features(network, batch), text, batch.contact)
         return network(noised[0], noised[1], steps, condition, None if keep is None else keep.to(self.device))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
 from models.common.features import hands_in_object_frame, hands_in_world
-from models.common.sampling import Motion, noise_factor
+from models.common.sampling import Motion
 from models.common.spline import fit_spline, intervals_of, spline_values, stacked_bases
 
 
@@ -21,13 +21,11 @@ from models.common.spline import fit_spline, intervals_of, spline_values, stacke
 class MotionCodeConfig:
     """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
     per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given.
-    noise_frames: over how many frames the noise that motions are made from is correlated; 0 (the paper): not at all.
     """
 
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
-    noise_frames: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,28 +75,6 @@ class MotionCode:
         # A control point moves four intervals; it is there where the hand is in any frame of them.
         touched = stacked_bases([len(thing)], [intervals], len(thing), torch.device("cpu"))[0].T > 0
         return CodedClip(curves, objects, (present.float() @ touched.T.float()) > 0)
-
-    def coloured(self, motion: Motion) -> Motion:
-        """White noise (B, 2, K, 99) and (B, L, 10) as the noise that motions of this code are mixed with."""
-        factors = self._factors(motion)
-        return (factors[0] @ motion[0], factors[1] @ motion[1]) if factors else motion
-
-    def whitened(self, motion: Motion) -> Motion:
-        """The inverse of ``coloured``."""
-        if not (factors := self._factors(motion)):
-            return motion
-        hands, objects = (
-            torch.linalg.solve_triangular(factor, part, upper=False)
-            for factor, part in zip(factors, motion, strict=True)
-        )
-        return hands, objects
-
-    def _factors(self, motion: Motion) -> tuple[Tensor, Tensor] | None:
-        if not self.config.noise_frames:
-            return None
-        reach = self.config.noise_frames / max(1, self.config.knot_frames)
-        hand = noise_factor(motion[0].shape[-2], reach).to(motion[0].device)
-        return hand, noise_factor(motion[1].shape[-2], reach * self.config.object_knots).to(hand.device)
 
     def curves(self, hands: Tensor, objects: Tensor, lengths: Tensor) -> Motion:
         """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper."""

@@ -112,25 +112,6 @@ def test_rows_of_a_hand_that_is_missing_for_a_while_are_marked(batch: ClipBatch)
     assert not present[1 - side].any()
 
 
-def test_correlated_noise_has_unit_spread_its_own_reach_and_an_inverse_that_padding_does_not_reach() -> None:
-    code = MotionCode(replace(OURS, noise_frames=12))
-    draws = torch.Generator().manual_seed(0)
-    white = torch.randn(400, 2, 20, 99, generator=draws), torch.randn(4000, 37, 10, generator=draws)
-    hands, objects = code.coloured(white)
-    for noise, reach in ((hands[:, 0], 3), (objects, 6)):
-        rows = noise.transpose(0, 1).flatten(1).double()
-        found = rows @ rows.T / rows.shape[1]
-        apart = torch.arange(len(rows))[:, None] - torch.arange(len(rows))
-        expected = 0.98 * torch.exp(-0.5 * (apart / reach).square()) + 0.02 * torch.eye(len(rows))
-        assert (found - expected).abs().max() < 0.05
-    back = code.whitened((hands, objects))
-    torch.testing.assert_close(back[0], white[0], atol=1e-3, rtol=0)
-    short = code.coloured((white[0][:, :, :9], white[1][:, :15]))
-    torch.testing.assert_close(short[0], hands[:, :, :9], atol=1e-5, rtol=0)
-    torch.testing.assert_close(short[1], objects[:, :15], atol=1e-5, rtol=0)
-    assert MotionCode(OURS).coloured(white)[0] is white[0]
-
-
 def test_padding_keeps_the_last_pose() -> None:
     bases = stacked_bases([9, 20], [2, 5], 20, torch.device("cpu"))
     torch.testing.assert_close(bases.sum(-1), torch.ones(2, 20))
