@@ -15,6 +15,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.contact.agreement import f1_score
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.metrics.pair import acting_sides
 from hoidata.splits.rules import PARTS
@@ -207,7 +208,7 @@ def _lookup_f1(clips: Clips, every: Clips, pooled: bool) -> float | None:
         maps = [other.touched for other in others]
         return [np.mean(maps, axis=0) >= 0.5] if pooled and maps else maps
 
-    return _mean([_mean([f1(made, clip.touched) for made in found(clip)]) or 0.0 for clip in clips])
+    return _mean([_mean([f1_score(made, clip.touched) for made in found(clip)]) or 0.0 for clip in clips])
 
 
 def _same_prompt(clips: Clips, every: Clips) -> float | None:
@@ -217,12 +218,6 @@ def _same_prompt(clips: Clips, every: Clips) -> float | None:
 
 def _cosine(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-12))
-
-
-def f1(made: np.ndarray, true: np.ndarray) -> float:
-    """F1 of two sets of touched points, (point,) bool; 1 where both are empty."""
-    total = int(made.sum()) + int(true.sum())
-    return 2 * int((made & true).sum()) / total if total else 1.0
 
 
 def _verbs_of(clips: Clips, condition: Condition) -> list[int]:

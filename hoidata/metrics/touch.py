@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from hoidata.clips.clip import FPS, Side
+from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
 from hoidata.hands.model import N_JOINTS
 from hoidata.metrics.pair import Motion, Pair
@@ -25,7 +26,7 @@ CELL_M = 0.002  # of the lattice of lines that volumes are measured along: off b
 def contact_f1(pair: Pair, every: int) -> np.ndarray:
     """(1,) F1 of the contact map the motion makes against that of the reference; 1 where both are empty."""
     del every  # a map is over all frames
-    return _f1(*_maps(pair))
+    return np.array([f1_score(*_maps(pair))])
 
 
 def contact_precision(pair: Pair, every: int) -> np.ndarray:
@@ -48,17 +49,12 @@ def contact_recall(pair: Pair, every: int) -> np.ndarray:
 def adherence(pair: Pair, every: int) -> np.ndarray:
     """(1,) F1 of the contact map the motion makes against the one it was asked for; none where none was asked for."""
     del every
-    return np.zeros(0) if pair.asked is None else _f1(touched_points(pair), pair.asked)
+    return np.zeros(0) if pair.asked is None else np.array([f1_score(touched_points(pair), pair.asked)])
 
 
 def _maps(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     """(point,) bool, what the motion touches and what the reference does."""
     return touched_points(pair), pair.contact.touched
-
-
-def _f1(made: np.ndarray, true: np.ndarray) -> np.ndarray:
-    total = int(made.sum()) + int(true.sum())
-    return np.array([2 * int((made & true).sum()) / total if total else 1.0])
 
 
 def _share(hits: np.ndarray, of: np.ndarray, other: np.ndarray) -> np.ndarray:

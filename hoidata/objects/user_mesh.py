@@ -91,6 +91,8 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
 def _read(path: Path) -> Mesh:
     if path.suffix.lower() not in (".stl", ".glb"):
         return load_mesh(path)
+    if not path.is_file():
+        raise BadInput(path, "a mesh file", "nothing there", "correct the path")
     if path.stat().st_size > LARGEST_MESH_BYTES:
         raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
     try:

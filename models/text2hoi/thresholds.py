@@ -4,16 +4,10 @@ import numpy as np
 import torch
 
 from hoidata.batches.dataset import ClipSample, collate
+from hoidata.contact.agreement import f1_score
 from models.text2hoi.contact import ContactModel
 
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
-
-
-def f1_score(predicted: np.ndarray, true: np.ndarray) -> float:
-    """F1 of boolean maps (point,): 2 TP / (2 TP + FP + FN); 1 where both are empty."""
-    hits = int((predicted & true).sum())
-    total = int(predicted.sum()) + int(true.sum())
-    return 2 * hits / total if total else 1.0
 
 
 def mean_f1(probabilities: np.ndarray, true: np.ndarray, threshold: float) -> float:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.contact.agreement import f1_score
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints
@@ -119,8 +120,7 @@ def _drawn(clip: Clip) -> Clip:
 
 def _agreement(asked: np.ndarray, reached: np.ndarray) -> str:
     """How far two contact maps (point,) agree, in words."""
-    both, total = int((asked & reached).sum()), int(asked.sum()) + int(reached.sum())
-    f1 = 2 * both / total if total else 1.0
+    both, f1 = int((asked & reached).sum()), f1_score(asked, reached)
     return f"{asked.sum()} points asked for, {reached.sum()} reached, {both} of them asked for (F1 {f1:.2f})"
 
 

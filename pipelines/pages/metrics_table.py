@@ -12,10 +12,10 @@ from rich.table import Table
 from hoidata.errors import BadInput
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
+from pipelines.promises import TRUTH
 
 AnyMetric = Metric | FeatureMetric
 ALL_METRICS: tuple[AnyMetric, ...] = (*METRICS, *FEATURE_METRICS)
-TRUTH = "ground-truth"
 LOOKUPS = ("nearest-clip", "prompt-lookup")
 CONTROLS = "controls"
 NO_FIGURE = "-"

@@ -10,6 +10,7 @@ import torch
 
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.clips.clip import SIDES, Clip
+from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.asked import read_asked
@@ -21,7 +22,7 @@ from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
 from models.text2hoi.family import other_prompts
 from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
-from models.text2hoi.thresholds import best_threshold, f1_score, mean_f1
+from models.text2hoi.thresholds import best_threshold, mean_f1
 from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
