@@ -62,6 +62,7 @@ def test_adherence_is_to_the_map_asked_for_and_not_to_the_true_one(make_clip, pa
     assert touch.adherence(replace(pair, asked=made), 1) == [1.0]
     assert touch.adherence(replace(pair, asked=asked), 1) == pytest.approx([2 * kept / (kept + made.sum())])
     assert touch.adherence(with_true(replace(pair, asked=~made), made), 1) == [0.0]
+    assert touch.adherence(with_true(replace(pair, asked=made), ~made), 1) == [1.0]
     assert len(touch.adherence(pair, 1)) == 0
 
 
