@@ -1,7 +1,7 @@
 """Training of the contact network: what one step and one validation are, and what is found on validation clips."""
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
 from models.common.checkpoints import Checkpoint
@@ -14,11 +14,11 @@ from models.text2hoi.thresholds import choose_contact_threshold
 class ContactObjective:
     """Text2HOI Sec. 3.1: cross-entropy, Dice and KL divergence."""
 
-    needs_entries = False
+    frames = entries = 0
 
     def __init__(self, network: ContactModel, weights: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
         self.network, self.weights, self.device = network, weights, device
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+        self.held_out = collate(corpus.held_out).to(device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
@@ -31,12 +31,12 @@ class ContactObjective:
         return contact_loss(logits, contact_map, mean, log_variance, self.weights)
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ContactModel)
         held = self.held_out
         latents = network.draw_latents(8, len(held), torch.Generator().manual_seed(0)).to(self.device)
         probability = network.sample(held.points_m, held.text[:, 0], held.active_hands, latents).mean(1)
-        return float(nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map))
+        return nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map)
 
 
 def contact_threshold(checkpoint: Checkpoint) -> float:

@@ -34,8 +34,6 @@ class DiffusionLossConfig:
 class DiffusionObjective:
     """Text2HOI eq. 4-7."""
 
-    needs_entries = True
-
     def __init__(
         self,
         network: DiffusionModel,
@@ -48,28 +46,27 @@ class DiffusionObjective:
         self.network, self.weights, self.device = network, weights, device
         self.hands, self.normaliser = hands.to(device), normaliser.to(device)
         self.signal = alphas_cumprod(device)
-        self.needs_entries = weights.distance_weight > 0
+        self.frames, self.entries = weights.frames, weights.entries if weights.distance_weight > 0 else 0
         self.features: dict[str, Tensor] = {}
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+        self.held_out = collate(corpus.held_out).to(device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
         keep = torch.rand(len(batch), 2, generator=generator) >= self.network.config.condition_dropout
         predicted = self._denoised(self.network, batch, any_form(batch, generator), steps, generator, keep.float())
         simple = self._simple(predicted, batch)
-        chosen = losses.pick_frames(batch.frames, self.weights.frames, generator)
-        distance, orientation = self._geometry(predicted, batch, chosen, generator)
+        distance, orientation = self._geometry(predicted, batch)
         total = simple + self.weights.distance_weight * distance + self.weights.orientation_weight * orientation
         return {"total": total, "simple": simple, "distance_map": distance, "relative_orientation": orientation}
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, DiffusionModel)
         generator = torch.Generator().manual_seed(0)
-        held, total = self.held_out, 0.0
+        held, total = self.held_out, torch.zeros((), device=self.device)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(held),), step, device=self.device)
-            total += float(self._simple(self._denoised(network, held, held.text[:, 0], steps, generator, None), held))
+            total += self._simple(self._denoised(network, held, held.text[:, 0], steps, generator, None), held)
         return total / len(VALIDATION_STEPS)
 
     def _denoised(
@@ -101,10 +98,9 @@ class DiffusionObjective:
             predicted[1], objects, batch.frames
         )
 
-    def _geometry(
-        self, predicted: tuple[Tensor, Tensor], batch: ClipBatch, chosen: Tensor, generator: torch.Generator
-    ) -> tuple[Tensor, Tensor]:
-        """Distance-map and relative-orientation losses on the chosen frames (B, K)."""
+    def _geometry(self, predicted: tuple[Tensor, Tensor], batch: ClipBatch) -> tuple[Tensor, Tensor]:
+        """Distance-map and relative-orientation losses on the batch's chosen frames (B, K)."""
+        chosen = batch.chosen
         hands, objects = self.normaliser.decode(*predicted)
         hands, objects = losses.take_frames(hands, chosen, 2), losses.take_frames(objects, chosen, 1)
         true_hands = losses.take_frames(batch.hands, chosen, 2)
@@ -119,17 +115,10 @@ class DiffusionObjective:
         )
         if not self.weights.distance_weight:
             return orientation.new_zeros(()), orientation
-        rows, distance = losses.entries_of_frames(
-            batch.entries,
-            batch.entry_distance_m,
-            chosen,
-            batch.frames.shape[1],
-            self.weights.entries,
-            generator,
-        )
         joints = self.hands.joints(hands, batch.betas, batch.template_m)
         points, scale_m = place_points(batch, objects), batch.contact_threshold_m
-        return losses.distance_map_loss(joints, points, rows, distance, scale_m), orientation
+        distance = losses.distance_map_loss(joints, points, batch.entries, batch.entry_distance_m, scale_m)
+        return distance, orientation
 
 
 def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:

@@ -1,7 +1,7 @@
 """Training of the length network: what one step and one validation are."""
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
 from models.common.corpus import Corpus, any_form
@@ -12,11 +12,11 @@ from models.text2hoi.length import LengthConfig, LengthModel, jittered_frames, l
 class LengthObjective:
     """Text2HOI Sec. 4.1, with a likelihood in place of the plain squared error."""
 
-    needs_entries = False
+    frames = entries = 0
 
     def __init__(self, network: LengthModel, corpus: Corpus, device: torch.device) -> None:
         self.network = network
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+        self.held_out = collate(corpus.held_out).to(device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         frames = jittered_frames(batch.lengths, generator)
@@ -24,14 +24,14 @@ class LengthObjective:
         return length_loss(mean, log_spread, frames)
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, LengthModel)
         held = self.held_out
         errors = [
             (network.expected_frames(held.text[:, form], held.active_hands) - held.lengths).abs()
             for form in range(held.text.shape[1])
         ]
-        return float(torch.stack(errors).mean())
+        return torch.stack(errors).mean()
 
 
 LENGTH = Network(

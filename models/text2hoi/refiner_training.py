@@ -2,11 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
+from hoidata.batches.sight import Sight
 from models.common import losses
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
@@ -67,7 +69,7 @@ class RefinerObjective:
     back to the clip's own hands relative to the object. The others are sampled from noise, as in use, where no true
     hands exist: they are to stay near themselves. All are to touch as the clip does, and not to penetrate."""
 
-    needs_entries = False
+    entries = 0
 
     def __init__(
         self,
@@ -80,6 +82,7 @@ class RefinerObjective:
         seed: int,
     ) -> None:
         self.network, self.weights, self.device = network, weights, device
+        self.frames = weights.frames
         self.generator, self.surface = generator, surface
         self.vertices = torch.arange(0, 778, max(1, 778 // weights.vertices), device=device)
         draws = torch.Generator().manual_seed(seed)
@@ -90,25 +93,27 @@ class RefinerObjective:
             for sample, coarse in zip(train, self._make(train, kind, draws), strict=True):
                 self.pool[sample.clip_id].append(coarse)
         held = self._make(held_out, "sampled", torch.Generator().manual_seed(0))
-        self.held_out = self._batch(collate(held_out, with_entries=False).to(device), held)
+        self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         number = torch.randint(self.weights.samples, (len(batch),), generator=generator).tolist()
         motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, number, strict=True)]
-        return self._losses(self.network, self._batch(batch, motions), generator)
+        return self._losses(self.network, self._batch(batch, motions))
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, RefinerModel)
-        found = self._losses(network, self.held_out, torch.Generator().manual_seed(0))
-        return float(found["total"])
+        return self._losses(network, self.held_out)["total"]
 
-    def _losses(self, network: RefinerModel, seen: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
+    def _sight(self, samples: list[ClipSample]) -> Sight:
+        return Sight.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
+
+    def _losses(self, network: RefinerModel, seen: _Comparison) -> dict[str, Tensor]:
         batch, coarse, weights = seen.batch, seen.coarse, self.weights
         refined = network(coarse)
         change = (hands_in_object_frame(refined, coarse.object) - seen.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
-        chosen = losses.pick_frames(batch.frames, weights.frames, generator)
+        chosen = batch.chosen
         present, true = (losses.take_frames(part, chosen, 2) for part in (coarse.present, seen.true_distance_m))
         skin, inner = self._distances(batch, losses.take_frames(refined, chosen, 2), coarse.object, chosen)
         penetration = losses.penetration_loss(skin, present)
@@ -145,7 +150,7 @@ class RefinerObjective:
         made: dict[int, _Coarse] = {}
         for start in range(0, len(order), GENERATED_AT_ONCE):
             rows = order[start : start + GENERATED_AT_ONCE]
-            batch = collate([samples[index] for index in rows], with_entries=False).to(self.device)
+            batch = collate([samples[index] for index in rows]).to(self.device)
             hands, objects = self._generate(batch, kind, draws)
             coarse = self.surface.coarse(batch, hands, objects, batch.contact_map, batch.present)
             own = (batch.hands, batch.object) if kind == "once" else (hands, objects)

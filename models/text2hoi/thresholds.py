@@ -30,7 +30,7 @@ def true_maps(samples: list[ClipSample]) -> np.ndarray:
 @torch.no_grad()
 def contact_probabilities(network: ContactModel, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
     """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
-    batch = collate(samples, with_entries=False)
+    batch = collate(samples)
     latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(seed))
     return network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).mean(1).numpy()
 

@@ -1,10 +1,12 @@
 """Stage train: one network on one dataset, with the record of what it was made from."""
 
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from hoidata.files import sha256_file
 from hoidata.files.atomic import atomic_folder
 from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph
@@ -12,15 +14,21 @@ from pipelines.lineage.provenance import build_provenance
 from pipelines.params import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
 
+THREADS = 2
+
 
 @dataclass(frozen=True)
 class TrainParams:
-    """size: which of the two budgets to take. Each holds a section per network, whose keys the network checks."""
+    """size: which of the two budgets to take. Each holds a section per network, whose keys the network checks.
+
+    processes: how many train one network together; ``training.parts`` says what each step computes.
+    """
 
     size: Literal["demo", "paper"]
     seed: int
     demo: Mapping[str, Any]
     paper: Mapping[str, Any]
+    processes: int = 1
 
     def of(self, network: str) -> dict[str, Any]:
         """The network's section in the chosen size, with the seed; a network without one keeps its defaults."""
@@ -28,28 +36,40 @@ class TrainParams:
 
 
 def run(place: Place) -> None:
-    """Train ``place.model``; a dataset without clips, or without what the network builds on, gives an empty output."""
-    if reason := empty_reason(place.clips):
+    """Train ``place.model``; a dataset without clips, or without what the network builds on, gives an empty output.
+
+    A killed training goes on where it was: what it needs for that, and its losses, lie in ``place.training``.
+    """
+    needed = [place.checkpoints / name for name in load_network(place.model).needs]
+    if reason := next(filter(None, map(empty_reason, [place.clips, *needed])), None):
         write_empty(place.checkpoint, reason)
         return
+    from models.common.team import run_team
+
+    with atomic_folder(place.checkpoint) as partial, tempfile.TemporaryDirectory() as meeting:
+        run_team(train, load_settings(TrainParams, "train").processes, Path(meeting) / "team", place, partial)
+
+
+def train(place: Place, out: Path) -> None:
+    """One process of the training of ``place.model`` into ``out``."""
     from models.common.device import chosen_device
+    from models.common.repeatable import make_repeatable
+    from models.common.team import Team
     from models.common.training import train_network
 
-    network = load_network(place.model)
-    needed = {load_network(name): place.checkpoints / name for name in network.needs}
-    if reason := next(filter(None, map(empty_reason, needed.values())), None):
-        write_empty(place.checkpoint, reason)
-        return
-    params = load_settings(TrainParams, "train").of(network.name)
+    network, settings = load_network(place.model), load_settings(TrainParams, "train")
     stage = producers(read_graph(Path()))[place.checkpoint.as_posix()].name
-    with atomic_folder(place.checkpoint) as partial:
-        train_network(
-            network,
-            place.data,
-            partial,
-            params,
-            load_hands(place.profile),
-            needed=needed,
-            provenance=lambda facts: build_provenance(Path(), stage, facts),
-            device=chosen_device(read_params(Path()).get("device", "auto")),
-        )
+    code = Path("code", "train", f"{network.name}.json")
+    make_repeatable(max(1, THREADS // settings.processes))
+    train_network(
+        network,
+        place.data,
+        out,
+        settings.of(network.name),
+        load_hands(place.profile),
+        needed={load_network(name): place.checkpoints / name for name in network.needs},
+        provenance=lambda facts: build_provenance(Path(), stage, facts),
+        device=Team.joined().device(chosen_device(read_params(Path()).get("device", "auto"))),
+        progress=place.training,
+        code=sha256_file(code) if code.is_file() else "",
+    )
