@@ -37,6 +37,16 @@ def distance_map_loss(
     return ((predicted - distance_m) / scale_m).square().mean()
 
 
+def joint_loss(joints_m: Tensor, true_m: Tensor, mask: Tensor, weight: Tensor, scale_m: float = 0.01) -> Tensor:
+    """Distance of joints (B, 2, F, 21, 3) from the true ones in units of ``scale_m``: squared below one, linear beyond.
+
+    mask (B, 2, F); weight (B, 2, F, 21) of each joint. Both in one frame, metres.
+    """
+    apart = (joints_m - true_m) / scale_m
+    huber = functional.huber_loss(apart, torch.zeros_like(apart), reduction="none").sum(-1)
+    return (huber * weight * mask[..., None]).sum() / (weight * mask[..., None]).sum().clamp_min(1.0)
+
+
 def relative_orientation_loss(
     hand: Tensor, objects: Tensor, true_hand: Tensor, true_object: Tensor, mask: Tensor
 ) -> Tensor:

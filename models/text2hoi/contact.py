@@ -5,8 +5,6 @@ sentence embedding hardly encodes left and right); layers that see per-clip feat
 instead of once per point (the same function); sizes come from the config.
 """
 
-from dataclasses import dataclass, field
-
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -14,33 +12,8 @@ from torch.nn import functional
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from models.common.features import scaled_text
-from models.common.point_net import PointLayer, PointNet, PointNetConfig, normalised_points
-
-HAND_FLAGS = 2
-
-
-@dataclass(frozen=True)
-class ContactConfig:
-    """Sizes; the defaults are the paper's."""
-
-    point_net: PointNetConfig = field(default_factory=PointNetConfig)
-    decoder_widths: tuple[int, int, int] = (512, 256, 128)
-    latent: int = 64
-    text: int = 512
-    dropout: float = 0.0
-
-
-@dataclass(frozen=True)
-class ContactLossConfig:
-    """Weights of KL divergence and Dice term beside the mean cross-entropy.
-
-    augment: turn and scale objects. points: how many points of every object a step sees, drawn anew each time.
-    """
-
-    kl_weight: float = 0.01
-    dice_weight: float = 1.0
-    augment: bool = True
-    points: int = 1024
+from models.common.point_net import PointLayer, PointNet, normalised_points
+from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
 
 
 class ContactModel(nn.Module):
@@ -93,8 +66,9 @@ class ContactModel(nn.Module):
 
     @torch.no_grad()
     def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, N) for latents (count, B, latent) drawn from N(0, I); in evaluation mode."""
-        return torch.stack([self.decode(points_m, text, active_hands, z).sigmoid() for z in latents], 1)
+        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I)."""
+        maps = torch.stack([self.decode(points_m, text, active_hands, z).sigmoid() for z in latents], 1)
+        return maps[:, :, None] * active_hands[:, None, :, None]
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
         """(count, clip, latent) draws from N(0, I)."""

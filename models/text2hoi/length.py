@@ -14,6 +14,7 @@ from hoidata.batches.dataset import MAX_FRAMES
 from models.common.features import scaled_text
 
 SHORTEST_FRAMES = 8
+WIDEST_DRAW = 2.0  # standard deviations; lengths of one verb have limits, a Gaussian has none
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,7 @@ class LengthModel(nn.Module):
         """(B,) whole numbers of frames, 8 to 150, with noise drawn from ``generator``."""
         mean, log_spread = self(text, active_hands)
         noise = torch.randn(len(text), generator=generator, device=generator.device)
+        noise = noise.clamp(-WIDEST_DRAW, WIDEST_DRAW)
         frames = (mean + log_spread.exp() * noise) * MAX_FRAMES
         return frames.round().clamp(SHORTEST_FRAMES, MAX_FRAMES).long()
 

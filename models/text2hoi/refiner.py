@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor, nn
 
-from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, HAND_POSE_6D, HAND_ROTATIONS_6D, WRIST
-from models.common.features import object_position_m, object_rotmat, proper_hands
+from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, WRIST
+from models.common.features import hands_in_object_frame, hands_in_world, proper_hands
+from models.common.spline import projected
 from models.common.transformer import (
     Encoder,
     TransformerConfig,
     agent_codes,
     attention_mask_of,
     sinusoid,
-    smoothed,
     to_frames,
     to_tokens,
 )
@@ -34,8 +34,8 @@ REACH_M = 0.05
 class RefinerConfig:
     """transformer: its sizes. contact_map: also read the raw contact map and the norms of the placed points (paper).
 
-    wrist_reach_m, rotation_reach: what an output of one means for the wrist and for a 6D number. smoothing_frames: the
-    residual is smoothed over time by a Gaussian of this deviation, so that corrections never jitter.
+    wrist_reach_m, rotation_reach: what an output of one means for the wrist and for a 6D number. knot_frames: the
+    residual becomes the nearest spline with a knot every so many frames (0: stays), so that corrections never jitter.
     """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
@@ -43,7 +43,7 @@ class RefinerConfig:
     points: int = 1024
     wrist_reach_m: float = 0.05
     rotation_reach: float = 0.3
-    smoothing_frames: float = 0.0
+    knot_frames: int = 0
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,8 @@ class CoarseMotion:
     """What the refiner sees: hands (B, 2, F, 99) and object (B, F, 10) in metres; and in the object's frame joints_m
     (B, 2, F, 21, 3), their signed distance_m (B, 2, F, 21) and offset_m to the nearest surface point (B, 2, F, 21, 3).
 
-    present (B, 2, F) masks; points_m (B, N, 3) the object's sampled points; contact_map (B, N) the contact map.
+    present (B, 2, F) masks; points_m (B, N, 3) the object's sampled points; contact_map (B, N) the contact map; counts:
+    how many frames each motion has.
     """
 
     hands: Tensor
@@ -62,31 +63,12 @@ class CoarseMotion:
     present: Tensor
     points_m: Tensor
     contact_map: Tensor
+    counts: tuple[int, ...]
 
 
 def attention_map(offset_m: Tensor) -> Tensor:
     """exp(-50 |D|) per axis of the displacement to the nearest surface point (Text2HOI Sec. 3.3; GRIP)."""
     return torch.exp(-ATTENTION_RATE_PER_M * offset_m.abs())
-
-
-def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
-    """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation; fingers unchanged."""
-    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
-    return _moved(hands, rotation.transpose(-1, -2), position)
-
-
-def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
-    """The inverse of :func:`hands_in_object_frame`."""
-    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
-    back = -(position[..., None, :] @ rotation)[..., 0, :]
-    return _moved(hands, rotation, back)
-
-
-def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
-    """Wrist and global 6D turned by ``rotation`` about ``origin``."""
-    wrist = (rotation @ (hands[..., WRIST] - origin)[..., None])[..., 0]
-    columns = rotation @ hands[..., GLOBAL_ORIENT_6D].unflatten(-1, (3, 2))
-    return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
 
 
 class RefinerModel(nn.Module):
@@ -124,7 +106,9 @@ class RefinerModel(nn.Module):
         attention_mask[:, 0] |= ~attention_mask.any(1)
         both = self.encoder(tokens.flatten(1, 2), attention_mask).unflatten(1, tokens.shape[1:3]).unbind(1)
         change = [to_frames(layer(x), n_frames, k) for layer, x in zip(self.hands_out, both, strict=True)]
-        residual = smoothed(torch.stack(change, 1), coarse.present.any(1), self.config.smoothing_frames)
+        residual = torch.stack(change, 1)
+        if self.config.knot_frames:
+            residual = projected(residual, list(coarse.counts), self.config.knot_frames)
         return hands_in_world(local + residual * self.reach, coarse.object)
 
     def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:

@@ -12,10 +12,11 @@ from hoidata.batches.sight import Sight
 from models.common import losses
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
+from models.common.features import hands_in_object_frame
 from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
-from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame
+from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
 from models.text2hoi.surface import Surface
 
 GENERATED_AT_ONCE = 32
@@ -84,6 +85,7 @@ class RefinerObjective:
         self.network, self.weights, self.device = network, weights, device
         self.frames = weights.frames
         self.generator, self.surface = generator, surface
+        self.targets = Targets(generator.network.code, generator.normaliser, device)
         self.vertices = torch.arange(0, 778, max(1, 778 // weights.vertices), device=device)
         draws = torch.Generator().manual_seed(seed)
         train, held_out = list(corpus.train), corpus.held_out
@@ -141,6 +143,7 @@ class RefinerObjective:
             for name in ("target", "true_distance_m")
         )
         common = {"present": batch.present, "points_m": batch.points_m, "contact_map": batch.contact_map}
+        common["counts"] = batch.counts
         return _Comparison(batch, CoarseMotion(object=objects, **hands, **common), target, true)
 
     @torch.no_grad()
@@ -166,13 +169,15 @@ class RefinerObjective:
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
         form = torch.randint(batch.text.shape[1], (len(batch),), generator=draws).to(self.device)
         text = batch.text[torch.arange(len(batch), device=form.device), form]
-        condition = Condition.of(batch, self.generator.network.object_feature(batch.points_m), text, batch.contact_map)
+        network = self.generator.network
+        condition = Condition.of(batch, network.object_feature(batch.points_m), text, batch.contact)
+        rows = self.targets.of(batch)
         if kind == "sampled":
             sampler = SamplerConfig(steps=self.weights.sampler_steps)
-            noise = draw_motion(batch.hands.shape, batch.object.shape, draws)
+            noise = draw_motion(rows.hands.shape, rows.object.shape, draws)
             return self.generator.sample(condition, sampler, noise, draws)
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=draws).to(self.device)
-        return self.generator.denoise_once(batch.hands, batch.object, steps, condition, draws)
+        return self.generator.denoise_once(rows.hands, rows.object, steps, condition, draws)
 
 
 def _refiner_objective(setup: Setup) -> tuple[Objective, None]:

@@ -11,9 +11,15 @@ TRANSFORMER = {
 }  # fmt: skip
 BUDGET = {"steps": 2, "batch": 2, "learning_rate": 0.001, "validate_every": 1, "ema_decay": 0.5}
 PARAMS = {
-    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
+    "contact": {
+        "network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "drawn_by": "anchor"},
+        "training": BUDGET,
+    },
     "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
-    "diffusion": {"network": {"transformer": TRANSFORMER, "contact_input": "moments"}, "training": BUDGET},
+    "diffusion": {
+        "network": {"transformer": TRANSFORMER, "contact_input": "tokens", "motion": {"knot_frames": 4}},
+        "training": BUDGET,
+    },
     "refiner": {
         "network": {"transformer": TRANSFORMER, "contact_map": False},
         "training": BUDGET,
