@@ -166,6 +166,7 @@ class TestText2Hoi:
             active_hands=torch.ones(1, 2, dtype=torch.bool),
             lengths=torch.tensor([150]),
             counts=(150,),
+            sides=(True, True),
         )
         with torch.no_grad():
             steps = torch.zeros(1, dtype=torch.long)

@@ -52,8 +52,8 @@ class RequestBatch:
     """Requests padded to the longest of them; tensors, padding is zero.
 
     objects: the model of each. text (B, ...) features of sentences. points_m, normals (B, N, 3), part (B, N).
-    active_hands (B, 2). frames (B, F): True where a motion has a frame. lengths (B,), and the same as plain numbers in
-    counts, which no device has to be waited for. betas (B, 2, 10).
+    active_hands (B, 2). frames (B, F): True where a motion has a frame. lengths (B,). Two of them also as plain values,
+    for which no device has to be waited: counts, the lengths, and sides, whether each acts in any. betas (B, 2, 10).
     template_m (B, 2, 778, 3) or None. hinge_axis, hinge_origin_m (B, 3), zero for rigid objects; articulated (B,).
     """
 
@@ -66,6 +66,7 @@ class RequestBatch:
     frames: Tensor
     lengths: Tensor
     counts: tuple[int, ...]
+    sides: tuple[bool, bool]
     betas: Tensor
     template_m: Tensor | None
     hinge_axis: Tensor
@@ -113,7 +114,8 @@ def conditions(asked: Sequence[Any], objects: Sequence[ObjectModel], lengths: np
     }
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
     templates = _batch_templates([item.template_m for item in asked])
-    return {"objects": tuple(objects), "counts": tuple(lengths.tolist()), "template_m": templates, **tensors}
+    plain = {"counts": tuple(lengths.tolist()), "sides": tuple(arrays["active_hands"].any(0).tolist())}
+    return {"objects": tuple(objects), "template_m": templates, **plain, **tensors}
 
 
 def _batch_templates(templates: Sequence[np.ndarray | None]) -> Tensor | None:

@@ -81,6 +81,15 @@ def contact_loss(
     return masked_mean(2 * functional.huber_loss(apart, torch.zeros_like(apart), reduction="none", delta=3.0), near)
 
 
+def surface_loss(distance_m: Tensor, mask: Tensor, threshold_m: float, scale_m: float = 1.0) -> Tensor:
+    """Eq. 11 as written: squared distances to the surface of the joints closer to it than ``threshold_m``.
+
+    Signed distances (B, 2, F, 21), mask (B, 2, F).
+    """
+    near = touching_joints(distance_m, threshold_m) & (mask[..., None] > 0)
+    return masked_mean((distance_m / scale_m).square(), near)
+
+
 def touching_joints(distance_m: Tensor, threshold_m: float) -> Tensor:
     """Joints closer than ``threshold_m`` to the surface, on either side of it."""
     return distance_m.abs() < threshold_m

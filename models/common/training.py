@@ -221,7 +221,11 @@ def _add_gradients(
             total += buffer / of
         for name, value in found.items():
             state.running[name] = state.running.get(name, 0) + value.detach() / of
-    team.add_up([*after, *(p.grad for p in state.network.parameters() if p.grad is not None)])
+    learnt = [parameter for parameter in state.network.parameters() if parameter.requires_grad]
+    for parameter in learnt:
+        # What a batch did not use (hands that are in none of its clips) has moments like all else, in every process.
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    team.add_up([*after, *(parameter.grad for parameter in learnt if parameter.grad is not None)])
     for buffer, total in zip(statistics, after, strict=True):
         buffer.copy_(total)
 

@@ -1,16 +1,21 @@
 """Training of the contact network: what one step and one validation are, and what is found on validation clips."""
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.batches.requests import RequestBatch
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss
 from models.text2hoi.contact import ContactModel, contact_loss, turned_and_scaled
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.thresholds import choose_contact_threshold
+from models.text2hoi.thresholds import ContactNetwork, choose_contact_threshold
+
+DrawContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
 
 
 class ContactObjective:
@@ -53,6 +58,27 @@ def contact_network(config: ContactConfig) -> ContactModel | AnchoredContact:
 def contact_threshold(checkpoint: Checkpoint) -> float:
     """The probability from which a point counts as touched, chosen on validation clips with the contact network."""
     return float(checkpoint.info["results"]["contact_threshold"])
+
+
+def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
+    """(B, 2, N) one map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, D) as the network draws them.
+
+    Where no point reaches the threshold the likeliest ones count.
+    """
+    network = checkpoint.network
+    assert isinstance(network, ContactNetwork)
+    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device))[:, 0]
+    limit = probability.amax(-1, keepdim=True).clamp_max(contact_threshold(checkpoint))
+    return ((probability >= limit) & batch.active_hands[..., None]).float()
+
+
+def contact_drawer(checkpoint: Checkpoint) -> DrawContact:
+    """Draws maps for the motions of a batch from a trained contact network, as sampling does."""
+    network = checkpoint.network
+    assert isinstance(network, ContactNetwork)
+    return lambda batch, text, generator: touched_maps(
+        checkpoint, batch, text, network.draw_latents(1, len(batch), generator)
+    )
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:

@@ -26,7 +26,7 @@ from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
-from models.text2hoi.contact_training import CONTACT
+from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawer
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
 from models.text2hoi.thresholds import ContactNetwork
@@ -38,18 +38,22 @@ OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT
 
 @dataclass(frozen=True)
 class DiffusionLossConfig:
-    """Weights beside the simple loss (1): eq. 6 in contact thresholds, eq. 7. frames: how many of a clip they see.
+    """Weights beside the simple loss (1): eq. 6 and eq. 7. frames: how many of a clip they see; entries: of eq. 6.
 
-    Switches: weighting "grouped" counts wrist, palm and fingers alike, and the object's position, rotation and hinge,
-    not every number alike. velocity_weight: of the same error of differences of rows. joint_weight: of joints in the
-    object's frame, those that touch counting ``touch_weight`` more.
+    contact: the map a motion is shown: drawn from the contact network, as in use, or the clip's own (released).
+    distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
+    mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
+    the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
+    ``touch_weight`` more.
     """
 
     distance_weight: float = 1.0
     orientation_weight: float = 1.0
     frames: int = 8
     entries: int = 8192
-    weighting: Literal["even", "grouped"] = "even"
+    contact: Literal["estimated", "recorded"] = "estimated"
+    distance_unit: Literal["metre", "threshold"] = "metre"
+    weighting: Literal["sum", "even", "grouped"] = "sum"
     velocity_weight: float = 0.0
     joint_weight: float = 0.0
     touch_weight: float = 4.0
@@ -115,8 +119,10 @@ class DiffusionObjective:
         hands: Hands,
         normaliser: Normaliser,
         device: torch.device,
+        drawn: DrawContact | None = None,
     ) -> None:
-        self.network, self.weights, self.device = network, weights, device
+        """drawn: draws contact maps for the motions of a batch; without it the clips' own are shown."""
+        self.network, self.weights, self.device, self.drawn = network, weights, device, drawn
         self.hands, self.normaliser = hands.to(device), normaliser.to(device)
         self.signal = alphas_cumprod(device)
         self.frames, self.entries = weights.frames, weights.entries if weights.distance_weight > 0 else 0
@@ -166,7 +172,8 @@ class DiffusionObjective:
         clean = target.hands, target.object
         noise = [torch.randn(part.shape, generator=generator).to(self.device) for part in clean]
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
-        condition = Condition.of(batch, self._object_features(network, batch), text, batch.contact)
+        contact = self.drawn(batch, text, generator) if self.drawn else batch.contact
+        condition = Condition.of(batch, self._object_features(network, batch), text, contact)
         return network(noised[0], noised[1], steps, condition, None if keep is None else keep.to(self.device))
 
     def _object_features(self, network: DiffusionModel, batch: ClipBatch) -> Tensor:
@@ -204,7 +211,7 @@ class DiffusionObjective:
         hands = code.in_world(own, moved)
         if weights.distance_weight:
             joints, points = self.hands.joints(hands, batch.betas, batch.template_m), place_points(batch, moved)
-            scale_m = batch.contact_threshold_m
+            scale_m = batch.contact_threshold_m if weights.distance_unit == "threshold" else 1.0
             given = batch.entries, batch.entry_distance_m
             found["distance_map"] = losses.distance_map_loss(joints, points, *given, scale_m)
         if weights.orientation_weight:
@@ -218,10 +225,10 @@ class DiffusionObjective:
 
 
 def feature_shares(weighting: str, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Shares of a hand's 99 and an object's 10 numbers in the loss; each sums to one."""
+    """Shares of a hand's 99 and an object's 10 numbers in the loss; each sums to one, but for "sum"."""
     shares = []
     for size, groups in ((HAND_FEATURES, HAND_GROUPS), (OBJECT_FEATURES, OBJECT_GROUPS)):
-        share = torch.full((size,), 1 / size, device=device)
+        share = torch.full((size,), 1.0 if weighting == "sum" else 1 / size, device=device)
         for group in groups if weighting == "grouped" else ():
             share[group] = 1 / (len(groups) * (group.stop - group.start))
         shares.append(share)
@@ -241,9 +248,13 @@ def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net)).to(setup.device)
     network.object_net.load_state_dict(contact.object_net.state_dict())
     coded = [network.code.encode(sample) for sample in setup.corpus.train]
-    normaliser = Normaliser.of([(own.hands, own.object, own.present) for own in coded])
+    normaliser = Normaliser.nothing()
+    if network.config.normalised:
+        normaliser = Normaliser.of([(own.hands, own.object, own.present) for own in coded])
     normaliser = normaliser.spread_to(network.config.signal_scale).to(setup.device)
-    return DiffusionObjective(network, setup.loss, setup.corpus, setup.hands, normaliser, setup.device), normaliser
+    drawn = contact_drawer(setup.trained["contact"]) if setup.loss.contact == "estimated" else None
+    given = setup.loss, setup.corpus, setup.hands, normaliser, setup.device, drawn
+    return DiffusionObjective(network, *given), normaliser
 
 
 DIFFUSION = Network(

@@ -11,7 +11,7 @@ from hoidata.files.atomic import atomic_folder
 from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph
 from pipelines.lineage.provenance import build_provenance
-from pipelines.params import read_params
+from pipelines.params import laid_over, read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
 
 THREADS = 2
@@ -19,20 +19,26 @@ THREADS = 2
 
 @dataclass(frozen=True)
 class TrainParams:
-    """size: which of the two budgets to take. Each holds a section per network, whose keys the network checks.
+    """preset: which method; size: which sizes and budgets, laid over it. Each has a section per network, whose keys the
+    network checks.
 
     processes: how many train one network together; ``training.parts`` says what each step computes.
     """
 
-    size: Literal["demo", "paper"]
+    preset: Literal["paper", "released", "ours"]
+    size: Literal["small", "full"]
     seed: int
-    demo: Mapping[str, Any]
     paper: Mapping[str, Any]
+    released: Mapping[str, Any]
+    ours: Mapping[str, Any]
+    small: Mapping[str, Any]
+    full: Mapping[str, Any]
     processes: int = 1
 
     def of(self, network: str) -> dict[str, Any]:
-        """The network's section in the chosen size, with the seed; a network without one keeps its defaults."""
-        return {**getattr(self, self.size).get(network, {}), "seed": self.seed}
+        """The network's settings by preset and size, with the seed; a network without any keeps its defaults."""
+        method, size = (getattr(self, name).get(network) or {} for name in (self.preset, self.size))
+        return {**laid_over(method, size), "seed": self.seed}
 
 
 def run(place: Place) -> None:

@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-import yaml
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
@@ -22,11 +20,13 @@ from models.registry import load_network
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
 from models.text2hoi.thresholds import best_threshold, contact_probabilities, f1_score, true_maps
+from pipelines.stages.base import load_settings
+from pipelines.stages.train import TrainParams
 from tests.builders.stores import write_annotated
 from tests.models.conftest import BOX, make_clip
 from tests.models.conftest import Plan as ToyPlan
 
-DEMO: Mapping[str, Any] = yaml.safe_load(Path("params.yaml").read_text())["train"]["demo"]
+DELIVERED = load_settings(TrainParams, "train")
 STEPS = {"contact": (300, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
 
 
@@ -56,8 +56,8 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> Learnt:
 
 
 def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module]) -> tuple[nn.Module, Any]:
-    """The network with the demo's settings, but for its budget and the dropout, which is against knowing by heart."""
-    plan = Plan.of(network, DEMO[network.name])
+    """The network with the delivered settings but for its budget, and without dropout, which is against knowing."""
+    plan = Plan.of(network, DELIVERED.of(network.name))
     config = replace(plan.network, dropout=0.0) if hasattr(plan.network, "dropout") else plan.network
     steps, size, rate = STEPS[network.name]
     trained = {name: SimpleNamespace(network=own) for name, own in before.items()}

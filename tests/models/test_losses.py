@@ -144,7 +144,7 @@ def test_length_and_contact_losses_by_hand() -> None:
     wider = length_loss(torch.tensor([0.5]), torch.tensor([1.0]), torch.tensor([150]))
     assert float(wider["likelihood"]) == pytest.approx(1 + 0.125 * np.exp(-2))
     logits, touched, latent = torch.full((1, 4), 20.0), torch.tensor([[1.0, 1, 0, 0]]), torch.ones(1, 2)
-    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig())
+    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig(reduction="mean"))
     # Everything is called touched: 1 - (2 x 2 + 1) / (4 + 2 + 1); half of points wrong by 20; two latents of mean 1.
     expected = [1 - 5 / 7, 10.0, 1.0]
     assert [float(found[name]) for name in ("dice", "cross_entropy", "kl")] == pytest.approx(expected, rel=1e-4)
