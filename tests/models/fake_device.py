@@ -6,7 +6,6 @@ torch's FakeTensorMode knows shape and device of every tensor but no value: a ho
 GPU.
 """
 
-import copy
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -53,7 +52,7 @@ def moved(module: nn.Module, device: Any) -> nn.Module:
         for table in (part._parameters, part._buffers):
             for name, old in table.items():
                 if old is not None:
-                    new = old.detach().to(device)
+                    new = torch.empty(old.shape, dtype=old.dtype, device=device)
                     table[name] = nn.Parameter(new, old.requires_grad) if isinstance(old, nn.Parameter) else new
     return module
 
@@ -76,9 +75,12 @@ def paths(root: Path, checkpoints: Path) -> Iterator[tuple[str, Callable[[], obj
 
 
 def on_device(stored: dict[str, Checkpoint]) -> dict[str, Checkpoint]:
-    """Checkpoints as ``load_checkpoint`` gives them there; files cannot be read where tensors hold no data."""
+    """Networks as ``load_checkpoint`` gives them there; files cannot be read where tensors hold no data."""
+    made = {network.name: network.build(stored[network.name].network.config) for network in NETWORKS}
     return {
-        name: Checkpoint(copy.deepcopy(own.network).to(DEVICE), own.normaliser and own.normaliser.to(DEVICE), own.info)
+        name: Checkpoint(
+            made[name].to(DEVICE).eval().requires_grad_(False), own.normaliser and own.normaliser.to(DEVICE), own.info
+        )
         for name, own in stored.items()
     }
 
