@@ -12,8 +12,8 @@ HAND_FLAGS = 2
 class ContactConfig:
     """Sizes; the defaults are the paper's.
 
-    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or an anchor,
-    one touched point for each hand (``anchored_contact``), which gives a map for each.
+    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or anchors,
+    touched points of each hand drawn one after the other (``anchored_contact``), which gives a map for each.
     """
 
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
@@ -22,6 +22,7 @@ class ContactConfig:
     text: int = 512
     dropout: float = 0.0
     drawn_by: Literal["latent", "anchor"] = "latent"
+    anchors: int = 4
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.sampling import SamplerConfig, draw_each
-from models.text2hoi.contact_training import contact_threshold
+from models.text2hoi.contact_training import draw_threshold
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import motion_generator
 from models.text2hoi.length import LengthModel
@@ -157,6 +157,6 @@ class Text2Hoi:
         assert isinstance(network, ContactNetwork)
         latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1).to(self.device)
         probability = network.sample(batch.points_m, batch.text, batch.active_hands, latents)[:, 0]
-        limit = torch.tensor(contact_threshold(self.trained["contact"]), device=self.device)
+        limit = torch.tensor(draw_threshold(self.trained["contact"]), device=self.device)
         touched = probability >= torch.minimum(probability.amax(-1, keepdim=True), limit)
         return (touched & batch.active_hands[..., None]).float()
