@@ -12,7 +12,7 @@ from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import laid_over, read_params
-from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
 THREADS = 2
 
@@ -41,41 +41,41 @@ class TrainParams:
         return {**laid_over(method, size), "seed": self.seed}
 
 
-def run(place: Place) -> None:
-    """Train ``place.model``; a dataset without clips, or without what the network builds on, gives an empty output.
+def run(paths: StagePaths) -> None:
+    """Train ``paths.model``; a dataset without clips, or without what the network builds on, gives an empty output.
 
-    A killed training goes on where it was: what it needs for that, and its losses, lie in ``place.training``.
+    A killed training goes on where it was: what it needs for that, and its losses, lie in ``paths.training``.
     """
-    needed = [place.checkpoints / name for name in load_network(place.model).needs]
-    if reason := next(filter(None, map(empty_reason, [place.clips, *needed])), None):
-        write_empty(place.checkpoint, reason)
+    needed = [paths.checkpoints / name for name in load_network(paths.model).needs]
+    if reason := next(filter(None, map(empty_reason, [paths.clips, *needed])), None):
+        write_empty(paths.checkpoint, reason)
         return
     from models.common.team import run_team
 
-    with atomic_folder(place.checkpoint) as partial, tempfile.TemporaryDirectory() as meeting:
-        run_team(train, load_settings(TrainParams, "train").processes, Path(meeting) / "team", place, partial)
+    with atomic_folder(paths.checkpoint) as partial, tempfile.TemporaryDirectory() as meeting:
+        run_team(train, load_settings(TrainParams, "train").processes, Path(meeting) / "team", paths, partial)
 
 
-def train(place: Place, out: Path) -> None:
-    """One process of the training of ``place.model`` into ``out``."""
+def train(paths: StagePaths, out: Path) -> None:
+    """One process of the training of ``paths.model`` into ``out``."""
     from models.common.device import chosen_device
     from models.common.repeatable import make_repeatable
     from models.common.team import Team
     from models.common.training import train_network
 
-    network, settings = load_network(place.model), load_settings(TrainParams, "train")
-    stage = producers(read_graph(Path()))[place.checkpoint.as_posix()].name
+    network, settings = load_network(paths.model), load_settings(TrainParams, "train")
+    stage = producers(read_graph(Path()))[paths.checkpoint.as_posix()].name
     code = Path("code", "train", f"{network.name}.json")
     make_repeatable(max(1, THREADS // settings.processes))
     train_network(
         network,
-        place.data,
+        paths.data,
         out,
         settings.of(network.name),
-        load_hands(place.profile),
-        needed={load_network(name): place.checkpoints / name for name in network.needs},
+        load_hands(paths.profile),
+        needed={load_network(name): paths.checkpoints / name for name in network.needs},
         provenance=lambda facts: build_provenance(Path(), stage, facts),
         device=Team.joined().device(chosen_device(read_params(Path()).get("device", "auto"))),
-        progress=place.training,
+        progress=paths.training,
         code=sha256_file(code) if code.is_file() else "",
     )
