@@ -6,6 +6,7 @@ from prefect import flow
 
 from pipelines.params import read_params
 from pipelines.repro import reproduce
+from pipelines.side_by_side import log_of
 
 
 class GraphError(RuntimeError):
@@ -14,9 +15,9 @@ class GraphError(RuntimeError):
 
 def run_target(targets: list[str]) -> None:
     """Preflight and ``dvc repro``. Raises GraphError so that the flow run counts as failed."""
-    code = reproduce(targets)
-    if code:
-        raise GraphError(f"dvc repro {' '.join(targets)} ended with exit code {code}")
+    run = reproduce(targets)
+    if run.failed:
+        raise GraphError("\n".join(f"{name} failed; see {log_of(name)}" for name in run.failed))
 
 
 @flow(name="annotate-arctic")

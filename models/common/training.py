@@ -84,7 +84,7 @@ def train_network(
     *,
     needed: Mapping[Network, str | Path] | None = None,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
-    threads: int = 2,
+    threads: int = 1,
     device: str = "cpu",
 ) -> Path:
     """Train one network on the training clips of one dataset; the path of what was written.

@@ -9,12 +9,16 @@ from pipelines.commands.project import enter_project
 
 def repro(
     targets: Annotated[list[str] | None, typer.Argument(help="Stages, e.g. annotate@embedded-arctic.")] = None,
+    jobs: Annotated[int, typer.Option(help="Stages at once; 0: one per core, at most 4.", min=0)] = 0,
 ) -> None:
-    """Check that the raw files a run needs are there, then `dvc repro`."""
+    """Check that the raw files a run needs are there, then bring the graph up to date, stages side by side."""
     enter_project()
     from pipelines.repro import reproduce
+    from pipelines.side_by_side import describe_run
 
-    raise typer.Exit(reproduce(targets or []))
+    run = reproduce(targets or [], jobs)
+    print(describe_run(run))
+    raise typer.Exit(1 if run.failed else 0)
 
 
 def up() -> None:

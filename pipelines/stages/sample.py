@@ -23,7 +23,7 @@ def sample(place: Place, params: dict, family: str) -> None:
 
     section = dict(params.get("sample") or {})
     settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
-    make_repeatable(0, threads=2)
+    make_repeatable(0, threads=1)
     counts = sample_family(
         load_family(family),
         place.data,
