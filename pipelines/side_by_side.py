@@ -193,7 +193,7 @@ class _Children:
     def run(self, name: str) -> int:
         """DVC's exit code for one stage; what it prints goes to the stage's log."""
         LOGS.mkdir(parents=True, exist_ok=True)
-        process = self.context.Process(target=_run_single_stage, args=(name, log_of(name), self.cores))
+        process = self.context.Process(target=_run_single_stage, args=(Path.cwd(), name, self.cores))
         process.start()
         self.processes.add(process)
         process.join()
@@ -204,13 +204,14 @@ def _stop(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _run_single_stage(name: str, log: Path, cores: int) -> None:
+def _run_single_stage(project: Path, name: str, cores: int) -> None:
     """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
     from dvc.cli import main
 
     os.setpgrp()
+    os.chdir(project)
     os.environ["HOIDATA_JOBS"] = str(cores)
-    with log.open("wb") as output:
+    with log_of(name).open("wb") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
     sys.exit(main(["--wait-for-lock", "repro", "--single-item", name]))
