@@ -10,7 +10,7 @@ from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import read_params
-from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
 
 @dataclass(frozen=True)
@@ -27,28 +27,28 @@ class TrainParams:
         return {**getattr(self, self.size).get(network, {}), "seed": self.seed}
 
 
-def run(place: Place) -> None:
-    """Train ``place.model``; a dataset without clips, or without what the network builds on, gives an empty output."""
-    if reason := empty_reason(place.clips):
-        write_empty(place.checkpoint, reason)
+def run(paths: StagePaths) -> None:
+    """Train ``paths.model``; a dataset without clips, or without what the network builds on, gives an empty output."""
+    if reason := empty_reason(paths.clips):
+        write_empty(paths.checkpoint, reason)
         return
     from models.common.device import chosen_device
     from models.common.training import train_network
 
-    network = load_network(place.model)
-    needed = {load_network(name): place.checkpoints / name for name in network.needs}
+    network = load_network(paths.model)
+    needed = {load_network(name): paths.checkpoints / name for name in network.needs}
     if reason := next(filter(None, map(empty_reason, needed.values())), None):
-        write_empty(place.checkpoint, reason)
+        write_empty(paths.checkpoint, reason)
         return
     params = load_settings(TrainParams, "train").of(network.name)
-    stage = producers(read_graph(Path()))[place.checkpoint.as_posix()].name
-    with atomic_folder(place.checkpoint) as partial:
+    stage = producers(read_graph(Path()))[paths.checkpoint.as_posix()].name
+    with atomic_folder(paths.checkpoint) as partial:
         train_network(
             network,
-            place.data,
+            paths.data,
             partial,
             params,
-            load_hands(place.profile),
+            load_hands(paths.profile),
             needed=needed,
             provenance=lambda facts: build_provenance(Path(), stage, facts),
             device=chosen_device(read_params(Path()).get("device", "auto")),
