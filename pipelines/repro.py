@@ -18,16 +18,18 @@ from pipelines.stages.raw import require_hand, write_generated
 MOST_JOBS = 4  # a stage can take a gigabyte or two of memory
 
 
-def reproduce(targets: list[str], jobs: int = 0, wrap: Callable[[RunStage], RunStage] | None = None) -> Run:
+def reproduce(
+    targets: list[str], jobs: int = 0, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
+) -> Run:
     """Preflight, then the targets (all when empty), up to ``jobs`` stages at once; 0: one per core, at most 4.
 
-    wrap: see :func:`reproduce_side_by_side`.
+    wrap, force: see :func:`reproduce_side_by_side`.
 
     Raises MissingResource before DVC starts when raw or MANO files that a stale stage needs are absent.
     """
     preflight()
     os.environ.update(stage_environment())
-    return reproduce_side_by_side(targets, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))), wrap)
+    return reproduce_side_by_side(targets, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))), wrap, force)
 
 
 def stage_environment() -> dict[str, str]:

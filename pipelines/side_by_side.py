@@ -39,10 +39,13 @@ class Run:
     wall: float = 0.0
 
 
-def reproduce_side_by_side(targets: list[str], jobs: int, wrap: Callable[[RunStage], RunStage] | None = None) -> Run:
+def reproduce_side_by_side(
+    targets: list[str], jobs: int, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
+) -> Run:
     """Bring the targets (all when empty) up to date, up to ``jobs`` stages at once. Bytes do not depend on ``jobs``.
 
     wrap: makes of the function that runs one stage the one that is called for each, for instance a Prefect task.
+    force: run the targets (all that is needed when empty) even where DVC finds nothing changed.
     A stage that fails stops what follows from it and nothing else. Raises BadInput when another run is under way here.
     """
     # Left in the opposite order: running stages are stopped before the threads that wait for them are.
@@ -50,24 +53,32 @@ def reproduce_side_by_side(targets: list[str], jobs: int, wrap: Callable[[RunSta
         run_stage = wrap(children.run) if wrap else children.run
         start, run = time.monotonic(), Run()
         if _timed(CODE, run_stage, run) == 0:
-            upstream = stale_stages(targets)
+            upstream = stale_stages(targets, children.forced if force else None)
             run_all(upstream, pool, jobs, run_stage, run)
             write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
         run.wall = time.monotonic() - start
         return run
 
 
-def stale_stages(targets: list[str]) -> dict[str, frozenset[str]]:
-    """Stages the targets need that DVC finds changed, and all that follow from them, each with those it waits for."""
+def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str, frozenset[str]]:
+    """Stages the targets need that DVC finds changed, and all that follow from them, each with those it waits for.
+
+    forced: filled with the names of the targets, which then count as changed.
+    """
     import networkx
     from dvc.repo import Repo
     from dvc.repo.reproduce import collect_stages, get_active_graph, plan_repro
 
     with Repo() as repo, repo.lock:
         graph = get_active_graph(repo.index.graph)
-        stages = plan_repro(graph, collect_stages(repo, targets or ["dvc.yaml"]))
+        asked = collect_stages(repo, targets or ["dvc.yaml"])
+        stages = plan_repro(graph, asked)
         needed = graph.subgraph(stages)
-        changed = [stage for stage in stages if stage.addressing != CODE and stage.changed()]
+        if forced is not None:
+            forced.update(stage.addressing for stage in (asked if targets else stages))
+        known = {CODE, *(forced or ())}
+        changed = [stage for stage in stages if stage.addressing not in known and stage.changed()]
+        changed += [stage for stage in stages if stage.addressing in known - {CODE}]
         stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
         return {
             stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
@@ -177,6 +188,7 @@ class _Children:
         self.cores = cores
         self.context = multiprocessing.get_context("forkserver")
         self.processes: set[Any] = set()
+        self.forced: set[str] = set()
 
     def __enter__(self) -> "_Children":
         self.context.set_forkserver_preload(PRELOADED)
@@ -193,7 +205,9 @@ class _Children:
     def run(self, name: str) -> int:
         """DVC's exit code for one stage; what it prints goes to the stage's log."""
         LOGS.mkdir(parents=True, exist_ok=True)
-        process = self.context.Process(target=_run_single_stage, args=(Path.cwd(), name, self.cores))
+        process = self.context.Process(
+            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, self.cores)
+        )
         process.start()
         self.processes.add(process)
         process.join()
@@ -204,7 +218,7 @@ def _stop(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _run_single_stage(project: Path, name: str, cores: int) -> None:
+def _run_single_stage(project: Path, name: str, force: bool, cores: int) -> None:
     """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
     from dvc.cli import main
 
@@ -214,4 +228,4 @@ def _run_single_stage(project: Path, name: str, cores: int) -> None:
     with log_of(name).open("wb") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
-    sys.exit(main(["--wait-for-lock", "repro", "--single-item", name]))
+    sys.exit(main(["--wait-for-lock", "repro", "--single-item", *["--force"] * force, name]))

@@ -23,7 +23,6 @@ PARTS = (
     ".gitattributes",
     ".gitignore",
     "prefect.toml",
-    "prefect.yaml",
     ".dvc/config",
     ".dvc/.gitignore",
 )

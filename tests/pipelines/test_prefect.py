@@ -20,9 +20,10 @@ class Client:
     async def read_deployment_by_name(self, name: str) -> str:
         return f"original {name}"
 
-    async def read_deployments(self, deployment_filter):
-        wanted = deployment_filter.name.any_
-        return [SimpleNamespace(name=name) for name in ("annotate-arctic", "full-graph") if name in wanted]
+    async def read_deployments(self, deployment_filter=None):
+        known = ("annotate-arctic", "full-graph")
+        wanted = deployment_filter.name.any_ if deployment_filter else known
+        return [SimpleNamespace(name=name) for name in known if name in wanted]
 
 
 def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefects():
@@ -32,12 +33,14 @@ def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefec
     wrap_lookup(Wrapped)
     assert asyncio.run(Wrapped().read_deployment_by_name("annotate-arctic")).name == "annotate-arctic"
     assert asyncio.run(Wrapped().read_deployment_by_name("a/b")) == "original a/b"
+    with pytest.raises(ValueError, match="did you mean annotate-arctic"):
+        asyncio.run(Wrapped().read_deployment_by_name("anotate-artic"))
 
 
 @pytest.mark.parametrize(("found", "message"), [([], "no deployment is named"), ([1, 2], "2 flows have")])
 def test_a_name_that_none_or_several_have_is_refused(found, message):
     with pytest.raises(ValueError, match=message):
-        only_one("annotate-arctic", found)
+        only_one("annotate-arctic", found, [])
 
 
 @pytest.mark.slow
@@ -46,6 +49,12 @@ def test_prefect_deployment_run_annotate_arctic_completes(project, project_tools
         asked = project_tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
         assert asked.returncode == 0, asked.stdout + asked.stderr
         assert flow_state(project, project_tools, up.settings, 900) == "Completed", up.log.read_text()
+        tasks = project_tools.run(project, "prefect", "task-run", "ls", **up.settings, COLUMNS="250").stdout
+        assert "annotate@embedded-arctic" in tasks
+        artifacts = project_tools.run(project, "prefect", "artifact", "ls", **up.settings, COLUMNS="250").stdout
+        assert "results" in artifacts
+        assert "stages" in artifacts
+        assert project_tools.run(project, "hoidata", "down", **up.settings).stdout == "stopped\n"
     assert (project / "data/embedded/arctic/annotation/text.parquet").is_file()
     assert not (project / "checkpoints").exists()
 

@@ -126,6 +126,8 @@ def test_a_project_comes_up_to_date_as_by_dvc_repro_and_a_second_run_has_nothing
     assert stale_stages([]) == {"b": frozenset(), "d": frozenset("b")}
     assert stale_stages(["c"]) == {}
     assert sorted(reproduce_side_by_side(["d"], jobs=1).seconds) == ["b", "code", "d"]
+    assert sorted(reproduce_side_by_side(["b"], jobs=1, force=True).seconds) == ["b", "code"]
+    assert "made b.out" in log_of("b").read_text()
 
 
 @pytest.mark.slow
