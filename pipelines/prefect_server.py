@@ -65,10 +65,9 @@ def stop_running() -> bool:
         with exclusive(KEY_FILE, wait_s=0):
             return False
     except BadInput:
-        owner = psutil.Process(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()))
-        owner.terminate()
-        owner.wait(2 * STOP_TIMEOUT_S + 5)
-        return True
+        os.kill(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()), signal.SIGTERM)
+        with exclusive(KEY_FILE, wait_s=3 * STOP_TIMEOUT_S):
+            return True
 
 
 def _stop(process: subprocess.Popen) -> None:
