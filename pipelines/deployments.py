@@ -9,7 +9,7 @@ from hoidata.files.atomic import write_whole
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import read_params
 
-FILE = Path(".prefect/deployments.yaml")
+FILE = Path(".hoidata/deployments.yaml")
 WHOLE_GRAPH = "full-graph"
 ENTRYPOINT = "pipelines/flows.py:bring_up_to_date"
 # Data stages a person asks for by themselves; what comes before each of them is brought up to date with it.

@@ -45,6 +45,7 @@ def test_a_name_that_none_or_several_have_is_refused(found, message):
 
 @pytest.mark.slow
 def test_prefect_deployment_run_annotate_arctic_completes(project, project_tools):
+    project_tools.make_narrow(project, ["arctic", "manipnet"], ["mean-pose"])  # few deployments are made faster
     with hoidata_up(project, project_tools) as up:
         asked = project_tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
         assert asked.returncode == 0, asked.stdout + asked.stderr
