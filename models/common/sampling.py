@@ -16,7 +16,7 @@ from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
 from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from torch import Tensor
 
-from hoidata.batches.dataset import MAX_FRAMES
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 
 TRAIN_STEPS = 1000
 Motion = tuple[Tensor, Tensor]
@@ -67,19 +67,19 @@ def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], gen
     return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
 
 
-def draw_each(hand_features: int, object_features: int, n_frames: int, generators: Sequence[torch.Generator]) -> Motion:
-    """Noise (B, 2, F, D) and (B, F, D), a generator for each of B motions.
+def draw_each(longest: tuple[int, int], rows: tuple[int, int], generators: Sequence[torch.Generator]) -> Motion:
+    """Noise (B, 2, K, 99) and (B, L, 10), a generator for each of B motions. rows: K and L.
 
-    The longest motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
+    The ``longest`` motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
     """
-    rows = [
+    drawn = [
         (
-            torch.randn(MAX_FRAMES, 2, hand_features, generator=generator)[:n_frames].transpose(0, 1),
-            torch.randn(MAX_FRAMES, object_features, generator=generator)[:n_frames],
+            torch.randn(longest[0], 2, HAND_FEATURES, generator=generator)[: rows[0]].transpose(0, 1),
+            torch.randn(longest[1], OBJECT_FEATURES, generator=generator)[: rows[1]],
         )
         for generator in generators
     ]
-    return torch.stack([hands for hands, _ in rows]), torch.stack([objects for _, objects in rows])
+    return torch.stack([hands for hands, _ in drawn]), torch.stack([objects for _, objects in drawn])
 
 
 @torch.no_grad()
