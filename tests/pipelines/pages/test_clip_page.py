@@ -156,7 +156,8 @@ def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
 
 def test_page_shows_the_same_whether_the_stage_surface_ran_or_not(dataset, page, hands, tmp_path):
     surface_store(dataset.root / "clips", dataset.root / "surface", progress=False)
-    assert write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands).read_text() == page("test/s1/lid").read_text()
+    after = write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands)
+    assert after.read_text() == page("test/s1/lid").read_text()
 
 
 def test_page_reads_what_the_stage_wrote_and_measures_what_quality_control_left_out(dataset, hands):
