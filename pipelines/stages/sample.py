@@ -23,7 +23,7 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
 
     section = dict(params.get("sample") or {})
     settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
-    make_repeatable(threads=2)
+    make_repeatable(threads=1)
     counts = sample_family(
         load_family(family),
         paths.data,

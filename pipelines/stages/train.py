@@ -66,7 +66,7 @@ def train(paths: StagePaths, out: Path) -> None:
     network, settings = load_network(paths.model), load_settings(TrainParams, "train")
     stage = producers(read_graph(Path()))[paths.checkpoint.as_posix()].name
     code = Path("code", "train", f"{network.name}.json")
-    make_repeatable(max(1, THREADS // settings.processes))
+    make_repeatable(threads=1)  # stages run side by side; more processes train one network together
     train_network(
         network,
         paths.data,
