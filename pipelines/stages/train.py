@@ -14,8 +14,6 @@ from pipelines.lineage.provenance import build_provenance
 from pipelines.params import laid_over, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
-THREADS = 2
-
 
 @dataclass(frozen=True)
 class TrainParams:

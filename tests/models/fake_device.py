@@ -37,6 +37,7 @@ from tests.models.toy import PARAMS, POINT_NET, TRANSFORMER
 BACKEND = "nodata"
 _setup_privateuseone_for_python_backend(BACKEND)
 DEVICE = torch.device(f"{BACKEND}:0")
+TO = torch.Tensor.to
 # The paper's way of everything, at the toy's sizes.
 PAPER: dict[str, dict[str, Any]] = {
     "contact": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8]},
@@ -55,6 +56,19 @@ def moved(module: nn.Module, device: Any) -> nn.Module:
                     new = torch.empty(old.shape, dtype=old.dtype, device=device)
                     table[name] = nn.Parameter(new, old.requires_grad) if isinstance(old, nn.Parameter) else new
     return module
+
+
+def sent(tensor: torch.Tensor, *given: Any, **named: Any) -> torch.Tensor:
+    """``Tensor.to`` from the CPU to the device, for which torch would look at small tensors' values."""
+    there = any(isinstance(own, torch.device | torch.Tensor) and _device(own) == DEVICE for own in given)
+    if not there or tensor.device.type != "cpu" or tensor.requires_grad:
+        return TO(tensor, *given, **named)
+    dtype = next((own.dtype for own in given if isinstance(own, torch.Tensor)), tensor.dtype)
+    return torch.empty(tensor.shape, dtype=dtype, device=DEVICE)
+
+
+def _device(own: torch.device | torch.Tensor) -> torch.device:
+    return own.device if isinstance(own, torch.Tensor) else own
 
 
 def paths(root: Path, checkpoints: Path) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -121,6 +135,7 @@ def lengths(stored: dict[str, Checkpoint], requests: list[Request]) -> None:
 
 def main() -> None:
     setattr(nn.Module, "to", moved)  # noqa: B010 (pyright knows it as a method)
+    setattr(torch.Tensor, "to", sent)  # noqa: B010
     every = [("a value that is waited for", lambda: float(torch.zeros((), device=DEVICE))),
              ("tensors of two devices", lambda: torch.zeros(2, device=DEVICE) + torch.zeros(2))]  # fmt: skip
     every += paths(*map(Path, sys.argv[1:]))
