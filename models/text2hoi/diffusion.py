@@ -297,7 +297,8 @@ class MotionGenerator:
         return self._features(self.network(noised[0], noised[1], timesteps, condition), condition)
 
     def _features(self, coded: Motion, condition: Condition) -> Motion:
-        rows = self.normaliser.decode(*coded)
-        hands, objects = self.network.code.curves(*rows, condition.frames.sum(1))
-        hands = self.network.code.in_world(hands, objects)
+        code, lengths = self.network.code, condition.frames.sum(1)
+        rows = code.settled(*self.normaliser.decode(*coded), lengths)
+        hands, objects = code.curves(*rows, lengths)
+        hands = code.in_world(hands, objects)
         return proper_hands(hands), proper_object(objects)

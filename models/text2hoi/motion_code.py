@@ -14,18 +14,24 @@ from torch import Tensor
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
 from models.common.features import hands_in_object_frame, hands_in_world
 from models.common.sampling import Motion
-from models.common.spline import fit_spline, intervals_of, spline_values, stacked_bases
+from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
+
+# What is like a metre of movement: 0.1 of a rotation's numbers per centimetre; fingers, of which there are many, more.
+OBJECT_REACH = torch.tensor([1.0] * 3 + [10.0] * 7)
+HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
 
 
 @dataclass(frozen=True)
 class MotionCodeConfig:
     """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
-    per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given.
+    per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
+    object, or a hand on it, that is generated with knots nearer than this to each other stands still (0: as generated).
     """
 
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
+    rest_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -85,6 +91,16 @@ class MotionCode:
         hands = spline_values(hands, stacked_bases(counts, knots, n_frames, hands.device))
         knots = [n * self.config.object_knots for n in knots]
         return hands, spline_values(objects, stacked_bases(counts, knots, n_frames, hands.device))
+
+    def settled(self, hands: Tensor, objects: Tensor, lengths: Tensor) -> Motion:
+        """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
+        if not (self.config.rest_m and self.config.knot_frames):
+            return hands, objects
+        present, there = self.rows(lengths)
+        if self.config.hand_frame == "object":
+            reach = self.config.rest_m * HAND_REACH.to(hands)
+            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
+        return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
 
     def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the model frame."""
