@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch
+from hoidata.batches.requests import RequestBatch
 from hoidata.clips.clip import SIDES
 from hoidata.clips.features import (
     GLOBAL_ORIENT_6D,
@@ -98,7 +98,7 @@ def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
     return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
 
 
-def place_points(batch: ClipBatch, objects: Tensor) -> Tensor:
+def place_points(batch: RequestBatch, objects: Tensor) -> Tensor:
     """The sampled object points at each pose (B, F, 10): (B, F, 1024, 3), the moving part turned about its hinge."""
     turn = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
     origin = batch.hinge_origin_m[:, None, None]
@@ -160,6 +160,12 @@ class Normaliser:
         object_mean, object_scale = _moments([own for _, own, _ in clips], OBJECT_FEATURES)
         arrays = (means, scales, object_mean, object_scale)
         return cls(*(torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in arrays))
+
+    @classmethod
+    def nothing(cls) -> "Normaliser":
+        """Leaves features as they are: metres and numbers."""
+        shapes = (2, HAND_FEATURES), (OBJECT_FEATURES,)
+        return cls(torch.zeros(shapes[0]), torch.ones(shapes[0]), torch.zeros(shapes[1]), torch.ones(shapes[1]))
 
     def spread_to(self, spread: float) -> "Normaliser":
         """The same means; features come out as wide as ``spread``, not 1."""

@@ -118,7 +118,8 @@ class AnchoredContact(nn.Module):
 
 def picked(weights: Tensor, draws: Tensor) -> Tensor:
     """(..., K) places drawn in proportion to weights (..., N) by even draws (..., K) from 0 to 1; none is beyond N."""
-    cumulative = weights.cumsum(-1)
+    places = torch.arange(weights.shape[-1], device=weights.device)
+    cumulative = weights @ (places[:, None] <= places).to(weights.dtype)  # cumsum on a GPU has no order it keeps to
     found = torch.searchsorted(cumulative, draws * cumulative[..., -1:], right=True)
     return found.clamp_max(weights.shape[-1] - 1)
 

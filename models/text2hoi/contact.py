@@ -1,8 +1,7 @@
 """Which points of an object the hands will touch, from a sentence: PointNet and a conditional VAE.
 
-Text2HOI Sec. 3.1 and supplement, Tables S4-S6. Deviations, each for a reason: the hand type is an explicit input (a
-sentence embedding hardly encodes left and right); layers that see per-clip features compute them once per clip
-instead of once per point (the same function); sizes come from the config.
+Text2HOI Sec. 3.1 and supplement, Tables S4-S6. Layers that see per-clip features compute them once per clip instead of
+once per point (the same function).
 """
 
 import torch
@@ -27,11 +26,16 @@ class ContactModel(nn.Module):
         self.object_net = PointNet(3, config.point_net)
         self.contact_net = PointNet(4, config.point_net)
         self.to_latent = nn.Sequential(
-            PointLayer(overall, heads[0]), PointLayer(heads[0], heads[1]), nn.Linear(heads[1], 2 * config.latent)
+            PointLayer(overall, heads[0]),
+            PointLayer(heads[0], heads[1]),
+            nn.Dropout(config.encoder_dropout),
+            nn.Linear(heads[1], 2 * config.latent),
         )
         first, second, third = config.decoder_widths
-        self.from_point = nn.Linear(local + 3, first)
-        self.from_clip = nn.Linear(overall + 1 + config.text + HAND_FLAGS + config.latent, first, bias=False)
+        more = (3, HAND_FLAGS) if config.told else (0, 0)
+        # Table S6's first layer, which sees the same numbers of a clip at each point, in two pieces.
+        self.from_point = nn.Linear(local + more[0], first)
+        self.from_clip = nn.Linear(overall + 1 + config.text + more[1] + config.latent, first, bias=False)
         self.rest = nn.Sequential(
             nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
@@ -52,8 +56,10 @@ class ContactModel(nn.Module):
         """Logits (B, N) from points (B, N, 3), sentence (B, text), hand flags (B, 2) and z (B, latent)."""
         points, scale = normalised_points(points_m)
         overall, local = self.object_net(points)
-        clip = torch.cat((overall, scale, scaled_text(text), active_hands.float(), latent), -1)
-        mixed = self.from_point(torch.cat((local, points), -1)) + self.from_clip(clip)[:, None]
+        text = scaled_text(text) if self.config.text_scaled else text
+        flags, places = ([active_hands.float()], [points]) if self.config.told else ([], [])
+        clip = torch.cat((overall, scale, text, *flags, latent), -1)
+        mixed = self.from_point(torch.cat((local, *places), -1)) + self.from_clip(clip)[:, None]
         return self.rest(mixed)[..., 0]
 
     def forward(
@@ -80,6 +86,7 @@ def contact_loss(
 ) -> dict[str, Tensor]:
     """Cross-entropy, Dice (per clip) and KL divergence to N(0, I) per latent, as named parts and their "total"."""
     cross = functional.binary_cross_entropy_with_logits(logits, contact_map)
+    cross = cross * logits.shape[1] if weights.reduction == "sum" else cross
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact_map).sum(1) + 1) / (probability.sum(1) + contact_map.sum(1) + 1)
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()

@@ -1,26 +1,31 @@
 """Training of the contact network: what one step and one validation are, and what is found on validation clips."""
 
+from collections.abc import Callable
+
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.batches.requests import RequestBatch
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss
 from models.text2hoi.contact import ContactModel, contact_loss, turned_and_scaled
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.thresholds import choose_contact_threshold, choose_draw_threshold
+from models.text2hoi.thresholds import ContactNetwork, choose_contact_threshold, choose_draw_threshold
+
+DrawContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
 
 
 class ContactObjective:
     """Text2HOI Sec. 3.1: cross-entropy, Dice and KL divergence; or anchors in place of the latent."""
 
-    needs_entries = False
+    frames = entries = 0
 
     def __init__(self, network: nn.Module, weights: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
         self.network, self.weights, self.device = network, weights, device
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+        self.held_out = collate(corpus.held_out).to(device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
@@ -37,12 +42,12 @@ class ContactObjective:
         return contact_loss(logits, contact_map, mean, log_variance, self.weights)
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ContactModel | AnchoredContact)
         held = self.held_out
         latents = network.draw_latents(4, len(held), torch.Generator().manual_seed(0)).to(self.device)
         probability = network.sample(held.points_m, held.text[:, 0], held.active_hands, latents).amax(2).mean(1)
-        return float(nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map))
+        return nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map)
 
 
 def contact_network(config: ContactConfig) -> ContactModel | AnchoredContact:
@@ -59,6 +64,27 @@ def draw_threshold(checkpoint: Checkpoint) -> float:
     """The same for the probability in one sample: best for means is too low for anchors, whose samples differ."""
     results = checkpoint.info["results"]
     return float(results.get("draw_threshold", results["contact_threshold"]))
+
+
+def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
+    """(B, 2, N) a map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, ...) as the network draws them.
+
+    Where no point reaches the threshold the likeliest ones count.
+    """
+    network = checkpoint.network
+    assert isinstance(network, ContactNetwork)
+    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device))[:, 0]
+    limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
+    return ((probability >= limit) & batch.active_hands[..., None]).float()
+
+
+def contact_drawer(checkpoint: Checkpoint) -> DrawContact:
+    """Draws maps for the motions of a batch from a trained contact network, as sampling does."""
+    network = checkpoint.network
+    assert isinstance(network, ContactNetwork)
+    return lambda batch, text, generator: touched_maps(
+        checkpoint, batch, text, network.draw_latents(1, len(batch), generator)
+    )
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:

@@ -60,7 +60,7 @@ def length_figures(sources: Sources, train: list[ClipSample], test: list[ClipSam
     """Mean absolute error of the expected length, in frames, beside the mean length of the training clips."""
     network = load_checkpoint(sources.checkpoints / LENGTH.name, LENGTH).network
     assert isinstance(network, LengthModel)
-    batch = collate(test, with_entries=False)
+    batch = collate(test)
     true = batch.lengths.numpy()
     error = float(np.abs(network.expected_frames(batch.text[:, 0], batch.active_hands).numpy() - true).mean())
     baseline = float(np.abs(np.mean([sample.length for sample in train]) - true).mean())

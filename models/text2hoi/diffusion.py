@@ -6,7 +6,7 @@ by default: what stands for a motion (``motion_code``), contact as points to att
 projection, the condition in every token, codes that count to the end. Hand flags are explicit inputs beside the masks.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -35,9 +35,13 @@ from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 class DiffusionConfig:
     """transformer: its sizes. point_net: as in the contact model it comes from. The defaults are the paper's.
 
-    motion: what a token stands for. contact_input: "map", the paper's raw numbers, or "tokens", ``contact_tokens`` of
-    each kind. text_input: a linear layer, or "projection", a normalised one with a hidden layer. condition_everywhere:
-    the condition is added to every token instead of being one. frames_to_go: tokens know how far they are from the end.
+    motion: what a token stands for. normalised: rows by mean and spread of the training clips, not metres and numbers
+    as they are. codes: of frames and agents, or (for an ablation) less. first_code: number of the first frame's code.
+    contact_input: "map", the paper's raw numbers, "tokens", ``contact_tokens`` of each kind, or "none". scale_input,
+    centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
+    is read from its own token, or from the object's as well (released). text_scaled: to a length of sqrt(512).
+    text_input: a linear layer, or "projection", a normalised one with a hidden layer. condition_everywhere: the
+    condition is added to every token instead of being one. frames_to_go: tokens know how far they are from the end.
     signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
     is to happen (Chen 2023).
     """
@@ -47,8 +51,16 @@ class DiffusionConfig:
     motion: MotionCodeConfig = field(default_factory=MotionCodeConfig)
     points: int = 1024
     text: int = 512
-    contact_input: Literal["map", "tokens"] = "map"
+    normalised: bool = False
+    codes: Literal["frames and agents", "frames", "none"] = "frames and agents"
+    first_code: int = 0
+    contact_input: Literal["map", "tokens", "none"] = "map"
     contact_tokens: int = 12
+    scale_input: bool = True
+    centroid: bool = False
+    told: bool = False
+    hand_head: Literal["hand", "hand and object"] = "hand"
+    text_scaled: bool = False
     text_input: Literal["linear", "projection"] = "linear"
     condition_everywhere: bool = False
     frames_to_go: bool = False
@@ -59,7 +71,9 @@ class DiffusionConfig:
 @dataclass(frozen=True)
 class Condition:
     """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3); part (B, N);
-    contact (B, 2, N) 0 or 1 for each hand; active_hands (B, 2) hand flags; frames (B, F) True up to each length."""
+    contact (B, 2, N) 0 or 1 for each hand; active_hands (B, 2) hand flags; lengths (B,), and as plain values counts and
+    sides (``RequestBatch``).
+    """
 
     text: Tensor
     object: Tensor
@@ -68,17 +82,15 @@ class Condition:
     part: Tensor
     contact: Tensor
     active_hands: Tensor
-    frames: Tensor
+    lengths: Tensor
+    counts: tuple[int, ...]
+    sides: tuple[bool, bool]
 
     @classmethod
     def of(cls, batch: RequestBatch, object_feature: Tensor, text: Tensor, contact: Tensor) -> "Condition":
         """From a batch, with one sentence (B, 512) and the contact (B, 2, N) of each motion."""
         shape = batch.points_m, batch.normals, batch.part
-        return cls(text, object_feature, *shape, contact, batch.active_hands, batch.frames)
-
-    def repeat(self, count: int) -> "Condition":
-        """Every clip ``count`` times in a row."""
-        return Condition(*(getattr(self, name).repeat_interleave(count, 0) for name in self.__dataclass_fields__))
+        return cls(text, object_feature, *shape, contact, batch.active_hands, batch.lengths, batch.counts, batch.sides)
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,8 @@ class _Prepared:
     """A condition as the Transformer takes it, the same at every timestep.
 
     text, object, extent (B, width). points (B, C, width) contact tokens with their mask (B, C). hand_rows (B, 2, K),
-    object_rows (B, L) bool: the rows of a motion that are there. to_go: places and lengths the codes are made from.
+    object_rows (B, L) bool: the rows of a motion that are there. lengths (B,). sides: which hands are in any motion;
+    the others' tokens are left out.
     """
 
     text: Tensor
@@ -97,6 +110,12 @@ class _Prepared:
     hand_rows: Tensor
     object_rows: Tensor
     lengths: Tensor
+    sides: tuple[int, ...]
+
+    def twice(self) -> "_Prepared":
+        """Every motion two times, one whole batch after the other."""
+        own = {name: value for name, value in vars(self).items() if isinstance(value, Tensor) and value.ndim}
+        return replace(self, **{name: torch.cat((value, value)) for name, value in own.items()})
 
 
 class DiffusionModel(nn.Module):
@@ -118,12 +137,14 @@ class DiffusionModel(nn.Module):
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.text_in = _text_layers(config)
         as_map = config.contact_input == "map"
-        self.object_condition_in = nn.Linear(config.point_net.widths[-1] + (config.points if as_map else 0) + 1, width)
-        self.points_in = None if as_map else _hidden_layer(TOKEN_FEATURES, width)
-        self.extent_in = nn.Linear(3, width)
+        body = config.point_net.widths[-1] + config.points * as_map + config.scale_input + 3 * config.centroid
+        self.object_condition_in = nn.Linear(body, width)
+        self.points_in = _hidden_layer(TOKEN_FEATURES, width) if config.contact_input == "tokens" else None
+        self.extent_in = nn.Linear(3, width) if config.told else None
         self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
         self.encoder = Encoder(config.transformer)
-        self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * self.hand_rows) for _ in range(2)])
+        head = width * (2 if config.hand_head == "hand and object" else 1)
+        self.hands_out = nn.ModuleList([nn.Linear(head, HAND_FEATURES * self.hand_rows) for _ in range(2)])
         self.object_out = nn.Linear(width, OBJECT_FEATURES * self.object_rows)
 
     @torch.no_grad()
@@ -144,30 +165,38 @@ class DiffusionModel(nn.Module):
 
     def prepare(self, condition: Condition) -> _Prepared:
         """The part of ``forward`` that is the same at every timestep (Text2HOI eq. 2, plus hand flags and length)."""
-        lengths = condition.frames.sum(1)
-        hand_rows, object_rows = self.code.rows(lengths)
+        lengths = condition.lengths
+        hand_rows, object_rows = self.code.rows(condition.counts, lengths.device)
         contact = condition.contact.bool() & condition.active_hands[..., None]
-        _, scale = normalised_points(condition.points_m)
-        body, points = [condition.object, scale], condition.points_m.new_zeros(len(scale), 0, TOKEN_FEATURES)
+        points = condition.points_m.new_zeros(len(lengths), 0, self.config.transformer.width)
         points_mask = points.new_zeros(points.shape[:2], dtype=torch.bool)
-        if self.points_in is None:
-            body.insert(1, contact.any(1).float())
-            points = points.new_zeros(len(points), 0, self.config.transformer.width)
-        else:
+        if self.points_in is not None:
             shape = condition.points_m, condition.normals, condition.part
             points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
             points = self.points_in(points)
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
         return _Prepared(
-            self.text_in(scaled_text(condition.text)),
-            self.object_condition_in(torch.cat(body, -1)),
-            self.extent_in(extent),
+            self.text_in(scaled_text(condition.text) if self.config.text_scaled else condition.text),
+            self.object_condition_in(self._body(condition, contact)),
+            self.extent_in(extent) if self.extent_in is not None else points.new_zeros(()),
             points,
             points_mask,
             condition.active_hands[:, :, None] & hand_rows[:, None],
             object_rows,
             lengths,
+            tuple(side for side in range(2) if condition.sides[side]),
         )
+
+    def _body(self, condition: Condition, contact: Tensor) -> Tensor:
+        """(B, D) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
+        config, body = self.config, [condition.object]
+        if config.contact_input == "map":
+            body.append(contact.any(1).float())
+        if config.scale_input:
+            body.append(normalised_points(condition.points_m)[1])
+        if config.centroid:
+            body.append(condition.points_m.mean(1))
+        return torch.cat(body, -1)
 
     def denoise(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, known: _Prepared, keep: Tensor | None = None
@@ -187,11 +216,12 @@ class DiffusionModel(nn.Module):
     ) -> Motion:
         k, wide = self.hand_rows, self.object_rows
         hands = hands * known.hand_rows[..., None]
-        agents = [layer(to_tokens(hands[:, side], k)) for side, layer in enumerate(self.hands_in)]
+        agents = [self.hands_in[side](to_tokens(hands[:, side], k)) for side in known.sides]
         agents.append(self.object_in(to_tokens(objects * known.object_rows[..., None], wide)))
-        codes = agent_codes(self.config.transformer.width, hands.device)
+        codes = agent_codes(self.config.transformer.width, hands.device)[[*known.sides, 2]]
+        codes = codes if self.config.codes == "frames and agents" else torch.zeros_like(codes)
         tokens = [x + code + self._codes(known.lengths, x.shape[1]) for x, code in zip(agents, codes, strict=True)]
-        masks = [attention_mask_of(known.hand_rows[:, side], k) for side in range(2)]
+        masks = [attention_mask_of(known.hand_rows[:, side], k) for side in known.sides]
         masks.append(attention_mask_of(known.object_rows, wide))
         first, points = self._condition(timesteps, known, keep)
         moving = torch.cat(tokens, 1)
@@ -200,9 +230,12 @@ class DiffusionModel(nn.Module):
         x = torch.cat((moving, first, points), 1)
         points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:] > 0)
         mask = torch.cat((*masks, masks[-1].new_ones(len(x), 1), points_mask), 1)
-        left, right, body = self.encoder(x, mask)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
-        both = [to_frames(layer(t), hands.shape[2], k) for layer, t in zip(self.hands_out, (left, right), strict=True)]
-        return torch.stack(both, 1), to_frames(self.object_out(body), objects.shape[1], wide)
+        *own, body = self.encoder(x, mask)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
+        found = [hands.new_zeros(hands[:, 0].shape)] * 2
+        for side, token in zip(known.sides, own, strict=True):
+            seen = torch.cat((token, body), -1) if self.config.hand_head == "hand and object" else token
+            found[side] = to_frames(self.hands_out[side](seen), hands.shape[2], k)
+        return torch.stack(found, 1), to_frames(self.object_out(body), objects.shape[1], wide)
 
     def _codes(self, lengths: Tensor, n_tokens: int) -> Tensor:
         """Position codes (B or 1, token, width): by frame, and by frames to go and the share that is done."""
@@ -210,7 +243,8 @@ class DiffusionModel(nn.Module):
         place = torch.arange(n_tokens, device=lengths.device) * (
             self.hand_rows * max(1, self.config.motion.knot_frames)
         )
-        codes = sinusoid(place, width)[None]
+        codes = sinusoid(place + self.config.first_code, width)[None]
+        codes = torch.zeros_like(codes) if self.config.codes == "none" else codes
         if self.to_go_in is not None:
             to_go = (lengths[:, None] - place).clamp_min(0)
             done = place * MAX_FRAMES / lengths[:, None]
@@ -244,15 +278,15 @@ def guided(model: DiffusionModel, condition: Condition, guidance: float) -> Deno
         return model.denoise(hands, objects, timesteps, known)
 
     def denoise_guided(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
-        conditional = denoise(hands, objects, timesteps)
+        both = [torch.cat((x, x)) for x in (hands, objects, timesteps)]
         # Words are what is pushed; an object that is not there would be a motion of another kind altogether.
-        only_object = torch.tensor([[0.0, 1.0]], device=hands.device).expand(len(hands), -1)
-        unconditional = model.denoise(hands, objects, timesteps, known, only_object)
-        return (
-            unconditional[0] + guidance * (conditional[0] - unconditional[0]),
-            unconditional[1] + guidance * (conditional[1] - unconditional[1]),
-        )
+        keep = torch.ones(2 * len(hands), 2, device=hands.device)
+        keep[len(hands) :, 0] = 0
+        found = [own.chunk(2) for own in model.denoise(both[0], both[1], both[2], doubled, keep)]
+        guided_hands, guided_objects = (without + guidance * (told - without) for told, without in found)
+        return guided_hands, guided_objects
 
+    doubled = known.twice() if guidance != 1 else known
     return denoise if guidance == 1 else denoise_guided
 
 
@@ -297,8 +331,8 @@ class MotionGenerator:
         return self._features(self.network(noised[0], noised[1], timesteps, condition), condition)
 
     def _features(self, coded: Motion, condition: Condition) -> Motion:
-        code, lengths = self.network.code, condition.frames.sum(1)
-        rows = code.settled(*self.normaliser.decode(*coded), lengths)
-        hands, objects = code.curves(*rows, lengths)
+        code, counts = self.network.code, condition.counts
+        rows = code.settled(*self.normaliser.decode(*coded), counts)
+        hands, objects = code.curves(*rows, counts)
         hands = code.in_world(hands, objects)
         return proper_hands(hands), proper_object(objects)

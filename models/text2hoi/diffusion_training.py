@@ -26,7 +26,7 @@ from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
-from models.text2hoi.contact_training import CONTACT
+from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawer
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
 from models.text2hoi.thresholds import ContactNetwork
@@ -38,19 +38,23 @@ OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT
 
 @dataclass(frozen=True)
 class DiffusionLossConfig:
-    """Weights beside the simple loss (1): eq. 6 in contact thresholds, eq. 7. frames: how many of a clip they see.
+    """Weights beside the simple loss (1): eq. 6 and eq. 7. frames: how many of a clip they see; entries: of eq. 6.
 
-    Switches: weighting "grouped" counts wrist, palm and fingers alike, and the object's position, rotation and hinge,
-    not every number alike. velocity_weight: of the same error of differences of rows. joint_weight: of joints in the
-    object's frame, those that touch counting ``touch_weight`` more. thin_contact: each clip is shown a share of its
-    touched points, as a drawn contact map may be as sparse, and no two steps the same.
+    contact: the map a motion is shown: drawn from the contact network, as in use, or the clip's own (released).
+    distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
+    mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
+    the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
+    ``touch_weight`` more. thin_contact: each clip is shown a share of its own touched points, as a drawn map may be as
+    sparse, and no two steps the same.
     """
 
     distance_weight: float = 1.0
     orientation_weight: float = 1.0
     frames: int = 8
     entries: int = 8192
-    weighting: Literal["even", "grouped"] = "even"
+    contact: Literal["estimated", "recorded"] = "estimated"
+    distance_unit: Literal["metre", "threshold"] = "metre"
+    weighting: Literal["sum", "even", "grouped"] = "sum"
     velocity_weight: float = 0.0
     joint_weight: float = 0.0
     touch_weight: float = 4.0
@@ -86,7 +90,7 @@ class Targets:
         hands, objects = self.normaliser.encode(
             self._padded([own.hands for own in coded], 1), self._padded([own.object for own in coded], 0)
         )
-        present, there = self._padded([own.present for own in coded], 1), self.code.rows(batch.lengths)[1]
+        present, there = self._padded([own.present for own in coded], 1), self.code.rows(batch.counts, self.device)[1]
         return _Target(hands, objects, present, there, self._padded(joints, 1), self._padded(touching, 1))
 
     def _clip(self, sample: ClipSample) -> tuple[CodedClip, Tensor, Tensor]:
@@ -94,7 +98,8 @@ class Targets:
         if key not in self.kept:
             joints, thing = torch.from_numpy(sample.joints_m), torch.from_numpy(sample.object)
             touching = torch.zeros(joints.shape[:3], dtype=torch.bool)
-            touching[sample.distances.side, sample.distances.frame, sample.distances.joint] = True
+            near = (sample.distances.side, sample.distances.frame, sample.distances.joint)
+            touching[tuple(torch.from_numpy(column).long() for column in near)] = True
             local = to_object_frame(joints, thing[None].expand(2, -1, -1))
             self.kept[key] = self.code.encode(sample), local, touching
         return self.kept[key]
@@ -108,8 +113,6 @@ class Targets:
 class DiffusionObjective:
     """Text2HOI eq. 4-7, and what the switches of :class:`DiffusionLossConfig` add."""
 
-    needs_entries = True
-
     def __init__(
         self,
         network: DiffusionModel,
@@ -118,24 +121,27 @@ class DiffusionObjective:
         hands: Hands,
         normaliser: Normaliser,
         device: torch.device,
+        drawn: DrawContact | None = None,
     ) -> None:
-        self.network, self.weights, self.device = network, weights, device
+        """drawn: draws contact maps for the motions of a batch; without it the clips' own are shown."""
+        self.network, self.weights, self.device, self.drawn = network, weights, device, drawn
         self.hands, self.normaliser = hands.to(device), normaliser.to(device)
         self.signal = alphas_cumprod(device)
-        self.needs_entries = weights.distance_weight > 0
+        self.frames, self.entries = weights.frames, weights.entries if weights.distance_weight > 0 else 0
         self.targets = Targets(network.code, self.normaliser, device)
         shares = feature_shares(weights.weighting, device)
         self.hand_shares, self.object_shares = (share / network.config.signal_scale**2 for share in shares)
         self.features: dict[str, Tensor] = {}
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+        self.held_out = collate(corpus.held_out).to(device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         weights, target = self.weights, self.targets.of(batch)
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
         keep = torch.rand(len(batch), 2, generator=generator) >= self.network.config.condition_dropout
-        text, contact = any_form(batch, generator), batch.contact
+        text = any_form(batch, generator)
+        contact = self._contact(batch, text, generator)
         if weights.thin_contact:
-            contact = contact & thinned(contact.shape, generator).to(self.device)
+            contact = contact.bool() & thinned(contact.shape, generator).to(self.device)
         predicted = self._denoised(self.network, batch, target, text, contact, steps, generator, keep.float())
         found = {"simple": self._simple(predicted, target)}
         factors = {"simple": 1.0, "velocity": weights.velocity_weight, "joints": weights.joint_weight}
@@ -143,20 +149,21 @@ class DiffusionObjective:
         if weights.velocity_weight:
             found["velocity"] = self._velocity(predicted, target)
         if weights.distance_weight or weights.orientation_weight or weights.joint_weight:
-            found |= self._geometry(predicted, batch, target, generator)
+            found |= self._geometry(predicted, batch, target)
         return {"total": sum((factors[name] * found[name] for name in found), torch.zeros(())), **found}
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, DiffusionModel)
         generator = torch.Generator().manual_seed(0)
-        held, total = self.held_out, 0.0
+        held, total = self.held_out, torch.zeros((), device=self.device)
         target = self.targets.of(held)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(held),), step, device=self.device)
-            seen = held.text[:, 0], held.contact
-            predicted = self._denoised(network, held, target, *seen, steps, generator, None)
-            total += float(self._simple(predicted, target))
+            text = held.text[:, 0]
+            contact = self._contact(held, text, generator)
+            predicted = self._denoised(network, held, target, text, contact, steps, generator, None)
+            total += self._simple(predicted, target)
         return total / len(VALIDATION_STEPS)
 
     def _denoised(
@@ -175,6 +182,10 @@ class DiffusionObjective:
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
         condition = Condition.of(batch, self._object_features(network, batch), text, contact)
         return network(noised[0], noised[1], steps, condition, None if keep is None else keep.to(self.device))
+
+    def _contact(self, batch: ClipBatch, text: Tensor, generator: torch.Generator) -> Tensor:
+        """The contact (B, 2, N) the motions are shown."""
+        return self.drawn(batch, text, generator) if self.drawn else batch.contact
 
     def _object_features(self, network: DiffusionModel, batch: ClipBatch) -> Tensor:
         """F_obj of every clip; computed once per object, since the point network is frozen."""
@@ -196,12 +207,12 @@ class DiffusionObjective:
         both = target.present[..., 1:] & target.present[..., :-1]
         return losses.masked_mean(hands, both) + losses.masked_mean(objects, target.there[:, 1:])
 
-    def _geometry(self, predicted: Motion, batch: ClipBatch, target: _Target, generator: torch.Generator) -> Losses:
+    def _geometry(self, predicted: Motion, batch: ClipBatch, target: _Target) -> Losses:
         """The losses with a weight that look at poses, on some frames of each clip."""
         weights, code, found = self.weights, self.network.code, Losses()
-        chosen = losses.pick_frames(batch.frames, weights.frames, generator)
+        chosen = batch.chosen
         rows = self.normaliser.decode(*predicted)
-        curves = code.curves(*rows, batch.lengths)
+        curves = code.curves(*rows, batch.counts)
         own, moved = losses.take_frames(curves[0], chosen, 2), losses.take_frames(curves[1], chosen, 1)
         present = losses.take_frames(batch.present, chosen, 2)
         if weights.joint_weight:
@@ -210,11 +221,10 @@ class DiffusionObjective:
             found["joints"] = losses.joint_loss(joints, true, present, 1 + weights.touch_weight * touching)
         hands = code.in_world(own, moved)
         if weights.distance_weight:
-            given = batch.entries, batch.entry_distance_m, chosen, batch.frames.shape[1], weights.entries, generator
-            listed, distance = losses.entries_of_frames(*given)
             joints, points = self.hands.joints(hands, batch.betas, batch.template_m), place_points(batch, moved)
-            scale_m = batch.contact_threshold_m
-            found["distance_map"] = losses.distance_map_loss(joints, points, listed, distance, scale_m)
+            scale_m = batch.contact_threshold_m if weights.distance_unit == "threshold" else 1.0
+            given = batch.entries, batch.entry_distance_m
+            found["distance_map"] = losses.distance_map_loss(joints, points, *given, scale_m)
         if weights.orientation_weight:
             true = losses.take_frames(batch.hands, chosen, 2), losses.take_frames(batch.object, chosen, 1)
             turns = [rot6d_to_rotmat(part[..., GLOBAL_ORIENT_6D]) for part in (hands, true[0])]
@@ -232,10 +242,10 @@ def thinned(shape: Sequence[int], generator: torch.Generator) -> Tensor:
 
 
 def feature_shares(weighting: str, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Shares of a hand's 99 and an object's 10 numbers in the loss; each sums to one."""
+    """Shares of a hand's 99 and an object's 10 numbers in the loss; each sums to one, but for "sum"."""
     shares = []
     for size, groups in ((HAND_FEATURES, HAND_GROUPS), (OBJECT_FEATURES, OBJECT_GROUPS)):
-        share = torch.full((size,), 1 / size, device=device)
+        share = torch.full((size,), 1.0 if weighting == "sum" else 1 / size, device=device)
         for group in groups if weighting == "grouped" else ():
             share[group] = 1 / (len(groups) * (group.stop - group.start))
         shares.append(share)
@@ -255,9 +265,13 @@ def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net)).to(setup.device)
     network.object_net.load_state_dict(contact.object_net.state_dict())
     coded = [network.code.encode(sample) for sample in setup.corpus.train]
-    normaliser = Normaliser.of([(own.hands, own.object, own.present) for own in coded])
+    normaliser = Normaliser.nothing()
+    if network.config.normalised:
+        normaliser = Normaliser.of([(own.hands, own.object, own.present) for own in coded])
     normaliser = normaliser.spread_to(network.config.signal_scale).to(setup.device)
-    return DiffusionObjective(network, setup.loss, setup.corpus, setup.hands, normaliser, setup.device), normaliser
+    drawn = contact_drawer(setup.trained["contact"]) if setup.loss.contact == "estimated" else None
+    given = setup.loss, setup.corpus, setup.hands, normaliser, setup.device, drawn
+    return DiffusionObjective(network, *given), normaliser
 
 
 DIFFUSION = Network(

@@ -5,9 +5,11 @@ frame the object has at the same moment, where a hand that holds still on a movi
 stand for frames, as control points of B-splines (``models.common.spline``).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,10 +63,10 @@ class MotionCode:
         """Rows of the longest motion there can be."""
         return self.sizes(MAX_FRAMES)
 
-    def rows(self, lengths: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, K) and (B, L) bool: the rows that motions of these lengths (B,) have."""
-        counts = torch.tensor([self.sizes(n) for n in lengths.tolist()], device=lengths.device)
-        hand, thing = (torch.arange(int(own.max()), device=own.device) < own[:, None] for own in counts.unbind(1))
+    def rows(self, counts: Sequence[int], device: torch.device) -> tuple[Tensor, Tensor]:
+        """(B, K) and (B, L) bool: the rows that motions of so many frames have."""
+        sizes = np.array([self.sizes(n) for n in counts])
+        hand, thing = (torch.from_numpy(np.arange(own.max()) < own[:, None]).to(device) for own in sizes.T)
         return hand, thing
 
     def encode(self, sample: ClipSample) -> CodedClip:
@@ -82,21 +84,21 @@ class MotionCode:
         touched = stacked_bases([len(thing)], [intervals], len(thing), torch.device("cpu"))[0].T > 0
         return CodedClip(curves, objects, (present.float() @ touched.T.float()) > 0)
 
-    def curves(self, hands: Tensor, objects: Tensor, lengths: Tensor) -> Motion:
+    def curves(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper."""
         if not self.config.knot_frames:
             return hands, objects
-        counts, n_frames = lengths.tolist(), int(lengths.max())
+        n_frames = max(counts)
         knots = [intervals_of(n, self.config.knot_frames) for n in counts]
-        hands = spline_values(hands, stacked_bases(counts, knots, n_frames, hands.device))
+        hands = spline_values(hands, stacked_bases(list(counts), knots, n_frames, hands.device))
         knots = [n * self.config.object_knots for n in knots]
-        return hands, spline_values(objects, stacked_bases(counts, knots, n_frames, hands.device))
+        return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
 
-    def settled(self, hands: Tensor, objects: Tensor, lengths: Tensor) -> Motion:
+    def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
         if not (self.config.rest_m and self.config.knot_frames):
             return hands, objects
-        present, there = self.rows(lengths)
+        present, there = self.rows(counts, hands.device)
         if self.config.hand_frame == "object":
             reach = self.config.rest_m * HAND_REACH.to(hands)
             hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)

@@ -19,7 +19,7 @@ from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.sampling import SamplerConfig, draw_each
-from models.text2hoi.contact_training import draw_threshold
+from models.text2hoi.contact_training import touched_maps
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import motion_generator
 from models.text2hoi.length import LengthModel
@@ -148,15 +148,12 @@ class Text2Hoi:
         parts = zip(coarse, refined, objects, contact_maps, strict=True)
         return [
             Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())
-            for (before, after, thing, contact_map), n in zip(parts, batch.lengths.tolist(), strict=True)
+            for (before, after, thing, contact_map), n in zip(parts, batch.counts, strict=True)
         ]
 
     def _contact(self, batch: RequestBatch, generators: Sequence[torch.Generator]) -> Tensor:
-        """(B, 2, N) one drawn map for each hand, 0 or 1; the likeliest points where none reaches the threshold."""
+        """(B, 2, N) one drawn map for each hand, 0 or 1."""
         network = self.trained["contact"].network
         assert isinstance(network, ContactNetwork)
-        latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1).to(self.device)
-        probability = network.sample(batch.points_m, batch.text, batch.active_hands, latents)[:, 0]
-        limit = torch.tensor(draw_threshold(self.trained["contact"]), device=self.device)
-        touched = probability >= torch.minimum(probability.amax(-1, keepdim=True), limit)
-        return (touched & batch.active_hands[..., None]).float()
+        latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1)
+        return touched_maps(self.trained["contact"], batch, batch.text, latents)

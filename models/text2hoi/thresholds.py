@@ -33,7 +33,7 @@ def true_maps(samples: list[ClipSample]) -> np.ndarray:
 @torch.no_grad()
 def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
     """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
-    batch = collate(samples, with_entries=False)
+    batch = collate(samples)
     latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(seed))
     return network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2).mean(1).numpy()
 
@@ -46,7 +46,7 @@ def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]
 @torch.no_grad()
 def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
     """The threshold at which single samples touch as large a share of an object as held-out clips do."""
-    batch = collate(held_out, with_entries=False)
+    batch = collate(held_out)
     latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(0))
     found = network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2)
     share = float(batch.contact.any(1).float().mean())

@@ -2,13 +2,11 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-import yaml
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
@@ -26,11 +24,13 @@ from models.text2hoi.refiner import RefinerModel, refine
 from models.text2hoi.refiner_training import RefinerObjective
 from models.text2hoi.surface import Surface
 from models.text2hoi.thresholds import best_threshold, contact_probabilities, true_maps
+from pipelines.stages.base import load_settings
+from pipelines.stages.train import TrainParams
 from tests.builders.stores import write_annotated
 from tests.models.conftest import BOX, make_clip
 from tests.models.conftest import Plan as ToyPlan
 
-DEMO: Mapping[str, Any] = yaml.safe_load(Path("params.yaml").read_text())["train"]["demo"]
+DELIVERED = load_settings(TrainParams, "train")
 STEPS = {"contact": (300, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
 
 
@@ -61,8 +61,8 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> Learnt:
 
 
 def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module]) -> tuple[nn.Module, Any]:
-    """The network with the demo's settings, but for its budget and the dropout, which is against knowing by heart."""
-    plan = Plan.of(network, DEMO[network.name])
+    """The network with the delivered settings but for its budget, and without dropout, which is against knowing."""
+    plan = Plan.of(network, DELIVERED.of(network.name))
     config = replace(plan.network, dropout=0.0) if hasattr(plan.network, "dropout") else plan.network
     steps, size, rate = STEPS[network.name]
     trained = {name: SimpleNamespace(network=own) for name, own in before.items()}
@@ -71,7 +71,7 @@ def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, n
     objective, normaliser = network.objective(setup)
     budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 20, "validate_every": steps}
     training = replace(plan.training, **budget, ema_decay=0.98, weight_decay=0.0, keep_best=False)
-    return fit(objective, learnt.corpus, training, 0, torch.device("cpu"))[0], normaliser
+    return fit(objective, corpus, training, 0, torch.device("cpu"))[0], normaliser
 
 
 @pytest.mark.slow
@@ -103,7 +103,8 @@ def test_exchanged_prompts_exchange_the_paths_of_the_object(learnt: Learnt) -> N
     noise = draw_motion((2, 2, rows[0], 99), (2, rows[1], 10), draws)
     for order, verbs in (([0, 1], [0, 1]), ([1, 0], [1, 0])):
         # Words, and the length they ask for; where to touch stays as it was.
-        asked = replace(condition(learnt, batch, batch.text[order]), frames=batch.frames[order])
+        asked = condition(learnt, batch, batch.text[order])
+        asked = replace(asked, lengths=batch.lengths[order], counts=tuple(batch.counts[row] for row in order))
         _, objects = learnt.generator.sample(asked, SamplerConfig(), noise, draws)
         # The box is lifted along z or passed along x, by 20 cm.
         last = torch.stack([own[n - 1, :3] for own, n in zip(objects, batch.lengths[order], strict=True)])
@@ -133,7 +134,7 @@ def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
 @pytest.mark.slow
 def test_the_refiner_takes_planted_noise_away(learnt: Learnt) -> None:
     network, clips = load_network("refiner"), learnt.clips
-    plan = Plan.of(network, DEMO["refiner"])
+    plan = Plan.of(network, DELIVERED.of("refiner"))
     loss = replace(plan.loss, samples=1, penetration_weight=0.0, field_resolution=24)
     generator = Planted(learnt.generator.network, learnt.generator.normaliser)
     surface = Surface.of(learnt.hands, [clips[0].object_model], 24, torch.device("cpu"))
@@ -146,6 +147,7 @@ def test_the_refiner_takes_planted_noise_away(learnt: Learnt) -> None:
     objective.weights = replace(loss, samples=len(pools))
     training = replace(plan.training, steps=500, batch=2, validate_every=500, keep_best=False, learning_rate=2e-3)
     refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
+    assert isinstance(refiner, RefinerModel)
     batch = collate(clips)
     coarse = planted(batch.hands, torch.Generator().manual_seed(2))
     seen = surface.coarse(batch, coarse, batch.object, batch.contact_map, batch.present)

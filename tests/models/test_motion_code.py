@@ -77,8 +77,8 @@ def without_jerks(sample: ClipSample) -> ClipSample:
 
 
 def decoded(code: MotionCode, sample: ClipSample) -> tuple[Tensor, Tensor]:
-    coded, length = code.encode(sample), torch.tensor([sample.length])
-    hands, objects = code.curves(coded.hands[None], coded.object[None], length)
+    coded = code.encode(sample)
+    hands, objects = code.curves(coded.hands[None], coded.object[None], [sample.length])
     return code.in_world(hands, objects)[0], objects[0]
 
 

@@ -15,15 +15,27 @@ PARAMS = {
         "network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "drawn_by": "anchor"},
         "training": BUDGET,
     },
-    "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
+    "length": {"network": {"width": 16, "drawn_by": "spread", "told": True}, "training": {**BUDGET, "keep_best": True}},
     "diffusion": {
-        "network": {"transformer": TRANSFORMER, "contact_input": "tokens", "motion": {"knot_frames": 4}},
+        "network": {
+            "transformer": TRANSFORMER,
+            "contact_input": "tokens",
+            "motion": {"knot_frames": 4},
+            "normalised": True,
+            "told": True,
+        },
         "training": BUDGET,
     },
     "refiner": {
-        "network": {"transformer": TRANSFORMER, "contact_map": False},
+        "network": {
+            "transformer": TRANSFORMER,
+            "contact_map": False,
+            "view": "object",
+            "surface_input": True,
+            "output": "residual",
+        },
         "training": BUDGET,
-        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
+        "loss": {"generated": "half", "samples": 2, "sampler_steps": 2, "field_resolution": 16},
     },
 }
 
