@@ -253,8 +253,10 @@ def nearest_by_libigl(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def rays_by_libigl(mesh: Mesh, start: np.ndarray, ahead: np.ndarray) -> list[np.ndarray]:
-    found = (igl.ray_mesh_intersect(*ray, mesh.vertices_m, mesh.faces) for ray in zip(start, ahead, strict=True))
-    return [np.array([(hit[0], hit[1]) for hit in hits or []]).reshape(-1, 2) for hits in found]
+    # In millimetres: it leaves out triangles of less than 1e-6 square units, seen along the ray.
+    rays, vertices = zip(1e3 * start, ahead, strict=True), 1e3 * mesh.vertices_m
+    found = (igl.ray_mesh_intersect(*ray, vertices, mesh.faces) for ray in rays)
+    return [np.array([(hit[0], hit[1] / 1e3) for hit in hits or []]).reshape(-1, 2) for hits in found]
 
 
 LOOPS: tuple[tuple[Loop, Rays], ...] = ((nearest_by_trimesh, rays_by_trimesh), (nearest_by_libigl, rays_by_libigl))

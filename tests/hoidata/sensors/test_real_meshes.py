@@ -20,6 +20,7 @@ from tests.hoidata.sensors.test_sensors import cells_in_object
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 FRAMES = 200  # of each recording and hand; 132 distances, 104 rays and 66 numbers of normals each
+_MM = 1e3  # libigl leaves out triangles of less than 1e-6 square units, seen along the ray
 EVERY = 20  # of those, for the 1,000 cells
 
 
@@ -87,8 +88,9 @@ def _proximity(tree: TriangleTree, start: np.ndarray, way: np.ndarray, depth: fl
     """As ``slow.proximity``, with libigl's loop over the triangles; its ways are float32."""
     vertices, faces, touching = tree.vertices_m, tree.corner, depth < 0.001
     back, reach = (0.02, 0.022) if touching else (0.0, 0.1)
-    hits = igl.ray_mesh_intersect(start - back * way, way, vertices, faces) or []
-    ways = [hit[1] for hit in hits if hit[1] <= reach and _normal(vertices[faces[hit[0]]]) @ way < 0]
+    hits = igl.ray_mesh_intersect(_MM * (start - back * way), way, _MM * vertices, faces) or []
+    facing = [hit[1] / _MM for hit in hits if _normal(vertices[faces[hit[0]]]) @ way < 0]
+    ways = [far for far in facing if far <= reach]
     missed = (-0.02 if depth < 0 else 0.0) if touching else 0.1
     return min(ways) - back if ways else missed
 
