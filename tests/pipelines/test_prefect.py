@@ -14,9 +14,10 @@ class Client:
     async def read_deployment_by_name(self, name: str) -> str:
         return f"original {name}"
 
-    async def read_deployments(self, deployment_filter):
-        wanted = deployment_filter.name.any_
-        return [SimpleNamespace(name=name) for name in ("annotate-arctic", "full-graph") if name in wanted]
+    async def read_deployments(self, deployment_filter=None):
+        known = ("annotate-arctic", "full-graph")
+        wanted = deployment_filter.name.any_ if deployment_filter else known
+        return [SimpleNamespace(name=name) for name in known if name in wanted]
 
 
 def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefects():
@@ -26,9 +27,11 @@ def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefec
     wrap_lookup(Wrapped)
     assert asyncio.run(Wrapped().read_deployment_by_name("annotate-arctic")).name == "annotate-arctic"
     assert asyncio.run(Wrapped().read_deployment_by_name("a/b")) == "original a/b"
+    with pytest.raises(ValueError, match="did you mean annotate-arctic"):
+        asyncio.run(Wrapped().read_deployment_by_name("anotate-artic"))
 
 
 @pytest.mark.parametrize(("found", "message"), [([], "no deployment is named"), ([1, 2], "2 flows have")])
 def test_a_name_that_none_or_several_have_is_refused(found, message):
     with pytest.raises(ValueError, match=message):
-        only_one("annotate-arctic", found)
+        only_one("annotate-arctic", found, [])
