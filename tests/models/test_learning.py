@@ -31,7 +31,7 @@ from tests.models.conftest import BOX, make_clip
 from tests.models.conftest import Plan as ToyPlan
 
 DELIVERED = load_settings(TrainParams, "train")
-STEPS = {"contact": (300, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
+STEPS = {"contact": (500, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ def test_the_refiner_takes_planted_noise_away(learnt: Learnt) -> None:
     pools = [objective._make(clips, "once", draws) for _ in range(24)]
     objective.pool = {clip.clip_id: [pool[row] for pool in pools] for row, clip in enumerate(clips)}
     objective.weights = replace(loss, samples=len(pools))
-    training = replace(plan.training, steps=500, batch=2, validate_every=500, keep_best=False, learning_rate=2e-3)
+    training = replace(plan.training, steps=1500, batch=2, validate_every=1500, keep_best=False, learning_rate=2e-3)
     refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
     assert isinstance(refiner, RefinerModel)
     batch = collate(clips)
