@@ -6,7 +6,21 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from bench import adapters, evaluate, evaluator, kernels, physics, realism, scale, sensors, store, surface, text
+from bench import (
+    adapters,
+    batches,
+    evaluate,
+    evaluator,
+    kernels,
+    physics,
+    realism,
+    samplers,
+    scale,
+    sensors,
+    store,
+    surface,
+    text,
+)
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -18,6 +32,8 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
+    "batches": batches.main,
+    "samplers": samplers.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
 }

@@ -12,6 +12,7 @@ from pipelines.commands import (
     evaluate,
     generate,
     graph,
+    import_checkpoint,
     inspect,
     raw,
     settings,
@@ -46,6 +47,7 @@ app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
+app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)
 

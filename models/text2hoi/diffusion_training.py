@@ -44,8 +44,13 @@ class DiffusionLossConfig:
     distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
     mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
     the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
+<<<<<<< HEAD
     ``touch_weight`` more. thin_contact: each clip is shown a share of its own touched points, as a drawn map may be as
     sparse, and no two steps the same.
+=======
+    ``touch_weight`` more. thin_contact: each clip is shown a share of its touched points, as a drawn contact map may be
+    as sparse, and no two steps the same.
+>>>>>>> main
     """
 
     distance_weight: float = 1.0
@@ -139,7 +144,11 @@ class DiffusionObjective:
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
         keep = torch.rand(len(batch), 2, generator=generator) >= self.network.config.condition_dropout
         text = any_form(batch, generator)
+<<<<<<< HEAD
         contact = self._contact(batch, text, generator)
+=======
+        contact = self._shown(batch, text, generator)
+>>>>>>> main
         if weights.thin_contact:
             contact = contact.bool() & thinned(contact.shape, generator).to(self.device)
         predicted = self._denoised(self.network, batch, target, text, contact, steps, generator, keep.float())
@@ -160,11 +169,20 @@ class DiffusionObjective:
         target = self.targets.of(held)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(held),), step, device=self.device)
+<<<<<<< HEAD
             text = held.text[:, 0]
             contact = self._contact(held, text, generator)
             predicted = self._denoised(network, held, target, text, contact, steps, generator, None)
+=======
+            seen = held.text[:, 0], self._shown(held, held.text[:, 0], generator)
+            predicted = self._denoised(network, held, target, *seen, steps, generator, None)
+>>>>>>> main
             total += self._simple(predicted, target)
         return total / len(VALIDATION_STEPS)
+
+    def _shown(self, batch: ClipBatch, text: Tensor, generator: torch.Generator) -> Tensor:
+        """(B, 2, N) bool: the contact maps that motions are shown."""
+        return batch.contact if self.drawn is None else self.drawn(batch, text, generator).bool()
 
     def _denoised(
         self,
