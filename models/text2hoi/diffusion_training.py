@@ -44,13 +44,8 @@ class DiffusionLossConfig:
     distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
     mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
     the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
-<<<<<<< HEAD
-    ``touch_weight`` more. thin_contact: each clip is shown a share of its own touched points, as a drawn map may be as
-    sparse, and no two steps the same.
-=======
     ``touch_weight`` more. thin_contact: each clip is shown a share of its touched points, as a drawn contact map may be
     as sparse, and no two steps the same.
->>>>>>> main
     """
 
     distance_weight: float = 1.0
@@ -144,11 +139,7 @@ class DiffusionObjective:
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
         keep = torch.rand(len(batch), 2, generator=generator) >= self.network.config.condition_dropout
         text = any_form(batch, generator)
-<<<<<<< HEAD
-        contact = self._contact(batch, text, generator)
-=======
         contact = self._shown(batch, text, generator)
->>>>>>> main
         if weights.thin_contact:
             contact = contact.bool() & thinned(contact.shape, generator).to(self.device)
         predicted = self._denoised(self.network, batch, target, text, contact, steps, generator, keep.float())
@@ -169,14 +160,8 @@ class DiffusionObjective:
         target = self.targets.of(held)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(held),), step, device=self.device)
-<<<<<<< HEAD
-            text = held.text[:, 0]
-            contact = self._contact(held, text, generator)
-            predicted = self._denoised(network, held, target, text, contact, steps, generator, None)
-=======
             seen = held.text[:, 0], self._shown(held, held.text[:, 0], generator)
             predicted = self._denoised(network, held, target, *seen, steps, generator, None)
->>>>>>> main
             total += self._simple(predicted, target)
         return total / len(VALIDATION_STEPS)
 
@@ -200,10 +185,6 @@ class DiffusionObjective:
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
         condition = Condition.of(batch, self._object_features(network, batch), text, contact)
         return network(noised[0], noised[1], steps, condition, None if keep is None else keep.to(self.device))
-
-    def _contact(self, batch: ClipBatch, text: Tensor, generator: torch.Generator) -> Tensor:
-        """The contact (B, 2, N) the motions are shown."""
-        return self.drawn(batch, text, generator) if self.drawn else batch.contact
 
     def _object_features(self, network: DiffusionModel, batch: ClipBatch) -> Tensor:
         """F_obj of every clip; computed once per object, since the point network is frozen."""

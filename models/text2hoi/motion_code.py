@@ -28,26 +28,19 @@ HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
 @dataclass(frozen=True)
 class MotionCodeConfig:
     """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
-<<<<<<< HEAD
     per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
     object, or a hand on it, that is generated with knots nearer than this to each other stands still (0: as generated).
-=======
-    per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given.
 
     convention: what rotations mean; "own", or that of a dataset in the authors' code, for networks they trained:
     GRAB's objects are transposed, ARCTIC's fingers are offsets from ``finger_mean_rad``, 45 numbers for each hand.
->>>>>>> main
     """
 
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
-<<<<<<< HEAD
     rest_m: float = 0.0
-=======
     convention: Literal["own", "h2o", "grab", "arctic"] = "own"
     finger_mean_rad: tuple[float, ...] = ()
->>>>>>> main
 
 
 @dataclass(frozen=True)
@@ -108,7 +101,6 @@ class MotionCode:
         knots = [n * self.config.object_knots for n in knots]
         return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
 
-<<<<<<< HEAD
     def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
         if not (self.config.rest_m and self.config.knot_frames):
@@ -118,7 +110,7 @@ class MotionCode:
             reach = self.config.rest_m * HAND_REACH.to(hands)
             hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
         return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
-=======
+
     def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
         """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
         if self.config.convention == "grab":
@@ -130,7 +122,6 @@ class MotionCode:
             fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
             hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
         return hands, objects
->>>>>>> main
 
     def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the model frame."""
