@@ -38,9 +38,9 @@ class MotionCodeConfig:
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
+    rest_m: float = 0.0
     convention: Literal["own", "h2o", "grab", "arctic"] = "own"
     finger_mean_rad: tuple[float, ...] = ()
-    rest_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -101,6 +101,16 @@ class MotionCode:
         knots = [n * self.config.object_knots for n in knots]
         return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
 
+    def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
+        """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
+        if not (self.config.rest_m and self.config.knot_frames):
+            return hands, objects
+        present, there = self.rows(counts, hands.device)
+        if self.config.hand_frame == "object":
+            reach = self.config.rest_m * HAND_REACH.to(hands)
+            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
+        return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
+
     def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
         """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
         if self.config.convention == "grab":
@@ -112,16 +122,6 @@ class MotionCode:
             fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
             hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
         return hands, objects
-
-    def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
-        """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
-        if not (self.config.rest_m and self.config.knot_frames):
-            return hands, objects
-        present, there = self.rows(counts, hands.device)
-        if self.config.hand_frame == "object":
-            reach = self.config.rest_m * HAND_REACH.to(hands)
-            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
-        return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
 
     def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the model frame."""

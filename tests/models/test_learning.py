@@ -31,7 +31,7 @@ from tests.models.conftest import BOX, make_clip
 from tests.models.conftest import Plan as ToyPlan
 
 DELIVERED = load_settings(TrainParams, "train")
-STEPS = {"contact": (300, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
+STEPS = {"contact": (400, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,8 @@ def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, n
     steps, size, rate = STEPS[network.name]
     trained = {name: SimpleNamespace(network=own) for name, own in before.items()}
     torch.manual_seed(0)
-    setup = Setup(config, plan.loss, 0, corpus, hands, torch.device("cpu"), trained)
+    loss = replace(plan.loss, points=1024) if network.name == "contact" else plan.loss
+    setup = Setup(config, loss, 0, corpus, hands, torch.device("cpu"), trained)
     objective, normaliser = network.objective(setup)
     budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 20, "validate_every": steps}
     training = replace(plan.training, **budget, ema_decay=0.98, weight_decay=0.0, keep_best=False)
@@ -142,10 +143,10 @@ def test_the_refiner_takes_planted_noise_away(learnt: Learnt) -> None:
     given = loss, learnt.corpus, generator, surface, torch.device("cpu"), 0
     objective = RefinerObjective(RefinerModel(plan.network), *given)
     draws = torch.Generator().manual_seed(1)
-    pools = [objective._make(clips, "once", draws) for _ in range(24)]
+    pools = [objective._make(clips, "once", draws) for _ in range(120)]
     objective.pool = {clip.clip_id: [pool[row] for pool in pools] for row, clip in enumerate(clips)}
     objective.weights = replace(loss, samples=len(pools))
-    training = replace(plan.training, steps=500, batch=2, validate_every=500, keep_best=False, learning_rate=2e-3)
+    training = replace(plan.training, steps=1200, batch=2, validate_every=1200, keep_best=False, learning_rate=2e-3)
     refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
     assert isinstance(refiner, RefinerModel)
     batch = collate(clips)
