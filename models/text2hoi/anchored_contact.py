@@ -22,6 +22,7 @@ ANCHOR_FEATURES = 8
 WAVES = (1.0, 2.0, 4.0)
 REACHES = (0.1, 0.2, 0.4)
 FAR = 10.0
+ANCHOR_STRIDE = 4  # every fourth of the sampled points may become an anchor
 Cloud = tuple[Tensor, Tensor, Tensor]
 
 
@@ -55,10 +56,9 @@ class AnchoredContact(nn.Module):
         clip = torch.cat((overall, scale, scaled_text(text), active_hands.float()), -1)
         return points, local, self.from_clip(clip)
 
-    def logits(self, cloud: Cloud, anchors: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Of touches and of maps, (B, 2, N) each; anchors (B, 2, A) rows of points, known (B, 2, A) which count."""
+    def logits(self, cloud: Cloud, at: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Of touches and of maps, (B, 2, N) each; at (B, 2, A, 3): anchors, known (B, 2, A): which of them count."""
         points, local, clip = cloud
-        at = points[:, None].expand(-1, SIDES, -1, -1).gather(2, anchors[..., None].expand(-1, -1, -1, 3))
         distance = torch.cdist(points[:, None], at).masked_fill(~known[:, :, None], FAR)
         nearest, which = distance.min(-1)
         offset = points[:, None] - at.gather(2, which[..., None].expand(-1, -1, -1, 3))
@@ -81,7 +81,8 @@ class AnchoredContact(nn.Module):
         """
         cloud, count, device = self.see(points_m, text, batch.active_hands), self.config.anchors, contact.device
         there = contact.any(-1) & batch.active_hands
-        anchors = picked(contact, torch.rand(len(contact), SIDES, count, generator=generator).to(device))
+        rows = picked(contact, torch.rand(len(contact), SIDES, count, generator=generator).to(device))
+        anchors = cloud[0][:, None].expand(-1, SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
         draws = torch.rand(len(contact), 2, generator=generator).to(device)
         right = there[:, 1] & (~there[:, 0] | (draws[:, 0] < 0.5))
         next_one = (draws[:, 1] * count).long()
@@ -98,12 +99,14 @@ class AnchoredContact(nn.Module):
     def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
         """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2, A), even draws from 0 to 1."""
         cloud, maps = self.see(points_m, text, active_hands), []
+        some = cloud[0][:, ::ANCHOR_STRIDE], cloud[1][:, ::ANCHOR_STRIDE], cloud[2]
+        clips = torch.arange(len(points_m), device=points_m.device)
         for draw in latents:
-            anchors = torch.zeros_like(draw, dtype=torch.long)
-            known = torch.zeros_like(anchors, dtype=torch.bool)
+            anchors = points_m.new_zeros(*draw.shape, 3)
+            known = torch.zeros_like(draw, dtype=torch.bool)
             for side, number in product(range(SIDES), range(self.config.anchors)):
-                touch = self.logits(cloud, anchors, known)[0][:, side].softmax(-1)
-                anchors[:, side, number] = picked(touch, draw[:, side, number, None])[:, 0]
+                touch = self.logits(some, anchors, known)[0][:, side].softmax(-1)
+                anchors[:, side, number] = some[0][clips, picked(touch, draw[:, side, number, None])[:, 0]]
                 known[:, side, number] = active_hands[:, side]
             maps.append(self.logits(cloud, anchors, known)[1].sigmoid() * active_hands[..., None])
         return torch.stack(maps, 1)

@@ -67,7 +67,7 @@ def draw_threshold(checkpoint: Checkpoint) -> float:
 
 
 def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-    """(B, 2, N) one map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, D) as the network draws them.
+    """(B, 2, N) a map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, ...) as the network draws them.
 
     Where no point reaches the threshold the likeliest ones count.
     """
