@@ -1,0 +1,58 @@
+"""What ManipNet is given: the motion of both wrists and of an object, at any rate, asked at any time."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from hoidata.clips.clip import Side
+from hoidata.geometry.transform import RigidTransform
+from hoidata.objects.model import ObjectModel
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One rigid body, world frame. time_s: (frame,) rising. rotmats: (frame, 3, 3); position_m: (frame, 3)."""
+
+    time_s: np.ndarray
+    rotmats: np.ndarray
+    position_m: np.ndarray
+
+    def at(self, time_s: np.ndarray) -> RigidTransform:
+        """``world_from_body`` at times of any shape: turned by slerp, moved straight, held beyond the ends."""
+        time = np.clip(time_s, self.time_s[0], self.time_s[-1])
+        return RigidTransform(self._turns(time), _between(self.time_s, self.position_m, time))
+
+    def _turns(self, time_s: np.ndarray) -> np.ndarray:
+        if len(self.time_s) == 1:
+            return np.broadcast_to(self.rotmats[0], (*time_s.shape, 3, 3))
+        return self._slerp(time_s.ravel()).as_matrix().reshape(*time_s.shape, 3, 3)
+
+    @cached_property
+    def _slerp(self) -> Slerp:
+        return Slerp(self.time_s, Rotation.from_matrix(self.rotmats))
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Wrists and object of one recording. wrists: world_from_wrist by side. thing: world_from_object.
+
+    model: the object's mesh. hinge_rad: (frame,) at ``thing.time_s`` for a hinged object, else None.
+    """
+
+    wrists: dict[Side, Motion]
+    thing: Motion
+    model: ObjectModel
+    hinge_rad: np.ndarray | None = None
+
+    def hinge_at(self, time_s: np.ndarray) -> np.ndarray | None:
+        """Angles at times of any shape, radians."""
+        if self.hinge_rad is None:
+            return None
+        return np.interp(time_s, self.thing.time_s, self.hinge_rad)
+
+
+def _between(time_s: np.ndarray, values: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
+    """(..., 3) straight between rows of ``values (frame, 3)``."""
+    return np.stack([np.interp(wanted_s, time_s, column) for column in values.T], axis=-1)
