@@ -1,0 +1,179 @@
+"""Running ManipNet: each hand frame by frame, its pose the next frame's input (Sec. 6.4).
+
+No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step, ``roll_out``
+whole clips of many hands at once, :class:`Stream` frames as they come. Rotations are predicted and joints placed by
+forward kinematics: bones keep their length, which the release's do not.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import torch
+
+from hoidata.clips.clip import Side
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.tracked_hand import HandState, TrackedHand
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.sensors import sense
+from models.manipnet.control import Control, Motion
+from models.manipnet.features import (
+    FeatureSettings,
+    joint_rotmats_of,
+    object_from_wrist,
+    pose_features,
+    trajectory_features,
+)
+from models.manipnet.inverse_kinematics import Limits, reach, target_points
+from models.manipnet.network import ManipNet
+from models.manipnet.targets import Nearest, Targets, paper_targets, released_targets
+
+Rule = Literal["off", "paper", "released"]
+OVERLAP_SHARE, OVERLAP_WEIGHT = 0.3, 0.3  # the demo's second pass: a joint moves by this share of a capsule's depth
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A trained network and how it is run. rule: of post-processing. low_rad, high_rad: (joint - 1, 3) ``Limits``."""
+
+    network: ManipNet
+    settings: FeatureSettings
+    low_rad: np.ndarray
+    high_rad: np.ndarray
+    rule: Rule = "paper"
+
+    @torch.no_grad()
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Outputs (hand, 214) of inputs (hand, 2350)."""
+        return self.network(torch.from_numpy(rows.astype(np.float32))).double().numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What is given of one hand in one frame. trajectory: (336,) features. object_from_wrist: (time,) now and later.
+
+    hinge_rad: (time,) of a hinged object, else None.
+    """
+
+    trajectory: np.ndarray
+    object_from_wrist: RigidTransform
+    hinge_rad: np.ndarray | None
+
+
+def situations(
+    control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray, settings: FeatureSettings
+) -> list[Situation]:
+    """One for every time."""
+    trajectory = trajectory_features(control, side, hand, time_s, settings)
+    placed, hinge = object_from_wrist(control, side, time_s, settings)
+    frames = range(len(time_s))
+    return [Situation(trajectory[f], placed[f], None if hinge is None else hinge[f]) for f in frames]
+
+
+@dataclass
+class Follower:
+    """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) as they are now, from the start pose on."""
+
+    predictor: Predictor
+    hand: TrackedHand
+    surface: SurfaceIndex
+    finger_rotmats: np.ndarray
+    limits: Limits = field(init=False)
+    state: HandState = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.limits = Limits.of(self.hand, self.predictor.low_rad, self.predictor.high_rad)
+        self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
+
+    def inputs(self, now: Situation) -> np.ndarray:
+        """(2350,) what the network sees."""
+        hinge = None if now.hinge_rad is None else now.hinge_rad[None]
+        at = now.object_from_wrist
+        placed = RigidTransform(at.rotation[None], at.translation[None])
+        sensed = sense(self.hand, self.state, placed, hinge, self.surface, self.predictor.settings.sensors)
+        return np.concatenate([pose_features(self.hand, self.state)[0], now.trajectory, sensed.flat()[0]])
+
+    def advance(self, output: np.ndarray, then: Situation) -> None:
+        """Take the pose of an output (214,) for the next frame, post-processed."""
+        fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
+        self._take(self.limits.within(fingers))
+        if self.predictor.rule != "off":
+            self._correct(output, then)
+
+    def _take(self, finger_rotmats: np.ndarray) -> None:
+        self.finger_rotmats = finger_rotmats
+        self.state = self.hand.state(finger_rotmats)
+
+    def _correct(self, output: np.ndarray, then: Situation) -> None:
+        hand, settings = self.hand, self.predictor.settings
+        radius = hand.point_radius_m
+        reaches_m = np.clip(output[-hand.n_points :], 0, 1) * settings.range_m
+        predicted_m = reaches_m + (radius if settings.less_radius else 0.0)
+        points = self.state.point_m[0]
+        if self.predictor.rule == "paper":
+            targets = paper_targets(points, predicted_m, self._nearest(points, then))
+        else:
+            targets = released_targets(points, predicted_m, radius, self._nearest(points, then))
+        moved = np.zeros(hand.n_points)
+        moved[target_points(hand)] = 1
+        self._reach(targets.point_m, targets.weight * moved)
+        if self.predictor.rule == "released":
+            apart = self._out_of_capsules(then)
+            self._reach(apart.point_m, apart.weight * moved)
+
+    def _reach(self, target_m: np.ndarray, weight: np.ndarray) -> None:
+        if weight.any():
+            self._take(reach(self.hand, self.limits, self.state, target_m, weight))
+
+    def _out_of_capsules(self, then: Situation) -> Targets:
+        """The second pass: joints whose capsule overlaps the object, moved out by a share of its depth."""
+        hand, points = self.hand, self.state.point_m[0]
+        middle = (self.state.capsule_start_m[0] + self.state.capsule_end_m[0]) / 2
+        found = self._nearest(middle, then)
+        depth = np.maximum(hand.capsules.radius_m - found.distance_m, 0) * (hand.capsules.joint > 0)
+        target, weight = points.copy(), np.zeros(len(points))
+        for capsule in np.flatnonzero(depth):
+            # A capsule hangs between its joint and the one after it: the latter moves it.
+            after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
+            tip = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
+            moved = np.concatenate([after, tip])
+            target[moved] += OVERLAP_SHARE * depth[capsule] * found.normal[capsule]
+            weight[moved] = OVERLAP_WEIGHT
+        return Targets(target, weight)
+
+    def _nearest(self, points_m: np.ndarray, then: Situation) -> Nearest:
+        """What the object is like at points (point, 3) of the wrist's frame."""
+        placed = then.object_from_wrist[0]
+        hinge = None if then.hinge_rad is None else then.hinge_rad[:1]
+        found = self.surface.nearest((placed @ points_m)[None], hinge)
+        back = placed.inverse()
+        return Nearest(found.distance_m[0], back @ found.closest_m[0], back.turn(found.gradient[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A hand to follow through a clip. start: (joint - 1, 3, 3) finger rotations at the first of ``time_s (frame,)``."""
+
+    hand: TrackedHand
+    side: Side
+    control: Control
+    time_s: np.ndarray
+    start: np.ndarray
+
+
+def roll_out(predictor: Predictor, tasks: Sequence[Task]) -> list[np.ndarray]:
+    """Finger rotations (frame, joint - 1, 3, 3) of each task, the start pose first; times are a step apart.
+
+    The hands of a frame share one call of the network, whose last bits depend on how many they are.
+    """
+    given = [situations(task.control, task.side, task.hand, task.time_s, predictor.settings) for task in tasks]
+    followers = [Follower(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
+    made = [[follower.finger_rotmats[0]] for follower in followers]
+    for frame in range(1, max(map(len, given), default=0)):
+        running = [number for number, frames in enumerate(given) if frame < len(frames)]
+        rows = np.stack([followers[number].inputs(given[number][frame - 1]) for number in running])
+        for number, output in zip(running, predictor(rows), strict=True):
+            followers[number].advance(output, given[number][frame])
+            made[number].append(followers[number].finger_rotmats[0])
+    return [np.stack(poses) for poses in made]
