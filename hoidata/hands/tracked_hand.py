@@ -57,7 +57,8 @@ class HandState(NamedTuple):
 _TURNED = ("joint_rotmats", "sensor_normal")
 
 
-class Skin(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Skin:
     """Points that follow the joints by linear blend skinning: the tips, then the proximity sensors.
 
     point_m, normal: (point, 3) at rest, skin frame. weight: (point, joint), rows summing to 1.
@@ -72,7 +73,8 @@ class Skin(NamedTuple):
     corrective_m: np.ndarray | None = None
 
 
-class JointCapsules(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class JointCapsules:
     """joint: (capsule,) each moves with. start_m, end_m: (capsule, 3) in that joint's frame. radius_m: (capsule,)."""
 
     joint: np.ndarray
@@ -172,7 +174,7 @@ class TrackedHand:
                 RigidTransform(_seen_in_mirror(move.rotation), move.translation * _MIRROR),
                 corrective,
             ),
-            capsules=capsules._replace(start_m=capsules.start_m * _MIRROR, end_m=capsules.end_m * _MIRROR),
+            capsules=replace(capsules, start_m=capsules.start_m * _MIRROR, end_m=capsules.end_m * _MIRROR),
             wrist_from_canonical=_MIRROR[:, None] * self.wrist_from_canonical,
             hinge_axis=self.hinge_axis * -_MIRROR,
         )

@@ -126,6 +126,73 @@ def lower_distances(tree, grid, places_m, most_m, distance_m):  # pragma: no cov
 
 
 @njit(cache=True)
+def nearest_triangles(tree, places_m, distance_m, closest_m, triangle_of):  # pragma: no cover (compiled)
+    """Set ``closest_m (place, 3)`` on the surface and its triangle, by the tree's order, in ``triangle_of (place,)``.
+
+    distance_m: (place,) exact distances, as ``lower_distances`` gives them; places with an infinite one are left alone.
+    """
+    triangle, box, link = tree[0], tree[1], tree[2]
+    stack, squares = np.empty(DEEPEST, np.int64), np.empty(LEAF)
+    for place in range(len(places_m)):
+        if distance_m[place] < np.inf:
+            x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
+            bound = distance_m[place] * _WIDER + _TINY_M
+            number = _triangle_within(triangle, box, link, x, y, z, bound * bound, stack, squares)
+            triangle_of[place] = number
+            _closest_place(triangle, number, x, y, z, closest_m[place])
+
+
+@njit(cache=True)
+def _triangle_within(triangle, box, link, x, y, z, bound, stack, squares):  # pragma: no cover (compiled)
+    """The nearest triangle, of those whose squared distance is not above ``bound``; -1 without any."""
+    best, found, size = bound, -1, 1
+    stack[0] = 0
+    while size:
+        size -= 1
+        node = stack[size]
+        if _square_to_box(box, node, x, y, z) * _BOX_ROUNDING > best:
+            continue
+        if link[node, 0]:
+            stack[size], stack[size + 1] = link[node, 0], node + 1
+            size += 2
+            continue
+        start, stop = link[node, 1], link[node, 2]
+        _leaf_squares(triangle, start, stop, x, y, z, squares)
+        for number in range(stop - start):
+            if squares[number] < best or (found < 0 and squares[number] <= best):
+                best, found = squares[number], start + number
+    return found
+
+
+@njit(cache=True)
+def _closest_place(triangle, number, x, y, z, closest):  # pragma: no cover (compiled)
+    """The place on one triangle nearest to (x, y, z), as ``_leaf_squares`` finds it."""
+    a, ab, ac = triangle[0:3, number], triangle[3:6, number], triangle[6:9, number]
+    normal, inverse = triangle[9:12, number], triangle[12:15, number]
+    p = np.array((x - a[0], y - a[1], z - a[2]))
+    least = np.inf
+    for edge in range(3):
+        origin, way = (ab, ac - ab) if edge == 2 else (np.zeros(3), ac if edge else ab)
+        along = min(max(np.sum((p - origin) * way) * inverse[edge], 0.0), 1.0)
+        place = origin + along * way
+        square = np.sum((p - place) ** 2)
+        if square < least:
+            least = square
+            closest[:] = a + place
+    height = np.sum(p * normal)
+    flat = p - height * normal
+    left_of_ab, left_of_ca = np.sum(_cross(ab, flat) * normal), np.sum(_cross(flat, ac) * normal)
+    left_of_bc = np.sum(_cross(ac - ab, flat - ab) * normal)
+    if min(left_of_ab, left_of_ca, left_of_bc) > 0.0 and height * height < least:
+        closest[:] = a + flat
+
+
+@njit(cache=True, inline="always")
+def _cross(u, v):  # pragma: no cover (compiled)
+    return np.array((u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]))
+
+
+@njit(cache=True)
 def sides(tree, grid, places_m):  # pragma: no cover (compiled)
     """(place,) int8: INSIDE or OUTSIDE of a closed surface where box or grid say so for certain, else UNSURE."""
     box, low_m, cell_m, value = tree[1], grid[0], grid[1], grid[2]

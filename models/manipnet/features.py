@@ -65,8 +65,8 @@ def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray) -> np.ndarray:
 
 def trajectory_features(control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray,
                         settings: FeatureSettings) -> np.ndarray:  # fmt: skip
-    """(frame, 21 x 16) at ``time_s (frame,)``: per sample the other wrist's distance, own wrist's position, z axis and y
-    axis, the object's position, its angular velocity (rad/s); metres, canonical axes of the own wrist at ``time_s``.
+    """(frame, 21 x 16): per sample distance of the other wrist; own wrist position, z axis, y axis; the object's
+    position and angular velocity (rad/s). Metres, canonical axes of the own wrist at ``time_s (frame,)``.
     """
     raise NotImplementedError
 
