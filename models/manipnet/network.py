@@ -7,18 +7,22 @@
 Numbers go in and come out as they are: normalisation is part of the network, so a checkpoint knows its own.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
+
+from models.manipnet.features import FeatureSettings
 
 Kind = Literal["manipnet", "resnet", "mlp"]
 
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """pose, trajectory, sensors, output: how many numbers there are of each.
+    """pose, trajectory, sensors, output: how many numbers there are of each; joints of the hand.
+
+    features: how they are measured, and the time from one pose to the next. without: sensors that are switched off.
 
     encoder: width of each of the three encoders, the paper's 512. kind: "resnet" has no way from a block's input to
     its output, "mlp" no way past any layer (Sec. 8). keep: share of the numbers that dropout keeps at the input of
@@ -29,6 +33,9 @@ class NetworkConfig:
     trajectory: int = 336
     sensors: int = 1822
     output: int = 214
+    joints: int = 17
+    features: FeatureSettings = field(default_factory=FeatureSettings)
+    without: tuple[str, ...] = ()
     encoder: int = 512
     blocks: int = 2
     kind: Kind = "manipnet"
@@ -63,7 +70,8 @@ class ManipNet(nn.Module):
     """Inputs (..., pose + trajectory + sensors) to outputs (..., output), both as measured.
 
     Buffers of the normalisation: input_mean, input_scale, output_mean, output_scale; kept: 0 for inputs it does not
-    see, which is how sensors are switched off: every variant has the same layers.
+    see, which is how sensors are switched off: every variant has the same layers. low_rad, high_rad: (joint - 1, 3)
+    how far finger joints turned in training (``inverse_kinematics.Limits``).
     """
 
     input_mean: Tensor
@@ -71,6 +79,8 @@ class ManipNet(nn.Module):
     output_mean: Tensor
     output_scale: Tensor
     kept: Tensor
+    low_rad: Tensor
+    high_rad: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -88,6 +98,8 @@ class ManipNet(nn.Module):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
         self.register_buffer("kept", torch.ones(sum(config.inputs)))
+        for name, value in (("low_rad", -torch.pi), ("high_rad", torch.pi)):
+            self.register_buffer(name, torch.full((config.joints - 1, 3), value))
 
     def forward(self, inputs: Tensor) -> Tensor:
         return self.normalised(inputs) * self.output_scale + self.output_mean

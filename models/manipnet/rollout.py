@@ -5,8 +5,8 @@ whole clips of many hands at once, :class:`Stream` frames as they come. Rotation
 forward kinematics: bones keep their length, which the release's do not.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import Control
 from models.manipnet.features import (
     FeatureSettings,
     joint_rotmats_of,
@@ -35,13 +35,19 @@ OVERLAP_SHARE, OVERLAP_WEIGHT = 0.3, 0.3  # the demo's second pass: a joint move
 
 @dataclass(frozen=True)
 class Predictor:
-    """A trained network and how it is run. rule: of post-processing. low_rad, high_rad: (joint - 1, 3) ``Limits``."""
+    """A trained network and how it is run. rule: of post-processing."""
 
     network: ManipNet
-    settings: FeatureSettings
-    low_rad: np.ndarray
-    high_rad: np.ndarray
     rule: Rule = "paper"
+
+    @property
+    def settings(self) -> FeatureSettings:
+        return self.network.config.features
+
+    def limits(self, hand: TrackedHand) -> Limits:
+        """How far the joints of a hand may turn: as far as in training, and as far as its hinges do."""
+        low, high = (array.double().numpy() for array in (self.network.low_rad, self.network.high_rad))
+        return Limits.of(hand, low, high)
 
     @torch.no_grad()
     def __call__(self, rows: np.ndarray) -> np.ndarray:
@@ -83,7 +89,7 @@ class Follower:
     state: HandState = field(init=False)
 
     def __post_init__(self) -> None:
-        self.limits = Limits.of(self.hand, self.predictor.low_rad, self.predictor.high_rad)
+        self.limits = self.predictor.limits(self.hand)
         self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
 
     def inputs(self, now: Situation) -> np.ndarray:
@@ -148,7 +154,7 @@ class Follower:
         hinge = None if then.hinge_rad is None else then.hinge_rad[:1]
         found = self.surface.nearest((placed @ points_m)[None], hinge)
         back = placed.inverse()
-        return Nearest(found.distance_m[0], back @ found.closest_m[0], back.turn(found.gradient[0]))
+        return Nearest(found.distance_m[0], back @ found.closest_m[0], back.turn(found.normal[0]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,170 @@
+"""Training of ManipNet on annotated clips: from the recorded pose of a frame to that of the next (Sec. 6.4)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hoidata.batches.dataset import ClipBatch, ClipSample
+from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.hands import HandPair
+from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.sensors import sensor_size
+from models.common.family import Losses, Network, Setup
+from models.manipnet.control import Control
+from models.manipnet.features import FeatureSettings, hand_inputs, outputs
+from models.manipnet.inverse_kinematics import turns_from_rest
+from models.manipnet.layout import floors, kept_columns, sizes
+from models.manipnet.network import ManipNet, NetworkConfig
+from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
+
+MARGIN_RAD = 0.1  # joints may turn by so much more than in any training clip
+
+
+class Examples(NamedTuple):
+    """Steps of a hand, from one frame to the next. frame: (step,) it starts in. inputs: (step, 2350), float32.
+
+    outputs: (step, 214), float32. turns_rad: (step, joint - 1, 3) from the neutral pose, as a right hand's.
+    """
+
+    frame: np.ndarray
+    inputs: np.ndarray
+    outputs: np.ndarray
+    turns_rad: np.ndarray
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """rows: steps drawn from each clip of a batch."""
+
+    rows: int = 16
+
+
+def hand_examples(
+    control: Control,
+    side: Side,
+    hand: TrackedHand,
+    finger_rotmats: np.ndarray,
+    time_s: np.ndarray,
+    usable: np.ndarray,
+    surface: SurfaceIndex,
+    settings: FeatureSettings,
+) -> Examples:
+    """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart."""
+    first = np.flatnonzero(usable[:-1] & usable[1:])
+    state = hand.state(finger_rotmats)
+    seen = hand_inputs(control, side, hand, state.taken(first), time_s[first], surface, settings)
+    placed = control.thing.at(time_s[first + 1]).inverse() @ control.wrists[side].at(time_s[first + 1])
+    hinge = control.hinge_at(time_s[first + 1])
+    after = state.taken(first + 1)
+    distance_m = surface.nearest(placed @ after.point_m, hinge).distance_m
+    made = outputs(hand, after, distance_m, settings)
+    rows = np.concatenate(seen, axis=1, dtype=np.float32)
+    return Examples(first, rows, made.astype(np.float32), turns_from_rest(hand, finger_rotmats[first]))
+
+
+def clip_examples(sample: ClipSample, pair: HandPair, settings: FeatureSettings) -> list[Examples]:
+    """The steps of every active hand of a whole clip."""
+    hands = hands_of(pair, sample.betas, sample.template_m)
+    control, surface = control_of(trajectories_of(sample), sample.object_model), surface_index(sample.object_model)
+    time_s = np.arange(sample.length) / FPS
+    return [
+        hand_examples(
+            control,
+            side,
+            hands[side],
+            finger_rotmats_of(sample.hands[row]),
+            time_s,
+            sample.valid[row],
+            surface,
+            settings,
+        )
+        for row, side in enumerate(SIDES)
+        if sample.active_hands[row] and (sample.valid[row, :-1] & sample.valid[row, 1:]).any()
+    ]
+
+
+def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
+    """The configuration with the numbers that this hand has."""
+    count = sizes(hand, config.features)
+    return replace(
+        config,
+        pose=count["pose"],
+        trajectory=count["trajectory"],
+        sensors=sensor_size(hand, config.features.sensors),
+        output=count["pose"] + hand.n_points,
+        joints=hand.n_joints,
+    )
+
+
+def prepared(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
+    """A network that knows its normalisation, its sensors and the limits of the joints from training examples."""
+    network = ManipNet(sized(config, hand))
+    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in _LEARNT)
+    least = [torch.from_numpy(values).float() for values in floors(hand, config.features)]
+    network.learn_normalisation(inputs, made, (least[0], least[1]))
+    network.kept.copy_(torch.from_numpy(kept_columns(hand, config.features, config.without)))
+    turns = torch.from_numpy(np.concatenate([one.turns_rad for one in examples]))
+    network.low_rad.copy_(turns.amin(0) - MARGIN_RAD)
+    network.high_rad.copy_(turns.amax(0) + MARGIN_RAD)
+    return network
+
+
+_LEARNT = ("inputs", "outputs")
+
+
+def step_loss(network: ManipNet, inputs: Tensor, made: Tensor) -> Tensor:
+    """Mean squared error of normalised outputs."""
+    return (network.normalised(inputs) - (made - network.output_mean) / network.output_scale).square().mean()
+
+
+class FingersObjective:
+    """Squared error of the next pose and distances; inputs are always the recorded ones."""
+
+    needs_entries = False
+
+    def __init__(self, setup: Setup) -> None:
+        pair = setup.corpus.annotated.store.hand_pair()
+        self.rows, self.device = setup.loss.rows, setup.device
+        settings = setup.network.features
+        whole = [setup.corpus.train.whole(clip_id) for clip_id in setup.corpus.train.ids]
+        self.examples = {sample.clip_id: clip_examples(sample, pair, settings) for sample in whole}
+        hand = hands_of(pair, whole[0].betas, whole[0].template_m)["right"]
+        known = [one for clip in self.examples.values() for one in clip]
+        self.network = prepared(setup.network, hand, known).to(setup.device)
+        held = [one for sample in setup.corpus.held_out for one in clip_examples(sample, pair, settings)]
+        self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in _LEARNT]
+
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
+        drawn = [pair for sample in batch.samples for pair in self._drawn(sample, generator)]
+        if not drawn:  # clips in which no hand is seen twice in a row
+            return {"total": self.network.decoder.bias.sum() * 0}
+        inputs, made = (torch.from_numpy(np.stack(rows)).to(self.device) for rows in zip(*drawn, strict=True))
+        return {"total": step_loss(self.network, inputs, made)}
+
+    def _drawn(self, sample: ClipSample, generator: torch.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+        """So many steps of the frames of a cropped clip, any hand."""
+        steps = [
+            (one, row)
+            for one in self.examples[sample.clip_id]
+            for row in np.flatnonzero((one.frame >= sample.start) & (one.frame < sample.start + sample.length - 1))
+        ]
+        if not steps:
+            return []
+        chosen = torch.randint(len(steps), (self.rows,), generator=generator).tolist()
+        return [(one.inputs[row], one.outputs[row]) for one, row in (steps[number] for number in chosen)]
+
+    @torch.no_grad()
+    def validation(self, network: nn.Module) -> float:
+        assert isinstance(network, ManipNet)
+        inputs, made = (torch.from_numpy(rows).to(self.device) for rows in self.held_out)
+        return float(step_loss(network, inputs, made))
+
+
+MANIPNET = Network(
+    "manipnet", NetworkConfig, ManipNet, lambda setup: (FingersObjective(setup), None), loss=LossConfig
+)
