@@ -97,13 +97,14 @@ def read_hands(root: Path, name: str) -> HandRecording:
     recording = read_recording(raw, name)
     left_path, right_path, object_path = recording.paths[:3]
     motions = {"left": _motion(raw, left_path), "right": _motion(raw, right_path)}
-    every = slice(None, None, round(recording.source_fps / RATE_HZ))
+    step = round(recording.source_fps / RATE_HZ)
+    every = slice(None, None, step)
     right = read_hand(raw, motions["right"])
     bodies = {side: _body(motions[side], every) for side in SIDES}
     thing = _body(_motion(raw, object_path), every)
     usable = np.ones(len(motions["left"].root_position), dtype=bool)
     for cut in recording.cuts:
-        usable[cut.start : cut.stop] = False
+        usable[cut.start // step * step : cut.stop] = False
     lowest = _lowest_m(recording, thing)
     height = height_above_table(lowest)
     return HandRecording(

@@ -15,6 +15,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sensor_size
 from models.common.family import Losses, Network, Setup
+from models.common.training import TrainingConfig, learning_rate_factor
 from models.manipnet.control import Control
 from models.manipnet.features import FeatureSettings, hand_inputs, outputs
 from models.manipnet.inverse_kinematics import turns_from_rest
@@ -122,6 +123,28 @@ def step_loss(network: ManipNet, inputs: Tensor, made: Tensor) -> Tensor:
     return (network.normalised(inputs) - (made - network.output_mean) / network.output_scale).square().mean()
 
 
+def fit_examples(network: ManipNet, examples: Sequence[Examples], config: TrainingConfig, seed: int) -> list[float]:
+    """Train on steps of any source in an order drawn anew for every epoch; the losses. Adam, as the paper's."""
+    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in _LEARNT)
+    generator = torch.Generator().manual_seed(seed)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    network.train()
+    losses, order = [], torch.zeros(0, dtype=torch.long)
+    for step in range(1, config.steps + 1):
+        if len(order) < config.batch:  # the last batch that is not full is left out
+            order = torch.randperm(len(inputs), generator=generator)
+        rows, order = order[: config.batch], order[config.batch :]
+        for group in optimiser.param_groups:
+            group["lr"] = config.learning_rate * learning_rate_factor(step, config)
+        loss = step_loss(network, inputs[rows], made[rows])
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    network.eval()
+    return losses
+
+
 class FingersObjective:
     """Squared error of the next pose and distances; inputs are always the recorded ones."""
 
@@ -130,12 +153,12 @@ class FingersObjective:
     def __init__(self, setup: Setup) -> None:
         pair = setup.corpus.annotated.store.hand_pair()
         self.rows, self.device = setup.loss.rows, setup.device
-        settings = setup.network.features
+        settings = replace(setup.network.features, step_s=1 / FPS)
         whole = [setup.corpus.train.whole(clip_id) for clip_id in setup.corpus.train.ids]
         self.examples = {sample.clip_id: clip_examples(sample, pair, settings) for sample in whole}
         hand = hands_of(pair, whole[0].betas, whole[0].template_m)["right"]
         known = [one for clip in self.examples.values() for one in clip]
-        self.network = prepared(setup.network, hand, known).to(setup.device)
+        self.network = prepared(replace(setup.network, features=settings), hand, known).to(setup.device)
         held = [one for sample in setup.corpus.held_out for one in clip_examples(sample, pair, settings)]
         self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in _LEARNT]
 

@@ -4,11 +4,12 @@ from pathlib import Path
 
 from pipelines.params import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, write_empty
+from pipelines.stages.listed import off_reason
 
 
 def run(place: Place) -> None:
     """Write the motions; a dataset without clips, or a family that is not trained, gives an empty output."""
-    if reason := empty_reason(place.clips):
+    if reason := off_reason(place.family) or empty_reason(place.clips):
         write_empty(place.samples, reason)
         return
     sample(place, read_params(Path()), place.family)

@@ -11,6 +11,7 @@ from pipelines.lineage.graph import producers, read_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import read_params
 from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, write_empty
+from pipelines.stages.listed import off_reason
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class TrainParams:
 
 def run(place: Place) -> None:
     """Train ``place.model``; a dataset without clips, or without what the network builds on, gives an empty output."""
-    if reason := empty_reason(place.clips):
+    if reason := off_reason(place.model) or empty_reason(place.clips):
         write_empty(place.checkpoint, reason)
         return
     from models.common.device import chosen_device
