@@ -10,6 +10,8 @@ from hoidata.clips.clip import Side
 from hoidata.geometry.transform import RigidTransform
 from hoidata.objects.model import ObjectModel
 
+_ON_FRAME = 1e-6  # of a frame: times this near to a frame are that frame's
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -22,12 +24,13 @@ class Motion:
     def at(self, time_s: np.ndarray) -> RigidTransform:
         """``world_from_body`` at times of any shape: turned by slerp, moved straight, held beyond the ends."""
         time = np.clip(time_s, self.time_s[0], self.time_s[-1])
-        return RigidTransform(self._turns(time), _between(self.time_s, self.position_m, time))
-
-    def _turns(self, time_s: np.ndarray) -> np.ndarray:
-        if len(self.time_s) == 1:
-            return np.broadcast_to(self.rotmats[0], (*time_s.shape, 3, 3))
-        return self._slerp(time_s.ravel()).as_matrix().reshape(*time_s.shape, 3, 3)
+        place = np.interp(time, self.time_s, np.arange(len(self.time_s)))
+        frame = np.rint(place).astype(np.int64)
+        if (np.abs(place - frame) < _ON_FRAME).all():
+            return RigidTransform(self.rotmats[frame], self.position_m[frame])
+        turn = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
+        columns = [np.interp(place, np.arange(len(self.time_s)), column) for column in self.position_m.T]
+        return RigidTransform(turn, np.stack(columns, axis=-1))
 
     @cached_property
     def _slerp(self) -> Slerp:
@@ -51,8 +54,3 @@ class Control:
         if self.hinge_rad is None:
             return None
         return np.interp(time_s, self.thing.time_s, self.hinge_rad)
-
-
-def _between(time_s: np.ndarray, values: np.ndarray, wanted_s: np.ndarray) -> np.ndarray:
-    """(..., 3) straight between rows of ``values (frame, 3)``."""
-    return np.stack([np.interp(wanted_s, time_s, column) for column in values.T], axis=-1)
