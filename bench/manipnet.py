@@ -24,18 +24,16 @@ from bench.harness import show
 from bench.manipnet_recordings import NAMES, RATE_HZ, TEST, TRAIN, HandRecording, read_hands
 from hoidata.clips.clip import SIDES, Side
 from hoidata.files import write_whole
-from hoidata.geometry.intervals import Interval
 from hoidata.hands.tracked_hand import HandState
 from hoidata.physics.capsules import capsule_contacts
 from hoidata.physics.realism import LARGEST_PENETRATION_M, VARIANTS, score, smoothness_m_s2
 from hoidata.physics.scene import Scene
 from models.common.training import TrainingConfig
-from models.manipnet.diagnostics import as_right, joint_errors_m
+from models.manipnet.examples import Examples, fit_examples, hand_examples, prepared
 from models.manipnet.features import FeatureSettings
-from models.manipnet.lookups import Lookup, control_inputs, mean_rotmats
+from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Predictor, Rule, Task, roll_out
-from models.manipnet.training import Examples, fit_examples, hand_examples, prepared
 
 KEPT = Path(".hoidata/manipnet")
 SETTINGS = FeatureSettings(step_s=1 / RATE_HZ)
@@ -117,13 +115,15 @@ def pieces(recording: HandRecording, kinds: tuple[int, ...]) -> list[Piece]:
         while first > 0 and first > start - LEAD_FRAMES and recording.usable[first - 1]:
             first -= 1
         scored = (recording.lifted & tenths)[first:stop]
-        scored[: LEAD_FRAMES] = False
+        scored[:LEAD_FRAMES] = False
         if scored.sum() >= 3:
             found.append(Piece(recording, slice(first, stop), scored))
     return found
 
 
-def table(trial: Trial, variants: dict[str, dict[str, Any]], size: str, seeds: int) -> dict[str, list[dict[str, float]]]:
+def table(
+    trial: Trial, variants: dict[str, dict[str, Any]], size: str, seeds: int
+) -> dict[str, list[dict[str, float]]]:
     """Figures of every row, one dictionary per seed."""
     rows = {name: [figures] for name, figures in kept(f"{trial.name} controls", lambda: controls(trial)).items()}
     for name, changes in variants.items():
@@ -208,9 +208,7 @@ def controls(trial: Trial) -> dict[str, dict[str, float]]:
         return measured(trial, [{side: pose(piece, side) for side in SIDES} for piece in trial.pieces])
 
     def held(pose: np.ndarray) -> Callable[[Piece, Side], np.ndarray]:
-        return lambda piece, side: np.tile(
-            as_right(piece.recording.hands[side], pose), (len(piece.scored), 1, 1, 1)
-        )
+        return lambda piece, side: np.tile(as_right(piece.recording.hands[side], pose), (len(piece.scored), 1, 1, 1))
 
     def looked_up(count: int) -> Callable[[Piece, Side], np.ndarray]:
         def pose(piece: Piece, side: Side) -> np.ndarray:

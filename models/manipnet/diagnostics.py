@@ -13,14 +13,14 @@ from hoidata.objects.surface_index import surface_index
 from models.common.family import Figures, Sources
 from models.manipnet.control import Control
 from models.manipnet.features import FeatureSettings
-from models.manipnet.lookups import Lookup, control_inputs, mean_rotmats
+from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
 from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 
 NEAREST = 10
 
 
 class RecordedHand(NamedTuple):
-    """An active hand of a clip. fingers: (frame, joint - 1, 3, 3) recorded; used: (frame,) numbers of tracked frames."""
+    """An active hand of a clip. fingers: (frame, 15, 3, 3) as recorded; used: numbers of the tracked frames."""
 
     side: Side
     hand: TrackedHand
@@ -34,15 +34,12 @@ def recorded_hands(sample: ClipSample, pair: HandPair) -> list[RecordedHand]:
     hands = hands_of(pair, sample.betas, sample.template_m)
     control = control_of(trajectories_of(sample), sample.object_model)
     return [
-        RecordedHand(side, hands[side], control, finger_rotmats_of(sample.hands[row]), np.flatnonzero(sample.valid[row]))
+        RecordedHand(
+            side, hands[side], control, finger_rotmats_of(sample.hands[row]), np.flatnonzero(sample.valid[row])
+        )
         for row, side in enumerate(SIDES)
         if sample.active_hands[row] and sample.valid[row].any()
     ]
-
-
-def joint_errors_m(hand: TrackedHand, made: np.ndarray, recorded: np.ndarray) -> np.ndarray:
-    """(frame, point) distances of joints and tips but the wrist, in its frame, of finger rotations (frame, joint - 1)."""
-    return np.linalg.norm(hand.state(made).point_m - hand.state(recorded).point_m, axis=-1)[:, 1:]
 
 
 def diagnose(
@@ -90,9 +87,7 @@ def _rivals(
             poses[one.used] = as_right(one.hand, lookup.poses(inputs, count))
             found[f"joint_error_{name}_mm"] = poses
         still = {"neutral": one.hand.rest_rotmats, "mean_pose": as_right(one.hand, mean)}
-        return found | {
-            f"joint_error_{name}_mm": np.tile(pose, (n_frames, 1, 1, 1)) for name, pose in still.items()
-        }
+        return found | {f"joint_error_{name}_mm": np.tile(pose, (n_frames, 1, 1, 1)) for name, pose in still.items()}
 
     return answer
 
@@ -100,9 +95,3 @@ def _rivals(
 def _inputs(one: RecordedHand, settings: FeatureSettings) -> np.ndarray:
     surface = surface_index(one.control.model)
     return control_inputs(one.control, one.side, one.hand, one.used / FPS, surface, settings)
-
-
-def as_right(hand: TrackedHand, fingers: np.ndarray) -> np.ndarray:
-    """Finger rotations of a left hand as its mirror image's, and back; those of a right hand as they are."""
-    mirror = np.array([-1.0, 1.0, 1.0])
-    return mirror[:, None] * fingers * mirror if hand.side == "left" else fingers

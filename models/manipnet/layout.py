@@ -7,9 +7,8 @@ import numpy as np
 from hoidata.errors import BadInput
 from hoidata.hands.tracked_hand import N_TIPS, TrackedHand
 from hoidata.sensors.settings import CELLS
-from models.manipnet.features import FeatureSettings
+from models.manipnet.features import SAMPLE_NUMBERS, FeatureSettings
 
-PER_SAMPLE = 16  # numbers of one trajectory sample
 SHORT_FUTURE_S = 0.1
 METRES, AXES, CELL, RAD_S, SHARE = 0.001, 0.01, 0.05, 0.05, 0.02  # the least spread a number is scaled by
 
@@ -19,18 +18,12 @@ def sizes(hand: TrackedHand, settings: FeatureSettings) -> dict[str, int]:
     times = len(settings.sensors.times_s)
     return {
         "pose": 3 * _positions(hand) + 6 * hand.n_joints,
-        "trajectory": PER_SAMPLE * len(sample_times_s(settings)),
+        "trajectory": SAMPLE_NUMBERS * len(settings.samples_s),
         "ambient": CELLS**3,
         "proximity": times * hand.n_sensors,
         "distance": times * hand.n_points,
         "normal": 3 * hand.n_points,
     }
-
-
-def sample_times_s(settings: FeatureSettings) -> np.ndarray:
-    """Times of the trajectory's samples, 0 is now."""
-    first, last = (round(span / settings.spacing_s) for span in (-settings.past_s, settings.future_s))
-    return np.arange(first, last + 1) * settings.spacing_s
 
 
 def kept_columns(hand: TrackedHand, settings: FeatureSettings, without: Iterable[str]) -> np.ndarray:
@@ -58,7 +51,7 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
     def at(times: np.ndarray) -> list[np.ndarray]:
         return [rows[name][number] for name in rows for number in np.flatnonzero(times)]
 
-    samples = kept["trajectory"].reshape(-1, PER_SAMPLE)
+    samples = kept["trajectory"].reshape(-1, SAMPLE_NUMBERS)
     signed = [kept["distance"], kept["normal"]]
     return {
         "ambient": [kept["ambient"]],
@@ -67,7 +60,7 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
         "distance": [kept["proximity"], *signed],
         "sensors": [kept["ambient"], kept["proximity"], *signed],
         "future": at(later),
-        "long-future": [*at(far), *samples[sample_times_s(settings) > SHORT_FUTURE_S + 1e-9]],
+        "long-future": [*at(far), *samples[settings.samples_s > SHORT_FUTURE_S + 1e-9]],
     }
 
 
@@ -78,7 +71,7 @@ def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np
     sample = np.repeat([METRES, AXES, METRES, RAD_S], [4, 6, 3, 3])
     inputs = [
         pose,
-        np.tile(sample, count["trajectory"] // PER_SAMPLE),
+        np.tile(sample, count["trajectory"] // SAMPLE_NUMBERS),
         np.full(count["ambient"], CELL),
         np.full(count["proximity"] + count["distance"], METRES),
         np.full(count["normal"], CELL),

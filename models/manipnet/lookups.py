@@ -1,4 +1,4 @@
-"""What any network has to beat: poses that need no network, found by what the network is given too, never by fingers."""
+"""What any network has to beat: poses without one, found by what it is given too, never by fingers."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,7 +18,12 @@ ROWS_AT_ONCE = 256
 
 
 def control_inputs(
-    control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray, surface: SurfaceIndex, settings: FeatureSettings
+    control: Control,
+    side: Side,
+    hand: TrackedHand,
+    time_s: np.ndarray,
+    surface: SurfaceIndex,
+    settings: FeatureSettings,
 ) -> np.ndarray:
     """(frame, 336 + 1000) float32: trajectories, and the ambient sensor of a hand in its neutral pose."""
     trajectory = trajectory_features(control, side, hand, time_s, settings)
@@ -26,6 +31,17 @@ def control_inputs(
     neutral = hand.state(np.tile(hand.rest_rotmats, (len(time_s), 1, 1, 1)))
     ambient = sense(hand, neutral, placed, hinge, surface, settings.sensors).ambient
     return np.concatenate([trajectory, ambient], axis=1, dtype=np.float32)
+
+
+def joint_errors_m(hand: TrackedHand, made: np.ndarray, recorded: np.ndarray) -> np.ndarray:
+    """(frame, point) of joints and tips but the wrist, in its frame; finger rotations (frame, joint - 1, 3, 3)."""
+    return np.linalg.norm(hand.state(made).point_m - hand.state(recorded).point_m, axis=-1)[:, 1:]
+
+
+def as_right(hand: TrackedHand, fingers: np.ndarray) -> np.ndarray:
+    """Finger rotations of a left hand as its mirror image's, and back; those of a right hand as they are."""
+    mirror = np.array([-1.0, 1.0, 1.0])
+    return mirror[:, None] * fingers * mirror if hand.side == "left" else fingers
 
 
 def mean_rotmats(rotmats: np.ndarray) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Running ManipNet: each hand frame by frame, its pose the next frame's input (Sec. 6.4).
 
-No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step, ``roll_out``
-whole clips of many hands at once, :class:`Stream` frames as they come. Rotations are predicted and joints placed by
+No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step,
+``roll_out`` whole clips of many hands at once, :class:`Stream` frames as they come. Rotations are predicted and joints placed by
 forward kinematics: bones keep their length, which the release's do not.
 """
 
@@ -159,7 +159,7 @@ class Follower:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A hand to follow through a clip. start: (joint - 1, 3, 3) finger rotations at the first of ``time_s (frame,)``."""
+    """A hand to follow through a clip. start: (joint - 1, 3, 3) finger rotations at the first of ``time_s``."""
 
     hand: TrackedHand
     side: Side

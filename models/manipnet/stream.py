@@ -50,13 +50,15 @@ class Stream:
         self.frames: list[TrackedFrame] = []
         self.made = 0
         self.first_s = 0.0
+        settings = predictor.settings
+        self._ahead_s = max(settings.samples_s[-1], settings.sensors.times_s[-1], settings.step_s)
         self._next: dict[Side, np.ndarray] = {}
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
         """Poses that can be told now: by side (joint - 1, 3, 3). Often none, sometimes several."""
         self.first_s = frame.time_s if not self.frames else self.first_s
         self.frames.append(frame)
-        return self._told(frame.time_s - max(self.predictor.settings.ahead_s, self.predictor.settings.step_s))
+        return self._told(frame.time_s - self._ahead_s)
 
     def finish(self) -> list[dict[Side, np.ndarray]]:
         """The poses up to the last frame; what lies beyond it is taken to stand still."""

@@ -37,17 +37,13 @@ def paper_targets(points_m: np.ndarray, predicted_m: np.ndarray, found: Nearest)
     points_m: (..., point, 3) as the network has them; predicted_m: (..., point) its distances from the object.
     """
     inside = found.distance_m < 0
-    mixed = np.where(
-        inside, 0.8 * predicted_m + 0.2 * found.distance_m, 0.2 * predicted_m + 0.8 * found.distance_m
-    )
+    mixed = np.where(inside, 0.8 * predicted_m + 0.2 * found.distance_m, 0.2 * predicted_m + 0.8 * found.distance_m)
     near = predicted_m <= PAPER_ACTIVE_M
     wanted = found.closest_m + mixed[..., None] * found.normal
     return Targets(np.where(near[..., None], wanted, points_m), np.ones(near.shape))
 
 
-def released_targets(
-    points_m: np.ndarray, predicted_m: np.ndarray, radius_m: np.ndarray, found: Nearest
-) -> Targets:
+def released_targets(points_m: np.ndarray, predicted_m: np.ndarray, radius_m: np.ndarray, found: Nearest) -> Targets:
     """The demo's rule: out of the object by the radius of the capsule, or a third of the way to the predicted distance.
 
     predicted_m: (..., point) as in ``paper_targets``, radius_m: (point,) of the capsule, 0 for tips.

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
+from hoidata.sensors.mano_hand import mano_hand
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Trajectories
@@ -21,7 +22,6 @@ from hoidata.geometry.rotations import rot6d_to_rotmat
 from hoidata.hands import HandModel, HandPair
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
-from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 
 UNSEEN_M = 1.0  # how far away a wrist is taken to be that is never tracked

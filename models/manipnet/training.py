@@ -1,41 +1,20 @@
-"""Training of ManipNet on annotated clips: from the recorded pose of a frame to that of the next (Sec. 6.4)."""
+"""Training of ManipNet on annotated clips: the shared loop draws clips, from each of which steps are drawn."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample
-from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.clips.clip import FPS, SIDES
 from hoidata.hands import HandPair
-from hoidata.hands.tracked_hand import TrackedHand
-from hoidata.objects.surface_index import SurfaceIndex, surface_index
-from hoidata.sensors import sensor_size
+from hoidata.objects.surface_index import surface_index
 from models.common.family import Losses, Network, Setup
-from models.common.training import TrainingConfig, learning_rate_factor
-from models.manipnet.control import Control
-from models.manipnet.features import FeatureSettings, hand_inputs, outputs
-from models.manipnet.inverse_kinematics import turns_from_rest
-from models.manipnet.layout import floors, kept_columns, sizes
+from models.manipnet.examples import LEARNT, Examples, hand_examples, prepared, step_loss
+from models.manipnet.features import FeatureSettings
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
-
-MARGIN_RAD = 0.1  # joints may turn by so much more than in any training clip
-
-
-class Examples(NamedTuple):
-    """Steps of a hand, from one frame to the next. frame: (step,) it starts in. inputs: (step, 2350), float32.
-
-    outputs: (step, 214), float32. turns_rad: (step, joint - 1, 3) from the neutral pose, as a right hand's.
-    """
-
-    frame: np.ndarray
-    inputs: np.ndarray
-    outputs: np.ndarray
-    turns_rad: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -43,29 +22,6 @@ class LossConfig:
     """rows: steps drawn from each clip of a batch."""
 
     rows: int = 16
-
-
-def hand_examples(
-    control: Control,
-    side: Side,
-    hand: TrackedHand,
-    finger_rotmats: np.ndarray,
-    time_s: np.ndarray,
-    usable: np.ndarray,
-    surface: SurfaceIndex,
-    settings: FeatureSettings,
-) -> Examples:
-    """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart."""
-    first = np.flatnonzero(usable[:-1] & usable[1:])
-    state = hand.state(finger_rotmats)
-    seen = hand_inputs(control, side, hand, state.taken(first), time_s[first], surface, settings)
-    placed = control.thing.at(time_s[first + 1]).inverse() @ control.wrists[side].at(time_s[first + 1])
-    hinge = control.hinge_at(time_s[first + 1])
-    after = state.taken(first + 1)
-    distance_m = surface.nearest(placed @ after.point_m, hinge).distance_m
-    made = outputs(hand, after, distance_m, settings)
-    rows = np.concatenate(seen, axis=1, dtype=np.float32)
-    return Examples(first, rows, made.astype(np.float32), turns_from_rest(hand, finger_rotmats[first]))
 
 
 def clip_examples(sample: ClipSample, pair: HandPair, settings: FeatureSettings) -> list[Examples]:
@@ -89,62 +45,6 @@ def clip_examples(sample: ClipSample, pair: HandPair, settings: FeatureSettings)
     ]
 
 
-def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
-    """The configuration with the numbers that this hand has."""
-    count = sizes(hand, config.features)
-    return replace(
-        config,
-        pose=count["pose"],
-        trajectory=count["trajectory"],
-        sensors=sensor_size(hand, config.features.sensors),
-        output=count["pose"] + hand.n_points,
-        joints=hand.n_joints,
-    )
-
-
-def prepared(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
-    """A network that knows its normalisation, its sensors and the limits of the joints from training examples."""
-    network = ManipNet(sized(config, hand))
-    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in _LEARNT)
-    least = [torch.from_numpy(values).float() for values in floors(hand, config.features)]
-    network.learn_normalisation(inputs, made, (least[0], least[1]))
-    network.kept.copy_(torch.from_numpy(kept_columns(hand, config.features, config.without)))
-    turns = torch.from_numpy(np.concatenate([one.turns_rad for one in examples]))
-    network.low_rad.copy_(turns.amin(0) - MARGIN_RAD)
-    network.high_rad.copy_(turns.amax(0) + MARGIN_RAD)
-    return network
-
-
-_LEARNT = ("inputs", "outputs")
-
-
-def step_loss(network: ManipNet, inputs: Tensor, made: Tensor) -> Tensor:
-    """Mean squared error of normalised outputs."""
-    return (network.normalised(inputs) - (made - network.output_mean) / network.output_scale).square().mean()
-
-
-def fit_examples(network: ManipNet, examples: Sequence[Examples], config: TrainingConfig, seed: int) -> list[float]:
-    """Train on steps of any source in an order drawn anew for every epoch; the losses. Adam, as the paper's."""
-    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in _LEARNT)
-    generator = torch.Generator().manual_seed(seed)
-    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    network.train()
-    losses, order = [], torch.zeros(0, dtype=torch.long)
-    for step in range(1, config.steps + 1):
-        if len(order) < config.batch:  # the last batch that is not full is left out
-            order = torch.randperm(len(inputs), generator=generator)
-        rows, order = order[: config.batch], order[config.batch :]
-        for group in optimiser.param_groups:
-            group["lr"] = config.learning_rate * learning_rate_factor(step, config)
-        loss = step_loss(network, inputs[rows], made[rows])
-        optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        optimiser.step()
-        losses.append(float(loss.detach()))
-    network.eval()
-    return losses
-
-
 class FingersObjective:
     """Squared error of the next pose and distances; inputs are always the recorded ones."""
 
@@ -160,7 +60,7 @@ class FingersObjective:
         known = [one for clip in self.examples.values() for one in clip]
         self.network = prepared(replace(setup.network, features=settings), hand, known).to(setup.device)
         held = [one for sample in setup.corpus.held_out for one in clip_examples(sample, pair, settings)]
-        self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in _LEARNT]
+        self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in LEARNT]
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         drawn = [pair for sample in batch.samples for pair in self._drawn(sample, generator)]
@@ -188,6 +88,4 @@ class FingersObjective:
         return float(step_loss(network, inputs, made))
 
 
-MANIPNET = Network(
-    "manipnet", NetworkConfig, ManipNet, lambda setup: (FingersObjective(setup), None), loss=LossConfig
-)
+MANIPNET = Network("manipnet", NetworkConfig, ManipNet, lambda setup: (FingersObjective(setup), None), loss=LossConfig)
