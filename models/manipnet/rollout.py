@@ -1,8 +1,8 @@
 """Running ManipNet: each hand frame by frame, its pose the next frame's input (Sec. 6.4).
 
 No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step,
-``roll_out`` whole clips of many hands at once, :class:`Stream` frames as they come. Rotations are predicted and joints placed by
-forward kinematics: bones keep their length, which the release's do not.
+``roll_out`` whole clips of many hands at once, ``stream.Stream`` frames as they come. Rotations are predicted and joints
+placed by forward kinematics: bones keep their length, which the release's do not.
 """
 
 from collections.abc import Sequence
