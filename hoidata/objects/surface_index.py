@@ -7,6 +7,7 @@ looking at triangles, and is made when an object is asked about so often that th
 
 import hashlib
 from collections import OrderedDict
+from functools import reduce
 
 import numpy as np
 
@@ -69,15 +70,20 @@ class PartSurface:
         lower_distances(self.tree, self.grid_for(positions_m), positions_m, float(most_m), distance)
         return distance
 
+    def signed_m(self, positions_m: np.ndarray) -> np.ndarray:
+        """(position,) distance to the surface, negative inside."""
+        distance = self.distance_m(positions_m)
+        return np.where(self.inside(positions_m), -distance, distance)
+
     def nearest(self, positions_m: np.ndarray) -> SignedDistance:
         """Signed distance and nearest place; ``normal`` is the gradient of the distance, outward, of length 1."""
-        distance, inside = self.distance_m(positions_m), self.inside(positions_m)
+        signed = self.signed_m(positions_m)
+        distance = np.abs(signed)
         closest, triangle = np.empty((len(positions_m), 3)), np.empty(len(positions_m), np.int64)
         nearest_triangles(self.tree, positions_m, distance, closest, triangle)
         way = positions_m - closest
         away = distance > ON_SURFACE_M
         gradient = self.tree.triangle[9:12, triangle].T
-        signed = np.where(inside, -distance, distance)
         gradient[away] = way[away] / signed[away, None]
         return SignedDistance(signed, closest, gradient)
 
@@ -160,15 +166,14 @@ class SurfaceIndex:
 
         Of ``filled``; of two parts the one whose signed distance is less. Arguments as in ``within``.
         """
-        best = None
-        for part, surface in self.filled.items():
-            found = surface.nearest(self._in_part(positions_m, hinge_rad, part))
-            object_from_part = self.model.object_from_part(part, hinge_rad)
-            closest, normal = (array.reshape(positions_m.shape) for array in found[1:])
-            distance = found.distance_m.reshape(positions_m.shape[:2])
-            own = SignedDistance(distance, object_from_part @ closest, object_from_part.turn(normal))
-            best = own if best is None else nearer_of(best, own)
-        return best
+        return reduce(nearer_of, (self._nearest_of(part, positions_m, hinge_rad) for part in self.filled))
+
+    def _nearest_of(self, part: int, positions_m: np.ndarray, hinge_rad: np.ndarray | None) -> SignedDistance:
+        found = self.filled[part].nearest(self._in_part(positions_m, hinge_rad, part))
+        object_from_part = self.model.object_from_part(part, hinge_rad)
+        closest, normal = (array.reshape(positions_m.shape) for array in found[1:])
+        distance = found.distance_m.reshape(positions_m.shape[:2])
+        return SignedDistance(distance, object_from_part @ closest, object_from_part.turn(normal))
 
     @property
     def filled(self) -> dict[int, PartSurface]:

@@ -1,5 +1,6 @@
 """What the sensors of a hand say about an object: 1,822 numbers per hand and frame for ManipNet's hand (section 5)."""
 
+from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -86,19 +87,21 @@ def _distances(
     hand: TrackedHand, state: HandState, parts: list[_Part], settings: SensorSettings
 ) -> tuple[np.ndarray, np.ndarray]:
     """(frame, time, point) signed distances, and (frame, point, 3) gradients now."""
-    points, nearest, distance = state.point_m, None, np.inf
-    for part in parts:
-        now = part.surface.nearest(_rows(part.from_wrist[:, 0] @ points))
-        gradient = part.from_wrist[:, 0].inverse().turn(now.normal.reshape(points.shape))
-        own = SignedDistance(now.distance_m.reshape(points.shape[:2]), points, gradient)
-        nearest = own if nearest is None else nearer_of(nearest, own)
-        later = _rows(part.from_wrist[:, 1:] @ points[:, None])
-        inside, far = part.surface.inside(later), part.surface.distance_m(later)
-        distance = np.minimum(distance, np.where(inside, -far, far))
-    assert nearest is not None
-    later = np.reshape(distance, (len(points), -1, points.shape[1]))
-    every = np.concatenate([nearest.distance_m[:, None], later], axis=1)
-    return np.clip(every, -settings.depth_m, settings.reach_m), nearest.normal @ hand.wrist_from_canonical
+    points = state.point_m
+    now = reduce(nearer_of, (_nearest_now(part, points) for part in parts))
+    later = reduce(
+        np.minimum, (part.surface.signed_m(_rows(part.from_wrist[:, 1:] @ points[:, None])) for part in parts)
+    )
+    every = np.concatenate([now.distance_m[:, None], later.reshape(len(points), -1, points.shape[1])], axis=1)
+    return np.clip(every, -settings.depth_m, settings.reach_m), now.normal @ hand.wrist_from_canonical
+
+
+def _nearest_now(part: _Part, points: np.ndarray) -> SignedDistance:
+    """Of points (frame, point, 3) of the wrist's frame, as are the gradients."""
+    now = part.from_wrist[:, 0]
+    found = part.surface.nearest(_rows(now @ points))
+    closest, normal = (array.reshape(points.shape) for array in found[1:])
+    return SignedDistance(found.distance_m.reshape(points.shape[:2]), closest, now.inverse().turn(normal))
 
 
 def _proximity(state: HandState, parts: list[_Part], settings: SensorSettings) -> np.ndarray:

@@ -127,7 +127,7 @@ def _sensing_skin(
 
 
 def _rest_rotmats(joint_from_skin: np.ndarray, skeleton: BvhMotion) -> np.ndarray:
-    """(16, 3, 3) of the bind pose. The skin leaves the thumb's base open: it turns as little as its bone's ends need."""
+    """(16, 3, 3) of the bind pose. The skin says nothing of the thumb's base: it turns as little as can be."""
     skin_from_joint = np.linalg.inv(joint_from_skin)
     turn, place = skin_from_joint[:, :3, :3], skin_from_joint[:, :3, 3]
     wanted = turn[0].T @ (place[THUMB_BASE + 1] - place[0]) - skeleton.offsets[THUMB_BASE]
