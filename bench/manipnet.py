@@ -25,11 +25,10 @@ from bench.manipnet_recordings import NAMES, RATE_HZ, TEST, TRAIN, HandRecording
 from hoidata.clips.clip import SIDES, Side
 from hoidata.files import write_whole
 from hoidata.hands.tracked_hand import HandState
-from hoidata.physics.capsules import capsule_contacts
-from hoidata.physics.realism import LARGEST_PENETRATION_M, VARIANTS, score, smoothness_m_s2
-from hoidata.physics.scene import Scene
+from hoidata.physics.capsules import CapsuleContacts
+from hoidata.physics.realism import LARGEST_PENETRATION_M, VARIANTS, contacts_in, score, smoothness_m_s2
 from models.common.training import TrainingConfig
-from models.manipnet.examples import Examples, fit_examples, hand_examples, prepared
+from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared
 from models.manipnet.features import FeatureSettings
 from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
 from models.manipnet.network import ManipNet, NetworkConfig
@@ -43,6 +42,7 @@ SIZES = {
 }
 VARIANTS_OF_OURS: dict[str, dict[str, Any]] = {
     "ours": {},
+    "trained as the paper": {"astray": False},
     "no sensors": {"without": ("sensors",)},
     "no ambient": {"without": ("ambient",)},
     "no distance": {"without": ("distance",)},
@@ -136,13 +136,14 @@ def table(
 
 def trained_row(trial: Trial, changes: dict[str, Any], size: str, seed: int) -> dict[str, dict[str, float]]:
     """Train one network and roll it out, without and with post-processing."""
-    began = time.process_time()
+    began, changes = time.process_time(), dict(changes)
     network, training = SIZES[size]
+    astray = changes.pop("astray", True)
     config = replace(network, features=SETTINGS, **changes)
-    hand = trial.train[0][0].hands["right"]
+    examples = examples_of(trial, astray)
     torch.manual_seed(seed)
-    model = prepared(config, hand, examples_of(trial))
-    fit_examples(model, examples_of(trial), training, seed)
+    model = prepared(config, trial.train[0][0].hands["right"], examples)
+    fit_examples(model, examples, training, seed)
     trained_s = time.process_time() - began
     found = {}
     for rule in ("off", "paper"):
@@ -150,25 +151,29 @@ def trained_row(trial: Trial, changes: dict[str, Any], size: str, seed: int) -> 
     return found
 
 
-_EXAMPLES: dict[tuple[str, Side], Examples] = {}
+_EXAMPLES: dict[tuple[str, Side, bool], Examples] = {}
 
 
-def examples_of(trial: Trial) -> list[Examples]:
-    """Training steps of both hands; those of a recording are computed once and cut."""
+def examples_of(trial: Trial, astray: bool) -> list[Examples]:
+    """Training steps of both hands; those of a recording are computed once and cut. astray: also from other poses."""
     found = []
     for recording, frames in trial.train:
         for side in SIDES:
-            every = _recorded_examples(recording, side)
-            chosen = frames[every.frame] & frames[every.frame + 1]
-            found.append(Examples(*(array[chosen] for array in every)))
+            for kind in (False, True)[: 1 + astray]:
+                every = _recorded_examples(recording, side, kind)
+                chosen = frames[every.frame] & frames[every.frame + 1]
+                found.append(Examples(*(array[chosen] for array in every)))
     return found
 
 
-def _recorded_examples(recording: HandRecording, side: Side) -> Examples:
-    key = (recording.name, side)
+def _recorded_examples(recording: HandRecording, side: Side, astray: bool) -> Examples:
+    key = (recording.name, side, astray)
     if key not in _EXAMPLES:
-        path = KEPT / f"examples-{recording.name}-{side}.npz"
+        path = KEPT / f"examples-{recording.name}-{side}{'-astray' * astray}.npz"
         if not path.is_file():
+            fingers, hand = recording.fingers[side], recording.hands[side]
+            # Of frames that may train alone: no test pose is met, not even as a way to go wrong.
+            pool = np.concatenate([fingers[recording.trains & recording.usable], hand.rest_rotmats[None]])
             made = hand_examples(
                 recording.control,
                 side,
@@ -178,6 +183,7 @@ def _recorded_examples(recording: HandRecording, side: Side) -> Examples:
                 recording.usable,
                 recording.surface,
                 SETTINGS,
+                other_poses(fingers, pool, NAMES.index(recording.name)) if astray else None,
             )
             path.parent.mkdir(parents=True, exist_ok=True)
             np.savez(path, **made._asdict())
@@ -263,16 +269,17 @@ def measured(trial: Trial, fingers: Sequence[Fingers], away_m: float = 0.0) -> d
 def _piece_sums(piece: Piece, made: Fingers, away_m: float) -> dict[str, float]:
     recording, frames, scored = piece
     raw_fingers = {side: recording.fingers[side][frames] for side in SIDES}
-    raw, states = recording.states(raw_fingers, frames), recording.states(made, frames)
+    states = recording.states(made, frames)
     if away_m:
         states = {side: _moved_away(recording, frames, state, away_m) for side, state in states.items()}
-    scene, raw_scene = recording.scene(states, frames), recording.scene(raw, frames)
+    scene = recording.scene(states, frames)
     errors = [joint_errors_m(recording.hands[side], made[side][scored], raw_fingers[side][scored]) for side in SIDES]
     results = {name: score(scene, variant, scored) for name, variant in VARIANTS.items()}
     depth = results["SI"].penetration_m[scored]
-    touching, touching_raw = _touching(scene, scored), _touching(raw_scene, scored)
+    contacts = contacts_in(scene, scored)
+    touching, touching_raw = _touching(contacts), _touching_raw(piece)
     motions = [recording.motion(state.taken(scored)) for state in states.values()]
-    inside = _depths(scene, scored)
+    inside = contacts.depth_m[contacts.depth_m > 0]
     return {
         "joint": float(sum(error.mean(axis=1).sum() for error in errors)),
         "tip": float(sum(error[:, -5:].mean(axis=1).sum() for error in errors)),
@@ -289,15 +296,22 @@ def _piece_sums(piece: Piece, made: Fingers, away_m: float) -> dict[str, float]:
     } | {name: float(result.passed.sum()) for name, result in results.items()}
 
 
-def _touching(scene: Scene, scored: np.ndarray) -> set[tuple[int, int]]:
-    """Frame and capsule of all overlaps in scored frames."""
-    contacts = capsule_contacts(scene.model, scene.poses.taken(scored), scene.capsules.taken(scored))
+_RAW_TOUCHING: dict[tuple[str, int], set[tuple[int, int]]] = {}
+
+
+def _touching_raw(piece: Piece) -> set[tuple[int, int]]:
+    """What touches in the recording; every row is held against it."""
+    recording, frames, scored = piece
+    key = (recording.name, frames.start)
+    if key not in _RAW_TOUCHING:
+        raw = {side: recording.fingers[side][frames] for side in SIDES}
+        _RAW_TOUCHING[key] = _touching(contacts_in(recording.scene(recording.states(raw, frames), frames), scored))
+    return _RAW_TOUCHING[key]
+
+
+def _touching(contacts: CapsuleContacts) -> set[tuple[int, int]]:
+    """Frame and capsule of all overlaps."""
     return set(zip(contacts.frame.tolist(), contacts.capsule.tolist(), strict=True))
-
-
-def _depths(scene: Scene, scored: np.ndarray) -> np.ndarray:
-    contacts = capsule_contacts(scene.model, scene.poses.taken(scored), scene.capsules.taken(scored))
-    return contacts.depth_m[contacts.depth_m > 0]
 
 
 def _moved_away(recording: HandRecording, frames: slice, state: HandState, way_m: float) -> HandState:

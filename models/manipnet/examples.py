@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from hoidata.clips.clip import Side
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import sensor_size
@@ -20,6 +21,9 @@ from models.manipnet.layout import floors, kept_columns, sizes
 from models.manipnet.network import ManipNet, NetworkConfig
 
 LEARNT = ("inputs", "outputs")
+# A hand that is not where it was recorded comes back with this time constant: the paper trains on recorded poses alone
+# ("No augmentation"), and its network keeps the pose it is given.
+WAY_BACK_S = 0.1
 MARGIN_RAD = 0.1  # joints may turn by so much more than in any training clip
 
 
@@ -44,18 +48,37 @@ def hand_examples(
     usable: np.ndarray,
     surface: SurfaceIndex,
     settings: FeatureSettings,
+    given: np.ndarray | None = None,
 ) -> Examples:
-    """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart."""
+    """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart.
+
+    given: (frame, joint - 1, 3, 3) other poses to start the steps from; they lead back to the recorded ones.
+    """
     first = np.flatnonzero(usable[:-1] & usable[1:])
-    state = hand.state(finger_rotmats)
-    seen = hand_inputs(control, side, hand, state.taken(first), time_s[first], surface, settings)
+    start = finger_rotmats[first] if given is None else given[first]
+    seen = hand_inputs(control, side, hand, hand.state(start), time_s[first], surface, settings)
     placed = control.thing.at(time_s[first + 1]).inverse() @ control.wrists[side].at(time_s[first + 1])
     hinge = control.hinge_at(time_s[first + 1])
-    after = state.taken(first + 1)
+    after = hand.state(finger_rotmats[first + 1])
     distance_m = surface.nearest(placed @ after.point_m, hinge).distance_m
+    if given is not None:
+        share = 1 - np.exp(-settings.step_s / WAY_BACK_S)
+        after = hand.state(between(start, finger_rotmats[first + 1], np.full(len(first), share)))
     made = outputs(hand, after, distance_m, settings)
     rows = np.concatenate(seen, axis=1, dtype=np.float32)
     return Examples(first, rows, made.astype(np.float32), turns_from_rest(hand, finger_rotmats[first]))
+
+
+def other_poses(fingers: np.ndarray, pool: np.ndarray, seed: int) -> np.ndarray:
+    """(frame, joint - 1, 3, 3) for each pose one that lies between it and another of the pool, anywhere on the way."""
+    draws = np.random.default_rng(seed)
+    return between(fingers, pool[draws.integers(len(pool), size=len(fingers))], draws.uniform(0, 1, len(fingers)))
+
+
+def between(start: np.ndarray, stop: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Rotations (frame, joint, 3, 3) a share (frame,) of the way from the first to the second."""
+    way = rotmat_to_rotvec(start.swapaxes(-1, -2) @ stop)
+    return start @ rotvec_to_rotmat(share[:, None, None] * way)
 
 
 def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:

@@ -1,8 +1,8 @@
 """Running ManipNet: each hand frame by frame, its pose the next frame's input (Sec. 6.4).
 
 No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step,
-``roll_out`` whole clips of many hands at once, ``stream.Stream`` frames as they come. Rotations are predicted and joints
-placed by forward kinematics: bones keep their length, which the release's do not.
+``roll_out`` whole clips of many hands at once, ``stream.Stream`` frames as they come. Rotations are predicted and
+joints placed by forward kinematics: bones keep their length, which the release's do not.
 """
 
 from collections.abc import Sequence
@@ -67,14 +67,12 @@ class Situation:
     hinge_rad: np.ndarray | None
 
 
-def situations(
-    control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray, settings: FeatureSettings
-) -> list[Situation]:
-    """One for every time."""
-    trajectory = trajectory_features(control, side, hand, time_s, settings)
-    placed, hinge = object_from_wrist(control, side, time_s, settings)
-    frames = range(len(time_s))
-    return [Situation(trajectory[f], placed[f], None if hinge is None else hinge[f]) for f in frames]
+def situation(control: Control, side: Side, hand: TrackedHand, time_s: float, settings: FeatureSettings) -> Situation:
+    """What is given at one time. Not for many at once: last bits would depend on how many, and a stream has one."""
+    now = np.array([time_s])
+    placed, hinge = object_from_wrist(control, side, now, settings)
+    trajectory = trajectory_features(control, side, hand, now, settings)
+    return Situation(trajectory[0], placed[0], None if hinge is None else hinge[0])
 
 
 @dataclass
@@ -113,14 +111,10 @@ class Follower:
 
     def _correct(self, output: np.ndarray, then: Situation) -> None:
         hand, settings = self.hand, self.predictor.settings
-        radius = hand.point_radius_m
-        reaches_m = np.clip(output[-hand.n_points :], 0, 1) * settings.range_m
-        predicted_m = reaches_m + (radius if settings.less_radius else 0.0)
-        points = self.state.point_m[0]
-        if self.predictor.rule == "paper":
-            targets = paper_targets(points, predicted_m, self._nearest(points, then))
-        else:
-            targets = released_targets(points, predicted_m, radius, self._nearest(points, then))
+        radius = hand.point_radius_m if settings.less_radius else np.zeros(hand.n_points)
+        predicted, points = np.clip(output[-hand.n_points :], 0, 1), self.state.point_m[0]
+        rule = paper_targets if self.predictor.rule == "paper" else released_targets
+        targets = rule(points, predicted, radius, settings.range_m, self._nearest(points, then))
         moved = np.zeros(hand.n_points)
         moved[target_points(hand)] = 1
         self._reach(targets.point_m, targets.weight * moved)
@@ -173,7 +167,10 @@ def roll_out(predictor: Predictor, tasks: Sequence[Task]) -> list[np.ndarray]:
 
     The hands of a frame share one call of the network, whose last bits depend on how many they are.
     """
-    given = [situations(task.control, task.side, task.hand, task.time_s, predictor.settings) for task in tasks]
+    given = [
+        [situation(task.control, task.side, task.hand, time_s, predictor.settings) for time_s in task.time_s]
+        for task in tasks
+    ]
     followers = [Follower(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
     made = [[follower.finger_rotmats[0]] for follower in followers]
     for frame in range(1, max(map(len, given), default=0)):

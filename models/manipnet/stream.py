@@ -11,7 +11,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, Motion
-from models.manipnet.rollout import Follower, Predictor, Situation, situations
+from models.manipnet.rollout import Follower, Predictor, Situation, situation
 
 SPARE_S = 0.25  # kept beyond the oldest sample: the one before it tells a velocity
 
@@ -52,7 +52,6 @@ class Stream:
         self.first_s = 0.0
         settings = predictor.settings
         self._ahead_s = max(settings.samples_s[-1], settings.sensors.times_s[-1], settings.step_s)
-        self._next: dict[Side, np.ndarray] = {}
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
         """Poses that can be told now: by side (joint - 1, 3, 3). Often none, sometimes several."""
@@ -72,6 +71,7 @@ class Stream:
             self.made = 1
         while self._time_s(self.made - 1) < known_s and self._time_s(self.made) <= self.frames[-1].time_s + 1e-6:
             now = self._situations(self._time_s(self.made - 1))
+            # Of the frame that is made only where the object is now counts: what is ahead of it may not be there yet.
             then = self._situations(self._time_s(self.made))
             rows = np.stack([self.followers[side].inputs(now[side]) for side in self.hands])
             for side, output in zip(self.hands, self.predictor(rows), strict=True):
@@ -82,17 +82,14 @@ class Stream:
         return told
 
     def _time_s(self, number: int) -> float:
-        return self.first_s + number * self.predictor.settings.step_s
+        return self.first_s + number / (1 / self.predictor.settings.step_s)  # as the times of clips round
 
     def _poses(self) -> dict[Side, np.ndarray]:
         return {side: follower.finger_rotmats[0] for side, follower in self.followers.items()}
 
     def _situations(self, time_s: float) -> dict[Side, Situation]:
         settings = self.predictor.settings
-        return {
-            side: situations(self._control(side), side, hand, np.array([time_s]), settings)[0]
-            for side, hand in self.hands.items()
-        }
+        return {side: situation(self._control(side), side, hand, time_s, settings) for side, hand in self.hands.items()}
 
     def _control(self, side: Side) -> Control:
         times = np.array([frame.time_s for frame in self.frames])

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 
 Rule = Literal["paper", "released"]
-PAPER_ACTIVE_M = 0.028
-RELEASED_ACTIVE_M, RELEASED_NEAR_M = 0.024, 0.06
+ACTIVE_SHARE = 0.8  # of the range of predicted distances: the paper's 2.8 of 3.5 cm, the demo's 2.4 of 3 cm
+NEAR_M = 0.06  # the demo looks at no point farther away; nor do we, or a wrong distance pulls at a hand in the air
 
 
 @dataclass(frozen=True)
@@ -31,29 +31,36 @@ class Targets:
     weight: np.ndarray
 
 
-def paper_targets(points_m: np.ndarray, predicted_m: np.ndarray, found: Nearest) -> Targets:
+def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
+                  found: Nearest) -> Targets:  # fmt: skip
     """Algorithm 1: near points to a mixture of predicted and true distance, the others to where they are.
 
-    points_m: (..., point, 3) as the network has them; predicted_m: (..., point) its distances from the object.
+    points_m: (..., point, 3) as the network has them. predicted: (..., point) its distances, 0 to 1 of range_m from the
+    skin, which is radius_m (point,) from the point.
     """
+    distance_m = predicted * range_m + radius_m
     inside = found.distance_m < 0
-    mixed = np.where(inside, 0.8 * predicted_m + 0.2 * found.distance_m, 0.2 * predicted_m + 0.8 * found.distance_m)
-    near = predicted_m <= PAPER_ACTIVE_M
+    mixed = np.where(inside, 0.8 * distance_m + 0.2 * found.distance_m, 0.2 * distance_m + 0.8 * found.distance_m)
     wanted = found.closest_m + mixed[..., None] * found.normal
-    return Targets(np.where(near[..., None], wanted, points_m), np.ones(near.shape))
+    return Targets(np.where(_active(predicted, found)[..., None], wanted, points_m), np.ones(predicted.shape))
 
 
-def released_targets(points_m: np.ndarray, predicted_m: np.ndarray, radius_m: np.ndarray, found: Nearest) -> Targets:
-    """The demo's rule: out of the object by the radius of the capsule, or a third of the way to the predicted distance.
+def released_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
+                     found: Nearest) -> Targets:  # fmt: skip
+    """The demo's rule: out of the object by the radius, or a third of the way to the predicted distance.
 
-    predicted_m: (..., point) as in ``paper_targets``, radius_m: (point,) of the capsule, 0 for tips.
+    Arguments as in ``paper_targets``.
     """
-    active = (predicted_m - radius_m < RELEASED_ACTIVE_M) & (found.distance_m < RELEASED_NEAR_M)
+    distance_m = predicted * range_m + radius_m
     inside = found.distance_m < radius_m
     away = points_m - found.closest_m
     length = np.linalg.norm(away, axis=-1, keepdims=True)
     away = np.where(length > 1e-6, away / np.maximum(length, 1e-6), found.normal)
-    mixed = 0.35 * predicted_m + 0.65 * found.distance_m
+    mixed = 0.35 * distance_m + 0.65 * found.distance_m
     out = found.closest_m + radius_m[:, None] * found.normal
     wanted = np.where(inside[..., None], out, found.closest_m + mixed[..., None] * away)
-    return Targets(wanted, np.where(inside, 0.8, 0.5) * active)
+    return Targets(wanted, np.where(inside, 0.8, 0.5) * _active(predicted, found))
+
+
+def _active(predicted: np.ndarray, found: Nearest) -> np.ndarray:
+    return (predicted < ACTIVE_SHARE) & (found.distance_m < NEAR_M)

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from hoidata.sensors.mano_hand import mano_hand
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Trajectories
@@ -19,9 +18,10 @@ from hoidata.clips.features import (
     WRIST,
 )
 from hoidata.geometry.rotations import rot6d_to_rotmat
-from hoidata.hands import HandModel, HandPair
+from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
+from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 
 UNSEEN_M = 1.0  # how far away a wrist is taken to be that is never tracked
@@ -62,14 +62,14 @@ def hands_of(pair: HandPair, betas: np.ndarray, template_m: np.ndarray | None) -
     """Both hands of a person: betas (2, 10), personal rest meshes (2, 778, 3) or None."""
     templates = (None, None) if template_m is None else template_m
     return {
-        side: _tracked(pair[side], betas[row].tobytes(), None if templates[row] is None else templates[row].tobytes())
+        side: _tracked(pair, side, betas[row].tobytes(), None if templates[row] is None else templates[row].tobytes())
         for row, side in enumerate(SIDES)
     }
 
 
 @lru_cache(maxsize=64)
-def _tracked(model: HandModel, betas: bytes, template: bytes | None) -> TrackedHand:
+def _tracked(pair: HandPair, side: Side, betas: bytes, template: bytes | None) -> TrackedHand:
     """Kept, since a person's hand is in many clips and takes a while to make."""
     shape = np.frombuffer(betas, np.float32).astype(np.float64)
     rest = None if template is None else np.frombuffer(template, np.float32).reshape(-1, 3).astype(np.float64)
-    return mano_hand(model, shape, rest)
+    return mano_hand(pair, side, shape, rest)
