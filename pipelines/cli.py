@@ -7,6 +7,7 @@ import typer
 from hoidata.errors import HoidataError
 from pipelines.commands import (
     adapters,
+    animate,
     controls,
     corpus,
     evaluate,
@@ -46,6 +47,7 @@ app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
 app.command("generate")(generate.generate)
+app.command("animate")(animate.animate)
 app.command("show")(show.show)
 
 
