@@ -6,7 +6,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from hoidata.clips.clip import Side
+from hoidata.clips.clip import SIDES, Side
+from hoidata.clips.recording import HandRecording
 from hoidata.geometry.transform import RigidTransform
 from hoidata.objects.model import ObjectModel
 
@@ -54,3 +55,13 @@ class Control:
         if self.hinge_rad is None:
             return None
         return np.interp(time_s, self.thing.time_s, self.hinge_rad)
+
+
+def recording_control(recording: HandRecording) -> Control:
+    """What a recording with its source's own hands gives the network, at its own rate, time 0 in its first frame."""
+    thing, time_s = recording.object, recording.time_s
+    poses = {side: recording.world_from_wrist(side) for side in SIDES}
+    wrists: dict[Side, Motion] = {side: Motion(time_s, pose.rotation, pose.translation) for side, pose in poses.items()}
+    body = thing.world_from_object
+    hinge = None if thing.hinge_rad is None else thing.hinge_rad.astype(np.float64)
+    return Control(wrists, Motion(time_s, body.rotation, body.translation), thing.model, hinge)

@@ -13,7 +13,7 @@ def small_hand(seed: int = 0) -> TrackedHand:
     """A right hand of 6 joints; fingers to +x, thumb to +y. seed: of its skin, which has no symmetry."""
     random = np.random.default_rng(seed)
     offset = np.array([[0, 0, 0], [3, 3, -1], [10, 2.5, 0], [10.5, 0.5, 0.5], [10, -1.5, 0], [9, -3.5, -0.5]]) / 100
-    tips = offset + [[0, 0, 0], *[[0.06, 0.0, -0.005]] * 5]
+    tips = offset + np.array([0.06, 0.0, -0.005])
     points = random.uniform([0, -0.05, -0.03], [0.16, 0.05, 0.0], (SENSORS, 3))
     normals = random.normal(size=(SENSORS, 3)) - [0, 0, 2]
     weight = np.zeros((5 + SENSORS, 6))

@@ -1,4 +1,4 @@
-"""The sensors once more, slowly and by other means: every triangle, one ray at a time, libigl's distances, NumPy only."""
+"""The sensors once more, slowly and by other means: every triangle, one ray at a time, libigl's distances."""
 
 import igl
 import numpy as np
@@ -45,12 +45,14 @@ def proximity(vertices: np.ndarray, faces: np.ndarray, start: np.ndarray, way: n
 
 
 def occupancy(vertices: np.ndarray, faces: np.ndarray, middle: np.ndarray, turn: np.ndarray, distance: float) -> float:
-    """Of one cell of 1.8 cm: a triangle clipped by the six planes of the cell leaves something, or the middle is inside."""
+    """Of one cell of 1.8 cm: it meets a triangle of which clipping by its six planes leaves something."""
     if distance <= 0:
         return 1.0
-    met = distance <= 0.009 or (
-        distance < 0.016 and any(_clipped((corners - middle) @ turn) for corners in vertices[faces])
-    )
+    if distance > 0.016:
+        return 0.0
+    corners = (vertices[faces] - middle) @ turn
+    near = ((corners.min(axis=1) <= 0.009) & (corners.max(axis=1) >= -0.009)).all(axis=1)
+    met = distance <= 0.009 or any(_clipped(triangle) for triangle in corners[near])
     return 1 - distance / 0.018 if met else 0.0
 
 
