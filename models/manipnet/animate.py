@@ -23,6 +23,7 @@ PALM_M = 0.08  # from the wrist to the middle of the palm
 SEAM_S = 0.5  # over so long a time fingers are led to where the recording goes on
 UNSEEN_M = 1.0
 FACING = np.array([0.8, 0.0, -0.6])  # canonical: where a hand that holds something looks to
+LOOKS_AWAY, LOOKS_TO = 0.2, 0.6  # mean cosines between that and the way to the object
 
 
 class Given(NamedTuple):
@@ -118,7 +119,7 @@ def _check_facing(found: TrajectoryFile, control: Control, side: Side, hand: Tra
 
     as_read = Rotation.from_matrix(found.wrists[side].rotmats).as_quat()  # x, y, z, w
     other = Rotation.from_quat(as_read[:, [3, 0, 1, 2]]).as_matrix() @ _model_from_file(found, hand)
-    if facing(wrist.rotmats) < 0 and facing(other) > 0.3:
+    if facing(wrist.rotmats) < LOOKS_AWAY and facing(other) > LOOKS_TO:
         got = f"a {side} hand that looks away from the object it is at, and to it if they are x, y, z, w"
         raise BadInput(found.where, "quaternions in the order w, x, y, z", got, "put w first")
 

@@ -23,13 +23,14 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.errors import BadInput
-from hoidata.files import load_npz_arrays
+from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.objects.user_mesh import UNITS_M
 
 Axes = Literal["model", "canonical"]
 BODIES = ("object", *SIDES)
 PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 FASTEST_HZ, SLOWEST_HZ = 1000.0, 5.0
+LARGEST = 1e30  # of any number: squares of it are numbers still
 MOST_BYTES, MOST_FRAMES = 64 * 2**20, 200_000
 UNITS = UNITS_M | {"dm": 0.1}
 _MIRROR_POSITION, _MIRROR_QUATERNION = np.array([-1.0, 1, 1]), np.array([1.0, 1, -1, -1])
@@ -145,8 +146,8 @@ def _numbers(rows: list[list[str]], count: int, where: str) -> np.ndarray:
         table = np.array([[float(word) for word in row] for row in rows], dtype=np.float64).reshape(len(rows), count)
     except ValueError as error:
         raise BadInput(where, "numbers", str(error)[:200], "correct the file") from error
-    if not np.isfinite(table).all():
-        row = int(np.flatnonzero(~np.isfinite(table).all(axis=1))[0])
+    if not (sane := np.abs(table) < LARGEST).all():
+        row = int(np.flatnonzero(~sane.all(axis=1))[0])
         raise BadInput(f"{where}: row {row + 1}", "finite numbers", "NaN or infinity", "cut the file there")
     return table
 
@@ -159,7 +160,7 @@ def _array(
         raise BadInput(where, f"an array {name}", "none", "add it")
     array = np.asarray(arrays[name])
     fits = array.ndim == 1 + len(shape) and array.shape[1:] == shape and len(array) == (count or len(array))
-    if not fits or array.dtype.kind not in "fiu" or not np.isfinite(array).all():
+    if not fits or array.dtype.kind not in "fiu" or not (np.abs(array) < LARGEST).all():
         expected = f"finite numbers of shape ({count or 'frame'}, {', '.join(map(str, shape))})"
         raise BadInput(f"{where}: {name}", expected, f"{array.dtype} {array.shape}", "correct it")
     return array.astype(np.float64)

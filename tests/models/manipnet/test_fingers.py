@@ -1,4 +1,4 @@
-"""Promises of the rollout and of ManipNet as a family: it sees no fingers, a stream is a clip, joints stay in limits."""
+"""Promises of the rollout and of ManipNet as a family: it sees no fingers, a stream is a clip, limits hold."""
 
 from dataclasses import replace
 from pathlib import Path
