@@ -87,6 +87,21 @@ def test_coordinates_beyond_all_units_are_bad_input_without_a_warning(tmp_path: 
             load_mesh(tmp_path / name)
 
 
+SIGNALLING_NAN = bytes.fromhex("0100807f")
+
+
+@pytest.mark.parametrize("column", [0, 9])
+def test_a_signalling_nan_in_a_mesh_is_bad_input_without_a_warning(tmp_path: Path, column: int) -> None:
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 3\n" + "".join(f"property float {c}\n" for c in "xyz")
+    numbers = [np.float32(number).tobytes() for number in (0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 1, 2)]
+    numbers[column] = SIGNALLING_NAN
+    rows = b"".join([*numbers[:9], b"\x03", *numbers[9:]])
+    head += "element face 1\nproperty list uchar float vertex_index\nend_header\n"
+    (tmp_path / "a.ply").write_bytes(head.encode() + rows)
+    with pytest.raises(BadInput, match=r"finite|whole number"):
+        load_mesh(tmp_path / "a.ply")
+
+
 def test_a_capsule_end_too_large_for_a_number_is_bad_input(tmp_path: Path) -> None:
     path = tmp_path / manipnet.HAND_REFERENCE
     path.parent.mkdir(parents=True)

@@ -14,7 +14,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import FILE_NAME, load_checkpoint
-from models.common.training import make_repeatable
+from models.common.repeatable import make_repeatable
 from models.manipnet.animate import (
     at_30_fps,
     clip_control,
@@ -32,7 +32,7 @@ from models.manipnet.trajectory_files import Axes, read_trajectories
 from pipelines.generation import MeshWish, stored_object
 from pipelines.pages.animation_page import write_animation
 from pipelines.showing import find_clip
-from pipelines.stages.base import Place, load_hands
+from pipelines.stages.base import StagePaths, load_hands
 
 UPS = {"": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
@@ -76,7 +76,7 @@ def animate_files(what: str, wish: AnimateWish, profile: str, datasets: tuple[st
 
 def animate(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...]) -> Animated:
     """The same without files. Raises BadInput or MissingResource that says what cannot be, and what to do."""
-    make_repeatable(0, threads=1)  # one hand is too small for two threads to agree on
+    make_repeatable(threads=1)  # one hand is too small for two threads to agree on
     hands = load_hands(profile)
     if Path(what).suffix.lower() in (".csv", ".npz", ".txt") or Path(what).is_file():
         return _from_file(Path(what), wish, profile, datasets, hands)
@@ -84,9 +84,9 @@ def animate(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...
 
 
 def _from_clip(clip_id: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Animated:
-    place = find_clip(clip_id, profile, list(datasets))
-    clip = load_annotated(place.data, hands).clip(clip_id)
-    predictor, facts = chosen_network(wish, profile, (place.dataset, *datasets), hands)
+    paths = find_clip(clip_id, profile, list(datasets))
+    clip = load_annotated(paths.data, hands).clip(clip_id)
+    predictor, facts = chosen_network(wish, profile, (paths.dataset, *datasets), hands)
     frames = _frames(wish.frames, clip.n_frames)
     control, tracks = clip_control(clip), dict(clip.hands)
     own = hands_of(hands, *_shape(clip))
@@ -134,7 +134,7 @@ def _object(
         return user.model, list(user.notes)
     if not wish.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")
-    return stored_object(wish.object, Place(profile, wish.model or datasets[0]), hands), []
+    return stored_object(wish.object, StagePaths(profile, wish.model or datasets[0]), hands), []
 
 
 def chosen_network(
@@ -142,10 +142,10 @@ def chosen_network(
 ) -> tuple[Predictor, list[tuple[str, str]]]:
     """The trained network of the dataset asked for, or of the first that has one, ready; and what is known of it."""
     names = (wish.model,) if wish.model else tuple(dict.fromkeys(datasets))
-    places = [Place(profile, name) for name in names]
-    trained = [place for place in places if (place.checkpoints / MANIPNET.name / FILE_NAME).is_file()]
+    found = [StagePaths(profile, name) for name in names]
+    trained = [paths for paths in found if (paths.checkpoints / MANIPNET.name / FILE_NAME).is_file()]
     if not trained:
-        where = ", ".join(str(place) for place in places)
+        where = ", ".join(str(paths) for paths in found)
         raise MissingResource(
             f"no network for fingers ({where}): list manipnet under families in params.yaml, then `dvc repro`"
         )

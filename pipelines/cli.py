@@ -34,6 +34,7 @@ app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list the
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)
+app.command("down")(graph.down)
 app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
 app.command("validate")(store.validate)

@@ -12,7 +12,7 @@ from hoidata.errors import HoidataError
 from pipelines.lineage.manifests import Manifest
 from pipelines.params import PROFILES, read_params
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import HAND, Place, load_hands, load_settings, own_root, root_variable
+from pipelines.stages.base import HAND, StagePaths, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
@@ -66,12 +66,12 @@ def _gpu() -> Finding:
 
 
 def _raw(profile: str, dataset: str) -> Finding:
-    part, place = f"raw {dataset} ({profile})", Place(profile, dataset)
+    part, paths = f"raw {dataset} ({profile})", StagePaths(profile, dataset)
     try:
-        manifest = manifest_of(place)
+        manifest = manifest_of(paths)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
-    root = own_root(dataset) if profile == "own" else place.generated_raw
+    root = own_root(dataset) if profile == "own" else paths.generated_raw
     if not manifest.present:
         return Finding(part, "absent", _why_absent(profile, manifest, root))
     if root is None or not root.is_dir():

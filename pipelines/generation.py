@@ -11,14 +11,14 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
+from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
-from models.common.training import make_repeatable
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
 from models.text2hoi.generation import Generator, Wish
 from models.text2hoi.sentences import read_sentence
 from pipelines.pages.generation_page import write_generation
-from pipelines.stages.base import Place, empty_reason, load_hands, load_settings
+from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings
 
 
 @dataclass(frozen=True)
@@ -66,51 +66,51 @@ def generate_files(asked: Asked, out: Path) -> Written:
     if isinstance(asked.object, Path):
         user = read_user_object(asked.object, asked.mesh.unit, asked.mesh.up, asked.mesh.hinge)
         notes += user.notes
-    place, why = chosen_model(asked, verb, thing)
+    paths, why = chosen_model(asked, verb, thing)
     notes.append(why)
-    make_repeatable(0, threads=1)  # one motion is too small for two threads to agree on
-    hands, encoder = load_hands(place.profile), _encoder()
-    model = user.model if user else stored_object(str(asked.object), place, hands)
-    generator = Generator.load(place.checkpoints, hands, encoder, sampler=asked.sampler)
+    make_repeatable(threads=1)  # one motion is too small for two threads to agree on
+    hands, encoder = load_hands(paths.profile), _encoder()
+    model = user.model if user else stored_object(str(asked.object), paths, hands)
+    generator = Generator.load(paths.checkpoints, hands, encoder, sampler=asked.sampler)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
-    return Written(write_generation(out, motions, hands, str(place.checkpoints), notes), notes)
+    return Written(write_generation(out, motions, hands, str(paths.checkpoints), notes), notes)
 
 
-def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[Place, str]:
+def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[StagePaths, str]:
     """The dataset whose models to use, and why, in words. Raises MissingResource where none is trained."""
     names = (asked.model,) if asked.model else asked.datasets
-    places = [Place(asked.profile, name) for name in names]
-    reasons = {place: why_not_trained(place) for place in places}
-    trained = [place for place in places if not reasons[place]]
+    runs = [StagePaths(asked.profile, name) for name in names]
+    reasons = {paths: why_not_trained(paths) for paths in runs}
+    trained = [paths for paths in runs if not reasons[paths]]
     if not trained:
-        reason = "; ".join(f"{place}: {reasons[place]}" for place in places)
+        reason = "; ".join(f"{paths}: {reasons[paths]}" for paths in runs)
         raise MissingResource(f"no models that can generate: {reason}")
     if asked.model:
         return trained[0], f"models: {trained[0]}, as asked for"
-    found = [(_vocabulary(place).knows(verb, thing) + 8 * _has_object(place, asked.object), place) for place in trained]
+    found = [(_vocabulary(paths).knows(verb, thing) + 8 * _has_object(paths, asked.object), paths) for paths in trained]
     score, best = max(found, key=lambda item: item[0])
     known = ", ".join(filter(None, (verb, thing))) if score else "none of the words"
     return best, f"models: {best}, which know best of {len(trained)}: {known} (--model chooses another)"
 
 
-def _vocabulary(place: Place) -> Vocabulary:
-    return Vocabulary.read(read_info(place.checkpoints / "contact" / FILE_NAME)["facts"])
+def _vocabulary(paths: StagePaths) -> Vocabulary:
+    return Vocabulary.read(read_info(paths.checkpoints / "contact" / FILE_NAME)["facts"])
 
 
-def _has_object(place: Place, name: str | Path) -> bool:
+def _has_object(paths: StagePaths, name: str | Path) -> bool:
     """Whether the dataset has the object that was asked for by name; a mesh file is nobody's."""
-    return isinstance(name, str) and name in list(open_store(place.clips, load_hands(place.profile)).objects["object"])
+    return isinstance(name, str) and name in list(open_store(paths.clips, load_hands(paths.profile)).objects["object"])
 
 
 def _encoder() -> TextEncoder:
     return load_encoder(load_settings(AnnotationSettings, "annotate").encoder)
 
 
-def why_not_trained(place: Place) -> str | None:
+def why_not_trained(paths: StagePaths) -> str | None:
     """What is missing of the four models of a dataset, or None when all are there."""
     for name in NAMES:
-        folder = place.checkpoints / name
+        folder = paths.checkpoints / name
         if reason := empty_reason(folder):
             return f"{name} is empty, {reason}"
         if not (folder / FILE_NAME).is_file():
@@ -118,9 +118,9 @@ def why_not_trained(place: Place) -> str | None:
     return None
 
 
-def stored_object(name: str, place: Place, hands: HandPair) -> ObjectModel:
+def stored_object(name: str, paths: StagePaths, hands: HandPair) -> ObjectModel:
     """An object of the dataset by name. Raises BadInput that lists the names there are."""
-    store = open_store(place.clips, hands)
+    store = open_store(paths.clips, hands)
     names = list(store.objects["object"])
     if name not in names:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"

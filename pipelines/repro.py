@@ -1,27 +1,35 @@
-"""``dvc repro`` after a look at whether what it is going to read is there: DVC itself looks too late."""
+"""The graph, after a look at whether what it is going to read is there: DVC itself looks too late."""
 
 import os
-import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from hoidata.errors import MissingResource
 from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
 from pipelines.params import read_params
+from pipelines.side_by_side import Run, RunStage, reproduce_side_by_side
 from pipelines.stages.adapters import ensure_manifests
-from pipelines.stages.base import Place, raw_root
+from pipelines.stages.base import StagePaths, raw_root
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
+MOST_JOBS = 4  # a stage can take a gigabyte or two of memory
 
-def reproduce(targets: list[str]) -> int:
-    """Preflight, then ``dvc repro`` of the targets (all when empty). Returns DVC's exit code.
+
+def reproduce(
+    targets: list[str], jobs: int = 0, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
+) -> Run:
+    """Preflight, then the targets (all when empty), up to ``jobs`` stages at once; 0: one per core, at most 4.
+
+    wrap, force: see :func:`reproduce_side_by_side`.
 
     Raises MissingResource before DVC starts when raw or MANO files that a stale stage needs are absent.
     """
     preflight()
-    return subprocess.run([sys.executable, "-m", "dvc", "repro", *targets], env=stage_environment()).returncode
+    os.environ.update(stage_environment())
+    return reproduce_side_by_side(targets, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))), wrap, force)
 
 
 def stage_environment() -> dict[str, str]:
@@ -33,25 +41,25 @@ def stage_environment() -> dict[str, str]:
 def preflight() -> None:
     """Write again a generated corpus that a conversion is about to read; refuse when the user's files are missing."""
     params = read_params(Path())
-    places = [Place(params["profile"], name) for name in params["datasets"]]
+    runs = [StagePaths(params["profile"], name) for name in params["datasets"]]
     ensure_manifests(params["profile"], params["datasets"])
-    present = [place for place in places if read_manifest(place.manifest).present]
-    for place in present:
-        if not place.is_generated:
-            require_hand(place)
-    unreadable = [place for place in present if not _is_readable(place)]
-    stale = _stale_stages([f"{stage}@{place}" for place in unreadable for stage in ("raw", "convert")])
-    for place in unreadable:
-        if not place.is_generated:
-            if {f"raw@{place}", f"convert@{place}"} & stale:
-                raw_root(place)
-        elif f"raw@{place}" not in stale and f"convert@{place}" in stale:
-            write_generated(place, read_manifest(place.manifest), place.generated_raw)
+    present = [paths for paths in runs if read_manifest(paths.manifest).present]
+    for paths in present:
+        if not paths.is_generated:
+            require_hand(paths)
+    unreadable = [paths for paths in present if not _is_readable(paths)]
+    stale = _stale_stages([f"{stage}@{paths}" for paths in unreadable for stage in ("raw", "convert")])
+    for paths in unreadable:
+        if not paths.is_generated:
+            if {f"raw@{paths}", f"convert@{paths}"} & stale:
+                raw_root(paths)
+        elif f"raw@{paths}" not in stale and f"convert@{paths}" in stale:
+            write_generated(paths, read_manifest(paths.manifest), paths.generated_raw)
 
 
-def _is_readable(place: Place) -> bool:
+def _is_readable(paths: StagePaths) -> bool:
     try:
-        return raw_root(place).is_dir()
+        return raw_root(paths).is_dir()
     except MissingResource:
         return False
 

@@ -10,7 +10,7 @@ from hoidata.store.store import Store, open_store
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.dataset_page import write_dataset_page
 from pipelines.params import read_params
-from pipelines.stages.base import Place, empty_reason, load_hands
+from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
 CLOSEST = 5
 
@@ -22,29 +22,29 @@ def write_shown(what: str, profile: str, out: Path) -> Path:
     """
     datasets = [str(name) for name in read_params(Path())["datasets"]]
     if what in datasets:
-        place = Place(profile, what)
-        return write_dataset_page(out, place.data, what, load_hands(profile), dataset_title(what))
-    place = find_clip(what, profile, datasets)
+        paths = StagePaths(profile, what)
+        return write_dataset_page(out, paths.data, what, load_hands(profile), dataset_title(what))
+    paths = find_clip(what, profile, datasets)
     hands = load_hands(profile)
-    return write_clip_page(out / page_name(what), load_annotated(place.data, hands), what, hands)
+    return write_clip_page(out / page_name(what), load_annotated(paths.data, hands), what, hands)
 
 
-def find_clip(clip_id: str, profile: str, datasets: list[str]) -> Place:
+def find_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
     """The dataset that holds a clip."""
-    stores = {name: store for name in datasets if (store := _store(Place(profile, name))) is not None}
+    stores = {name: store for name in datasets if (store := _store(StagePaths(profile, name))) is not None}
     for name, store in stores.items():
         if clip_id in store.sequences.index:
-            return Place(profile, name)
+            return StagePaths(profile, name)
     if not stores:
         raise MissingResource(f"no dataset of the profile {profile} is converted; run `dvc repro` first")
     raise _unknown(clip_id, profile, stores)
 
 
-def _store(place: Place) -> Store | None:
+def _store(paths: StagePaths) -> Store | None:
     """The clips of a dataset, or None where there are none."""
-    if empty_reason(place.clips) or not (place.clips / "meta" / "info.json").is_file():
+    if empty_reason(paths.clips) or not (paths.clips / "meta" / "info.json").is_file():
         return None
-    return open_store(place.clips)
+    return open_store(paths.clips)
 
 
 def _unknown(clip_id: str, profile: str, stores: dict[str, Store]) -> BadInput:

@@ -71,17 +71,24 @@ def _fill(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
 
 @njit(cache=True, inline="always")
 def _between(low_m, cell_m, value, x, y, z):  # pragma: no cover (compiled)
-    """Interpolated value at a place, and how far the truth may be off; (0, inf) off the grid."""
-    u, v, w = (x - low_m[0]) / cell_m, (y - low_m[1]) / cell_m, (z - low_m[2]) / cell_m
-    if not (0 <= u < value.shape[2] - 1 and 0 <= v < value.shape[1] - 1 and 0 <= w < value.shape[0] - 1):
+    """Interpolated value at a place, and how far the truth may be off; (0, inf) without a grid.
+
+    Off the grid the value of its nearest place stands, and the way to there is added to what it may be off.
+    """
+    if not (value.size and abs(x) + abs(y) + abs(z) < np.inf):
         return 0.0, np.inf
-    i, j, k = int(u), int(v), int(w)
-    u, v, w = u - i, v - j, w - k
+    u, v, w = (x - low_m[0]) / cell_m, (y - low_m[1]) / cell_m, (z - low_m[2]) / cell_m
+    i = min(max(int(u), 0), value.shape[2] - 2)
+    j = min(max(int(v), 0), value.shape[1] - 2)
+    k = min(max(int(w), 0), value.shape[0] - 2)
+    far_u, far_v, far_w = u - i, v - j, w - k
+    u, v, w = min(max(far_u, 0.0), 1.0), min(max(far_v, 0.0), 1.0), min(max(far_w, 0.0), 1.0)
+    beyond = cell_m * np.sqrt((far_u - u) ** 2 + (far_v - v) ** 2 + (far_w - w) ** 2)
     near = (value[k, j, i] * (1 - u) + value[k, j, i + 1] * u) * (1 - v)
     near += (value[k, j + 1, i] * (1 - u) + value[k, j + 1, i + 1] * u) * v
     far = (value[k + 1, j, i] * (1 - u) + value[k + 1, j, i + 1] * u) * (1 - v)
     far += (value[k + 1, j + 1, i] * (1 - u) + value[k + 1, j + 1, i + 1] * u) * v
-    slack = cell_m * np.sqrt(u * (1 - u) + v * (1 - v) + w * (1 - w)) + _ROUNDING_M
+    slack = cell_m * np.sqrt(u * (1 - u) + v * (1 - v) + w * (1 - w)) + _ROUNDING_M + beyond * _WIDER
     return near * (1 - w) + far * w, slack
 
 

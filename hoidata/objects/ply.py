@@ -211,7 +211,8 @@ def _positions(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
     numbers = [names.index(axis) for axis in "xyz" if axis in names]
     if len(numbers) < 3 or any(element.properties[number].count_kind is not None for number in numbers):
         raise ValueError("vertices without x, y and z")
-    return np.concatenate([columns[number] for number in numbers], axis=1).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one, and is refused as such
+        return np.concatenate([columns[number] for number in numbers], axis=1).astype(np.float64)
 
 
 def _fans(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
@@ -222,7 +223,8 @@ def _fans(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
     corners = columns[numbers[0]]
     if len(corners) and corners.shape[1] < 3:
         raise ValueError(f"a face of {corners.shape[1]} corners")
-    whole = np.asarray(corners, dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        whole = np.asarray(corners, dtype=np.float64)
     if not (np.isfinite(whole).all() and (whole == np.rint(whole)).all() and (np.abs(whole) < 2**53).all()):
         raise ValueError("a corner that is no whole number")
     first, second, third = whole[:, :1], whole[:, 1:-1], whole[:, 2:]

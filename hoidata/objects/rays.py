@@ -21,53 +21,69 @@ def first_hits(tree, start_m, direction, reach_m, facing, way_m):  # pragma: no 
     start_m, direction: (ray, 3), directions of length 1. facing: (ray,) ENTERING meets only triangles whose outward
     normal points against the ray, LEAVING only those along it, EITHER all; a triangle seen edge on is never met.
     """
-    box, link, corner, vertices_m = tree[1], tree[2], tree[4], tree[5]
-    stack = np.empty(DEEPEST, np.int64)
+    stack, ways = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
     for ray in range(len(start_m)):
         best = min(reach_m[ray], way_m[ray])
-        found = _first_hit(box, link, corner, vertices_m, start_m[ray], direction[ray], best, facing[ray], stack)
+        found = _first_hit(tree, start_m[ray], direction[ray], best, facing[ray], stack, ways)
         if found >= 0:
             way_m[ray] = found
 
 
 @njit(cache=True)
-def _first_hit(box, link, corner, vertices_m, start, direction, reach, facing, stack):  # pragma: no cover (compiled)
-    """Way to the first triangle met within ``reach``; -1 where there is none."""
-    size = np.abs(direction)
-    kz = 0 if size[0] >= size[1] and size[0] >= size[2] else 1 if size[1] >= size[2] else 2
-    kx, ky = (kz + 1) % 3, (kz + 2) % 3
-    if direction[kz] < 0:
-        kx, ky = ky, kx
-    shear_x, shear_y = direction[kx] / direction[kz], direction[ky] / direction[kz]
+def _first_hit(tree, start, way, reach, facing, stack, ways):  # pragma: no cover (compiled)
+    """Way to the first triangle met within ``reach``; -1 where there is none. way: the ray's direction."""
+    box, link, over, axes = tree[1], tree[2], 1 / way, _axes(way)
     best, hit, waiting = reach, -1.0, 1
-    stack[0] = 0
+    stack[0], ways[0] = 0, _way_to_box(box, 0, start, over)
     while waiting:
         waiting -= 1
         node = stack[waiting]
-        if _way_to_box(box, node, start, direction) > best * _WIDER:
+        if ways[waiting] > best * _WIDER:
             continue
         second = link[node, 0]
         if second:
             near, far = node + 1, second
-            if _way_to_box(box, far, start, direction) < _way_to_box(box, near, start, direction):
-                near, far = far, near
-            stack[waiting], stack[waiting + 1] = far, near
-            waiting += 2
+            near_way, far_way = _way_to_box(box, near, start, over), _way_to_box(box, far, start, over)
+            if far_way < near_way:
+                near, far, near_way, far_way = far, near, far_way, near_way
+            for child, child_way in ((far, far_way), (near, near_way)):
+                if child_way <= best * _WIDER:
+                    stack[waiting], ways[waiting] = child, child_way
+                    waiting += 1
             continue
-        for number in range(link[node, 1], link[node, 2]):
-            a, b, c = corner[number, 0], corner[number, 1], corner[number, 2]
-            ax, ay, az = _sheared(vertices_m, a, start, kx, ky, kz, shear_x, shear_y)
-            bx, by, bz = _sheared(vertices_m, b, start, kx, ky, kz, shear_x, shear_y)
-            cx, cy, cz = _sheared(vertices_m, c, start, kx, ky, kz, shear_x, shear_y)
-            u, v, w = cx * by - cy * bx, ax * cy - ay * cx, bx * ay - by * ax
-            if (u < 0 or v < 0 or w < 0) and (u > 0 or v > 0 or w > 0):
-                continue
-            area = u + v + w
-            if area == 0 or area * facing > 0:
-                continue
-            way = (u * az + v * bz + w * cz) / area / direction[kz]
-            if 0 <= way <= best:
-                best, hit = way, way
+        found = _hit_in_leaf(tree[4], tree[5], link[node, 1], link[node, 2], start, axes, facing, best)
+        if found >= 0:
+            best, hit = found, found
+    return hit
+
+
+@njit(cache=True, inline="always")
+def _axes(way):  # pragma: no cover (compiled)
+    """The axis a ray runs along most, last, and the two others, so that orientation stays; its shear along them."""
+    size = np.abs(way)
+    kz = 0 if size[0] >= size[1] and size[0] >= size[2] else 1 if size[1] >= size[2] else 2
+    kx, ky = (kz + 1) % 3, (kz + 2) % 3
+    if way[kz] < 0:
+        kx, ky = ky, kx
+    return kx, ky, kz, way[kx] / way[kz], way[ky] / way[kz], way[kz]
+
+
+@njit(cache=True)
+def _hit_in_leaf(corner, vertices_m, first, last, start, axes, facing, best):  # pragma: no cover (compiled)
+    """Way to the first of some triangles that is met within ``best``; -1 where none is."""
+    kx, ky, kz, shear_x, shear_y, speed = axes
+    hit = -1.0
+    for number in range(first, last):
+        ax, ay, az = _sheared(vertices_m, corner[number, 0], start, kx, ky, kz, shear_x, shear_y)
+        bx, by, bz = _sheared(vertices_m, corner[number, 1], start, kx, ky, kz, shear_x, shear_y)
+        cx, cy, cz = _sheared(vertices_m, corner[number, 2], start, kx, ky, kz, shear_x, shear_y)
+        u, v, w = cx * by - cy * bx, ax * cy - ay * cx, bx * ay - by * ax
+        area = u + v + w
+        if min(u, v, w) < 0 < max(u, v, w) or area == 0 or area * facing > 0:
+            continue
+        way = (u * az + v * bz + w * cz) / area / speed
+        if 0 <= way <= best:
+            best, hit = way, way
     return hit
 
 
@@ -81,16 +97,16 @@ def _sheared(vertices_m, vertex, start, kx, ky, kz, shear_x, shear_y):  # pragma
 
 
 @njit(cache=True, inline="always")
-def _way_to_box(box, node, start, direction):  # pragma: no cover (compiled)
-    """Way along the ray to a node's box, 0 inside, infinite where it is missed."""
+def _way_to_box(box, node, start, over):  # pragma: no cover (compiled)
+    """Way along the ray to a node's box, 0 inside, infinite where it is missed. over: 1 / direction, infinite for 0."""
     enter, leave = 0.0, np.inf
     for axis in range(3):
         low, high = box[node, axis] - start[axis], box[node, axis + 3] - start[axis]
-        if direction[axis] == 0:
+        if abs(over[axis]) == np.inf:
             if low > 0 or high < 0:
                 return np.inf
         else:
-            first, last = low / direction[axis], high / direction[axis]
+            first, last = low * over[axis], high * over[axis]
             enter, leave = max(enter, min(first, last)), min(leave, max(first, last))
     return enter if enter <= leave * _WIDER else np.inf
 

@@ -70,10 +70,12 @@ class PartSurface:
         lower_distances(self.tree, self.grid_for(positions_m), positions_m, float(most_m), distance)
         return distance
 
-    def signed_m(self, positions_m: np.ndarray) -> np.ndarray:
-        """(position,) distance to the surface, negative inside."""
-        distance = self.distance_m(positions_m)
-        return np.where(self.inside(positions_m), -distance, distance)
+    def signed_m(self, positions_m: np.ndarray, most_m: float = np.inf) -> np.ndarray:
+        """(position,) distance to the surface, negative inside; infinite beyond ``most_m`` outside."""
+        inside, signed = self.inside(positions_m), np.empty(len(positions_m))
+        signed[~inside] = self.distance_m(positions_m[~inside], most_m)
+        signed[inside] = -self.distance_m(positions_m[inside])
+        return signed
 
     def nearest(self, positions_m: np.ndarray) -> SignedDistance:
         """Signed distance and nearest place; ``normal`` is the gradient of the distance, outward, of length 1."""

@@ -89,11 +89,13 @@ def _distances(
     """(frame, time, point) signed distances, and (frame, point, 3) gradients now."""
     points = state.point_m
     now = reduce(nearer_of, (_nearest_now(part, points) for part in parts))
-    later = reduce(
-        np.minimum, (part.surface.signed_m(_rows(part.from_wrist[:, 1:] @ points[:, None])) for part in parts)
-    )
+    later = reduce(np.minimum, (_signed_later(part, points, settings.reach_m) for part in parts))
     every = np.concatenate([now.distance_m[:, None], later.reshape(len(points), -1, points.shape[1])], axis=1)
     return np.clip(every, -settings.depth_m, settings.reach_m), now.normal @ hand.wrist_from_canonical
+
+
+def _signed_later(part: _Part, points: np.ndarray, reach_m: float) -> np.ndarray:
+    return part.surface.signed_m(_rows(part.from_wrist[:, 1:] @ points[:, None]), reach_m)
 
 
 def _nearest_now(part: _Part, points: np.ndarray) -> SignedDistance:

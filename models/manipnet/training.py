@@ -6,7 +6,7 @@ from hashlib import sha256
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.clip import FPS, SIDES
@@ -69,7 +69,7 @@ def pose_pool(samples: Sequence[ClipSample], pair: HandPair) -> np.ndarray:
 class FingersObjective:
     """Squared error of the next pose and distances, from recorded poses and from poses beside them."""
 
-    needs_entries = False
+    frames = entries = 0
 
     def __init__(self, setup: Setup) -> None:
         pair, self.loss, self.device = setup.corpus.annotated.store.hand_pair(), setup.loss, setup.device
@@ -111,10 +111,10 @@ class FingersObjective:
         return [(one.inputs[row], one.outputs[row]) for one, row in found]
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ManipNet)
         inputs, made = (torch.from_numpy(rows).to(self.device) for rows in self.held_out)
-        return float(step_loss(network, inputs, made))
+        return step_loss(network, inputs, made)
 
 
 MANIPNET = Network("manipnet", NetworkConfig, ManipNet, lambda setup: (FingersObjective(setup), None), loss=LossConfig)

@@ -24,16 +24,16 @@ def scan(
     enter_project()
     from pipelines.lineage.manifests import write_manifest
     from pipelines.stages.adapters import ensure_manifests
-    from pipelines.stages.base import HAND, Place
+    from pipelines.stages.base import HAND, StagePaths
 
     name = HAND if dataset == "mano" else dataset
-    place = Place("own", name)
-    manifest = _scan_hand(place, root) if name == HAND else _scan_dataset(place, root)
+    paths = StagePaths("own", name)
+    manifest = _scan_hand(paths, root) if name == HAND else _scan_dataset(paths, root)
     ensure_manifests("own", read_params(Path())["datasets"])
-    write_manifest(place.manifest, manifest)
+    write_manifest(paths.manifest, manifest)
     remember_root(name, root)
     size = sum(entry.size for entry in manifest.files)
-    typer.echo(f"{place.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
+    typer.echo(f"{paths.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
     if name == HAND:
         return
     typer.echo(f"{manifest.dataset} {manifest.version}: {manifest.licence}")
@@ -55,19 +55,19 @@ def profile(
     typer.echo(current_profile())
 
 
-def _scan_dataset(place, root: Path):
+def _scan_dataset(paths, root: Path):
     from pipelines.lineage.manifests import absent_manifest, scan_files
     from pipelines.stages.adapters import configured_adapter
     from pipelines.stages.raw import require_hand
 
     known = read_params(Path())["datasets"]
-    adapter = configured_adapter(place.dataset)
-    if place.dataset not in known:
-        remedy = f"add {place.dataset} to `datasets` in params.yaml"
-        raise BadInput("params.yaml: datasets", place.dataset, f"only {', '.join(known)}", remedy)
+    adapter = configured_adapter(paths.dataset)
+    if paths.dataset not in known:
+        remedy = f"add {paths.dataset} to `datasets` in params.yaml"
+        raise BadInput("params.yaml: datasets", paths.dataset, f"only {', '.join(known)}", remedy)
     # First what was asked about, then what it needs besides.
     try:
-        require_hand(place)
+        require_hand(paths)
     except MissingResource as error:
         _require_parts(adapter, root, also=str(error))
         raise
@@ -94,7 +94,7 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
         typer.echo(f"{adapter.name}: without {part.what} ({part.patterns[0]}), to be had from {part.where}")
 
 
-def _scan_hand(place, root: Path):
+def _scan_hand(paths, root: Path):
     from hoidata.clips.clip import SourceFile
     from hoidata.files import sha256_file
     from pipelines.lineage.manifests import ABSENT_HAND
@@ -122,21 +122,21 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     """
     from pipelines.lineage.manifests import read_manifest, verify_files
     from pipelines.stages.adapters import configured_adapter, manifest_of
-    from pipelines.stages.base import Place, raw_root
+    from pipelines.stages.base import StagePaths, raw_root
 
-    place, adapter = Place(current_profile(), dataset), configured_adapter(dataset)
-    manifest = manifest_of(place)
+    paths, adapter = StagePaths(current_profile(), dataset), configured_adapter(dataset)
+    manifest = manifest_of(paths)
     if not manifest.present:
-        typer.echo(f"{dataset}: not present in the profile {place.profile}: no raw files were scanned")
+        typer.echo(f"{dataset}: not present in the profile {paths.profile}: no raw files were scanned")
         _say_where_to_get(adapter)
         return not asked_for
     try:
-        root = raw_root(place)
+        root = raw_root(paths)
     except MissingResource as error:
         typer.echo(f"{dataset}: {error}")
         _say_where_to_get(adapter)
         return False
-    listed = read_manifest(place.raw_manifest) if manifest.synthetic else manifest
+    listed = read_manifest(paths.raw_manifest) if manifest.synthetic else manifest
     differences = verify_files(root, listed, adapter.parts)
     for item in differences[:SHOWN_DIFFERENCES]:
         typer.echo(f"{dataset}: {item.path} is {item.problem}{_where_to_get(adapter, item.path)}")

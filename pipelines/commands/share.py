@@ -52,8 +52,8 @@ def _config() -> Any:
 def _terms() -> list[str]:
     """One line per dataset of the current profile whose licence does not let derived data be passed on."""
     from pipelines.stages.adapters import manifest_of
-    from pipelines.stages.base import Place
+    from pipelines.stages.base import StagePaths
 
-    places = [Place(current_profile(), name) for name in read_params(Path())["datasets"]]
-    bound = [manifest for place in places if (manifest := manifest_of(place)).present]
+    runs = [StagePaths(current_profile(), name) for name in read_params(Path())["datasets"]]
+    bound = [manifest for paths in runs if (manifest := manifest_of(paths)).present]
     return [f"{item.dataset}: {item.licence}" for item in bound if not item.may_be_shared]

@@ -19,13 +19,13 @@ def write(dataset: Dataset = "", profile: Profile = "embedded") -> None:
     """Write the raw trees of a profile's corpora anew, as their committed recipes say."""
     enter_project()
     from pipelines.lineage.manifests import read_manifest
-    from pipelines.stages.base import Place
+    from pipelines.stages.base import StagePaths
     from pipelines.stages.raw import write_generated
 
     for name in _chosen(dataset, profile):
-        place = Place(profile, name)
-        write_generated(place, read_manifest(place.manifest), place.generated_raw)
-        typer.echo(f"{name}: written to {place.generated_raw}")
+        paths = StagePaths(profile, name)
+        write_generated(paths, read_manifest(paths.manifest), paths.generated_raw)
+        typer.echo(f"{name}: written to {paths.generated_raw}")
 
 
 @app.command()

@@ -48,16 +48,16 @@ def main() -> int:
 def _run(module, options: argparse.Namespace) -> int:
     from hoidata.errors import BadInput, HoidataError
     from pipelines.params import read_params
-    from pipelines.stages.base import Place
+    from pipelines.stages.base import StagePaths
 
-    place = Place(options.profile, options.dataset, options.model, options.family)
+    paths = StagePaths(options.profile, options.dataset, options.model, options.family)
     try:
         chosen = read_params(Path())["profile"]
-        if place.profile not in ("", chosen):
-            raise BadInput("--profile", f"{chosen}, which params.yaml chooses", place.profile, "choose it there")
-        module.run(replace(place, profile=chosen))
+        if paths.profile not in ("", chosen):
+            raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "choose it there")
+        module.run(replace(paths, profile=chosen))
     except HoidataError as error:
-        print(f"{options.stage} of {place}: {error}", file=sys.stderr)
+        print(f"{options.stage} of {paths}: {error}", file=sys.stderr)
         return 1
     return 0
 

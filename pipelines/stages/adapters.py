@@ -8,7 +8,7 @@ from hoidata.datasets.base import Adapter
 from hoidata.datasets.registry import get_adapter
 from hoidata.errors import BadInput
 from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
-from pipelines.stages.base import Place, load_settings
+from pipelines.stages.base import StagePaths, load_settings
 
 
 @dataclass(frozen=True)
@@ -32,18 +32,18 @@ class ConvertSettings:
         return get_adapter(name, **{**common, **(self.adapters.get(name) or {})})
 
 
-def manifest_of(place: Place) -> Manifest:
+def manifest_of(paths: StagePaths) -> Manifest:
     """What is known of a dataset's raw files; that it is absent where nothing has been scanned."""
-    path = place.manifest
-    return read_manifest(path) if path.is_file() else absent_manifest(configured_adapter(place.dataset))
+    path = paths.manifest
+    return read_manifest(path) if path.is_file() else absent_manifest(configured_adapter(paths.dataset))
 
 
 def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:
     """Write the manifests the graph depends on where nobody has: those datasets, and the hand, are absent."""
-    for place in (Place(profile, name) for name in datasets):
-        if not place.manifest.is_file():
-            write_manifest(place.manifest, manifest_of(place))
-    hand = Place(profile).hand_manifest
+    for paths in (StagePaths(profile, name) for name in datasets):
+        if not paths.manifest.is_file():
+            write_manifest(paths.manifest, manifest_of(paths))
+    hand = StagePaths(profile).hand_manifest
     if not hand.is_file():
         write_manifest(hand, ABSENT_HAND)
 

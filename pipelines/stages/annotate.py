@@ -2,30 +2,29 @@
 
 from pathlib import Path
 
-from hoidata.annotation.settings import AnnotationSettings
-from hoidata.contact.settings import read_contact_settings
-from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, print_counts, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, print_counts, write_empty
 
 # Text features of earlier runs, of all datasets and profiles; they spare time and change no output.
 FEATURES = Path(".hoidata", "features")
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Annotate every clip; a dataset without clips gives an empty output."""
-    settings = load_settings(AnnotationSettings, "annotate")
-    if reason := empty_reason(place.clips):
-        write_empty(place.annotation, reason)
+    if reason := empty_reason(paths.clips):
+        write_empty(paths.annotation, reason)
         return
+    from hoidata.annotation.settings import AnnotationSettings
     from hoidata.annotation.stage import annotate_store
+    from hoidata.contact.settings import read_contact_settings
     from hoidata.quality.verdicts import left_out_reasons
 
     counts = annotate_store(
-        place.clips,
-        place.annotation,
-        settings,
-        contact=read_contact_settings(place.contact),
-        hands=load_hands(place.profile),
-        left_out=left_out_reasons(place.quality),
+        paths.clips,
+        paths.annotation,
+        load_settings(AnnotationSettings, "annotate"),
+        contact=read_contact_settings(paths.contact),
+        hands=load_hands(paths.profile),
+        left_out=left_out_reasons(paths.quality),
         features=FEATURES,
     )
-    print_counts(place, counts)
+    print_counts(paths, counts)

@@ -29,12 +29,12 @@ class _At:
     def __init__(self, pattern: str) -> None:
         self.pattern = pattern
 
-    def __get__(self, place: "Place", owner: type) -> Path:
-        return Path(self.pattern.format(**vars(place)))
+    def __get__(self, paths: "StagePaths", owner: type) -> Path:
+        return Path(self.pattern.format(**vars(paths)))
 
 
 @dataclass(frozen=True)
-class Place:
+class StagePaths:
     """Where the files of one stage run lie, relative to the project folder (the current folder)."""
 
     profile: str
@@ -55,6 +55,7 @@ class Place:
     splits = _At("data/{profile}/{dataset}/splits")
     checkpoints = _At("checkpoints/{profile}/{dataset}")
     checkpoint = _At("checkpoints/{profile}/{dataset}/{model}")
+    training = _At(".hoidata/training/{profile}/{dataset}/{model}")
     evaluators = _At("evaluators/{profile}/{dataset}")
     samples = _At("samples/{profile}/{dataset}/{family}")
     metrics = _At("metrics/{profile}/{dataset}/{family}.json")
@@ -104,16 +105,16 @@ def _registered_roots(path: Path) -> dict[str, str]:
     return roots
 
 
-def raw_root(place: Place) -> Path:
+def raw_root(paths: StagePaths) -> Path:
     """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
-    if place.is_generated:
-        root = place.generated_raw
-        remedy = f"write it again with `hoidata synth write {place.dataset} --profile {place.profile}`"
+    if paths.is_generated:
+        root = paths.generated_raw
+        remedy = f"write it again with `hoidata synth write {paths.dataset} --profile {paths.profile}`"
     else:
-        root = own_root(place.dataset)
-        remedy = f"set {root_variable(place.dataset)}, or run `hoidata raw scan {place.dataset} --root PATH`"
+        root = own_root(paths.dataset)
+        remedy = f"set {root_variable(paths.dataset)}, or run `hoidata raw scan {paths.dataset} --root PATH`"
     if root is None or not root.is_dir():
-        raise MissingResource(f"the raw files of {place.dataset} ({place.profile}) are not at {root}; {remedy}")
+        raise MissingResource(f"the raw files of {paths.dataset} ({paths.profile}) are not at {root}; {remedy}")
     return root
 
 
@@ -121,7 +122,7 @@ def load_hands(profile: str) -> "HandPair":
     """The hand of the profile: the user's MANO files where its manifest lists some, else the embedded one."""
     from hoidata.hands import load_embedded_hands, load_mano_hands
 
-    if Place(profile).is_generated or not hand_is_present(profile):
+    if StagePaths(profile).is_generated or not hand_is_present(profile):
         return load_embedded_hands()
     root = own_root(HAND)
     if root is None or not root.is_dir():
@@ -131,7 +132,7 @@ def load_hands(profile: str) -> "HandPair":
 
 def hand_is_present(profile: str) -> bool:
     """Whether the profile has a hand of its own: the embedded one, or MANO files that were scanned."""
-    path = Place(profile).hand_manifest
+    path = StagePaths(profile).hand_manifest
     return path.is_file() and bool(json.loads(path.read_text())["present"])
 
 
@@ -153,9 +154,9 @@ def write_empty(folder: Path, reason: str) -> None:
         note_empty(partial, reason)
 
 
-def print_counts(place: Place, counts: Mapping[str, int]) -> None:
+def print_counts(paths: StagePaths, counts: Mapping[str, int]) -> None:
     """What a stage says of a run that went well."""
-    print(f"{place}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
+    print(f"{paths}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
 
 
 def write_json(path: Path, values: Any) -> None:

@@ -15,7 +15,7 @@ from hoidata.files.digest import canonical_json
 from models.registry import IF_LISTED, NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.params import chosen_params, read_file, read_params
-from pipelines.stages.base import Place, write_json
+from pipelines.stages.base import StagePaths, write_json
 
 CODE = Path("code")
 STAGES_OF_DATASETS = ("raw", "convert", "quality", "annotate", "contact", "surface", "split")
@@ -40,14 +40,14 @@ class Start:
     chosen: dict[str, list[Choice]] = field(default_factory=dict)
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Write one file per stage, and per dataset, network or family where that chooses among modules.
 
     Manifests the graph depends on and nobody has written are written too: those datasets are absent.
     """
     params = read_params(Path())
-    places = [Place(params["profile"], name) for name in params["datasets"]]
-    if not all(path.is_file() for place in places for path in (place.manifest, place.hand_manifest)):
+    runs = [StagePaths(params["profile"], name) for name in params["datasets"]]
+    if not all(path.is_file() for paths in runs for path in (paths.manifest, paths.hand_manifest)):
         from pipelines.stages.adapters import ensure_manifests  # imports adapters, which takes longer than all the rest
 
         ensure_manifests(params["profile"], params["datasets"])
@@ -134,7 +134,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     stage, _, of = name.partition("/")
     section = params.get(stage) or {}
     if stage == "train":
-        return section.get("seed"), (section.get(section.get("size")) or {}).get(of)
+        return section.get("seed"), *[(section.get(section.get(kind)) or {}).get(of) for kind in ("preset", "size")]
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
     return (section, params.get("sample")) if stage == "controls" else section

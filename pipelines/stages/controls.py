@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pipelines.params import read_params
-from pipelines.stages.base import Place, empty_reason, load_settings, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
 from pipelines.stages.evaluate import run as evaluate
 from pipelines.stages.sample import sample
 
@@ -20,12 +20,12 @@ class ControlSettings:
     samples: int | None = None
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Write motions and metrics of every row, as sample and evaluate would, into folders ``controls`` beside theirs."""
     settings = load_settings(ControlSettings, "controls")
-    rows = {name: replace(place, family=f"controls/{name}") for name in settings.families}
-    folders = [replace(place, family="controls").samples, place.metrics.parent / "controls"]
-    if reason := empty_reason(place.clips) if rows else OFF:
+    rows = {name: replace(paths, family=f"controls/{name}") for name in settings.families}
+    folders = [replace(paths, family="controls").samples, paths.metrics.parent / "controls"]
+    if reason := empty_reason(paths.clips) if rows else OFF:
         for folder in folders:
             write_empty(folder, reason)
         return

@@ -4,26 +4,26 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipelines.stages.base import Place, empty_reason, jobs, load_hands, write_json
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, write_json
 
 if TYPE_CHECKING:
     from models.evaluator.encoders import MotionEvaluator
 
 
-def run(place: Place) -> None:
-    """Write the metrics; a dataset or family without motions gets the reason in their place."""
-    folders = (place.clips, place.annotation, place.contact, place.splits, place.samples)
+def run(paths: StagePaths) -> None:
+    """Write the metrics; a dataset or family without motions gets the reason instead."""
+    folders = (paths.clips, paths.annotation, paths.contact, paths.splits, paths.samples)
     if reason := next(filter(None, map(empty_reason, folders)), None):
-        write_json(place.metrics, {"empty": reason, "held_out_clips": 0})
+        write_json(paths.metrics, {"empty": reason, "held_out_clips": 0})
         return
     from hoidata.metrics.evaluate import evaluate_store
 
-    hands, encoders = load_hands(place.profile), _encoders(place)
-    samples = place.samples / "clips"
-    found = evaluate_store(samples, place.data, hands, encoders=encoders, jobs=jobs(), progress=True)
-    found["left_out"] = _with_reasons(found["left_out"], place.samples / "left_out.json")
-    diagnostics = json.loads((place.samples / "diagnostics.json").read_text(encoding="utf-8"))
-    write_json(place.metrics, found | {"diagnostics": diagnostics})
+    hands, encoders = load_hands(paths.profile), _encoders(paths)
+    samples = paths.samples / "clips"
+    found = evaluate_store(samples, paths.data, hands, encoders=encoders, jobs=jobs(), progress=True)
+    found["left_out"] = _with_reasons(found["left_out"], paths.samples / "left_out.json")
+    diagnostics = json.loads((paths.samples / "diagnostics.json").read_text(encoding="utf-8"))
+    write_json(paths.metrics, found | {"diagnostics": diagnostics})
 
 
 def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
@@ -33,10 +33,10 @@ def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, 
     return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]
 
 
-def _encoders(place: Place) -> list["MotionEvaluator"]:
+def _encoders(paths: StagePaths) -> list["MotionEvaluator"]:
     """The networks of the stage evaluator; none, and no torch either, where that is off."""
-    if not (place.evaluators / "info.json").is_file():
+    if not (paths.evaluators / "info.json").is_file():
         return []
     from models.evaluator.encoders import load_evaluators
 
-    return load_evaluators(place.evaluators)
+    return load_evaluators(paths.evaluators)

@@ -5,33 +5,35 @@ from pathlib import Path
 from hoidata.files.atomic import atomic_folder
 from models.evaluator.settings import EvaluatorSettings
 from pipelines.lineage.graph import producers, read_graph
-from pipelines.stages.base import Place, empty_reason, load_hands, load_settings, note_empty, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, note_empty, write_empty
 
 OFF = "off: params.yaml names no networks under evaluator"
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Train all of them; a dataset without clips or labels, or none asked for, gives an empty output."""
     settings = load_settings(EvaluatorSettings, "evaluator")
-    folders = (place.clips, place.annotation, place.contact, place.splits)
+    folders = (paths.clips, paths.annotation, paths.contact, paths.splits)
     reason = next(filter(None, map(empty_reason, folders)), None) if settings.networks else OFF
     if reason:
-        write_empty(place.evaluators, reason)
+        write_empty(paths.evaluators, reason)
         return
+    from models.common.repeatable import make_repeatable
     from models.evaluator.stage import train_evaluators
     from pipelines.lineage.provenance import build_provenance
 
-    stage = producers(read_graph(Path()))[place.evaluators.as_posix()].name
-    with atomic_folder(place.evaluators) as part:
+    make_repeatable(threads=1)
+    stage = producers(read_graph(Path()))[paths.evaluators.as_posix()].name
+    with atomic_folder(paths.evaluators) as part:
         found = train_evaluators(
-            place.data,
+            paths.data,
             part,
             settings,
-            load_hands(place.profile),
+            load_hands(paths.profile),
             provenance=lambda facts: build_provenance(Path(), stage, facts),
         )
         if isinstance(found, str):
             note_empty(part, found)
             return
     for name, known in found["evaluators"].items():
-        print(f"{place}: {name}: {known.get('accuracy') or known['loss']}")
+        print(f"{paths}: {name}: {known.get('accuracy') or known['loss']}")

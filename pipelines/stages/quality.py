@@ -1,16 +1,16 @@
 """Stage quality: every clip and object mesh measured and judged; what fails is left out of annotation and training."""
 
 from hoidata.quality.thresholds import Thresholds
-from pipelines.stages.base import Place, empty_reason, jobs, load_hands, load_settings, print_counts, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, print_counts, write_empty
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Measure and judge every clip; a dataset without clips gives an empty output."""
     thresholds = load_settings(Thresholds, "quality")
-    if reason := empty_reason(place.clips):
-        write_empty(place.quality, reason)
+    if reason := empty_reason(paths.clips):
+        write_empty(paths.quality, reason)
         return
     from hoidata.quality.stage import quality_store
 
-    hands = load_hands(place.profile)
-    print_counts(place, quality_store(place.clips, place.quality, thresholds=thresholds, hands=hands, jobs=jobs()))
+    hands = load_hands(paths.profile)
+    print_counts(paths, quality_store(paths.clips, paths.quality, thresholds=thresholds, hands=hands, jobs=jobs()))

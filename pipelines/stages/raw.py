@@ -9,32 +9,32 @@ from pipelines.lineage.closure import SourceTree
 from pipelines.lineage.digests import value_digest
 from pipelines.lineage.manifests import Manifest, scan_files, verify_files, write_manifest
 from pipelines.stages.adapters import configured_adapter, manifest_of
-from pipelines.stages.base import Place, hand_is_present, jobs, raw_root, root_variable
+from pipelines.stages.base import StagePaths, hand_is_present, jobs, raw_root, root_variable
 
 SHOWN_DIFFERENCES = 5
 WRITER = "hoidata.synthetic.corpus"
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Write ``raw.json``: the committed manifest itself, or for a generated corpus the files its recipe gives."""
-    manifest = manifest_of(place)
+    manifest = manifest_of(paths)
     if manifest.present and manifest.synthetic:
-        manifest = manifest.with_files(generated_files(place, manifest))
+        manifest = manifest.with_files(generated_files(paths, manifest))
     elif manifest.present:
-        require_hand(place)
-        check_own_files(place, manifest)
-    write_manifest(place.raw_manifest, manifest)
-    print(f"{place}: {len(manifest.files)} raw files" if manifest.present else f"{place}: not present")
+        require_hand(paths)
+        check_own_files(paths, manifest)
+    write_manifest(paths.raw_manifest, manifest)
+    print(f"{paths}: {len(manifest.files)} raw files" if manifest.present else f"{paths}: not present")
 
 
-def generated_files(place: Place, manifest: Manifest) -> tuple[SourceFile, ...]:
+def generated_files(paths: StagePaths, manifest: Manifest) -> tuple[SourceFile, ...]:
     """Write the corpus of the manifest's recipe, unless the same recipe and code already did, and list its files."""
-    root = place.generated_raw
+    root = paths.generated_raw
     stamp, wanted = root.with_suffix(".recipe"), recipe_digest(manifest)
     if not (root.is_dir() and stamp.is_file() and stamp.read_text() == wanted):
-        write_generated(place, manifest, root)
+        write_generated(paths, manifest, root)
         write_whole(stamp, wanted)
-    return scan_files(root, configured_adapter(place.dataset).parts)
+    return scan_files(root, configured_adapter(paths.dataset).parts)
 
 
 def recipe_digest(manifest: Manifest) -> str:
@@ -42,33 +42,33 @@ def recipe_digest(manifest: Manifest) -> str:
     return value_digest([manifest.recipe, SourceTree(Path()).closure([WRITER], {})])
 
 
-def write_generated(place: Place, manifest: Manifest, root: Path) -> None:
+def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
     """Write the corpus of the manifest's recipe into ``root``, whole or not at all."""
     from hoidata.synthetic.corpus import write_corpus
 
     recipe = manifest.recipe or {}
     if recipe.keys() != {"seed", "size"}:
-        raise BadInput(place.manifest, "a recipe of seed and size", ", ".join(recipe), "restore it with git checkout")
-    write_corpus(place.dataset, root, recipe["seed"], recipe["size"], jobs())
+        raise BadInput(paths.manifest, "a recipe of seed and size", ", ".join(recipe), "restore it with git checkout")
+    write_corpus(paths.dataset, root, recipe["seed"], recipe["size"], jobs())
 
 
-def require_hand(place: Place) -> None:
+def require_hand(paths: StagePaths) -> None:
     """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
-    if not configured_adapter(place.dataset).needs_mano or hand_is_present(place.profile):
+    if not configured_adapter(paths.dataset).needs_mano or hand_is_present(paths.profile):
         return
     raise MissingResource(
-        f"{place.dataset} holds MANO parameters and no MANO files are registered. Register at "
+        f"{paths.dataset} holds MANO parameters and no MANO files are registered. Register at "
         f"https://mano.is.tue.mpg.de, put MANO_RIGHT.pkl and MANO_LEFT.pkl into one folder, then run "
         f"`hoidata raw scan mano --root FOLDER` (it can also be named in {root_variable('hand')})"
     )
 
 
-def check_own_files(place: Place, manifest: Manifest) -> None:
+def check_own_files(paths: StagePaths, manifest: Manifest) -> None:
     """Compare the user's files with the scanned manifest. Raises BadInput that lists the first differences."""
-    root = raw_root(place)
-    differences = verify_files(root, manifest, configured_adapter(place.dataset).parts)
+    root = raw_root(paths)
+    differences = verify_files(root, manifest, configured_adapter(paths.dataset).parts)
     if differences:
         shown = ", ".join(f"{item.path} ({item.problem})" for item in differences[:SHOWN_DIFFERENCES])
         got = f"{len(differences)} differences: {shown}"
-        remedy = f"restore the files, or accept them with `hoidata raw scan {place.dataset} --root {root}`"
-        raise BadInput(root, f"the files listed in {place.manifest}", got, remedy)
+        remedy = f"restore the files, or accept them with `hoidata raw scan {paths.dataset} --root {root}`"
+        raise BadInput(root, f"the files listed in {paths.manifest}", got, remedy)

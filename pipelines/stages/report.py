@@ -3,14 +3,14 @@
 from pathlib import Path
 
 from pipelines.params import read_params
-from pipelines.stages.base import Place, load_hands
+from pipelines.stages.base import StagePaths, load_hands
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Write the page; datasets without clips are listed with their reason."""
     from hoidata.files.atomic import atomic_folder
     from pipelines.pages.report import write_report
 
     params = read_params(Path())
-    with atomic_folder(place.report) as partial:
-        write_report(partial, place.profile, params["datasets"], params["families"], load_hands(place.profile))
+    with atomic_folder(paths.report) as partial:
+        write_report(partial, paths.profile, params["datasets"], params["families"], load_hands(paths.profile))

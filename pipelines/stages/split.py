@@ -1,15 +1,15 @@
 """Stage split: the parts of every named split, the chosen one, its leak check, and the training statistics."""
 
-from pipelines.stages.base import Place, empty_reason, print_counts, read_section, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, print_counts, read_section, write_empty
 
 
-def run(place: Place) -> None:
+def run(paths: StagePaths) -> None:
     """Split the annotated clips; a dataset without clips gives an empty output."""
     # A split's name, or a rule (``hoidata.splits.SplitRule``).
-    wanted = read_section("split").get(place.dataset)
-    if reason := empty_reason(place.annotation):
-        write_empty(place.splits, reason)
+    wanted = read_section("split").get(paths.dataset)
+    if reason := empty_reason(paths.annotation):
+        write_empty(paths.splits, reason)
         return
     from hoidata.splits.stage import split_store
 
-    print_counts(place, split_store(place.clips, place.annotation, place.splits, wanted))
+    print_counts(paths, split_store(paths.clips, paths.annotation, paths.splits, wanted))

@@ -12,17 +12,17 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.stages import annotate, contact, quality
-from pipelines.stages.base import Place
+from pipelines.stages.base import StagePaths
 
-PLACE = Place("embedded", "grab")
+PATHS = StagePaths("embedded", "grab")
 
 
 @pytest.fixture
 def clips(stage_folder, make_clip):
     """A clip with a verb and one without in the current folder."""
     clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
-    write_store(PLACE.clips, [clips[0], replace(clips[1], verb=None)], generated_info("grab"))
-    quality.run(PLACE)
+    write_store(PATHS.clips, [clips[0], replace(clips[1], verb=None)], generated_info("grab"))
+    quality.run(PATHS)
     return clips
 
 
@@ -32,10 +32,10 @@ def annotated_with(clips, stage_folder):
 
     def run(of_contact: dict | None = None, **settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
         stage_folder(annotate={"encoder": "hash", **settings}, contact=of_contact or {})
-        contact.run(PLACE)
-        annotate.run(PLACE)
-        hands, text = (pd.read_parquet(PLACE.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
-        return hands.set_index("clip_id"), text, orjson.loads((PLACE.annotation / "info.json").read_bytes())
+        contact.run(PATHS)
+        annotate.run(PATHS)
+        hands, text = (pd.read_parquet(PATHS.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
+        return hands.set_index("clip_id"), text, orjson.loads((PATHS.annotation / "info.json").read_bytes())
 
     return run
 
@@ -54,7 +54,7 @@ def test_hand_types_may_have_a_threshold_of_their_own(annotated_with) -> None:
 
 def test_the_contact_stage_has_to_run_first(clips) -> None:
     with pytest.raises(MissingResource, match="run the stage 'contact'"):
-        annotate.run(PLACE)
+        annotate.run(PATHS)
 
 
 def test_forms_are_those_asked_for(clips, annotated_with) -> None:

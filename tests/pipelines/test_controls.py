@@ -23,12 +23,12 @@ from models.registry import family_names, load_family
 from pipelines.cli import app
 from pipelines.promises import CONFUSED, PROMISES, Promise, datasets_below, kept, read_rows, taken_for_reverse
 from pipelines.stages import controls
-from pipelines.stages.base import Place, empty_reason
+from pipelines.stages.base import StagePaths, empty_reason
 from tests.builders.annotated import write_annotated_dataset
 from tests.builders.stores import write_annotated
 
 PROJECT = Path(__file__).parents[2]
-PLACE = Place("embedded", "grab")
+PATHS = StagePaths("embedded", "grab")
 SAMPLES, METRICS_OF = Path("samples/embedded/grab/controls"), Path("metrics/embedded/grab/controls")
 
 
@@ -37,13 +37,13 @@ def project(tmp_path, monkeypatch, make_clip):
     """An annotated dataset where the stage looks for it."""
     shutil.copytree(PROJECT / "manifests" / "embedded", tmp_path / "manifests" / "embedded")
     monkeypatch.chdir(tmp_path)
-    write_annotated_dataset(PLACE.data, make_clip)
+    write_annotated_dataset(PATHS.data, make_clip)
 
 
 def run_with(**settings) -> None:
     params = {"profile": "embedded", "sample": {"samples": 2, "seed": 0}, "controls": settings}
     Path("params.yaml").write_text(yaml.safe_dump(params))
-    controls.run(PLACE)
+    controls.run(PATHS)
 
 
 def names(folder: Path) -> set[str]:
@@ -53,8 +53,8 @@ def names(folder: Path) -> set[str]:
 def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
     Path("params.yaml").write_text("{profile: embedded, controls: {}}")
     code = (
-        "import sys; from pipelines.stages import controls; from pipelines.stages.base import Place;"
-        "controls.run(Place('embedded', 'grab')); sys.exit('torch' in sys.modules)"
+        "import sys; from pipelines.stages import controls; from pipelines.stages.base import StagePaths;"
+        "controls.run(StagePaths('embedded', 'grab')); sys.exit('torch' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert empty_reason(SAMPLES) == empty_reason(METRICS_OF) == "off: params.yaml names no families under controls"

@@ -14,7 +14,7 @@ from hoidata.hands import load_embedded_hands
 from pipelines.cli import app
 from pipelines.commands.project import remember_root
 from pipelines.stages import annotate, contact, convert, quality, raw, split
-from pipelines.stages.base import Place, empty_reason
+from pipelines.stages.base import StagePaths, empty_reason
 from tests.builders import kitchen, taco
 from tests.builders.mano import write_mano_pickle
 
@@ -44,12 +44,12 @@ def hoidata(*words: str) -> str:
     return result.output
 
 
-def split_of(place: Place) -> dict[str, int]:
+def split_of(paths: StagePaths) -> dict[str, int]:
     """How many clips each part has."""
-    chosen = json.loads((place.splits / "info.json").read_text())["chosen"]
+    chosen = json.loads((paths.splits / "info.json").read_text())["chosen"]
     assert chosen["name"] == "drawn"
     assert chosen["keeps_its_promises"]
-    assert len(pd.read_parquet(place.annotation / "text.parquet")) >= 3
+    assert len(pd.read_parquet(paths.annotation / "text.parquet")) >= 3
     return chosen["clips"]
 
 
@@ -71,11 +71,11 @@ def test_a_dataset_from_a_folder_outside_the_repository_takes_three_lines(here: 
     assert "CC BY 4.0" in hoidata("raw", "scan", "kitchen", "--root", str(root))
     assert 'paths = ["../mine/kitchen"]' in Path("hoidata.toml").read_text()
     for stage in (raw, convert, quality, contact, annotate, split):
-        stage.run(Place("own", "kitchen"))
-    assert split_of(Place("own", "kitchen")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
-    raw.run(Place("embedded", "kitchen"))
-    convert.run(Place("embedded", "kitchen"))
-    assert empty_reason(Place("embedded", "kitchen").clips) == "kitchen is not present in the profile embedded"
+        stage.run(StagePaths("own", "kitchen"))
+    assert split_of(StagePaths("own", "kitchen")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
+    raw.run(StagePaths("embedded", "kitchen"))
+    convert.run(StagePaths("embedded", "kitchen"))
+    assert empty_reason(StagePaths("embedded", "kitchen").clips) == "kitchen is not present in the profile embedded"
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_taco_goes_through_dvc_repro_by_its_word(here: Path, tmp_path: Path, pro
     hoidata("raw", "scan", "taco", "--root", str(root))
     built = project_tools.run(here, "dvc", "repro", "split@own-taco")
     assert built.returncode == 0, built.stdout + built.stderr
-    assert split_of(Place("own", "taco")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
+    assert split_of(StagePaths("own", "taco")) == {"train": 1, "validation": 1, "test": 1, "left_out": 0}
 
 
 def test_a_scan_keeps_what_else_stands_in_the_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

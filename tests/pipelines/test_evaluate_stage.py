@@ -12,28 +12,28 @@ from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.cli import app
 from pipelines.stages import evaluate
-from pipelines.stages.base import Place, write_empty
+from pipelines.stages.base import StagePaths, write_empty
 from tests.builders.annotated import write_annotated_dataset
 
 PROJECT = Path(__file__).parents[2]
-PLACE = Place("embedded", "grab", family="ours")
+PATHS = StagePaths("embedded", "grab", family="ours")
 
 
 @pytest.fixture
 def clips(stage_folder, make_clip):
     """An annotated dataset where the stage looks for it; its test clips."""
-    return write_annotated_dataset(PLACE.data, make_clip)[1]
+    return write_annotated_dataset(PATHS.data, make_clip)[1]
 
 
 def write_samples(clips):
     predicted = [replace(clip, clip_id=f"{clip.clip_id}~0") for clip in clips.values()]
-    write_store(PLACE.samples / "clips", predicted, generated_info("ours"))
-    (PLACE.samples / "diagnostics.json").write_text(json.dumps({"length": {"mae_frames": 3.5}}))
+    write_store(PATHS.samples / "clips", predicted, generated_info("ours"))
+    (PATHS.samples / "diagnostics.json").write_text(json.dumps({"length": {"mae_frames": 3.5}}))
 
 
 def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
     write_samples(clips)
-    evaluate.run(PLACE)
+    evaluate.run(PATHS)
     found = json.loads(Path("metrics/embedded/grab/ours.json").read_text())
     assert found["figures"]["contact_f1"] == 1
     assert found["held_out_clips"] == found["motions"] == 2
@@ -41,16 +41,16 @@ def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
 
 
 def test_the_reason_passes_through_where_there_are_no_motions(clips):
-    write_empty(PLACE.samples, "not trained: length")
-    evaluate.run(PLACE)
-    assert json.loads(PLACE.metrics.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
+    write_empty(PATHS.samples, "not trained: length")
+    evaluate.run(PATHS)
+    assert json.loads(PATHS.metrics.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
 
 
 def test_a_store_written_by_the_script_of_the_readme_is_measured_by_the_command(clips):
     script = re.search(r"```python\n(# Your system.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)[1]
     assert sum(1 for line in script.splitlines() if line and not line.startswith("#")) <= 10
     exec(compile(script, "README.md", "exec"), {})
-    done = CliRunner().invoke(app, ["evaluate", "mine", "--reference", str(PLACE.data), "--out", "mine.json"])
+    done = CliRunner().invoke(app, ["evaluate", "mine", "--reference", str(PATHS.data), "--out", "mine.json"])
     assert done.exit_code == 0, done.output
     assert "joint error of the best sample" in done.output
     found = json.loads(Path("mine.json").read_text())

@@ -12,18 +12,18 @@ import yaml
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.stages import evaluate, evaluator
-from pipelines.stages.base import Place, empty_reason
+from pipelines.stages.base import StagePaths, empty_reason
 from pipelines.stages.code import write_code
 from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
 
 PROJECT = Path(__file__).parents[2]
-PLACE = Place("embedded", "grab", family="ours")
+PATHS = StagePaths("embedded", "grab", family="ours")
 IMPORTED = """
 import sys
 from pipelines.stages import evaluator
-from pipelines.stages.base import Place
-evaluator.run(Place("embedded", "grab"))
+from pipelines.stages.base import StagePaths
+evaluator.run(StagePaths("embedded", "grab"))
 print("torch" in sys.modules)
 """
 
@@ -48,7 +48,7 @@ def test_off_it_writes_the_reason_without_loading_torch(project):
     command = [sys.executable, "-c", IMPORTED]
     done = subprocess.run(command, env={"PYTHONPATH": str(PROJECT)}, check=True, capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == "False"
-    assert empty_reason(PLACE.evaluators) == "off: params.yaml names no networks under evaluator"
+    assert empty_reason(PATHS.evaluators) == "off: params.yaml names no networks under evaluator"
 
 
 @pytest.mark.slow
@@ -58,18 +58,18 @@ def test_on_its_figures_and_digests_stand_in_the_metrics_of_a_family(project):
         build_clip(20, seed=seed, clip_id=f"toy/{subject}/{seed}", subject=subject, verb=verb)
         for seed, (subject, verb) in enumerate(plans)
     ]
-    write_annotated(PLACE.data, clips)
+    write_annotated(PATHS.data, clips)
     subprocess.run(["git", "init", "-q"], check=True)
     subprocess.run([sys.executable, "-m", "dvc", "init", "-q"], check=True)
     choose(project, networks=["corrected", "text-motion"], most_steps=2)
     write_code(Path())
-    evaluator.run(PLACE)
+    evaluator.run(PATHS)
     predicted = [replace(clip, clip_id=f"{clip.clip_id}~0") for clip in clips[3:]]
-    write_store(PLACE.samples / "clips", predicted, generated_info("ours"))
-    (PLACE.samples / "diagnostics.json").write_text("{}")
-    evaluate.run(PLACE)
-    found = json.loads(PLACE.metrics.read_text())
-    info = json.loads((PLACE.evaluators / "info.json").read_text())
+    write_store(PATHS.samples / "clips", predicted, generated_info("ours"))
+    (PATHS.samples / "diagnostics.json").write_text("{}")
+    evaluate.run(PATHS)
+    found = json.loads(PATHS.metrics.read_text())
+    info = json.loads((PATHS.evaluators / "info.json").read_text())
     assert found["evaluators"].pop("path")
     assert {name: known["digest"] for name, known in found["evaluators"].items()} == {
         name: known["digest"] for name, known in info["evaluators"].items()

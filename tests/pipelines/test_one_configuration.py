@@ -23,10 +23,10 @@ from models.common import losses
 from pipelines.commands.settings import SECTIONS, settings_class
 from pipelines.pages.report import touch_words
 from pipelines.stages import annotate, contact, evaluate, quality, split
-from pipelines.stages.base import Place
+from pipelines.stages.base import StagePaths
 
 PROJECT = Path(__file__).parents[2]
-PLACE = Place("embedded", "grab")
+PATHS = StagePaths("embedded", "grab")
 THRESHOLD_M = {"wide": 0.02, "narrow": 0.01}
 SHIFT_M = np.float32([0.006, 0.004, 0.004])
 RULE = {"by": "subject", "train": "rest", "validation": ["s9"], "test": ["s10"]}
@@ -49,10 +49,10 @@ def annotated_at(folder: Path, threshold_m: float, make_clip, monkeypatch) -> An
     clips = [
         make_clip(30, seed=seed, clip_id=f"grab/{name}/box_lift_1", subject=name) for seed, name in enumerate(subjects)
     ]
-    write_store(PLACE.clips, clips, generated_info("grab"))
+    write_store(PATHS.clips, clips, generated_info("grab"))
     for stage in (quality, contact, annotate, split):
-        stage.run(PLACE)
-    return load_annotated(folder / PLACE.data)
+        stage.run(PATHS)
+    return load_annotated(folder / PATHS.data)
 
 
 @pytest.fixture
@@ -82,7 +82,7 @@ def test_the_losses_of_a_batch_use_the_threshold_it_was_made_with(wide_and_narro
 
 
 def test_the_figures_of_evaluation_use_the_threshold_the_contact_stage_was_told(wide_and_narrow, tmp_path, monkeypatch):
-    place, found = replace(PLACE, family="ours"), {}
+    paths, found = replace(PATHS, family="ours"), {}
     for name, store in zip(("wide", "narrow"), wide_and_narrow, strict=True):
         monkeypatch.chdir(tmp_path / name)
         [key] = store.ids("test")
@@ -90,10 +90,10 @@ def test_the_figures_of_evaluation_use_the_threshold_the_contact_stage_was_told(
         made = replace(
             true, hands={side: replace(hand, wrist_m=hand.wrist_m + SHIFT_M) for side, hand in true.hands.items()}
         )
-        write_store(place.samples / "clips", [made], generated_info("ours"))
-        (place.samples / "diagnostics.json").write_text("{}")
-        evaluate.run(place)
-        found[name] = json.loads(place.metrics.read_text())
+        write_store(paths.samples / "clips", [made], generated_info("ours"))
+        (paths.samples / "diagnostics.json").write_text("{}")
+        evaluate.run(paths)
+        found[name] = json.loads(paths.metrics.read_text())
         touched = [
             touched_points(clip, store.points(store.object_key(key)).points_m, THRESHOLD_M[name])
             for clip in (made, true)

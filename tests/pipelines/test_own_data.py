@@ -15,7 +15,7 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
-from pipelines.stages.base import Place, load_hands, load_settings, raw_root
+from pipelines.stages.base import StagePaths, load_hands, load_settings, raw_root
 from pipelines.stages.train import TrainParams
 
 PROJECT = Path(__file__).parents[2]
@@ -28,7 +28,7 @@ def is_present(folder: Path, name: str) -> bool:
 
 def make_present(folder: Path, name: str) -> None:
     """As if the dataset had been scanned."""
-    found = manifest_of(Place("own", name))
+    found = manifest_of(StagePaths("own", name))
     write_manifest(folder / "manifests/own" / f"{name}.json", replace(found, present=True))
 
 
@@ -215,7 +215,7 @@ def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
 
 
 def test_places_of_two_profiles_never_meet():
-    embedded, own = Place("embedded", "grab", "contact"), Place("own", "grab", "contact")
+    embedded, own = StagePaths("embedded", "grab", "contact"), StagePaths("own", "grab", "contact")
     data = ("clips", "annotation", "contact", "splits")
     for name in (*data, "checkpoint", "metrics", "report", "manifest", "hand_manifest"):
         assert getattr(embedded, name) != getattr(own, name)
@@ -226,7 +226,7 @@ def test_any_profile_whose_manifests_are_recipes_has_generated_files_and_the_emb
     shutil.copytree(project / "manifests" / "embedded", project / "manifests" / "mine", dirs_exist_ok=True)
     assert load_hands("mine").name == "embedded"
     with pytest.raises(MissingResource, match="hoidata synth write grab --profile mine"):
-        raw_root(Place("mine", "grab"))
+        raw_root(StagePaths("mine", "grab"))
 
 
 def test_outside_of_a_project_the_command_says_so(tmp_path, project_tools):

@@ -50,7 +50,8 @@ def test_lineage_names_everything_behind_each_checkpoint(built, project_tools):
             "manifests/embedded/grab.json",
             "raw@embedded-grab",
             "convert@embedded-grab",
-            f"train.demo.{model}",
+            f"train.ours.{model}",
+            f"train.small.{model}",
         ):
             assert f'"name": "{name}"' in result.stdout
 

@@ -14,9 +14,9 @@ from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.lineage.graph import producers, read_graph
 from pipelines.stages import split
-from pipelines.stages.base import Place
+from pipelines.stages.base import StagePaths
 
-GRAB = Place("embedded", "grab")
+GRAB = StagePaths("embedded", "grab")
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def test_a_name_that_is_not_there_lists_those_that_are(folder):
 
 def test_a_dataset_without_clips_passes_its_reason_on(folder):
     choose_split(folder, "text2hoi")
-    empty = Place("embedded", "h2o")
+    empty = StagePaths("embedded", "h2o")
     empty.annotation.mkdir(parents=True)
     (empty.annotation / "empty.json").write_text('{"reason": "h2o is not present"}')
     split.run(empty)

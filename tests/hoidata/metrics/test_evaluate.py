@@ -207,21 +207,20 @@ def test_figures_do_not_depend_on_the_number_of_processes(write_annotated, moved
     assert json.dumps(one) == json.dumps(two)
 
 
-def test_contact_maps_asked_for_lie_beside_the_clips(write_annotated, tmp_path):
+def test_contact_maps_asked_for_lie_beside_the_clips_one_per_motion(write_annotated, tmp_path):
     root, clips = write_annotated()
-    store = written(tmp_path / "mine" / "clips", clips.values())
+    first, second = (named(clips[RIGHT], f"{RIGHT}~{number}") for number in range(2))
+    store = written(tmp_path / "mine" / "clips", [first, second, clips[BOTH]])
     assert "adherence" not in evaluate_store(store, root)["figures"]
-    annotated = load_annotated(root)
-    true = annotated.contact_of(RIGHT, "right") > 0
-    write_asked(store.parent, {RIGHT: true})
-    found = evaluate_store(store, root)
-    assert found["figures"]["adherence"] == 1
-    assert found["counts"]["adherence"] == {"clips": 1, "motions": 1, "values": 1}
-    write_asked(store.parent, {RIGHT: ~true})
-    assert evaluate_store(store, root)["figures"]["adherence"] == 0
-    write_asked(store.parent, {RIGHT: true[:-1]})
+    true = load_annotated(root).contact_of(RIGHT, "right") > 0
+    for asked, adherence in (([(first, true)], 1), ([(first, ~true)], 0), ([(first, true), (second, ~true)], 0.5)):
+        write_asked(store.parent, {motion.clip_id: own for motion, own in asked})
+        found = evaluate_store(store, root)
+        assert found["figures"]["adherence"] == adherence
+        assert found["counts"]["adherence"] == {"clips": 1, "motions": len(asked), "values": len(asked)}
+    write_asked(store.parent, {first.clip_id: true[:-1]})
     reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(store, root)["left_out"]}
-    assert reasons == {RIGHT: "the contact map asked for has 255 points, 256 expected"}
+    assert reasons == {first.clip_id: "the contact map asked for has 255 points, 256 expected"}
     write_npz(store.parent / FILE_NAME, {"motion_id": np.array([RIGHT]), "asked": true})
     with pytest.raises(BadInput, match="motion_id"):
         evaluate_store(store, root)
