@@ -6,7 +6,20 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from bench import adapters, evaluate, evaluator, kernels, physics, realism, scale, sensors, store, surface, text
+from bench import (
+    adapters,
+    evaluate,
+    evaluator,
+    kernels,
+    manipnet,
+    physics,
+    realism,
+    scale,
+    sensors,
+    store,
+    surface,
+    text,
+)
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -20,6 +33,7 @@ BENCHMARKS = {
     "text": text.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
+    "manipnet": manipnet.main,
 }
 
 
