@@ -12,6 +12,7 @@ from bench import (
     evaluator,
     kernels,
     manipnet,
+    manipnet_speed,
     physics,
     realism,
     scale,
@@ -33,6 +34,7 @@ BENCHMARKS = {
     "text": text.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
+    "fingers": manipnet_speed.main,
     "manipnet": manipnet.main,
 }
 

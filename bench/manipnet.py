@@ -146,7 +146,7 @@ def trained_row(trial: Trial, changes: dict[str, Any], size: str, seed: int) -> 
     fit_examples(model, examples, training, seed)
     trained_s = time.process_time() - began
     found = {}
-    for rule in ("off", "paper"):
+    for rule in ("off", "released"):
         found[rule] = measured(trial, rolled(trial, model, rule)) | {"train_s": trained_s}
     return found
 

@@ -48,7 +48,7 @@ class AnimateWish:
     sides: tuple[Side, ...] = SIDES
     frames: str = ""
     model: str = ""
-    rule: Rule = "paper"
+    rule: Rule = "released"
     object: str = ""
     unit: str = "m"
     axes: Axes = "model"

@@ -38,7 +38,7 @@ class Predictor:
     """A trained network and how it is run. rule: of post-processing."""
 
     network: ManipNet
-    rule: Rule = "paper"
+    rule: Rule = "released"
 
     @property
     def settings(self) -> FeatureSettings:

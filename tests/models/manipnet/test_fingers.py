@@ -18,6 +18,7 @@ from models.common.checkpoints import load_checkpoint
 from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
+from models.manipnet.animate import new_fingers
 from models.manipnet.family import Fingers
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.lookups import as_right
@@ -25,7 +26,7 @@ from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Task, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
 from models.manipnet.targets import Nearest, paper_targets, released_targets
-from models.manipnet.tracks import control_of, hands_of, trajectories_of
+from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.training import MANIPNET
 
 HANDS = load_embedded_hands()
@@ -236,3 +237,22 @@ def test_targets_are_those_of_algorithm_1_and_of_the_demo() -> None:
     demo = released_targets(points, predicted, radius, range_m, found)
     np.testing.assert_allclose(demo.point_m[:2, 2], [0.008, 0.35 * 0.011 + 0.65 * 0.02])
     np.testing.assert_allclose(demo.weight, [0.8, 0.5, 0.0])
+
+
+def test_frames_of_a_clip_are_made_from_the_poses_beside_them_alone(
+    fingers: Fingers, samples: list[ClipSample]
+) -> None:
+    sample, frames = samples[0], slice(9, 20)
+    control, hand = (
+        control_of(trajectories_of(sample), sample.object_model),
+        hands_of(HANDS, sample.betas, None)["right"],
+    )
+    recorded = finger_rotmats_of(sample.hands[1])
+    made = new_fingers(fingers.predictor, hand, "right", control, frames, recorded)
+    other = recorded.copy()
+    kept = np.isin(np.arange(len(other)), [8, 20])
+    other[~kept] = rotvec_to_rotmat(np.random.default_rng(0).normal(size=(int((~kept).sum()), 15, 3)))
+    np.testing.assert_array_equal(made, new_fingers(fingers.predictor, hand, "right", control, frames, other))
+    other[20] = hand.rest_rotmats @ rotvec_to_rotmat(np.full((15, 3), 0.2))
+    assert np.abs(made - new_fingers(fingers.predictor, hand, "right", control, frames, other)).max() > 0.05
+    assert len(made) == 11
