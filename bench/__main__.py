@@ -8,6 +8,7 @@ import sys
 
 from bench import (
     adapters,
+    batches,
     evaluate,
     evaluator,
     kernels,
@@ -15,6 +16,7 @@ from bench import (
     manipnet_speed,
     physics,
     realism,
+    samplers,
     scale,
     sensors,
     store,
@@ -32,6 +34,8 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
+    "batches": batches.main,
+    "samplers": samplers.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,

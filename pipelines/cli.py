@@ -13,6 +13,7 @@ from pipelines.commands import (
     evaluate,
     generate,
     graph,
+    import_checkpoint,
     inspect,
     raw,
     settings,
@@ -47,6 +48,7 @@ app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
+app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
 app.command("show")(show.show)

@@ -21,9 +21,6 @@ from models.manipnet.layout import floors, kept_columns, sizes
 from models.manipnet.network import ManipNet, NetworkConfig
 
 LEARNT = ("inputs", "outputs")
-# A hand that is not where it was recorded comes back with this time constant: the paper trains on recorded poses alone
-# ("No augmentation"), and its network keeps the pose it is given.
-WAY_BACK_S = 0.1
 MARGIN_RAD = 0.1  # joints may turn by so much more than in any training clip
 
 
@@ -52,7 +49,8 @@ def hand_examples(
 ) -> Examples:
     """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart.
 
-    given: (frame, joint - 1, 3, 3) other poses to start the steps from; they lead back to the recorded ones.
+    given: (frame, joint - 1, 3, 3) other poses to start the steps from, which lead to the recorded ones all the same:
+    the paper trains from recorded poses alone, and a network may then keep any pose it is given.
     """
     first = np.flatnonzero(usable[:-1] & usable[1:])
     start = finger_rotmats[first] if given is None else given[first]
@@ -61,9 +59,6 @@ def hand_examples(
     hinge = control.hinge_at(time_s[first + 1])
     after = hand.state(finger_rotmats[first + 1])
     distance_m = surface.nearest(placed @ after.point_m, hinge).distance_m
-    if given is not None:
-        share = 1 - np.exp(-settings.step_s / WAY_BACK_S)
-        after = hand.state(between(start, finger_rotmats[first + 1], np.full(len(first), share)))
     made = outputs(hand, after, distance_m, settings)
     rows = np.concatenate(seen, axis=1, dtype=np.float32)
     return Examples(first, rows, made.astype(np.float32), turns_from_rest(hand, finger_rotmats[first]))

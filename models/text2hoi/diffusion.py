@@ -331,7 +331,8 @@ class MotionGenerator:
         return self._features(self.network(noised[0], noised[1], timesteps, condition), condition)
 
     def _features(self, coded: Motion, condition: Condition) -> Motion:
-        rows = self.normaliser.decode(*coded)
-        hands, objects = self.network.code.curves(*rows, condition.counts)
-        hands = self.network.code.in_world(hands, objects)
+        code, counts = self.network.code, condition.counts
+        rows = code.settled(*self.normaliser.decode(*coded), counts)
+        hands, objects = code.curves(*rows, counts)
+        hands = code.in_world(hands, objects)
         return proper_hands(hands), proper_object(objects)
