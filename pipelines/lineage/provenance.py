@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
+from hoidata.files.sealed import read_metadata
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.lineage.graph import Stage, look_up, producers, read_graph
 from pipelines.params import read_params
 
 SCHEMA = "hoidata.provenance/1"
-METADATA_KEY = "hoidata"
 LIBRARIES = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "lemminflect", "safetensors")
-MAX_HEADER_BYTES = 100_000_000
 
 
 def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict[str, Any]:
@@ -72,25 +71,11 @@ def library_versions() -> dict[str, str]:
     return {name: version(name) for name in LIBRARIES}
 
 
-def read_checkpoint_metadata(path: Path) -> dict[str, Any]:
-    """The ``hoidata`` entry of a safetensors file's header, read without torch. Raises BadInput when there is none."""
-    with open(path, "rb") as stream:
-        length = int.from_bytes(stream.read(8), "little")
-        if not 2 <= length <= MAX_HEADER_BYTES:
-            raise BadInput(path, "a safetensors file", f"a header of {length} bytes", "train it again")
-        header = stream.read(length)
-    try:
-        metadata = json.loads(header)["__metadata__"]
-        return json.loads(metadata[METADATA_KEY])
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(path, "a checkpoint with hoidata's provenance", "none", "train it with `dvc repro`") from error
-
-
 def read_provenance(path: Path) -> dict[str, Any]:
     """The provenance a checkpoint carries. Raises BadInput when there is none of a schema known here."""
     if not path.is_file():
         raise BadInput(path, "a checkpoint", "no file", "make it with `dvc repro`")
-    values = read_checkpoint_metadata(path)
+    values = read_metadata(path)
     values = values.get("provenance", values)
     if values.get("schema") != SCHEMA:
         raise BadInput(path, f"provenance of schema {SCHEMA}", str(values.get("schema")), "train it with `dvc repro`")

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 import yaml
 
-from pipelines.lineage.provenance import read_checkpoint_metadata
+from hoidata.files.sealed import read_metadata
 
 pytestmark = [pytest.mark.slow, pytest.mark.first]
 MODELS = ("contact", "length", "diffusion", "refiner")
@@ -28,7 +28,7 @@ def test_all_models_of_the_present_dataset_are_trained_and_those_of_the_others_a
 
 def test_each_checkpoint_records_what_it_was_trained_on(built):
     for model in MODELS:
-        metadata = read_checkpoint_metadata(built / "checkpoints/embedded/grab" / model / "model.safetensors")
+        metadata = read_metadata(built / "checkpoints/embedded/grab" / model / "model.safetensors")
         provenance = metadata["provenance"]
         assert provenance["synthetic"] is True
         assert provenance["datasets"] == {"grab": 4}
