@@ -22,7 +22,8 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
     """The provenance of what ``stage_name`` is about to make from the working tree at ``root``.
 
     facts: what the stage itself knows (model, config, seed, clips by split, synthetic). Every stage behind it is
-    recorded with the values of its params and the digests of its code, inputs and outputs.
+    recorded with the values of its params and the digests of its code, inputs and outputs; of the clips, the raw files
+    and frames they are.
     """
     graph = read_graph(root)
     if stage_name not in graph:
@@ -39,7 +40,17 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
         "code_digest": value_digest(stages[stage_name]["code"]),
         "libraries": library_versions(),
         "stages": stages,
+        "raw": _raw_facts(root, facts, stages),
     }
+
+
+def _raw_facts(root: Path, facts: dict[str, Any], stages: dict[str, Any]) -> dict[str, Any]:
+    """The raw files and frames behind the clips, so that the header tells them where there is no store."""
+    from pipelines.lineage.raw import read_raw, stores_behind
+
+    wanted = {clip for ids in facts.get("clips", {}).values() for clip in ids}
+    found = {path: read_raw(root, path, wanted) for path in stores_behind({"stages": stages})}
+    return {path: source.as_json() for path, source in found.items() if source is not None}
 
 
 def _stages_behind(graph: dict[str, Stage], name: str) -> list[str]:
@@ -75,8 +86,8 @@ def read_provenance(path: Path) -> dict[str, Any]:
     """The provenance a checkpoint carries. Raises BadInput when there is none of a schema known here."""
     if not path.is_file():
         raise BadInput(path, "a checkpoint", "no file", "make it with `dvc repro`")
-    values = read_metadata(path)
-    values = values.get("provenance", values)
+    metadata = read_metadata(path)
+    values = {**metadata.get("provenance", metadata), "seal": metadata.get("seal") or {}}
     if values.get("schema") != SCHEMA:
         raise BadInput(path, f"provenance of schema {SCHEMA}", str(values.get("schema")), "train it with `dvc repro`")
     return values
