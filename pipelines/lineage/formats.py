@@ -31,17 +31,34 @@ class Step:
 
 def steps(tree: Node, record: dict[str, Any]) -> list[Step]:
     """The runs behind a lineage, the last one first; a motion's is the one that generated it."""
-    found: dict[str, Step] = {}
     if tree.kind == "motion":
         inputs = {child.name: child.digest for child in tree.children}
         return [Step("generate", {}, "", inputs, {tree.name: tree.digest})]
     last = record["stage"]
     algorithm = "md5" if record.get("schema", "").startswith("hoidata.lock") else "sha256"
-    for name, stage in record["stages"].items():
+    found = []
+    for name in _latest_first(record):
+        stage = record["stages"][name]
         outputs = {tree.name: tree.digest} if name == last else _with(algorithm, stage.get("outputs", {}))
         inputs = _with(algorithm, stage["inputs"])
-        found[name] = Step(name, stage["params"], value_digest(stage["code"]), inputs, outputs)
-    return list(found.values())
+        found.append(Step(name, stage["params"], value_digest(stage["code"]), inputs, outputs))
+    return found
+
+
+def _latest_first(record: dict[str, Any]) -> list[str]:
+    """The stages so that each stands before those it is made from."""
+    stages = record["stages"]
+    made_by = {path: name for name, stage in stages.items() for path in stage.get("outputs", ())}
+    done: dict[str, None] = {}
+
+    def visit(name: str) -> None:
+        for path in stages[name]["inputs"]:
+            if path in made_by and made_by[path] not in done:
+                visit(made_by[path])
+        done[name] = None
+
+    visit(record["stage"])
+    return list(reversed(done))
 
 
 def _with(algorithm: str, digests: dict[str, str | None]) -> dict[str, str]:

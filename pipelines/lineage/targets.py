@@ -29,7 +29,7 @@ _DIGEST = re.compile(r"[0-9a-f]{8,64}(\.dir)?")
 class Target:
     """name: the path as shown. status and note: of its own bytes, whatever it was made from.
 
-    record: as ``build_provenance`` gives it; of a motion instead the payload digest of each checkpoint by path.
+    record: as ``build_provenance`` gives it; of a motion instead the SHA-256 of each checkpoint by path.
     """
 
     kind: Kind
@@ -72,7 +72,7 @@ def _target_at(root: Path | None, path: Path) -> Target:
 
 
 def motion_checkpoints(path: Path) -> dict[str, str]:
-    """The payload digest of each checkpoint a generated motion names; empty for any other file."""
+    """The SHA-256 of each checkpoint a generated motion names; empty for any other file."""
     if path.suffix != ".npz" or not path.is_file():
         return {}
     try:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
+from hoidata.files.digest import sha256_file
 from pipelines.lineage.digests import path_digest
 from pipelines.lineage.graph import Stage, look_up, written_graph
 from pipelines.lineage.history import History
@@ -82,20 +83,17 @@ def target_tree(root: Path | None, target: Target) -> Node:
     return Node(target.kind, target.name, target.status, detail, (top,), digest=_own_digest(target))  # pyright: ignore
 
 
-def _named_checkpoint(root: Path | None, name: str, payload: str) -> Node:
-    """A checkpoint as a motion names it: by its path in the project and the digest of its tensors."""
-    from hoidata.files.sealed import payload_digest
-
-    digest, path = f"sha256 {payload}", (root or Path()) / name
+def _named_checkpoint(root: Path | None, name: str, recorded: str) -> Node:
+    """A checkpoint as a motion names it: by its path in the project and the SHA-256 of its file."""
+    digest = f"sha256 {recorded}"
     if root is None:
         return Node("checkpoint", name, "recorded", digest=digest)
-    if not path.is_file():
+    if not (root / name).is_file():
         return Node("checkpoint", name, "missing", digest=digest)
     tree = target_tree(root, find_target(root, name, root))
-    same = payload_digest(path) == payload or tree.status != "same"
-    status: Status = tree.status if same else "changed"
-    detail = tree.detail if same else "other weights than the motion was made with"
-    return Node("checkpoint", name, status, detail, tree.children if same else (), digest=digest)
+    if tree.status == "same" and sha256_file(root / name) != recorded:
+        return Node("checkpoint", name, "changed", "another one than the motion was made with", digest=digest)
+    return Node("checkpoint", name, tree.status, tree.detail, tree.children, digest=digest)
 
 
 def _own_digest(target: Target) -> str:

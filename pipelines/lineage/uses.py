@@ -10,6 +10,7 @@ from pipelines.lineage.locks import Locked, read_locks
 from pipelines.lineage.provenance import read_provenance
 from pipelines.lineage.raw import RawClip, RawSource, raw_sources, read_raw
 from pipelines.lineage.targets import WEIGHTS
+from pipelines.stages.base import empty_reason
 
 _STORE = "clips"
 _CHECKPOINTS = ("checkpoints", "evaluators")
@@ -109,7 +110,7 @@ def _derived(root: Path, lock: Locked, clips: dict[str, set[str]], seen: dict[st
     found = []
     for path, kind in outs.items():
         ids = recorded if kind == "table" else _asked(root, path, lock, recorded) | below
-        if ids and (root / path).exists():
+        if ids and (root / path).exists() and not empty_reason(root / path):
             seen[path] = ids
             found.append(Use(kind, path, _count(ids)))
     return found

@@ -27,14 +27,22 @@ OTHER_OBJECT_COLOUR = (0.90, 0.90, 0.89)
 CONTACT_COLOURS = ((0.0, OBJECT_COLOUR), (0.5, (0.95, 0.62, 0.25)), (1.0, (0.78, 0.12, 0.14)))
 
 
-def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> Path:
-    """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable."""
-    return write_whole(path, glb_bytes(clip, hands, contact))
+def write_glb(
+    path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None, extras: dict | None = None
+) -> Path:
+    """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable.
+
+    extras: further facts for the asset's own, as JSON values.
+    """
+    return write_whole(path, glb_bytes(clip, hands, contact, extras))
 
 
-def glb_bytes(clip: Clip, hands: HandPair | None, contact: ContactPaint | None = None) -> bytes:
+def glb_bytes(
+    clip: Clip, hands: HandPair | None, contact: ContactPaint | None = None, extras: dict | None = None
+) -> bytes:
     """The bytes of ``write_glb``; hands None: the objects alone."""
-    builder = GltfBuilder(clip.clip_id, {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS})
+    facts = {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS}
+    builder = GltfBuilder(clip.clip_id, facts | (extras or {}))
     world = builder.node("world", None, rotation=upright_rotation(clip.gravity).as_quat().round(9).tolist())
     times = builder.array((np.arange(clip.n_frames) / FPS).astype(np.float32), bounds=True)
     _add_object(builder, world, times, "object", clip.object, contact)
