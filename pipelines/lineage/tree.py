@@ -235,7 +235,7 @@ class _Comparison:
         """One node for a stage's code, with a child for each file it ran then or would run now."""
         recorded = self.stages[stage]["code"]
         today = {} if self.root is None else self.code_of(stage)
-        if self.root is not None and all(path.startswith("code/") for path in recorded):
+        if self.root is not None and recorded and all(path.startswith("code/") for path in recorded):
             return Node("code", "code", "changed", "which files it was is not recorded; they are others now")
         children = tuple(self.file(path, recorded.get(path), today.get(path)) for path in sorted({*recorded, *today}))
         worst = overall_status(Node("code", "code", "same", children=children))
