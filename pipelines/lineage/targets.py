@@ -5,6 +5,7 @@ SHA-256; a generated motion names its checkpoints.
 """
 
 import json
+import os
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -60,8 +61,10 @@ def find_target(root: Path | None, words: str, here: Path | None = None) -> Targ
 def _target_at(root: Path | None, path: Path) -> Target:
     for name in (WEIGHTS, "motion.npz"):
         path = path / name if (path / name).is_file() else path
-    inside = root is not None and path.resolve().is_relative_to(root.resolve())
-    name = path.resolve().relative_to(root.resolve()).as_posix() if root is not None and inside else path.as_posix()
+    # Links are not followed: DVC may keep what lies in the project elsewhere.
+    base, whole = (Path(os.path.abspath(root)) if root else None), Path(os.path.abspath(path))
+    inside = base is not None and whole.is_relative_to(base)
+    name = whole.relative_to(base).as_posix() if base is not None and inside else path.as_posix()
     if path.suffix == ".safetensors":
         return _checkpoint(root, path, name)
     if made_from := motion_checkpoints(path):

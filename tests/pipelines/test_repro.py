@@ -55,6 +55,23 @@ def test_lineage_names_everything_behind_each_checkpoint(built, project_tools):
             assert f'"name": "{name}"' in result.stdout
 
 
+def test_lineage_check_finds_every_output_as_dvc_wrote_it(built, project_tools):
+    result = project_tools.run(built, "hoidata", "lineage", "check")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.endswith(", 0 not as they were written\n")
+
+
+def test_lineage_rerun_trains_the_same_weights_in_a_clean_clone(built, project_tools):
+    identity = ("-c", "user.name=t", "-c", "user.email=t@example.org")
+    for words in (("add", "-A"), ("commit", "--quiet", "-m", "run")):
+        assert project_tools.run(built, "git", *identity, *words).returncode == 0
+    try:
+        result = project_tools.run(built, "hoidata", "lineage", "rerun", "checkpoints/embedded/grab/length")
+        assert result.stdout.endswith("\nsame\n"), result.stdout + result.stderr
+    finally:
+        assert project_tools.run(built, "git", "update-ref", "-d", "HEAD").returncode == 0
+
+
 def test_lineage_says_what_has_changed_since(built, project_tools):
     params = (built / "params.yaml").read_text()
     values = yaml.safe_load(params)
