@@ -12,7 +12,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 .PHONY: demo install install-dev test test-fast fuzz lint types imports check bench clean
 
 demo: $(VENV)/.installed
-	dvc repro
+	hoidata repro
 
 install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev

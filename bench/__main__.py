@@ -6,7 +6,21 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from bench import adapters, evaluate, evaluator, kernels, physics, realism, scale, store, surface, text
+from bench import (
+    adapters,
+    batches,
+    evaluate,
+    evaluator,
+    kernels,
+    physics,
+    realism,
+    samplers,
+    scale,
+    sensors,
+    store,
+    surface,
+    text,
+)
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -14,9 +28,12 @@ BENCHMARKS = {
     "scale": scale.main,
     "kernels": kernels.main,
     "surface": surface.main,
+    "sensors": sensors.main,
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
+    "batches": batches.main,
+    "samplers": samplers.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
 }

@@ -8,6 +8,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -18,6 +19,8 @@ from multiprocessing.context import SpawnProcess
 from typing import Any
 
 from hoidata.errors import BadInput, HoidataError
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 class WorkerLost(BadInput):
@@ -176,16 +179,18 @@ def _received(copy: Any) -> _Descriptor:
 
 def _serve(function: Function, connection: Connection, lock: _Descriptor) -> None:
     """A worker's life. ``lock`` is held by being open until the process ends."""
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
     # Ctrl-C reaches the whole group: the parent decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    with one_thread():
-        while True:
-            try:
-                item = connection.recv()
-            except EOFError:  # the parent is gone
-                return
-            connection.send(_answer(function, item))
+    if torch := sys.modules.get("torch"):  # loaded with the function
+        torch.set_num_threads(1)
+    while True:
+        try:
+            item = connection.recv()
+        except EOFError:  # the parent is gone
+            return
+        connection.send(_answer(function, item))
 
 
 def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:

@@ -12,6 +12,7 @@ from pipelines.commands import (
     evaluate,
     generate,
     graph,
+    import_checkpoint,
     inspect,
     lineage,
     raw,
@@ -35,6 +36,7 @@ app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a ma
 app.add_typer(lineage.app, name="lineage")
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)
+app.command("down")(graph.down)
 app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
 app.command("validate")(store.validate)
@@ -46,6 +48,7 @@ app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
+app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("show")(show.show)
 

@@ -11,8 +11,8 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
+from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
-from models.common.training import make_repeatable
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
 from models.text2hoi.generation import Generator, Wish
@@ -68,7 +68,7 @@ def generate_files(asked: Asked, out: Path) -> Written:
         notes += user.notes
     paths, why = chosen_model(asked, verb, thing)
     notes.append(why)
-    make_repeatable(0, threads=1)  # one motion is too small for two threads to agree on
+    make_repeatable(threads=1)  # one motion is too small for two threads to agree on
     hands, encoder = load_hands(paths.profile), _encoder()
     model = user.model if user else stored_object(str(asked.object), paths, hands)
     generator = Generator.load(paths.checkpoints, hands, encoder, sampler=asked.sampler)

@@ -1,5 +1,6 @@
 """params.yaml as the chosen profile has it: ``profiles.<profile>`` laid over the sections of the same names."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from hoidata.settings import refuse_unknown
 # embedded and study: made here, two corpora for two ends; own: the user's files.
 PROFILES = ("embedded", "study", "own")
 # dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
-TEMPLATED = ("profile", "profiles", "datasets", "families", "train.size")
+TEMPLATED = ("profile", "profiles", "datasets", "families", "train.preset", "train.size")
 
 
 def read_params(root: Path) -> dict[str, Any]:
@@ -41,7 +42,7 @@ def chosen_params(values: dict[str, Any]) -> dict[str, Any]:
     for profile, overlay in overlays.items():
         _check(_mapping(overlay, f"params.yaml: profiles.{profile}"), sections, f"params.yaml: profiles.{profile}")
     chosen = _mapping(overlays.get(str(values.get("profile"))), "params.yaml: profiles")
-    return _laid_over(sections, {name: value for name, value in chosen.items() if value is not None})
+    return laid_over(sections, {name: value for name, value in chosen.items() if value is not None})
 
 
 def _check(overlay: dict[str, Any], sections: dict[str, Any], where: str) -> None:
@@ -62,9 +63,11 @@ def _mapping(value: Any, where: str) -> dict[str, Any]:
     return value or {}
 
 
-def _laid_over(base: dict[str, Any], overlay: dict[str, Any]) -> dict[str, Any]:
+def laid_over(base: Mapping[str, Any], overlay: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with what ``overlay`` says: mappings are merged, all else is replaced."""
+
     def laid(name: str, value: Any) -> Any:
         both = isinstance(base.get(name), dict) and isinstance(value, dict)
-        return _laid_over(base[name], value) if both else value
+        return laid_over(base[name], value) if both else value
 
     return {**base, **{name: laid(name, value) for name, value in overlay.items()}}

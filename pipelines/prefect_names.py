@@ -6,6 +6,7 @@ in without its key, which the hook takes from ``.prefect/``.
 """
 
 import os
+from difflib import get_close_matches
 
 from prefect.plugins import SetupResult, register_hook
 
@@ -44,7 +45,8 @@ def wrap_lookup(client: type) -> None:
     async def read_deployment_by_name(self, name: str):
         if "/" in name:
             return await original(self, name)
-        return only_one(name, await _deployments_named(self, name))
+        found = await _deployments_named(self, name)
+        return only_one(name, found, [] if found else await _all_names(self))
 
     client.read_deployment_by_name = read_deployment_by_name
 
@@ -55,12 +57,18 @@ async def _deployments_named(client, name: str) -> list:
     return await client.read_deployments(deployment_filter=DeploymentFilter(name=DeploymentFilterName(any_=[name])))
 
 
-def only_one(name: str, found: list):
-    """The one deployment of that name. Raises ValueError when there is none, or more than one flow has one."""
+async def _all_names(client) -> list[str]:
+    return [deployment.name for deployment in await client.read_deployments()]
+
+
+def only_one(name: str, found: list, names: list[str]):
+    """The one deployment of that name. Raises ValueError, with the nearest of ``names``, when there is not just one."""
     if len(found) == 1:
         return found[0]
     if not found:
+        near = ", ".join(get_close_matches(name, names, 3, 0.5))
+        meant = f"did you mean {near}? " if near else ""
         raise ValueError(
-            f"no deployment is named {name!r}; `prefect deployment ls` lists them, `hoidata up` makes them"
+            f"no deployment is named {name!r}; {meant}`prefect deployment ls` lists them, `hoidata up` makes them"
         )
     raise ValueError(f"{len(found)} flows have a deployment named {name!r}; write FLOW/{name}")

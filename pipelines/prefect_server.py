@@ -22,6 +22,7 @@ import psutil
 
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import exclusive
+from pipelines.deployments import write_deployments
 from pipelines.prefect_key import KEY_FILE, is_loopback, write_key
 
 START_TIMEOUT_S = 180
@@ -56,6 +57,17 @@ def _serve(url: str, environment: dict[str, str]) -> int:
     finally:
         for process in reversed(running):
             _stop(process)
+
+
+def stop_running() -> bool:
+    """Stop this folder's `hoidata up`, if there is one, and wait until it has ended; whether there was one."""
+    try:
+        with exclusive(KEY_FILE, wait_s=0):
+            return False
+    except BadInput:
+        os.kill(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()), signal.SIGTERM)
+        with exclusive(KEY_FILE, wait_s=3 * STOP_TIMEOUT_S):
+            return True
 
 
 def _stop(process: subprocess.Popen) -> None:
@@ -101,10 +113,11 @@ def server_environment(url: str, key: str) -> dict[str, str]:
 
 
 def deploy(environment: dict[str, str]) -> None:
-    """Make the work pool (again) and the deployments of prefect.yaml."""
+    """Make the work pool (again) and the deployments of this project's graph."""
     template = ("--base-job-template", str(POOL_TEMPLATE))
     pool = _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite", *template)
-    for command in (pool, _prefect("--no-prompt", "deploy", "--all")):
+    deployments = _prefect("--no-prompt", "deploy", "--all", "--prefect-file", str(write_deployments(Path())))
+    for command in (pool, deployments):
         code = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode
         if code:
             raise MissingResource(f"`{' '.join(command[2:])}` ended with exit code {code}; its output says why")

@@ -1,27 +1,35 @@
-"""``dvc repro`` after a look at whether what it is going to read is there: DVC itself looks too late."""
+"""The graph, after a look at whether what it is going to read is there: DVC itself looks too late."""
 
 import os
-import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 from hoidata.errors import MissingResource
 from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
 from pipelines.params import read_params
+from pipelines.side_by_side import Run, RunStage, reproduce_side_by_side
 from pipelines.stages.adapters import ensure_manifests
 from pipelines.stages.base import StagePaths, raw_root
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
+MOST_JOBS = 4  # a stage can take a gigabyte or two of memory
 
-def reproduce(targets: list[str]) -> int:
-    """Preflight, then ``dvc repro`` of the targets (all when empty). Returns DVC's exit code.
+
+def reproduce(
+    targets: list[str], jobs: int = 0, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
+) -> Run:
+    """Preflight, then the targets (all when empty), up to ``jobs`` stages at once; 0: one per core, at most 4.
+
+    wrap, force: see :func:`reproduce_side_by_side`.
 
     Raises MissingResource before DVC starts when raw or MANO files that a stale stage needs are absent.
     """
     preflight()
-    return subprocess.run([sys.executable, "-m", "dvc", "repro", *targets], env=stage_environment()).returncode
+    os.environ.update(stage_environment())
+    return reproduce_side_by_side(targets, jobs or min(MOST_JOBS, len(os.sched_getaffinity(0))), wrap, force)
 
 
 def stage_environment() -> dict[str, str]:

@@ -161,11 +161,15 @@ class TestText2Hoi:
             object=torch.zeros(1, 1024),
             points_m=torch.rand(1, 1024, 3),
             normals=torch.rand(1, 1024, 3),
-            contact_map=torch.zeros(1, 1024),
+            part=torch.zeros(1, 1024, dtype=torch.long),
+            contact=torch.zeros(1, 2, 1024),
             active_hands=torch.ones(1, 2, dtype=torch.bool),
-            frames=torch.ones(1, 150, dtype=torch.bool),
+            lengths=torch.tensor([150]),
+            counts=(150,),
+            sides=(True, True),
         )
         with torch.no_grad():
-            hands, objects = model(torch.zeros(1, 2, 150, 99), torch.zeros(1, 150, 10), torch.zeros(1), condition)
+            steps = torch.zeros(1, dtype=torch.long)
+            hands, objects = model(torch.zeros(1, 2, 150, 99), torch.zeros(1, 150, 10), steps, condition)
         assert shapes == [(1, 451, 16)]
         assert (hands.shape, objects.shape) == ((1, 2, 150, 99), (1, 150, 10))

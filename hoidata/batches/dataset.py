@@ -17,6 +17,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from hoidata.batches.requests import ObjectPoints, RequestBatch, conditions
+from hoidata.batches.sight import Sight
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.clips.features import OBJECT_POSITION, WRIST, hand_features, object_features, upright
 from hoidata.errors import BadInput
@@ -75,7 +76,7 @@ class ClipSample:
     def crop(self, start: int, length: int) -> "ClipSample":
         """``length`` frames from ``start``; contact map and distances are restricted to them. The frame stays."""
         stop = start + length
-        distances = self.distances.window(start, stop)
+        distances = self.distances.interval(start, stop)
         return replace(
             self,
             start=self.start + start,
@@ -214,9 +215,11 @@ def _points(annotated: AnnotatedStore, object_key: str) -> ObjectPoints:
 
 
 def _acting_entries(stored: Any, active_hands: np.ndarray) -> DistanceEntries:
-    index = {name: np.asarray(getattr(stored, name), np.int64) for name in ("side", "frame", "joint", "point")}
+    """Entries of the acting hands, in the order of their frames, in numbers as small as they are stored."""
+    index = {name: np.asarray(getattr(stored, name), np.int16) for name in ("side", "frame", "joint", "point")}
     entries = DistanceEntries(**index, distance_m=np.asarray(stored.distance_m, np.float32))
-    return entries.select(active_hands[entries.side])
+    entries = entries.select(active_hands[entries.side])
+    return entries.select(np.argsort(entries.frame, kind="stable"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,8 +228,9 @@ class ClipBatch(RequestBatch):
 
     Axes (clip, side, frame, ...), padding is zero. hands (B, 2, F, 99), object (B, F, 10), joints_m (B, 2, F, 21, 3).
     text (B, 4, 512): the four sentences. present (B, 2, F): the side takes part and is tracked in the frame.
-    contact (B, 2, N), at contact_threshold_m, which is that of all clips. entries: (entry, 5) int64 rows (clip, side,
-    frame, joint, point) and their distances (entry,).
+    contact (B, 2, N), at contact_threshold_m, which is that of all clips. chosen (B, K): the frames that losses of
+    geometry see. entries: (entry, 5) int64 rows (clip, side, place among the chosen frames, joint, point) and their
+    distances (entry,).
     """
 
     samples: tuple[ClipSample, ...]
@@ -236,6 +240,7 @@ class ClipBatch(RequestBatch):
     present: Tensor
     contact: Tensor
     contact_threshold_m: float
+    chosen: Tensor
     entries: Tensor
     entry_distance_m: Tensor
 
@@ -245,42 +250,38 @@ class ClipBatch(RequestBatch):
         return self.contact.any(1).float()
 
 
-def collate(samples: Sequence[ClipSample], with_entries: bool = True) -> ClipBatch:
-    """Samples to one padded batch; without distance entries (none at all) where they are not needed."""
+def collate(samples: Sequence[ClipSample], sight: Sight | None = None) -> ClipBatch:
+    """Samples to one padded batch. sight: the frames and distance entries that losses of geometry see; none without."""
     lengths = np.array([sample.length for sample in samples])
     asked = conditions(samples, [sample.object_model for sample in samples], lengths)
     n_frames = int(lengths.max())
-    rows, distance = _entry_rows(samples if with_entries else ())
+    sight = sight or Sight.nothing(len(samples))
+    rows, distance = sight.entries([sample.distances for sample in samples])
     arrays = {
         "text": np.stack([sample.text for sample in samples]),
-        "hands": np.stack([_padded(sample.hands, 1, n_frames) for sample in samples]),
-        "object": np.stack([_padded(sample.object, 0, n_frames) for sample in samples]),
-        "joints_m": np.stack([_padded(sample.joints_m, 1, n_frames) for sample in samples]),
+        "hands": _padded([sample.hands for sample in samples], 1, n_frames),
+        "object": _padded([sample.object for sample in samples], 0, n_frames),
+        "joints_m": _padded([sample.joints_m for sample in samples], 1, n_frames),
         "contact": np.stack([sample.contact for sample in samples]),
+        "chosen": sight.frames,
         "entries": rows,
         "entry_distance_m": distance,
     }
     tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    valid = torch.from_numpy(np.stack([_padded(sample.valid, 1, n_frames) for sample in samples]))
+    valid = torch.from_numpy(_padded([sample.valid for sample in samples], 1, n_frames))
     present = valid & asked["active_hands"][:, :, None] & asked["frames"][:, None]
     threshold_m = _batch_threshold_m(samples)
     return ClipBatch(samples=tuple(samples), present=present, contact_threshold_m=threshold_m, **asked, **tensors)
 
 
-def _padded(array: np.ndarray, axis: int, n_frames: int) -> np.ndarray:
-    widths = [(0, 0)] * array.ndim
-    widths[axis] = (0, n_frames - array.shape[axis])
-    return np.pad(array, widths)
-
-
-def _entry_rows(samples: Sequence[ClipSample]) -> tuple[np.ndarray, np.ndarray]:
-    rows, distances = [np.zeros((0, 5), np.int64)], [np.zeros(0, np.float32)]
-    for index, sample in enumerate(samples):
-        entries = sample.distances
-        clip = np.full(len(entries.frame), index)
-        rows.append(np.stack((clip, entries.side, entries.frame, entries.joint, entries.point), axis=1))
-        distances.append(entries.distance_m)
-    return np.concatenate(rows), np.concatenate(distances)
+def _padded(arrays: Sequence[np.ndarray], axis: int, n_frames: int) -> np.ndarray:
+    """The arrays in one, each with zeros up to ``n_frames`` along ``axis``."""
+    shape = list(arrays[0].shape)
+    shape[axis] = n_frames
+    padded = np.zeros((len(arrays), *shape), arrays[0].dtype)
+    for row, array in zip(padded, arrays, strict=True):
+        row.swapaxes(0, axis)[: array.shape[axis]] = array.swapaxes(0, axis)
+    return padded
 
 
 def _batch_threshold_m(samples: Sequence[ClipSample]) -> float:

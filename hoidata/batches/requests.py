@@ -52,7 +52,8 @@ class RequestBatch:
     """Requests padded to the longest of them; tensors, padding is zero.
 
     objects: the model of each. text (B, ...) features of sentences. points_m, normals (B, N, 3), part (B, N).
-    active_hands (B, 2). frames (B, F): True where a motion has a frame. lengths (B,). betas (B, 2, 10).
+    active_hands (B, 2). frames (B, F): True where a motion has a frame. lengths (B,). Two of them also as plain values,
+    for which no device has to be waited: counts, the lengths, and sides, whether each acts in any. betas (B, 2, 10).
     template_m (B, 2, 778, 3) or None. hinge_axis, hinge_origin_m (B, 3), zero for rigid objects; articulated (B,).
     """
 
@@ -64,6 +65,8 @@ class RequestBatch:
     active_hands: Tensor
     frames: Tensor
     lengths: Tensor
+    counts: tuple[int, ...]
+    sides: tuple[bool, bool]
     betas: Tensor
     template_m: Tensor | None
     hinge_axis: Tensor
@@ -110,7 +113,9 @@ def conditions(asked: Sequence[Any], objects: Sequence[ObjectModel], lengths: np
         "articulated": np.array([hinge is not None for hinge in hinges]),
     }
     tensors = {name: torch.from_numpy(array) for name, array in arrays.items()}
-    return {"objects": tuple(objects), "template_m": _batch_templates([item.template_m for item in asked]), **tensors}
+    templates = _batch_templates([item.template_m for item in asked])
+    plain = {"counts": tuple(lengths.tolist()), "sides": tuple(arrays["active_hands"].any(0).tolist())}
+    return {"objects": tuple(objects), "template_m": templates, **plain, **tensors}
 
 
 def _batch_templates(templates: Sequence[np.ndarray | None]) -> Tensor | None:

@@ -13,12 +13,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.clips.clip import SourceFile
+from hoidata.clips.clip import Clip, SourceFile
 from hoidata.clips.hand_parameters import hands_for
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
-from hoidata.conversion.finished import FinishedWork, job_of
-from hoidata.datasets.base import Adapter, RawTree, SequenceKey
+from hoidata.conversion.finished import FinishedWork, Item, job_of
+from hoidata.datasets.base import Adapter, RawTree, Recorded, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
@@ -116,10 +116,12 @@ class SequenceConverter:
     def __call__(self, key: SequenceKey) -> None:
         raw = RawTree(self.root, self.manifest)
         try:
-            results = [
+            results: list[Item] = [
                 item if isinstance(item, Quarantined) else check_clip(replace(item, synthetic=self.synthetic))
                 for item in self.adapter.load(raw, key, self.hands)
             ]
+            if isinstance(self.adapter, Recorded) and any(isinstance(item, Clip) for item in results):
+                results += self.adapter.recordings(raw, key)
         except BadInput as error:
             self.work.keep(key, [_left_out(key, self.root, error)], None)
         except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault

@@ -22,6 +22,7 @@ import numpy as np
 
 from hoidata.clips.clip import Clip, SourceFile
 from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording
 from hoidata.conversion.packing import Packer, unpack
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.datasets.registry import FACTS
@@ -35,6 +36,7 @@ from hoidata.store.store import SCHEMA_VERSION
 ROOMS = ("conversion", "datasets", "store", "clips", "objects", "hands", "geometry", "files", "workers.py", "errors.py")
 LIBRARIES = ("numpy", "scipy", "torch", "trimesh")
 _CACHED_ARRAYS = 32
+Item = Clip | HandRecording | Quarantined
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class FinishedWork:
             os.replace(self.folder, dead)
         shutil.rmtree(dead, ignore_errors=True)
 
-    def keep(self, key: SequenceKey, results: list[Clip | Quarantined], sources: Sequence[SourceFile] | None) -> None:
+    def keep(self, key: SequenceKey, results: list[Item], sources: Sequence[SourceFile] | None) -> None:
         """Write the results of one sequence. sources: what was read; None for one that failed and is to be redone."""
         packer = Packer(self._share)
         try:
@@ -93,7 +95,7 @@ class FinishedWork:
         except (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile):
             return False  # not there, or damaged: it is made again
 
-    def read(self, key: SequenceKey) -> list[Clip | Quarantined]:
+    def read(self, key: SequenceKey) -> list[Item]:
         """The results of one finished sequence, equal in every bit to those that were kept."""
         arrays = read_npz(self._file(key))
         return unpack(json.loads(arrays["results"].tobytes()), arrays["data"], self._shared)

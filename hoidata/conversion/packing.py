@@ -12,6 +12,9 @@ import numpy as np
 
 from hoidata.clips.clip import BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, SourceContact, SourceFile
 from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.tracked_hand import JointCapsules, Skin, TrackedHand
 from hoidata.objects.model import Hinge, ObjectModel
 
 KINDS: dict[str, type] = {
@@ -19,6 +22,7 @@ KINDS: dict[str, type] = {
     for kind in (
         *(Clip, HandTrack, ObjectTrack, CameraTrack, BodyTrack, SourceContact, SourceFile),
         *(ObjectModel, Hinge, Quarantined),
+        *(HandRecording, OwnHandTrack, TrackedHand, Skin, JointCapsules, RigidTransform),
     )
 }
 SHARED = {("ObjectModel", "vertices_m"), ("ObjectModel", "faces"), ("ObjectModel", "part"), ("HandTrack", "template_m")}

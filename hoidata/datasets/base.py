@@ -16,12 +16,13 @@ from typing import ClassVar, Protocol, runtime_checkable
 from hoidata.clips.clip import Clip, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
 from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording
 from hoidata.dataset_folders import DatasetFacts
 from hoidata.errors import BadInput
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 
-__all__ = ["Adapter", "DatasetPart", "Described", "Quarantined", "RawTree", "SequenceKey"]
+__all__ = ["Adapter", "DatasetPart", "Described", "Quarantined", "RawTree", "Recorded", "SequenceKey"]
 
 _SMALL_BYTES = 65536
 _LARGEST_FILE = 256 << 20
@@ -107,6 +108,15 @@ class Adapter(Protocol):
 
         Every file is reached through ``raw``. Raises BadInput when the whole sequence cannot be used.
         """
+        ...
+
+
+@runtime_checkable
+class Recorded(Protocol):
+    """An adapter whose source has hands of its own skeleton, which are kept beside the clips."""
+
+    def recordings(self, raw: "RawTree", key: SequenceKey) -> list[HandRecording]:
+        """The whole recording of one sequence, or none where the files that describe the hand are missing."""
         ...
 
 

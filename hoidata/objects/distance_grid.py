@@ -71,17 +71,24 @@ def _fill(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
 
 @njit(cache=True, inline="always")
 def _between(low_m, cell_m, value, x, y, z):  # pragma: no cover (compiled)
-    """Interpolated value at a place, and how far the truth may be off; (0, inf) off the grid."""
-    u, v, w = (x - low_m[0]) / cell_m, (y - low_m[1]) / cell_m, (z - low_m[2]) / cell_m
-    if not (0 <= u < value.shape[2] - 1 and 0 <= v < value.shape[1] - 1 and 0 <= w < value.shape[0] - 1):
+    """Interpolated value at a place, and how far the truth may be off; (0, inf) without a grid.
+
+    Off the grid the value of its nearest place stands, and the way to there is added to what it may be off.
+    """
+    if not (value.size and abs(x) + abs(y) + abs(z) < np.inf):
         return 0.0, np.inf
-    i, j, k = int(u), int(v), int(w)
-    u, v, w = u - i, v - j, w - k
+    u, v, w = (x - low_m[0]) / cell_m, (y - low_m[1]) / cell_m, (z - low_m[2]) / cell_m
+    i = min(max(int(u), 0), value.shape[2] - 2)
+    j = min(max(int(v), 0), value.shape[1] - 2)
+    k = min(max(int(w), 0), value.shape[0] - 2)
+    far_u, far_v, far_w = u - i, v - j, w - k
+    u, v, w = min(max(far_u, 0.0), 1.0), min(max(far_v, 0.0), 1.0), min(max(far_w, 0.0), 1.0)
+    beyond = cell_m * np.sqrt((far_u - u) ** 2 + (far_v - v) ** 2 + (far_w - w) ** 2)
     near = (value[k, j, i] * (1 - u) + value[k, j, i + 1] * u) * (1 - v)
     near += (value[k, j + 1, i] * (1 - u) + value[k, j + 1, i + 1] * u) * v
     far = (value[k + 1, j, i] * (1 - u) + value[k + 1, j, i + 1] * u) * (1 - v)
     far += (value[k + 1, j + 1, i] * (1 - u) + value[k + 1, j + 1, i + 1] * u) * v
-    slack = cell_m * np.sqrt(u * (1 - u) + v * (1 - v) + w * (1 - w)) + _ROUNDING_M
+    slack = cell_m * np.sqrt(u * (1 - u) + v * (1 - v) + w * (1 - w)) + _ROUNDING_M + beyond * _WIDER
     return near * (1 - w) + far * w, slack
 
 
@@ -123,6 +130,73 @@ def lower_distances(tree, grid, places_m, most_m, distance_m):  # pragma: no cov
         found = np.sqrt(_least_square(triangle, box, link, x, y, z, bound * bound, 0.0, stack, squares))
         if found <= most:
             distance_m[place] = found
+
+
+@njit(cache=True)
+def nearest_triangles(tree, places_m, distance_m, closest_m, triangle_of):  # pragma: no cover (compiled)
+    """Set ``closest_m (place, 3)`` on the surface and its triangle, by the tree's order, in ``triangle_of (place,)``.
+
+    distance_m: (place,) exact distances, as ``lower_distances`` gives them; places with an infinite one are left alone.
+    """
+    triangle, box, link = tree[0], tree[1], tree[2]
+    stack, squares = np.empty(DEEPEST, np.int64), np.empty(LEAF)
+    for place in range(len(places_m)):
+        if distance_m[place] < np.inf:
+            x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
+            bound = distance_m[place] * _WIDER + _TINY_M
+            number = _triangle_within(triangle, box, link, x, y, z, bound * bound, stack, squares)
+            triangle_of[place] = number
+            _closest_place(triangle, number, x, y, z, closest_m[place])
+
+
+@njit(cache=True)
+def _triangle_within(triangle, box, link, x, y, z, bound, stack, squares):  # pragma: no cover (compiled)
+    """The nearest triangle, of those whose squared distance is not above ``bound``; -1 without any."""
+    best, found, size = bound, -1, 1
+    stack[0] = 0
+    while size:
+        size -= 1
+        node = stack[size]
+        if _square_to_box(box, node, x, y, z) * _BOX_ROUNDING > best:
+            continue
+        if link[node, 0]:
+            stack[size], stack[size + 1] = link[node, 0], node + 1
+            size += 2
+            continue
+        start, stop = link[node, 1], link[node, 2]
+        _leaf_squares(triangle, start, stop, x, y, z, squares)
+        for number in range(stop - start):
+            if squares[number] < best or (found < 0 and squares[number] <= best):
+                best, found = squares[number], start + number
+    return found
+
+
+@njit(cache=True)
+def _closest_place(triangle, number, x, y, z, closest):  # pragma: no cover (compiled)
+    """The place on one triangle nearest to (x, y, z), as ``_leaf_squares`` finds it."""
+    a, ab, ac = triangle[0:3, number], triangle[3:6, number], triangle[6:9, number]
+    normal, inverse = triangle[9:12, number], triangle[12:15, number]
+    p = np.array((x - a[0], y - a[1], z - a[2]))
+    least = np.inf
+    for edge in range(3):
+        origin, way = (ab, ac - ab) if edge == 2 else (np.zeros(3), ac if edge else ab)
+        along = min(max(np.sum((p - origin) * way) * inverse[edge], 0.0), 1.0)
+        place = origin + along * way
+        square = np.sum((p - place) ** 2)
+        if square < least:
+            least = square
+            closest[:] = a + place
+    height = np.sum(p * normal)
+    flat = p - height * normal
+    left_of_ab, left_of_ca = np.sum(_cross(ab, flat) * normal), np.sum(_cross(flat, ac) * normal)
+    left_of_bc = np.sum(_cross(ac - ab, flat - ab) * normal)
+    if min(left_of_ab, left_of_ca, left_of_bc) > 0.0 and height * height < least:
+        closest[:] = a + flat
+
+
+@njit(cache=True, inline="always")
+def _cross(u, v):  # pragma: no cover (compiled)
+    return np.array((u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]))
 
 
 @njit(cache=True)

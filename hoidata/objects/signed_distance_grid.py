@@ -127,14 +127,16 @@ class DistanceFields:
         node = (inside - low) / (high - low) * (self.resolution - 1)
         corner = node.detach().floor().clamp_(0, self.resolution - 2)
         weight = node - corner
-        steps = torch.tensor([self.resolution**2, self.resolution, 1], device=points.device)
-        first = (corner.long() * steps).sum(-1) + ((rows * 2 + part) * self.resolution**3)[:, None, None]
-        total = _blend(self.values, first, weight, steps)
+        x, y, z = corner.long().unbind(-1)
+        first = (
+            (x * self.resolution + y) * self.resolution + z + ((rows * 2 + part) * self.resolution**3)[:, None, None]
+        )
+        total = _blend(self.values, first, weight, (self.resolution**2, self.resolution, 1))
         distance = total[..., 0] + (beyond.square().sum(-1) + 1e-12).sqrt() - 1e-6
         return torch.cat((distance[..., None], total[..., 1:] - beyond), -1)
 
 
-def _blend(values: Tensor, first: Tensor, weight: Tensor, steps: Tensor) -> Tensor:
+def _blend(values: Tensor, first: Tensor, weight: Tensor, steps: tuple[int, int, int]) -> Tensor:
     """Trilinear interpolation of rows of ``values`` at the eight corners above index ``first``."""
     total = values.new_zeros(())
     for corner in range(8):
@@ -142,7 +144,7 @@ def _blend(values: Tensor, first: Tensor, weight: Tensor, steps: Tensor) -> Tens
         share = values.new_ones(())
         for axis, bit in enumerate(bits):
             share = share * (weight[..., axis] if bit else 1 - weight[..., axis])
-        shift = sum(int(bit) * int(step) for bit, step in zip(bits, steps, strict=True))
+        shift = sum(bit * step for bit, step in zip(bits, steps, strict=True))
         total = total + share[..., None] * values[first + shift]
     return total
 

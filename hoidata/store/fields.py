@@ -168,6 +168,64 @@ TEMPLATES = StoreFile(
     (Field("<template>", "float32", "replaces MANO's template", (N_VERTICES, 3), ("vertex", "xyz"), "metre", "hand"),),
 )
 
+
+def _recorded(name: str, meaning: str, unit: str, frame: str = "world", joints: bool = False) -> Field:
+    shape = ("frame", "joint", 3) if joints else ("frame", 3)
+    axes = ("frame", "joint", "axis-angle") if joints else ("frame", "axis-angle" if unit == "radian" else "xyz")
+    return Field(name, "float32", meaning, shape, axes, unit, frame)
+
+
+RECORDINGS = StoreFile(
+    "arrays/recordings.npz",
+    "whole recordings at the source's own rate, hands with the source's own joints; there where info.json names some "
+    "under recordings; every member is called <sequence>/<name>",
+    "members by name",
+    (
+        *_both(_recorded("<side>_wrist_m", "where the <side> wrist is", "metre")),
+        *_both(_recorded("<side>_rotvec", "world_from_wrist of the <side> hand, then joints relative to their parents",
+                         "radian", "parent joint", joints=True)),
+        _recorded("object_rotvec", "world_from_object, column vectors", "radian"),
+        _recorded("object_translation_m", "origin of the object frame", "metre"),
+        Field("object_hinge_rad", "float32", "0 for rigid ones", ("frame",), ("frame",), "radian", "object"),
+        Field("usable", "bool", "False: tracking failed", ("frame",), ("frame",)),
+    ),
+)  # fmt: skip
+
+_JOINT, _CAPSULE, _SKIN = ("joint",), ("capsule",), ("skin point",)
+
+
+def _of_hand(name: str, rows: str, meaning: str, frame: str = "joint", unit: str = "metre") -> Field:
+    return Field(name, "float64", meaning, (rows, 3), (rows, "xyz"), unit, frame)
+
+
+SOURCE_HANDS = StoreFile(
+    "arrays/source_hands.npz",
+    "the right hands of recordings.npz: skeleton, sensing skin, capsules; every member is called <hand>/<name>, "
+    "and info.json names layout and joints under source_hands",
+    "members by name",
+    (
+        Field("parents", "int64", "-1 for the wrist, which is first", _JOINT, _JOINT),
+        _of_hand("offset_m", "joint", "from the parent", "parent joint"),
+        Field("rest_rotmats", "float64", "neutral pose, relative to parents", ("finger joint", 3, 3),
+              ("finger joint", "row", "column")),
+        _of_hand("skin_point_m", "skin point", "the five tips, then the proximity sensors, at rest", "skin"),
+        _of_hand("skin_normal", "skin point", "outward", "skin", ""),
+        Field("skin_weight", "float64", "of linear blend skinning", ("skin point", "joint"), ("skin point", "joint")),
+        Field("joint_from_skin", "float64", "rotations at rest", ("joint", 3, 3), ("joint", "row", "column")),
+        _of_hand("joint_from_skin_m", "joint", "the skin frame's origin at rest"),
+        Field("tip_joint", "int64", "last joint of each finger", ("finger",), ("finger",)),
+        Field("capsule_joint", "int64", "what each moves with", _CAPSULE, _CAPSULE),
+        _of_hand("capsule_start_m", "capsule", "middle of the first sphere"),
+        _of_hand("capsule_end_m", "capsule", "middle of the last sphere"),
+        Field("capsule_radius_m", "float64", "of the spheres", _CAPSULE, _CAPSULE, "metre"),
+        Field("wrist_from_canonical", "float64", "columns: to the fingers, to the thumb, out of the back", (3, 3),
+              ("row", "column")),
+        _of_hand("hinge_axis", "joint", "unit, or zero for joints that turn freely", unit=""),
+        Field("limit_rad", "float64", "least and most angle from the neutral pose", ("joint", 2), ("joint", "value"),
+              "radian"),
+    ),
+)  # fmt: skip
+
 _TEXT, _WHOLE, _ROW = "string", "int32", "int64"
 
 
@@ -317,7 +375,8 @@ INFO = StoreFile(
 )  # fmt: skip
 
 TABLES = {"sequences": SEQUENCES, "objects": OBJECTS, "files": FILES, "quarantine": QUARANTINE}
-STORE_FILES = (INFO, *TABLES.values(), FRAMES, BODY, SOURCE_CONTACT, OBJECT_ARRAYS, TEMPLATES)
+STORE_FILES = (INFO, *TABLES.values(), FRAMES, BODY, SOURCE_CONTACT, OBJECT_ARRAYS, TEMPLATES, RECORDINGS,
+               SOURCE_HANDS)  # fmt: skip
 AXES = {
     field.name.replace("left_", "<side>_"): list(field.axes)
     for field in FRAMES.fields

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from hoidata.clips.clip import Clip
 from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording
 from hoidata.errors import BadInput
 from hoidata.store.fields import SCHEMA_VERSION, parse_version
 from hoidata.store.store import Store, open_store, read_info
@@ -33,8 +34,10 @@ def is_current(version: str) -> bool:
     return parse_version(version) >= parse_version(SCHEMA_VERSION)
 
 
-def _contents(store: Store) -> Iterator[Clip | Quarantined]:
+def _contents(store: Store) -> Iterator[Clip | HandRecording | Quarantined]:
     for row in store.quarantine.to_dict("records"):
         yield Quarantined(**{str(key): value for key, value in row.items()})
     for clip_id in store.ids:
         yield store.clip(clip_id)
+    for sequence in store.recordings:
+        yield store.recording(sequence)

@@ -31,6 +31,7 @@ from hoidata.clips.clip import (
     SourceFile,
 )
 from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.hands.fast_joints import fast_track_joints
@@ -38,6 +39,7 @@ from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.store.fields import SCHEMA_VERSION, TABLES
 from hoidata.store.mapped import map_npz
 from hoidata.store.reading import FrameShard, clip_rows
+from hoidata.store.recordings import read_hand, read_recording
 from hoidata.store.versions import checked_version, filled_info, filled_sequences
 from hoidata.store.writing import write_store
 
@@ -138,6 +140,20 @@ class Store:
             source_contact=None if motion_only else self._source_contact(row),
             **row["facts"],
         )
+
+    @property
+    def recordings(self) -> list[str]:
+        """The sequences whose whole recording is kept, with the hands as the source has them."""
+        return sorted(self.info.get("recordings", {}))
+
+    def recording(self, sequence: str) -> HandRecording:
+        """One of ``recordings``. Raises KeyError when there is none of that name."""
+        if sequence not in self.recordings:
+            raise KeyError(f"no recording {sequence!r} in {self.folder}; there are: {', '.join(self.recordings)}")
+        facts = self.info["recordings"][sequence]
+        hand = read_hand(facts["hand"], self.info["source_hands"][facts["hand"]], self._file("source_hands"))
+        model, sources = self.object_model(facts["object"]), self._sources_of(facts)
+        return read_recording(sequence, self.info["dataset"], facts, self._file("recordings"), hand, model, sources)
 
     def joints(self, clip_id: str, side: Side) -> np.ndarray:
         """(frame, 21, 3) float32 world joints of one hand, metres, valid frames or not (see ``HandTrack.valid``)."""

@@ -19,6 +19,7 @@ from hoidata.clips.clip import (
     SourceFile,
 )
 from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording
 from hoidata.clips.validation import check_clip
 from hoidata.files import atomic_folder, canonical_json, sha256_bytes
 from hoidata.files.arrays import write_npz
@@ -27,18 +28,23 @@ from hoidata.store.fields import (
     AXES,
     BODY,
     FRAMES,
+    RECORDINGS,
     SCHEMA_VERSION,
     SOURCE_CONTACT,
+    SOURCE_HANDS,
     TABLES,
     UNITS,
     arrow_schema,
 )
 from hoidata.store.info import check_info
-from hoidata.store.meshes import MeshWriter
+from hoidata.store.meshes import MeshKey, MeshWriter
+from hoidata.store.recordings import RecordingWriter
 from hoidata.store.shards import ShardWriter
 
 
-def write_store(folder: str | Path, clips: Iterable[Clip | Quarantined], info: dict[str, Any]) -> dict[str, int]:
+def write_store(
+    folder: str | Path, clips: Iterable[Clip | HandRecording | Quarantined], info: dict[str, Any]
+) -> dict[str, int]:
     """Write clips, in the order given, as the store ``folder``; it appears whole or not at all.
 
     info: the facts of ``hoidata.store.info.store_info``, and whatever else belongs into ``meta/info.json``.
@@ -54,6 +60,8 @@ def write_store(folder: str | Path, clips: Iterable[Clip | Quarantined], info: d
         for item in clips:
             if isinstance(item, Quarantined):
                 writer.quarantined.append(vars(item))
+            elif isinstance(item, HandRecording):
+                writer.add_recording(item)
             else:
                 writer.add(check_clip(item))
         return writer.finish(info)
@@ -64,6 +72,7 @@ class _Writer:
         self.folder = folder
         self.shards = ShardWriter(folder)
         self.meshes = MeshWriter(folder)
+        self.recordings = RecordingWriter()
         self.rows: dict[str, dict[str, Any]] = {}
         self.quarantined: list[dict[str, Any]] = []
         self.templates: dict[str, np.ndarray] = {}
@@ -97,8 +106,15 @@ class _Writer:
             "source_from_world": clip.source_from_world.ravel().tolist(),
             "first_source_frame": int(clip.source_frames[0]),
             "last_source_frame": int(clip.source_frames[-1]),
-            "source_files": [self.files.setdefault(source, len(self.files)) for source in clip.sources],
+            "source_files": self._numbers(clip.sources),
         }
+
+    def add_recording(self, recording: HandRecording) -> None:
+        model = self.meshes.add(recording.object.model)
+        self.recordings.add(recording, model, self._numbers(recording.sources))
+
+    def _numbers(self, sources: tuple[SourceFile, ...]) -> list[int]:
+        return [self.files.setdefault(source, len(self.files)) for source in sources]
 
     def _add_hand(self, side: str, track: HandTrack) -> dict[str, Any]:
         names = ("wrist_m", "global_orient", "hand_pose", "valid")
@@ -170,10 +186,23 @@ class _Writer:
             "files": len(files),
             "quarantined": len(self.quarantined),
         }
+        found = self._write_recordings(names)
         own = {"schema_version": SCHEMA_VERSION, "fps": FPS, "units": UNITS, "axes": AXES, "counts": counts}
-        text = orjson.dumps(orjson.loads(canonical_json(info | own)), option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS)
+        text = orjson.dumps(
+            orjson.loads(canonical_json(info | own | found)), option=orjson.OPT_INDENT_2 | orjson.OPT_SORT_KEYS
+        )
         (self.folder / "meta" / "info.json").write_bytes(text + b"\n")
         return counts
+
+    def _write_recordings(self, object_names: dict[MeshKey, str]) -> dict[str, Any]:
+        """What info.json says of recordings; nothing in a store without any."""
+        own = self.recordings
+        if not own.facts:
+            return {}
+        write_npz(self.folder / RECORDINGS.path, dict(sorted(own.arrays.items())))
+        write_npz(self.folder / SOURCE_HANDS.path, dict(sorted(own.hands.items())))
+        facts = {name: {**fact, "object": object_names[fact["object"]]} for name, fact in own.facts.items()}
+        return {"recordings": facts, "source_hands": own.hand_facts}
 
 
 def template_key(template_m: np.ndarray) -> str:

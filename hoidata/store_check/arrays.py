@@ -66,7 +66,7 @@ def read_shards(
     start, end = file.path.split("*")
     shards, problems = {}, []
     for path in sorted(path for path in paths if path.startswith(start)):
-        arrays, found = _read_members(folder, path, {field.name: field for field in file.fields_of(version)})
+        arrays, found = read_members(folder, path, {field.name: field for field in file.fields_of(version)})
         problems += found
         if arrays is not None:
             found = list(_equal_lengths(path, file.fields_of(version), arrays))
@@ -76,7 +76,7 @@ def read_shards(
     return shards, problems
 
 
-def _read_members(folder: Path, path: str, fields: dict[str, Field]) -> tuple[Arrays | None, list[BadInput]]:
+def read_members(folder: Path, path: str, fields: dict[str, Field]) -> tuple[Arrays | None, list[BadInput]]:
     if not (folder / path).is_file():
         return None, []  # listed with the missing files
     try:
@@ -109,8 +109,8 @@ def _checksum_problems(folder: Path, path: str) -> Iterator[BadInput]:
 
 
 def _member_problems(where: str, field: Field, array: np.ndarray) -> Iterator[BadInput]:
-    first = field.shape[0]
-    shape = (first if isinstance(first, int) else len(array) if array.ndim else 0, *field.row_shape)
+    own = (*array.shape, *[0] * (len(field.shape) - array.ndim))
+    shape = tuple(n if isinstance(n, int) else m for n, m in zip(field.shape, own, strict=False))
     if array.dtype != np.dtype(field.dtype):
         yield BadInput(where, field.dtype, f"{array.dtype}", REMEDY)
     elif array.shape != shape:
@@ -187,7 +187,7 @@ def _frame_problems(clips: list[dict[str, Any]], arrays: Arrays) -> Iterator[Bad
 def mesh_problems(folder: Path, objects: Columns) -> Iterator[BadInput]:
     """objects.npz against the rows that name its members."""
     fields = {f"{name}/{field.name}": field for name in objects["object"] for field in OBJECT_ARRAYS.fields}
-    arrays, found = _read_members(folder, OBJECT_ARRAYS.path, fields)
+    arrays, found = read_members(folder, OBJECT_ARRAYS.path, fields)
     yield from found
     if arrays is not None:
         for row in _rows(objects):
@@ -197,7 +197,7 @@ def mesh_problems(folder: Path, objects: Columns) -> Iterator[BadInput]:
 def template_problems(folder: Path, sequences: Columns) -> Iterator[BadInput]:
     """templates.npz against the rows that name its members."""
     names = {name for side in SIDES for name in sequences[f"{side}_template"] if name is not None}
-    arrays, found = _read_members(folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)})
+    arrays, found = read_members(folder, TEMPLATES.path, {name: TEMPLATES.fields[0] for name in sorted(names)})
     yield from found
     for name, template_m in (arrays or {}).items():
         if template_key(template_m) != name:

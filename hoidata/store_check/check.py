@@ -6,11 +6,22 @@ from typing import Any
 
 from hoidata.clips.validation import check_clip
 from hoidata.errors import BadInput, MissingResource
-from hoidata.store.fields import BODY, FRAMES, INFO, SOURCE_CONTACT, STORE_FILES, TABLES, Version
+from hoidata.store.fields import (
+    BODY,
+    FRAMES,
+    INFO,
+    RECORDINGS,
+    SOURCE_CONTACT,
+    SOURCE_HANDS,
+    STORE_FILES,
+    TABLES,
+    Version,
+)
 from hoidata.store.info import info_problems
 from hoidata.store.store import open_store, read_info
 from hoidata.store.versions import CURRENT, checked_version
 from hoidata.store_check.arrays import mesh_problems, read_shards, shard_problems, template_problems
+from hoidata.store_check.recordings import recording_problems
 from hoidata.store_check.tables import REMEDY, Columns, is_whole, read_columns, reference_problems, table_problems
 
 
@@ -44,8 +55,10 @@ def check_store(folder: str | Path) -> list[BadInput]:
         return problems  # what else is wrong cannot be told before this is mended
     problems += reference_problems(tables)
     problems += _count_problems(info, tables)
-    problems += _file_problems(folder, tables["sequences"], version)
+    recorded = info.get("recordings", {})
+    problems += _file_problems(folder, tables["sequences"], version, bool(recorded))
     problems += _array_problems(folder, tables, version)
+    problems += recording_problems(folder, info, set(tables["objects"]["object"]), len(tables["files"]["path"]))
     return problems or list(_clip_problems(folder))
 
 
@@ -64,10 +77,11 @@ def _count_problems(info: dict[str, Any], tables: dict[str, Columns]) -> Iterato
             yield BadInput(f"{INFO.path}: counts.{name}", f"{number}", f"{counts.get(name)}", REMEDY)
 
 
-def expected_files(sequences: Columns, version: Version) -> set[str]:
-    """The path of every file a store with these clips has."""
+def expected_files(sequences: Columns, version: Version, recorded: bool = False) -> set[str]:
+    """The path of every file a store with these clips has. recorded: it has whole recordings, too."""
     shards = set(sequences["shard"]) or {0}
     with_rows = {
+        **({} if recorded else {RECORDINGS.path: set(), SOURCE_HANDS.path: set()}),
         FRAMES.path: shards,
         BODY.path: _shards_where(sequences, "body_row", -1),
         SOURCE_CONTACT.path: _shards_where(sequences, "source_contact_count", 0),
@@ -86,8 +100,8 @@ def _shards_where(sequences: Columns, column: str, above: int) -> set[int]:
     return {shard for shard, value in zip(sequences["shard"], sequences[column], strict=True) if value > above}
 
 
-def _file_problems(folder: Path, sequences: Columns, version: Version) -> Iterator[BadInput]:
-    expected = expected_files(sequences, version)
+def _file_problems(folder: Path, sequences: Columns, version: Version, recorded: bool) -> Iterator[BadInput]:
+    expected = expected_files(sequences, version, recorded)
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
     for path in sorted(expected - found):
         yield BadInput(path, "a file", "nothing there", REMEDY)

@@ -68,9 +68,14 @@ def read_info(path: str | Path) -> dict[str, Any]:
     return info
 
 
+def checkpoint_file(folder: str | Path) -> Path:
+    """The file of a checkpoint's folder; of a file itself."""
+    return Path(folder) if str(folder).endswith(".safetensors") else Path(folder) / FILE_NAME
+
+
 def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.device | str = "cpu") -> Checkpoint:
     """The checkpoint of ``network`` in ``folder``, or of a file. Raises BadInput where there is none, or of another."""
-    path = Path(folder) if str(folder).endswith(".safetensors") else Path(folder) / FILE_NAME
+    path = checkpoint_file(folder)
     if not path.is_file():
         raise BadInput(path, "a trained model", empty_reason(path.parent) or "no file", "run `dvc repro`")
     info = read_info(path)

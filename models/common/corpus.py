@@ -1,22 +1,42 @@
 """Clips for a training: the two splits that may be read, batches in a repeatable order, and facts to record."""
 
-from collections.abc import Iterator
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
+from hoidata.batches.sight import Sight
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
 from models.common.vocabulary import Vocabulary
 
 BUCKET_BATCHES = 4
+Balance = Literal["none", "verb"]
 Item = TypeVar("Item")
 HAND_TYPES = ("left", "right", "both")
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What of every batch is asked for. frames, entries: of each clip and in all, for losses of geometry (``Sight``).
+
+    parts: those of ``of`` equal parts of a batch that this process computes. balance: clips drawn evenly, or verbs.
+    """
+
+    frames: int = 0
+    entries: int = 0
+    parts: Sequence[int] = (0,)
+    of: int = 1
+    balance: Balance = "none"
 
 
 @dataclass(frozen=True)
@@ -40,6 +60,22 @@ class Corpus:
             return list(self.validation)
         return list(HoiDataset(self.annotated, "train", crop="start"))
 
+    def digest(self) -> str:
+        """SHA-256 of all that training and validation see of the clips: arrays, words and meshes."""
+        found, validation = sha256(), self.validation if len(self.validation) else self.train
+        for sample in itertools.chain.from_iterable(map(split.whole, split.ids) for split in (self.train, validation)):
+            model, entries = sample.object_model, sample.distances
+            words = (sample.clip_id, sample.hand_type, sample.verb, *sample.sentences, len(sample.object))
+            found.update(canonical_json(words).encode())
+            arrays = (
+                *(sample.hands, sample.object, sample.joints_m, sample.valid, sample.betas, sample.template_m),
+                *(sample.text, sample.contact, *vars(sample.points).values(), *vars(entries).values()),
+                *(model.vertices_m, model.faces, model.part),
+            )
+            for array in arrays:
+                found.update(b"" if array is None else np.ascontiguousarray(array).data)
+        return found.hexdigest()
+
     def facts(self, hands: HandPair) -> dict[str, Any]:
         """What a checkpoint records about its clips."""
         clips = {"train": list(self.train.ids), "validation": list(self.validation.ids)}
@@ -59,21 +95,51 @@ class Corpus:
         }
 
 
-def batches(dataset: HoiDataset, size: int, generator: torch.Generator, with_entries: bool) -> Iterator[ClipBatch]:
-    """Endless batches of about ``size`` clips; every epoch has a new order and meets every clip once.
+def batches(
+    dataset: HoiDataset, size: int, seed: int, wanted: Wanted = Wanted(), start: int = 0
+) -> Iterator[list[tuple[int, ClipBatch]]]:
+    """Endless steps of about ``size`` clips, from step ``start`` on; each the parts asked for, with their numbers.
 
-    Clips of like length share a batch, which saves padding: within each stretch of a few batches they are sorted.
+    Every epoch has a new order and meets every clip once. All that is drawn comes from (seed, epoch) or (seed, step,
+    part), so that a training that goes on finds what it would have found.
     """
-    epoch = 0
-    while True:
-        dataset.set_epoch(epoch)
-        order = torch.randperm(len(dataset), generator=generator).tolist()
-        for window in _split(order, size * BUCKET_BATCHES):
-            clips = sorted((dataset[index] for index in window), key=lambda sample: (sample.length, sample.clip_id))
-            groups = _split(clips, size)
-            for index in torch.randperm(len(groups), generator=generator).tolist():
-                yield collate(groups[index], with_entries)
-        epoch += 1
+    lengths = [min(dataset.whole(clip_id).length, dataset.max_frames) for clip_id in dataset.ids]
+    weights = _verb_weights(dataset) if wanted.balance == "verb" else None
+    for step, (epoch, rows) in enumerate(_plan(lengths, size, seed, weights), 1):
+        if step > start:
+            dataset.set_epoch(epoch)
+            parts = {part: rows[part :: wanted.of] or rows[:1] for part in wanted.parts}
+            yield [
+                (part, _collated([dataset[row] for row in own], wanted, seed, step, part))
+                for part, own in parts.items()
+            ]
+
+
+def _collated(samples: list[ClipSample], wanted: Wanted, seed: int, step: int, part: int) -> ClipBatch:
+    random = np.random.default_rng([seed, step, part])
+    lengths = [sample.length for sample in samples]
+    sight = Sight.drawn(lengths, wanted.frames, wanted.entries, random) if wanted.frames else None
+    return collate(samples, sight)
+
+
+def _plan(lengths: list[int], size: int, seed: int, weights: np.ndarray | None) -> Iterator[tuple[int, list[int]]]:
+    """Epoch and clips of every step. Clips of like length share a batch, which saves padding: within each interval of a
+    few batches they are sorted. weights: how often each clip is drawn; then an epoch may leave some out."""
+    for epoch in itertools.count():
+        random, count = np.random.default_rng([seed, epoch]), len(lengths)
+        order = random.permutation(count) if weights is None else random.choice(count, count, p=weights)
+        for window in _split(order.tolist(), size * BUCKET_BATCHES):
+            groups = _split(sorted(window, key=lambda row: (lengths[row], row)), size)
+            for number in random.permutation(len(groups)):
+                yield epoch, groups[number]
+
+
+def _verb_weights(dataset: HoiDataset) -> np.ndarray:
+    """(clip,) probabilities with which every verb is drawn alike."""
+    verbs = [dataset.whole(clip_id).verb for clip_id in dataset.ids]
+    counts = Counter(verbs)
+    weights = np.array([1 / counts[verb] for verb in verbs])
+    return weights / weights.sum()
 
 
 def _split(items: list[Item], size: int) -> list[list[Item]]:

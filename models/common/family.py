@@ -32,20 +32,21 @@ Losses = dict[str, Tensor]
 
 
 class Objective(Protocol):
-    """How to train one network. ``needs_entries``: whether batches must carry the distance entries."""
+    """How to train one network. frames, entries: how many frames of each clip and distance entries of all of them
+    batches are to carry for its losses (``Wanted``)."""
+
+    frames: int
+    entries: int
 
     @property
     def network(self) -> nn.Module: ...
-
-    @property
-    def needs_entries(self) -> bool: ...
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         """Named losses of one training batch; "total" is the one to minimise."""
         ...
 
-    def validation(self, network: nn.Module) -> float:
-        """The loss on held-out clips, always with the same draws; network is in evaluation mode."""
+    def validation(self, network: nn.Module) -> Tensor:
+        """() the loss on held-out clips, always with the same draws; network is in evaluation mode."""
         ...
 
 

@@ -4,16 +4,18 @@ Feature layout: ``hoidata.clips.features``. Axes (batch, side, frame, ...); side
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch, ClipSample
+from hoidata.batches.requests import RequestBatch
 from hoidata.clips.clip import SIDES
 from hoidata.clips.features import (
+    GLOBAL_ORIENT_6D,
     HAND_FEATURES,
+    HAND_POSE_6D,
     HAND_ROTATIONS_6D,
     N_ROTATIONS,
     OBJECT_FEATURES,
@@ -76,7 +78,27 @@ def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:
     return (points_m - object_position_m(objects)[..., None, :]) @ object_rotmat(objects)
 
 
-def place_points(batch: ClipBatch, objects: Tensor) -> Tensor:
+def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
+    """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation; fingers unchanged."""
+    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
+    return _moved(hands, rotation.transpose(-1, -2), position)
+
+
+def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
+    """The inverse of :func:`hands_in_object_frame`."""
+    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
+    back = -(position[..., None, :] @ rotation)[..., 0, :]
+    return _moved(hands, rotation, back)
+
+
+def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
+    """Wrist and global 6D turned by ``rotation`` about ``origin``."""
+    wrist = (rotation @ (hands[..., WRIST] - origin)[..., None])[..., 0]
+    columns = rotation @ hands[..., GLOBAL_ORIENT_6D].unflatten(-1, (3, 2))
+    return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
+
+
+def place_points(batch: RequestBatch, objects: Tensor) -> Tensor:
     """The sampled object points at each pose (B, F, 10): (B, F, 1024, 3), the moving part turned about its hinge."""
     turn = rotvec_to_rotmat(batch.hinge_axis[:, None] * object_hinge_rad(objects)[..., None])
     origin = batch.hinge_origin_m[:, None, None]
@@ -130,15 +152,24 @@ class Normaliser:
     object_scale: Tensor
 
     @classmethod
-    def of(cls, samples: Sequence[ClipSample]) -> "Normaliser":
-        """From training samples; frames of a side that does not act are left out."""
+    def of(cls, clips: Sequence[tuple[Tensor, Tensor, Tensor]]) -> "Normaliser":
+        """From rows of training clips: hands (2, K, 99), object (L, 10), present (2, K); absent hands are left out."""
         means, scales = np.zeros((2, HAND_FEATURES)), np.ones((2, HAND_FEATURES))
         for side in range(2):
-            frames = [s.hands[side][s.valid[side]] for s in samples if s.active_hands[side]]
-            means[side], scales[side] = _moments(frames, HAND_FEATURES)
-        object_mean, object_scale = _moments([sample.object for sample in samples], OBJECT_FEATURES)
+            means[side], scales[side] = _moments([own[side][there[side]] for own, _, there in clips], HAND_FEATURES)
+        object_mean, object_scale = _moments([own for _, own, _ in clips], OBJECT_FEATURES)
         arrays = (means, scales, object_mean, object_scale)
         return cls(*(torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in arrays))
+
+    @classmethod
+    def nothing(cls) -> "Normaliser":
+        """Leaves features as they are: metres and numbers."""
+        shapes = (2, HAND_FEATURES), (OBJECT_FEATURES,)
+        return cls(torch.zeros(shapes[0]), torch.ones(shapes[0]), torch.zeros(shapes[1]), torch.ones(shapes[1]))
+
+    def spread_to(self, spread: float) -> "Normaliser":
+        """The same means; features come out as wide as ``spread``, not 1."""
+        return replace(self, hand_scale=self.hand_scale / spread, object_scale=self.object_scale / spread)
 
     def encode(self, hands: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
         """Features (B, 2, F, 99) and (B, F, 10) to zero mean and unit spread."""
@@ -159,8 +190,8 @@ class Normaliser:
         return {name: getattr(self, name) for name in ("hand_mean", "hand_scale", "object_mean", "object_scale")}
 
 
-def _moments(frames: list[np.ndarray], size: int) -> tuple[np.ndarray, np.ndarray]:
-    rows = np.concatenate([np.zeros((0, size)), *frames]).astype(np.float64)
+def _moments(frames: list[Tensor], size: int) -> tuple[np.ndarray, np.ndarray]:
+    rows = torch.cat([torch.zeros(0, size), *frames]).double().numpy()
     if not len(rows):
         return np.zeros(size), np.ones(size)
     scale = rows.std(axis=0)

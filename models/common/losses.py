@@ -37,6 +37,16 @@ def distance_map_loss(
     return ((predicted - distance_m) / scale_m).square().mean()
 
 
+def joint_loss(joints_m: Tensor, true_m: Tensor, mask: Tensor, weight: Tensor, scale_m: float = 0.01) -> Tensor:
+    """Distance of joints (B, 2, F, 21, 3) from the true ones in units of ``scale_m``: squared below one, linear beyond.
+
+    mask (B, 2, F); weight (B, 2, F, 21) of each joint. Both in one frame, metres.
+    """
+    apart = (joints_m - true_m) / scale_m
+    huber = functional.huber_loss(apart, torch.zeros_like(apart), reduction="none").sum(-1)
+    return (huber * weight * mask[..., None]).sum() / (weight * mask[..., None]).sum().clamp_min(1.0)
+
+
 def relative_orientation_loss(
     hand: Tensor, objects: Tensor, true_hand: Tensor, true_object: Tensor, mask: Tensor
 ) -> Tensor:
@@ -71,35 +81,21 @@ def contact_loss(
     return masked_mean(2 * functional.huber_loss(apart, torch.zeros_like(apart), reduction="none", delta=3.0), near)
 
 
+def surface_loss(distance_m: Tensor, mask: Tensor, threshold_m: float, scale_m: float = 1.0) -> Tensor:
+    """Eq. 11 as written: squared distances to the surface of the joints closer to it than ``threshold_m``.
+
+    Signed distances (B, 2, F, 21), mask (B, 2, F).
+    """
+    near = touching_joints(distance_m, threshold_m) & (mask[..., None] > 0)
+    return masked_mean((distance_m / scale_m).square(), near)
+
+
 def touching_joints(distance_m: Tensor, threshold_m: float) -> Tensor:
     """Joints closer than ``threshold_m`` to the surface, on either side of it."""
     return distance_m.abs() < threshold_m
-
-
-def pick_frames(frames: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """(B, count) frames drawn among each clip's own (B, F), one from each of ``count`` equal stretches."""
-    place = torch.rand(len(frames), count, generator=generator)
-    lengths = frames.sum(1).cpu()
-    chosen = ((torch.arange(count) + place) / count * lengths[:, None]).long()
-    return torch.minimum(chosen, lengths[:, None] - 1).to(frames.device)
 
 
 def take_frames(x: Tensor, chosen: Tensor, axis: int) -> Tensor:
     """The chosen frames (B, K) of ``x``, whose frame axis is ``axis`` (1 or 2)."""
     rows = torch.arange(len(x), device=x.device)[:, None]
     return x[rows, chosen] if axis == 1 else x.transpose(1, 2)[rows, chosen].transpose(1, 2)
-
-
-def entries_of_frames(
-    entries: Tensor, distance_m: Tensor, chosen: Tensor, n_frames: int, at_most: int, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """The entries in chosen frames (B, K), with the frame replaced by its place 0..K-1; ``at_most`` of them."""
-    slot = torch.full((len(chosen), n_frames), -1, device=chosen.device)
-    slot.scatter_(1, chosen, torch.arange(chosen.shape[1], device=chosen.device).expand_as(chosen))
-    place = slot[entries[:, 0], entries[:, 2]]
-    kept = torch.nonzero(place >= 0)[:, 0]
-    if len(kept) > at_most:
-        kept = kept[torch.randint(len(kept), (at_most,), generator=generator).to(kept.device)]
-    rows = entries[kept].clone()
-    rows[:, 2] = place[kept]
-    return rows, distance_m[kept]

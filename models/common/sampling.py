@@ -1,22 +1,21 @@
-"""Noise schedule and samplers: diffusers' schedulers around any denoiser that predicts the clean motion.
+"""Noise schedule and samplers around any denoiser that predicts what is clean.
 
 Text2HOI: 1,000 steps, cosine schedule (Nichol and Dhariwal 2021), x0-prediction. DDPM walks every step (Ho et al.
-2020); DDIM strides over them (Song et al. 2021); DPM-Solver++ (Lu et al. 2022, second order) needs fewer calls still.
-A denoiser here is ``x0 = denoise(x_t, t)`` on a pair (hands, object).
+2020); DDIM strides over them (Song et al. 2021); DPM-Solver++ (Lu et al. 2022, second order, multistep) needs fewer
+calls still. The schedule is plain numbers: no step waits for a device. A denoiser of motions is
+``x0 = denoise(x_t, t)`` on a pair (hands, object).
 """
 
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from functools import cache
+from typing import Literal
 
 import torch
-from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
-from diffusers.schedulers.scheduling_dpmsolver_multistep import DPMSolverMultistepScheduler
 from torch import Tensor
 
-from hoidata.batches.dataset import MAX_FRAMES
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 
 TRAIN_STEPS = 1000
 Motion = tuple[Tensor, Tensor]
@@ -36,23 +35,25 @@ class SamplerConfig:
     guidance: float = 1.0
 
 
-def noise_schedule(kind: Kind = "ddim") -> DDIMScheduler | DDPMScheduler | DPMSolverMultistepScheduler:
-    """The cosine schedule over 1,000 steps for x0-prediction, without clipping."""
-    shared: dict[str, Any] = {
-        "num_train_timesteps": TRAIN_STEPS,
-        "beta_schedule": "squaredcos_cap_v2",
-        "prediction_type": "sample",
-        "timestep_spacing": "trailing",
-    }
-    if kind == "dpm++":
-        return DPMSolverMultistepScheduler(**shared, algorithm_type="dpmsolver++", final_sigmas_type="zero")
-    scheduler = DDIMScheduler if kind == "ddim" else DDPMScheduler
-    return scheduler(**shared, clip_sample=False)
+@cache
+def signal_shares() -> tuple[float, ...]:
+    """Cumulative signal share of each of the 1,000 steps: alpha-bar of Ho et al. 2020, betas at most 0.999."""
+    curve = [math.cos((step / TRAIN_STEPS + 0.008) / 1.008 * math.pi / 2) ** 2 for step in range(TRAIN_STEPS + 1)]
+    shares, share = [], 1.0
+    for step in range(TRAIN_STEPS):
+        share *= max(curve[step + 1] / curve[step], 0.001)
+        shares.append(share)
+    return tuple(shares)
 
 
 def alphas_cumprod(device: torch.device | str = "cpu") -> Tensor:
-    """(1000,) cumulative signal share of the schedule, alpha-bar of Ho et al. 2020."""
-    return noise_schedule().alphas_cumprod.to(device)
+    """(1000,) float32 of :func:`signal_shares`."""
+    return torch.tensor(signal_shares(), device=device)
+
+
+def timesteps(steps: int) -> list[int]:
+    """The steps that are walked: from the last of the 1,000 down, evenly ("trailing", Lin et al. 2024)."""
+    return [round(TRAIN_STEPS * (1 - number / steps)) - 1 for number in range(steps)]
 
 
 def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, signal: Tensor) -> Tensor:
@@ -67,41 +68,95 @@ def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], gen
     return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
 
 
-def draw_each(hand_features: int, object_features: int, n_frames: int, generators: Sequence[torch.Generator]) -> Motion:
-    """Noise (B, 2, F, D) and (B, F, D), a generator for each of B motions.
+def draw_each(longest: tuple[int, int], rows: tuple[int, int], generators: Sequence[torch.Generator]) -> Motion:
+    """Noise (B, 2, K, 99) and (B, L, 10), a generator for each of B motions. rows: K and L.
 
-    The longest motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
+    The ``longest`` motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
     """
-    rows = [
+    drawn = [
         (
-            torch.randn(MAX_FRAMES, 2, hand_features, generator=generator)[:n_frames].transpose(0, 1),
-            torch.randn(MAX_FRAMES, object_features, generator=generator)[:n_frames],
+            torch.randn(longest[0], 2, HAND_FEATURES, generator=generator)[: rows[0]].transpose(0, 1),
+            torch.randn(longest[1], OBJECT_FEATURES, generator=generator)[: rows[1]],
         )
         for generator in generators
     ]
-    return torch.stack([hands for hands, _ in rows]), torch.stack([objects for _, objects in rows])
+    return torch.stack([hands for hands, _ in drawn]), torch.stack([objects for _, objects in drawn])
 
 
 @torch.no_grad()
 def sample_motion(
     denoise: Denoise, noise: Motion, config: SamplerConfig, generator: torch.Generator | list[torch.Generator]
 ) -> Motion:
-    """Motions (hands, object) from noise, on the noise's device.
-
-    generator: of the noise that DDPM adds, one for all motions or one for each.
-    """
-    scheduler = noise_schedule(config.kind)
-    scheduler.set_timesteps(config.steps)
+    """Motions (hands, object) from noise, on the noise's device; ``generator`` as in :func:`sample`."""
     shapes = noise[0].shape, noise[1].shape
-    x = torch.cat([part.flatten(1) for part in noise], 1)
-    for timestep in scheduler.timesteps:
-        hands, objects = _unflatten(x, *shapes)
-        timesteps = torch.full((len(x),), int(timestep), device=x.device)
-        clean = torch.cat([part.flatten(1) for part in denoise(hands, objects, timesteps)], 1)
-        # diffusers draws from a list of generators too, one for each row, though its signature does not say so.
-        step = scheduler.step(clean, int(timestep), x, generator=generator, return_dict=False)  # pyright: ignore[reportArgumentType]
-        x = step[0]
-    return _unflatten(x, *shapes)
+
+    def denoise_both(x: Tensor, steps: Tensor) -> Tensor:
+        return torch.cat([part.flatten(1) for part in denoise(*_unflatten(x, *shapes), steps)], 1)
+
+    return _unflatten(
+        sample(denoise_both, torch.cat([part.flatten(1) for part in noise], 1), config, generator), *shapes
+    )
+
+
+@torch.no_grad()
+def sample(
+    denoise: Callable[[Tensor, Tensor], Tensor],
+    noise: Tensor,
+    config: SamplerConfig,
+    generator: torch.Generator | list[torch.Generator],
+) -> Tensor:
+    """Samples from noise (B, ...), on its device; ``denoise(x, t)`` gives what is clean in x at timesteps (B,).
+
+    generator: of the noise that DDPM adds, one for all rows or one for each.
+    """
+    x, walked, shares = noise, timesteps(config.steps), signal_shares()
+    before: Tensor | None = None
+    for number, step in enumerate(walked):
+        now, then = shares[step], shares[walked[number + 1]] if number + 1 < len(walked) else 1.0
+        clean = denoise(x, torch.full((len(x),), step, device=x.device))
+        if config.kind == "ddpm":
+            fresh = _drawn(x, generator) if then < 1 else torch.zeros_like(x)
+            x = _ddpm(x, clean, now, then, fresh)
+        elif config.kind == "ddim" or then == 1:
+            x = _ddim(x, clean, now, then)
+        else:
+            last = shares[walked[number - 1]] if number else now
+            x = _dpm_solver(x, clean, before, last, now, then)
+        before = clean
+    return x
+
+
+def _ddpm(x: Tensor, clean: Tensor, now: float, then: float, fresh: Tensor) -> Tensor:
+    """Ho et al. 2020, eq. 6-7: the posterior of a step, between signal shares ``now`` and ``then``."""
+    ratio = now / then
+    mean = math.sqrt(then) * (1 - ratio) / (1 - now) * clean + math.sqrt(ratio) * (1 - then) / (1 - now) * x
+    return mean + math.sqrt((1 - then) / (1 - now) * (1 - ratio)) * fresh
+
+
+def _ddim(x: Tensor, clean: Tensor, now: float, then: float) -> Tensor:
+    """Song et al. 2021, eq. 12 with sigma 0."""
+    return math.sqrt(then) * clean + math.sqrt((1 - then) / (1 - now)) * (x - math.sqrt(now) * clean)
+
+
+def _dpm_solver(x: Tensor, clean: Tensor, before: Tensor | None, last: float, now: float, then: float) -> Tensor:
+    """Lu et al. 2022 (DPM-Solver++), algorithm 2; its first step, without one ``before``, is of first order."""
+    width = _half_log_ratio(then) - _half_log_ratio(now)
+    data = clean
+    if before is not None:
+        share = (_half_log_ratio(now) - _half_log_ratio(last)) / width
+        data = clean + (clean - before) / (2 * share)
+    return math.sqrt((1 - then) / (1 - now)) * x - math.sqrt(then) * math.expm1(-width) * data
+
+
+def _half_log_ratio(share: float) -> float:
+    """Half the logarithm of signal over noise."""
+    return 0.5 * math.log(share / (1 - share))
+
+
+def _drawn(x: Tensor, generator: torch.Generator | list[torch.Generator]) -> Tensor:
+    if isinstance(generator, list):
+        return torch.stack([torch.randn(x.shape[1:], generator=own) for own in generator]).to(x)
+    return torch.randn(x.shape, generator=generator).to(x)
 
 
 def _unflatten(x: Tensor, hands_shape: tuple[int, ...], object_shape: tuple[int, ...]) -> Motion:

@@ -1,51 +1,70 @@
 """Training: one plain loop for every network, and the stage entry ``train_network``.
 
-Budgets are steps, never seconds; every draw comes from a seeded generator; deterministic algorithms and a fixed
-number of threads make equal inputs give equal bytes on one machine.
+Budgets are steps, never seconds; what a step draws comes from (seed, step, part of the batch). In a process that has
+called ``make_repeatable`` equal inputs give equal bytes on one machine, however often the training was killed.
 """
 
 import copy
-import csv
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from rich.progress import track
 from torch import nn
 
+from hoidata.batches.dataset import ClipBatch
 from hoidata.errors import BadInput
-from hoidata.files import atomic_file
+from hoidata.files import canonical_json, sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 from hoidata.settings import build_config, plain_config
 from hoidata.store.annotated import load_annotated
-from models.common.checkpoints import empty_reason, load_checkpoint, save_checkpoint, write_empty
-from models.common.corpus import Corpus, batches
+from models.common.checkpoints import (
+    FILE_NAME,
+    checkpoint_file,
+    empty_reason,
+    load_checkpoint,
+    save_checkpoint,
+    write_empty,
+)  # fmt: skip
+from models.common.corpus import Balance, Corpus, Wanted, batches
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands
+from models.common.precision import Precision, compute_in_bfloat16
+from models.common.progress import LOG_NAME, Progress, Row, State, write_log
+from models.common.repeatable import own_draws, seed_draws
+from models.common.team import Team
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
     """Budget and optimiser (AdamW). The defaults are Text2HOI's released ones, but for ``steps``.
 
-    schedule: "constant", or "cosine" to zero after ``warmup`` steps. average: decay of the running average of the
-    weights that is kept (0: the weights themselves). keep_best: keep the step with the lowest validation loss, not
-    the last.
+    schedule: "constant", or "cosine" to zero after ``warmup`` steps. ema_decay: of the running average of the weights
+    that is kept (0: the weights themselves). keep_best: keep the step with the lowest validation loss, not the last.
+    patience: stop after so many validations without a lower loss (0: never). balance: draw clips evenly, or verbs.
+    precision: of Transformers and point networks, where the time is; all else stays float32. parts: of a batch, whose
+    gradients (and statistics of batch norms) are averaged; they take turns, or are shared by ``train.processes``.
+    save_every: steps after which all is written down that a killed training needs to go on.
     """
 
     steps: int = 30_000
     batch: int = 64
     learning_rate: float = 1e-4
     weight_decay: float = 0.01
-    schedule: str = "constant"
+    schedule: Literal["constant", "cosine"] = "constant"
     warmup: int = 0
     ema_decay: float = 0.0
     clip_norm: float = 0.0
     keep_best: bool = False
+    patience: int = 0
     validate_every: int = 500
+    balance: Balance = "none"
+    precision: Precision = "float32"
+    parts: int = 1
+    save_every: int = 500
 
 
 @dataclass(frozen=True)
@@ -84,23 +103,25 @@ def train_network(
     *,
     needed: Mapping[Network, str | Path] | None = None,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
-    threads: int = 2,
     device: str = "cpu",
+    progress: str | Path | None = None,
+    code: str = "",
 ) -> Path:
     """Train one network on the training clips of one dataset; the path of what was written.
 
     annotated_root: folder with clips, annotation, contact and splits. params: see :meth:`Plan.of`.
     hands: the hand model of the clips where it is not the embedded one. provenance: from facts to what is stored.
     needed: the checkpoint folder of every network that ``network.needs`` names. device: as torch names it; recorded.
+    progress: a folder where a killed training leaves what it needs to go on, and its losses so far. code: a digest of
+    what runs; a training of other code, data or settings is not taken up.
 
     Reads the train split, and validation for choosing; never test. Writes ``model.safetensors`` and ``log.csv``, or
-    ``empty.json`` with the reason where there is nothing to train on.
+    ``empty.json`` with the reason where there is nothing to train on. In a :class:`Team` only one process writes.
     """
-    plan, needed = Plan.of(network, params), needed or {}
+    plan, needed, team = Plan.of(network, params), needed or {}, Team.joined()
     if missing := set(network.needs) - {other.name for other in needed}:
         got = f"none of {', '.join(sorted(missing))}"
         raise BadInput(f"training of {network.name}", "checkpoint folders", got, "pass needed")
-    make_repeatable(plan.seed, threads)
     folders = [*(Path(annotated_root) / name for name in ("clips", "annotation", "contact")), *needed.values()]
     if reason := next(filter(None, map(empty_reason, folders)), None):
         return write_empty(out_folder, reason)
@@ -110,10 +131,17 @@ def train_network(
         return write_empty(out_folder, f"{annotated_root}: no training clips")
     pair, where = annotated.store.hand_pair(), torch.device(device)
     trained = {other.name: load_checkpoint(folder, other, where) for other, folder in needed.items()}
-    setup = Setup(plan.network, plan.loss, plan.seed, corpus, Hands(pair), where, trained)
-    objective, normaliser = network.objective(setup)
-    kept, log = fit(objective, corpus, plan.training, plan.seed, where)
-    facts = {"model": network.name, "seed": plan.seed, "steps": plan.training.steps, "device": where.type}
+    with own_draws(where):
+        seed_draws(plan.seed)
+        setup = Setup(plan.network, plan.loss, plan.seed, corpus, Hands(pair), where, trained)
+        objective, normaliser = network.objective(setup)
+        kept_there = None
+        if progress is not None:
+            made_from = [network.name, code, corpus.digest(), pair.digest, where.type, asdict(plan)]
+            made_from += [sha256_file(checkpoint_file(folder)) for folder in needed.values()]
+            kept_there = Progress(Path(progress), sha256_bytes(canonical_json(made_from).encode()), team.writes)
+        kept, log = fit(objective, corpus, plan.training, plan.seed, where, kept_there)
+    facts = {"model": network.name, "seed": plan.seed, "steps": int(log[-1]["step"]), "device": where.type}
     facts |= corpus.facts(pair)
     info = {
         "facts": facts,
@@ -122,53 +150,108 @@ def train_network(
         "results": {"validation_loss": log[-1]["validation"], **network.results(kept.cpu(), corpus)},
         "provenance": provenance(facts) if provenance else {},
     }
+    if not team.writes:
+        return Path(out_folder) / FILE_NAME
     path = save_checkpoint(out_folder, network.name, kept, normaliser, info)
-    write_log(Path(out_folder) / "log.csv", log)
+    write_log(Path(out_folder) / LOG_NAME, log)
+    if kept_there:
+        kept_there.clear()
     return path
 
 
-def make_repeatable(seed: int, threads: int) -> None:
-    """Fix what could change bytes from run to run: seed, threads, algorithms. Matrix products may use bfloat16x3."""
-    torch.manual_seed(seed)
-    torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(True)
-    # Nothing here reads memory before writing it; filling it first would cost a seventh of the time.
-    setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010 (pyright does not know it)
-    torch.set_float32_matmul_precision("medium")
-
-
 def fit(
-    objective: Objective, corpus: Corpus, config: TrainingConfig, seed: int, device: torch.device
-) -> tuple[nn.Module, list[dict[str, float]]]:
+    objective: Objective,
+    corpus: Corpus,
+    config: TrainingConfig,
+    seed: int,
+    device: torch.device,
+    progress: Progress | None = None,
+) -> tuple[nn.Module, list[Row]]:
     """Run the steps; the network to keep, in evaluation mode, and one log row per validation."""
-    network = objective.network.train()
-    kept = copy.deepcopy(network).eval().requires_grad_(False)
+    team, network = Team.joined(), objective.network.train()
     learnt = [parameter for parameter in network.parameters() if parameter.requires_grad]
     optimiser = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
-    generator = torch.Generator().manual_seed(seed)
-    stream = batches(corpus.train, config.batch, generator, objective.needs_entries)
-    log, best, best_loss, running = [], None, math.inf, {}
-    for step in track(range(1, config.steps + 1), description=type(network).__name__, transient=True):
-        for group in optimiser.param_groups:
-            group["lr"] = config.learning_rate * learning_rate_factor(step, config)
-        found = objective.losses(next(stream).to(device), generator)
+    state = State(network, copy.deepcopy(network).eval().requires_grad_(False), optimiser)
+    if config.precision == "bfloat16":
+        compute_in_bfloat16(network)
+    if progress:
+        progress.load(state)
+    wanted = Wanted(objective.frames, objective.entries, team.own_parts(config.parts), config.parts, config.balance)
+    stream = batches(corpus.train, config.batch, seed, wanted, state.step)
+    remaining = range(state.step + 1, config.steps + 1)
+    for step in track(remaining, description=type(network).__name__, transient=True, disable=not team.writes):
+        if config.patience and state.since >= config.patience:
+            break
         optimiser.zero_grad(set_to_none=True)
-        found["total"].backward()
-        if config.clip_norm:
-            nn.utils.clip_grad_norm_(learnt, config.clip_norm)
-        optimiser.step()
-        _follow(kept, network, config.ema_decay if step > config.warmup else 0.0)
-        for name, value in found.items():
-            running.setdefault(name, []).append(value.detach())
+        _add_gradients(state, objective, next(stream), (seed, step, config.parts), device, team)
+        _update(state, learnt, config)
+        state.step = step
         if step % config.validate_every == 0 or step == config.steps:
-            row = {f"train_{name}": float(torch.stack(values).mean()) for name, values in running.items()}
-            loss, running = objective.validation(kept), {}
-            log.append({"step": step, "validation": loss, **row})
-            if config.keep_best and loss < best_loss:
-                best, best_loss = copy.deepcopy(kept.state_dict()), loss
-    if best is not None:
-        kept.load_state_dict(best)
-    return kept, log
+            _validate(state, objective, config, team)
+        if progress:
+            progress.keep(state, config.save_every)
+    if state.best:
+        state.kept.load_state_dict(state.best)
+    return state.kept, state.log
+
+
+def _add_gradients(
+    state: State,
+    objective: Objective,
+    parts: list[tuple[int, ClipBatch]],
+    numbers: tuple[int, int, int],
+    device: torch.device,
+    team: Team,
+) -> None:
+    """Gradients of one step, the mean over all parts of its batch. numbers: seed, step, and how many parts there are.
+
+    Every part starts with the same statistics of batch norms; the mean of what they become is kept.
+    """
+    seed, step, of = numbers
+    buffers = list(state.network.buffers()) if of > 1 else []
+    before = [buffer.clone() for buffer in buffers]
+    statistics = [buffer for buffer in buffers if buffer.is_floating_point()]
+    after = [torch.zeros_like(buffer) for buffer in statistics]
+    for part, batch in parts:
+        for buffer, old in zip(buffers, before, strict=True):
+            buffer.copy_(old)
+        found = objective.losses(batch.to(device), seed_draws(seed, step, part))
+        (found["total"] / of).backward()
+        for total, buffer in zip(after, statistics, strict=True):
+            total += buffer / of
+        for name, value in found.items():
+            state.running[name] = state.running.get(name, 0) + value.detach() / of
+    learnt = [parameter for parameter in state.network.parameters() if parameter.requires_grad]
+    for parameter in learnt:
+        # What a batch did not use (hands that are in none of its clips) has moments like all else, in every process.
+        parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+    team.add_up([*after, *(parameter.grad for parameter in learnt if parameter.grad is not None)])
+    for buffer, total in zip(statistics, after, strict=True):
+        buffer.copy_(total)
+
+
+def _update(state: State, learnt: list[nn.Parameter], config: TrainingConfig) -> None:
+    """One step of the optimiser and of the running average."""
+    for group in state.optimiser.param_groups:
+        group["lr"] = config.learning_rate * learning_rate_factor(state.step + 1, config)
+    if config.clip_norm:
+        nn.utils.clip_grad_norm_(learnt, config.clip_norm)
+    state.optimiser.step()
+    _follow(state.kept, state.network, config.ema_decay if state.step >= config.warmup else 0.0)
+
+
+def _validate(state: State, objective: Objective, config: TrainingConfig, team: Team) -> None:
+    """A row of the log; the weights and the loss where they are the best so far."""
+    team.add_up(state.running.values())
+    steps = state.step - (int(state.log[-1]["step"]) if state.log else 0)
+    row = {f"train_{name}": float(value) / steps for name, value in state.running.items()}
+    loss = float(objective.validation(state.kept))
+    state.log.append({"step": state.step, "validation": loss, **row})
+    state.running, better = {}, loss < state.best_loss
+    state.since = 0 if better else state.since + 1
+    state.best_loss = loss if better else state.best_loss
+    if better and config.keep_best:
+        state.best = copy.deepcopy(state.kept.state_dict())
 
 
 def learning_rate_factor(step: int, config: TrainingConfig) -> float:
@@ -188,11 +271,3 @@ def _follow(kept: nn.Module, network: nn.Module, decay: float) -> None:
         target.lerp_(source, 1 - decay)
     for target, source in zip(kept.buffers(), network.buffers(), strict=True):
         target.copy_(source)
-
-
-def write_log(path: Path, log: list[dict[str, float]]) -> None:
-    """log.csv: step, validation loss, and the mean training losses since the row before."""
-    with atomic_file(path) as partial, open(partial, "w", newline="") as stream:
-        writer = csv.DictWriter(stream, list(log[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in log)

@@ -78,9 +78,26 @@ class Encoder(nn.Module):
 
     def forward(self, x: Tensor, attention_mask: Tensor) -> Tensor:
         """(batch, token, width) to the same; ``attention_mask`` as in :class:`Block`."""
+        x, attention_mask, back = packed(x, attention_mask)
         for block in self.blocks:
             x = block(x, attention_mask)
-        return self.last_norm(x)
+        x = self.last_norm(x)
+        return x if back is None else x.gather(1, back[..., None].expand(-1, -1, x.shape[-1]))
+
+
+def packed(x: Tensor, attention_mask: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Tokens without those that nobody in the batch attends to, their mask, and where each token went (B, token).
+
+    The order of tokens is free: positions are codes in them. A token that is left out comes back as some other.
+    Only on CPUs: a GPU would have to wait for the number of tokens, and has room for all.
+    """
+    longest = int(attention_mask.sum(1).max()) if x.device.type == "cpu" else x.shape[1]
+    if longest == x.shape[1]:
+        return x, attention_mask, None
+    order = attention_mask.int().argsort(dim=1, descending=True, stable=True)
+    back = order.argsort(dim=1).clamp_max(longest - 1)
+    kept = order[:, :longest]
+    return x.gather(1, kept[..., None].expand(-1, -1, x.shape[-1])), attention_mask.gather(1, kept), back
 
 
 def sinusoid(positions: Tensor, width: int) -> Tensor:
@@ -110,20 +127,6 @@ def to_tokens(x: Tensor, frames_per_token: int) -> Tensor:
 def to_frames(tokens: Tensor, n_frames: int, frames_per_token: int) -> Tensor:
     """The inverse of :func:`to_tokens`, cut to ``n_frames``."""
     return tokens.reshape(*tokens.shape[:-2], -1, tokens.shape[-1] // frames_per_token)[..., :n_frames, :]
-
-
-def smoothed(x: Tensor, frames: Tensor, width_frames: float) -> Tensor:
-    """Gaussian mean over time of (B, ..., F, D) with standard deviation ``width_frames``; 0 changes nothing.
-
-    Only frames set in ``frames`` (B, F) count, so ends stay in place and padding does not enter.
-    """
-    if not width_frames:
-        return x
-    place = torch.arange(x.shape[-2], device=x.device, dtype=x.dtype)
-    near = torch.exp(-0.5 * ((place[:, None] - place) / width_frames).square())
-    weight = near * frames[:, None].to(x.dtype) + 1e-12
-    weight = weight / weight.sum(-1, keepdim=True)
-    return weight.reshape(len(x), *[1] * (x.ndim - 3), *weight.shape[1:]) @ x
 
 
 def attention_mask_of(frames: Tensor, frames_per_token: int) -> Tensor:

@@ -14,7 +14,7 @@ from hoidata.metrics.encoded import UNKNOWN
 from hoidata.metrics.majority import majority_rows
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from models.common.checkpoints import save_checkpoint
-from models.common.training import make_repeatable
+from models.common.repeatable import own_draws
 from models.evaluator.encoders import stored_network, weights_digest
 from models.evaluator.examples import Examples
 from models.evaluator.networks import EncoderConfig, MotionEncoder
@@ -44,7 +44,6 @@ def train_evaluators(
     hands: HandPair | None = None,
     *,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
-    threads: int = 1,
 ) -> dict[str, Any] | str:
     """Write ``out/<network>/model.safetensors`` and ``out/info.json``; what stands there, or why nothing was written.
 
@@ -63,7 +62,7 @@ def train_evaluators(
         "evaluators": {},
     }
     for name in settings.networks:
-        trainings = [_trained(name, seed, parts, settings, threads) for seed in settings.seeds]
+        trainings = [_trained(name, seed, parts, settings) for seed in settings.seeds]
         kept = sorted(trainings, key=lambda one: (one.chosen_by, -one.seed))[len(trainings) // 2]
         by_seed = {str(one.seed): one.figures for one in trainings}
         facts = _facts(name, kept, parts, settings, annotated, info["labels"])
@@ -90,12 +89,13 @@ def _why_not(train: Examples, settings: EvaluatorSettings) -> str | None:
     )
 
 
-def _trained(name: str, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings, threads: int) -> Trained:
-    make_repeatable(seed, threads)
+def _trained(name: str, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings) -> Trained:
     train = parts["train"]
     held_out = parts["validation"] if len(parts["validation"]) else train
-    task, network = _task(name, train, settings), MotionEncoder(config_of(name, train, settings.labels))
-    fit(network, task, train, held_out, RECIPES[name], seed, settings.most_steps)
+    with own_draws():
+        torch.manual_seed(seed)
+        task, network = _task(name, train, settings), MotionEncoder(config_of(name, train, settings.labels))
+        fit(network, task, train, held_out, RECIPES[name], seed, settings.most_steps)
     if isinstance(task, Classification):
         found = {split: _accuracies(network, task, examples) for split, examples in parts.items() if len(examples)}
         chosen_by = _accuracies(network, task, held_out)["top1"]

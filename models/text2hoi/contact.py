@@ -1,11 +1,8 @@
 """Which points of an object the hands will touch, from a sentence: PointNet and a conditional VAE.
 
-Text2HOI Sec. 3.1 and supplement, Tables S4-S6. Deviations, each for a reason: the hand type is an explicit input (a
-sentence embedding hardly encodes left and right); layers that see per-clip features compute them once per clip
-instead of once per point (the same function); sizes come from the config.
+Text2HOI Sec. 3.1 and supplement, Tables S4-S6. Layers that see per-clip features compute them once per clip instead of
+once per point (the same function).
 """
-
-from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -14,33 +11,8 @@ from torch.nn import functional
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from models.common.features import scaled_text
-from models.common.point_net import PointLayer, PointNet, PointNetConfig, normalised_points
-
-HAND_FLAGS = 2
-
-
-@dataclass(frozen=True)
-class ContactConfig:
-    """Sizes; the defaults are the paper's."""
-
-    point_net: PointNetConfig = field(default_factory=PointNetConfig)
-    decoder_widths: tuple[int, int, int] = (512, 256, 128)
-    latent: int = 64
-    text: int = 512
-    dropout: float = 0.0
-
-
-@dataclass(frozen=True)
-class ContactLossConfig:
-    """Weights of KL divergence and Dice term beside the mean cross-entropy.
-
-    augment: turn and scale objects. points: how many points of every object a step sees, drawn anew each time.
-    """
-
-    kl_weight: float = 0.01
-    dice_weight: float = 1.0
-    augment: bool = True
-    points: int = 1024
+from models.common.point_net import PointLayer, PointNet, normalised_points
+from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
 
 
 class ContactModel(nn.Module):
@@ -54,11 +26,16 @@ class ContactModel(nn.Module):
         self.object_net = PointNet(3, config.point_net)
         self.contact_net = PointNet(4, config.point_net)
         self.to_latent = nn.Sequential(
-            PointLayer(overall, heads[0]), PointLayer(heads[0], heads[1]), nn.Linear(heads[1], 2 * config.latent)
+            PointLayer(overall, heads[0]),
+            PointLayer(heads[0], heads[1]),
+            nn.Dropout(config.encoder_dropout),
+            nn.Linear(heads[1], 2 * config.latent),
         )
         first, second, third = config.decoder_widths
-        self.from_point = nn.Linear(local + 3, first)
-        self.from_clip = nn.Linear(overall + 1 + config.text + HAND_FLAGS + config.latent, first, bias=False)
+        more = (3, HAND_FLAGS) if config.told else (0, 0)
+        # Table S6's first layer, which sees the same numbers of a clip at each point, in two pieces.
+        self.from_point = nn.Linear(local + more[0], first)
+        self.from_clip = nn.Linear(overall + 1 + config.text + more[1] + config.latent, first, bias=False)
         self.rest = nn.Sequential(
             nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
@@ -79,8 +56,10 @@ class ContactModel(nn.Module):
         """Logits (B, N) from points (B, N, 3), sentence (B, text), hand flags (B, 2) and z (B, latent)."""
         points, scale = normalised_points(points_m)
         overall, local = self.object_net(points)
-        clip = torch.cat((overall, scale, scaled_text(text), active_hands.float(), latent), -1)
-        mixed = self.from_point(torch.cat((local, points), -1)) + self.from_clip(clip)[:, None]
+        text = scaled_text(text) if self.config.text_scaled else text
+        flags, places = ([active_hands.float()], [points]) if self.config.told else ([], [])
+        clip = torch.cat((overall, scale, text, *flags, latent), -1)
+        mixed = self.from_point(torch.cat((local, *places), -1)) + self.from_clip(clip)[:, None]
         return self.rest(mixed)[..., 0]
 
     def forward(
@@ -93,8 +72,9 @@ class ContactModel(nn.Module):
 
     @torch.no_grad()
     def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, N) for latents (count, B, latent) drawn from N(0, I); in evaluation mode."""
-        return torch.stack([self.decode(points_m, text, active_hands, z).sigmoid() for z in latents], 1)
+        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I)."""
+        maps = torch.stack([self.decode(points_m, text, active_hands, z).sigmoid() for z in latents], 1)
+        return maps[:, :, None] * active_hands[:, None, :, None]
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
         """(count, clip, latent) draws from N(0, I)."""
@@ -106,6 +86,7 @@ def contact_loss(
 ) -> dict[str, Tensor]:
     """Cross-entropy, Dice (per clip) and KL divergence to N(0, I) per latent, as named parts and their "total"."""
     cross = functional.binary_cross_entropy_with_logits(logits, contact_map)
+    cross = cross * logits.shape[1] if weights.reduction == "sum" else cross
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact_map).sum(1) + 1) / (probability.sum(1) + contact_map.sum(1) + 1)
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()

@@ -39,7 +39,7 @@ class OtherContact:
             clip if request.clip_id in self.others else LeftOut(request.motion_id, reason)
             for request, clip in zip(requests, made, strict=True)
         ]
-        return answers, [contact_map.numpy() > 0 for contact_map in own]
+        return answers, [contact_map.amax(0).numpy() > 0 for contact_map in own]
 
 
 @dataclass(frozen=True)

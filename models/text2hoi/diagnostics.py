@@ -11,11 +11,10 @@ from hoidata.batches.dataset import ClipSample, HoiDataset, collate
 from models.common.checkpoints import load_checkpoint
 from models.common.family import Figures, Sources
 from models.common.point_net import normalised_points
-from models.text2hoi.contact import ContactModel
 from models.text2hoi.contact_training import CONTACT, contact_threshold
 from models.text2hoi.length import LengthModel
 from models.text2hoi.length_training import LENGTH
-from models.text2hoi.thresholds import best_threshold, contact_probabilities, mean_f1, true_maps
+from models.text2hoi.thresholds import ContactNetwork, best_threshold, contact_probabilities, mean_f1, true_maps
 
 CONTACT_SAMPLES = 32
 
@@ -37,7 +36,7 @@ def contact_figures(
 ) -> dict[str, float]:
     """F1 of the mean of samples at the checkpoint's threshold, beside mean maps at thresholds chosen alike."""
     checkpoint = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT)
-    assert isinstance(checkpoint.network, ContactModel)
+    assert isinstance(checkpoint.network, ContactNetwork)
     threshold = contact_threshold(checkpoint)
     f1 = mean_f1(contact_probabilities(checkpoint.network, test, CONTACT_SAMPLES, 0), true_maps(test), threshold)
     baselines = {}
@@ -61,7 +60,7 @@ def length_figures(sources: Sources, train: list[ClipSample], test: list[ClipSam
     """Mean absolute error of the expected length, in frames, beside the mean length of the training clips."""
     network = load_checkpoint(sources.checkpoints / LENGTH.name, LENGTH).network
     assert isinstance(network, LengthModel)
-    batch = collate(test, with_entries=False)
+    batch = collate(test)
     true = batch.lengths.numpy()
     error = float(np.abs(network.expected_frames(batch.text[:, 0], batch.active_hands).numpy() - true).mean())
     baseline = float(np.abs(np.mean([sample.length for sample in train]) - true).mean())

@@ -1,12 +1,12 @@
 """The motion generator: a Transformer that denoises both hands and the object together.
 
 Text2HOI Sec. 3.2 and supplement, Tables S7-S9: tokens [condition] + (left, right, object) x frames, frame-wise and
-agent-wise position codes, x0-prediction, masks by hand type and length. Deviations, switchable in the config: tokens of
-several frames, codes that count the frames left to the end, and contact given by its moments instead of the raw map,
-whose order of points means something different on every object. Hand flags are explicit inputs beside the masks.
+agent-wise position codes, x0-prediction, masks by hand type and length. Each deviation is a switch of the config, off
+by default: what stands for a motion (``motion_code``), contact as points to attend to, sentences through a learnt
+projection, the condition in every token, codes that count to the end. Hand flags are explicit inputs beside the masks.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
-from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
+from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES, OBJECT_POSITION, WRIST
 from models.common.features import Normaliser, proper_hands, proper_object, scaled_text
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
@@ -24,89 +24,128 @@ from models.common.transformer import (
     agent_codes,
     attention_mask_of,
     sinusoid,
-    smoothed,
     to_frames,
     to_tokens,
 )
-
-CONTACT_MOMENTS = 13
+from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens
+from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 
 
 @dataclass(frozen=True)
 class DiffusionConfig:
     """transformer: its sizes. point_net: as in the contact model it comes from. The defaults are the paper's.
 
-    smoothing_frames: samples are smoothed over time by a Gaussian of this deviation: a small model, trained for
-    minutes, lets some of the noise it starts from through.
+    motion: what a token stands for. normalised: rows by mean and spread of the training clips, not metres and numbers
+    as they are. codes: of frames and agents, or (for an ablation) less. first_code: number of the first frame's code.
+    contact_input: "map", the paper's raw numbers, "tokens", ``contact_tokens`` of each kind, or "none". scale_input,
+    centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
+    is read from its own token, or from the object's as well (released). text_scaled: to a length of sqrt(512).
+    text_input: a linear layer, or "projection", a normalised one with a hidden layer. condition_everywhere: the
+    condition is added to every token instead of being one. frames_to_go: tokens know how far they are from the end.
+    signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
+    is to happen (Chen 2023).
     """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
+    motion: MotionCodeConfig = field(default_factory=MotionCodeConfig)
     points: int = 1024
     text: int = 512
-    contact_input: Literal["map", "moments"] = "map"
+    normalised: bool = False
+    codes: Literal["frames and agents", "frames", "none"] = "frames and agents"
+    first_code: int = 0
+    contact_input: Literal["map", "tokens", "none"] = "map"
+    contact_tokens: int = 12
+    scale_input: bool = True
+    centroid: bool = False
+    told: bool = False
+    hand_head: Literal["hand", "hand and object"] = "hand"
+    text_scaled: bool = False
+    text_input: Literal["linear", "projection"] = "linear"
+    condition_everywhere: bool = False
     frames_to_go: bool = False
+    signal_scale: float = 1.0
     condition_dropout: float = 0.1
-    smoothing_frames: float = 0.0
 
 
 @dataclass(frozen=True)
 class Condition:
-    """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3);
-    contact_map (B, N); active_hands (B, 2) hand flags; frames (B, F) True up to each length."""
+    """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3); part (B, N);
+    contact (B, 2, N) 0 or 1 for each hand; active_hands (B, 2) hand flags; lengths (B,), and as plain values counts and
+    sides (``RequestBatch``).
+    """
 
     text: Tensor
     object: Tensor
     points_m: Tensor
     normals: Tensor
-    contact_map: Tensor
+    part: Tensor
+    contact: Tensor
     active_hands: Tensor
-    frames: Tensor
+    lengths: Tensor
+    counts: tuple[int, ...]
+    sides: tuple[bool, bool]
 
     @classmethod
-    def of(cls, batch: RequestBatch, object_feature: Tensor, text: Tensor, contact_map: Tensor) -> "Condition":
-        """From a batch, with one sentence (B, 512) and one contact map (B, N) of each motion."""
-        return cls(text, object_feature, batch.points_m, batch.normals, contact_map, batch.active_hands, batch.frames)
-
-    def repeat(self, count: int) -> "Condition":
-        """Every clip ``count`` times in a row."""
-        return Condition(*(getattr(self, name).repeat_interleave(count, 0) for name in self.__dataclass_fields__))
+    def of(cls, batch: RequestBatch, object_feature: Tensor, text: Tensor, contact: Tensor) -> "Condition":
+        """From a batch, with one sentence (B, 512) and the contact (B, 2, N) of each motion."""
+        shape = batch.points_m, batch.normals, batch.part
+        return cls(text, object_feature, *shape, contact, batch.active_hands, batch.lengths, batch.counts, batch.sides)
 
 
-def contact_moments(points_m: Tensor, normals: Tensor, contact_map: Tensor) -> Tensor:
-    """(B, 13) summary of a contact map (B, N) that does not depend on the order of the points.
+@dataclass(frozen=True)
+class _Prepared:
+    """A condition as the Transformer takes it, the same at every timestep.
 
-    Mean and spread of the touched points about the object's centre, in units of its size and in metres (mean), their
-    mean normal, and the share of points touched.
+    text, object, extent (B, width). points (B, C, width) contact tokens with their mask (B, C). hand_rows (B, 2, K),
+    object_rows (B, L) bool: the rows of a motion that are there. lengths (B,). sides: which hands are in any motion;
+    the others' tokens are left out.
     """
-    points, scale = normalised_points(points_m)
-    weight = contact_map / contact_map.sum(1, keepdim=True).clamp_min(1.0)
-    mean = (weight[..., None] * points).sum(1)
-    spread = (weight[..., None] * (points - mean[:, None]).square()).sum(1).clamp_min(1e-8).sqrt()
-    normal = (weight[..., None] * normals).sum(1)
-    return torch.cat((mean, spread, normal, mean * scale * 10, contact_map.mean(1, keepdim=True)), -1)
+
+    text: Tensor
+    object: Tensor
+    extent: Tensor
+    points: Tensor
+    points_mask: Tensor
+    hand_rows: Tensor
+    object_rows: Tensor
+    lengths: Tensor
+    sides: tuple[int, ...]
+
+    def twice(self) -> "_Prepared":
+        """Every motion two times, one whole batch after the other."""
+        own = {name: value for name, value in vars(self).items() if isinstance(value, Tensor) and value.ndim}
+        return replace(self, **{name: torch.cat((value, value)) for name, value in own.items()})
 
 
 class DiffusionModel(nn.Module):
-    """``x0 = model(hands, object, timesteps, condition)`` in normalised features."""
+    """``x0 = model(hands, object, timesteps, condition)`` in normalised rows of the motion code."""
+
+    signal: Tensor
 
     def __init__(self, config: DiffusionConfig) -> None:
         super().__init__()
-        self.config = config
-        width, per_token = config.transformer.width, config.transformer.frames_per_token
+        self.config, self.code = config, MotionCode(config.motion)
+        self.register_buffer("signal", alphas_cumprod(), persistent=False)
+        width = config.transformer.width
+        self.hand_rows = config.transformer.frames_per_token
+        self.object_rows = self.hand_rows * config.motion.object_knots
         # Trained with the contact model and frozen here; kept so that a checkpoint of this model is enough to sample.
         self.object_net = PointNet(3, config.point_net).requires_grad_(False)
-        self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * per_token, width) for _ in range(2)])
-        self.object_in = nn.Linear(OBJECT_FEATURES * per_token, width)
+        self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * self.hand_rows, width) for _ in range(2)])
+        self.object_in = nn.Linear(OBJECT_FEATURES * self.object_rows, width)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
-        self.text_in = nn.Linear(config.text, width)
-        contact = config.points if config.contact_input == "map" else CONTACT_MOMENTS
-        self.object_condition_in = nn.Linear(config.point_net.widths[-1] + contact + 1, width)
-        self.extent_in = nn.Linear(3, width)
-        self.to_go_in = nn.Linear(width, width) if config.frames_to_go else None
+        self.text_in = _text_layers(config)
+        as_map = config.contact_input == "map"
+        body = config.point_net.widths[-1] + config.points * as_map + config.scale_input + 3 * config.centroid
+        self.object_condition_in = nn.Linear(body, width)
+        self.points_in = _hidden_layer(TOKEN_FEATURES, width) if config.contact_input == "tokens" else None
+        self.extent_in = nn.Linear(3, width) if config.told else None
+        self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
         self.encoder = Encoder(config.transformer)
-        self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * per_token) for _ in range(2)])
-        self.object_out = nn.Linear(width, OBJECT_FEATURES * per_token)
+        head = width * (2 if config.hand_head == "hand and object" else 1)
+        self.hands_out = nn.ModuleList([nn.Linear(head, HAND_FEATURES * self.hand_rows) for _ in range(2)])
+        self.object_out = nn.Linear(width, OBJECT_FEATURES * self.object_rows)
 
     @torch.no_grad()
     def object_feature(self, points_m: Tensor) -> Tensor:
@@ -117,70 +156,138 @@ class DiffusionModel(nn.Module):
     def forward(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, keep: Tensor | None = None
     ) -> Motion:
-        """Clean hands (B, 2, F, 99) and object (B, F, 10) from noised ones at timesteps (B,).
+        """Clean hands (B, 2, K, 99) and object (B, L, 10) from noised ones at timesteps (B,).
 
         keep: (B, 2) factors 0 or 1 of the text and object conditions, for condition dropout and guidance.
         Padding and hands that do not act neither enter nor influence anything; their outputs mean nothing.
         """
-        n_frames, k = hands.shape[2], self.config.transformer.frames_per_token
-        frames = condition.frames
-        attended = (
-            torch.cat((condition.active_hands, torch.ones_like(condition.active_hands[:, :1])), 1)[:, :, None]
-            & frames[:, None]
-        )
-        objects = objects * frames[..., None]
-        hands = hands * attended[:, :2, :, None]
-        agents = [layer(to_tokens(hands[:, side], k)) for side, layer in enumerate(self.hands_in)]
-        tokens = torch.stack((*agents, self.object_in(to_tokens(objects, k))), 1)
-        tokens = tokens + self._codes(frames, tokens.shape[2])
-        first = self._condition(timesteps, condition, keep)[:, None]
-        attention_mask = attention_mask_of(attended, k)
-        x = torch.cat((first, tokens.flatten(1, 2)), 1)
-        x = self.encoder(x, torch.cat((attention_mask.new_ones(len(attention_mask), 1), attention_mask.flatten(1)), 1))
-        left, right, body = x[:, 1:].unflatten(1, tokens.shape[1:3]).unbind(1)
-        both = [to_frames(layer(t), n_frames, k) for layer, t in zip(self.hands_out, (left, right), strict=True)]
-        return torch.stack(both, 1), to_frames(self.object_out(body), n_frames, k)
+        return self.denoise(hands, objects, timesteps, self.prepare(condition), keep)
 
-    def _codes(self, frames: Tensor, n_tokens: int) -> Tensor:
-        """Position codes (B or 1, 3, token, width): by frame, by agent, and by frames to go."""
-        width, k = self.config.transformer.width, self.config.transformer.frames_per_token
-        place = torch.arange(n_tokens, device=frames.device) * k
-        codes = sinusoid(place, width)[None, None] + agent_codes(width, frames.device)[None, :, None]
+    def prepare(self, condition: Condition) -> _Prepared:
+        """The part of ``forward`` that is the same at every timestep (Text2HOI eq. 2, plus hand flags and length)."""
+        lengths = condition.lengths
+        hand_rows, object_rows = self.code.rows(condition.counts, lengths.device)
+        contact = condition.contact.bool() & condition.active_hands[..., None]
+        points = condition.points_m.new_zeros(len(lengths), 0, self.config.transformer.width)
+        points_mask = points.new_zeros(points.shape[:2], dtype=torch.bool)
+        if self.points_in is not None:
+            shape = condition.points_m, condition.normals, condition.part
+            points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
+            points = self.points_in(points)
+        extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
+        return _Prepared(
+            self.text_in(scaled_text(condition.text) if self.config.text_scaled else condition.text),
+            self.object_condition_in(self._body(condition, contact)),
+            self.extent_in(extent) if self.extent_in is not None else points.new_zeros(()),
+            points,
+            points_mask,
+            condition.active_hands[:, :, None] & hand_rows[:, None],
+            object_rows,
+            lengths,
+            tuple(side for side in range(2) if condition.sides[side]),
+        )
+
+    def _body(self, condition: Condition, contact: Tensor) -> Tensor:
+        """(B, D) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
+        config, body = self.config, [condition.object]
+        if config.contact_input == "map":
+            body.append(contact.any(1).float())
+        if config.scale_input:
+            body.append(normalised_points(condition.points_m)[1])
+        if config.centroid:
+            body.append(condition.points_m.mean(1))
+        return torch.cat(body, -1)
+
+    def denoise(
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, known: _Prepared, keep: Tensor | None = None
+    ) -> Motion:
+        """``forward`` for a condition that has been prepared."""
+        size, spread = self._size(timesteps), self.config.signal_scale
+        hands, objects = self._layers(hands * size[:, None], objects * size, timesteps, known, keep)
+        return hands * spread, objects * spread
+
+    def _size(self, timesteps: Tensor) -> Tensor:
+        """(B, 1, 1) factors that make noised rows of ``signal_scale`` as wide as 1."""
+        share = self.signal[timesteps][:, None, None]
+        return (share * self.config.signal_scale**2 + 1 - share).rsqrt()
+
+    def _layers(
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, known: _Prepared, keep: Tensor | None
+    ) -> Motion:
+        k, wide = self.hand_rows, self.object_rows
+        hands = hands * known.hand_rows[..., None]
+        agents = [self.hands_in[side](to_tokens(hands[:, side], k)) for side in known.sides]
+        agents.append(self.object_in(to_tokens(objects * known.object_rows[..., None], wide)))
+        codes = agent_codes(self.config.transformer.width, hands.device)[[*known.sides, 2]]
+        codes = codes if self.config.codes == "frames and agents" else torch.zeros_like(codes)
+        tokens = [x + code + self._codes(known.lengths, x.shape[1]) for x, code in zip(agents, codes, strict=True)]
+        masks = [attention_mask_of(known.hand_rows[:, side], k) for side in known.sides]
+        masks.append(attention_mask_of(known.object_rows, wide))
+        first, points = self._condition(timesteps, known, keep)
+        moving = torch.cat(tokens, 1)
+        if self.config.condition_everywhere:
+            moving = moving + first
+        x = torch.cat((moving, first, points), 1)
+        points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:] > 0)
+        mask = torch.cat((*masks, masks[-1].new_ones(len(x), 1), points_mask), 1)
+        *own, body = self.encoder(x, mask)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
+        found = [hands.new_zeros(hands[:, 0].shape)] * 2
+        for side, token in zip(known.sides, own, strict=True):
+            seen = torch.cat((token, body), -1) if self.config.hand_head == "hand and object" else token
+            found[side] = to_frames(self.hands_out[side](seen), hands.shape[2], k)
+        return torch.stack(found, 1), to_frames(self.object_out(body), objects.shape[1], wide)
+
+    def _codes(self, lengths: Tensor, n_tokens: int) -> Tensor:
+        """Position codes (B or 1, token, width): by frame, and by frames to go and the share that is done."""
+        width = self.config.transformer.width
+        place = torch.arange(n_tokens, device=lengths.device) * (
+            self.hand_rows * max(1, self.config.motion.knot_frames)
+        )
+        codes = sinusoid(place + self.config.first_code, width)[None]
+        codes = torch.zeros_like(codes) if self.config.codes == "none" else codes
         if self.to_go_in is not None:
-            to_go = frames.sum(1)[:, None] - place
-            codes = codes + self.to_go_in(sinusoid(to_go.clamp_min(0), width))[:, None]
+            to_go = (lengths[:, None] - place).clamp_min(0)
+            done = place * MAX_FRAMES / lengths[:, None]
+            codes = codes + self.to_go_in(torch.cat((sinusoid(to_go, width), sinusoid(done, width)), -1))
         return codes
 
-    def _condition(self, timesteps: Tensor, condition: Condition, keep: Tensor | None) -> Tensor:
-        """The condition token (B, width): Text2HOI eq. 2 and 3, plus hand flags and length."""
-        _, scale = normalised_points(condition.points_m)
-        contact = condition.contact_map
-        if self.config.contact_input == "moments":
-            contact = contact_moments(condition.points_m, condition.normals, condition.contact_map)
-        text = self.text_in(scaled_text(condition.text))
-        body = self.object_condition_in(torch.cat((condition.object, contact, scale), -1))
+    def _condition(self, timesteps: Tensor, known: _Prepared, keep: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The condition token (B, 1, width) and the contact tokens: Text2HOI eq. 3."""
+        text, body, points = known.text, known.object, known.points
         if keep is not None:
             text, body = text * keep[:, :1], body * keep[:, 1:]
-        length = condition.frames.sum(1, keepdim=True) / MAX_FRAMES
-        extent = self.extent_in(torch.cat((condition.active_hands.float(), length), -1))
         time = self.step_in(sinusoid(timesteps, self.config.transformer.width))
-        return time + text + body + extent
+        return (time + text + body + known.extent)[:, None], points
+
+
+def _text_layers(config: DiffusionConfig) -> nn.Module:
+    if config.text_input == "linear":
+        return nn.Linear(config.text, config.transformer.width)
+    return nn.Sequential(nn.LayerNorm(config.text), _hidden_layer(config.text, config.transformer.width))
+
+
+def _hidden_layer(inputs: int, width: int) -> nn.Module:
+    return nn.Sequential(nn.Linear(inputs, width), nn.GELU(), nn.Linear(width, width))
 
 
 def guided(model: DiffusionModel, condition: Condition, guidance: float) -> Denoise:
     """The model as a denoiser for ``sample_motion``; classifier-free guidance (Ho and Salimans 2022) if not 1."""
+    known = model.prepare(condition)
 
     def denoise(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
-        conditional = model(hands, objects, timesteps, condition)
-        if guidance == 1:
-            return conditional
-        unconditional = model(hands, objects, timesteps, condition, hands.new_zeros(len(hands), 2))
-        return (
-            unconditional[0] + guidance * (conditional[0] - unconditional[0]),
-            unconditional[1] + guidance * (conditional[1] - unconditional[1]),
-        )
+        return model.denoise(hands, objects, timesteps, known)
 
-    return denoise
+    def denoise_guided(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
+        both = [torch.cat((x, x)) for x in (hands, objects, timesteps)]
+        # Words are what is pushed; an object that is not there would be a motion of another kind altogether.
+        keep = torch.ones(2 * len(hands), 2, device=hands.device)
+        keep[len(hands) :, 0] = 0
+        found = [own.chunk(2) for own in model.denoise(both[0], both[1], both[2], doubled, keep)]
+        guided_hands, guided_objects = (without + guidance * (told - without) for told, without in found)
+        return guided_hands, guided_objects
+
+    doubled = known.twice() if guidance != 1 else known
+    return denoise if guidance == 1 else denoise_guided
 
 
 @dataclass(frozen=True)
@@ -198,25 +305,34 @@ class MotionGenerator:
         noise: Motion,
         generator: torch.Generator | list[torch.Generator],
     ) -> Motion:
-        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise of these shapes; generator: of DDPM's."""
+        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise (B, 2, K, 99) and (B, L, 10).
+
+        generator: of DDPM's noise. The object's origin is at zero in the first frame.
+        """
         denoise = guided(self.network, condition, sampler.guidance)
         device = condition.text.device
-        hands, objects = sample_motion(denoise, (noise[0].to(device), noise[1].to(device)), sampler, generator)
-        width = self.network.config.smoothing_frames
-        return self._features((smoothed(hands, condition.frames, width), smoothed(objects, condition.frames, width)))
+        coded = sample_motion(denoise, (noise[0].to(device), noise[1].to(device)), sampler, generator)
+        hands, objects = self._features(coded, condition)
+        shift = objects[:, :1, OBJECT_POSITION].clone()
+        hands[..., WRIST] -= shift[:, None]
+        objects[..., OBJECT_POSITION] -= shift
+        return hands, objects
 
     @torch.no_grad()
     def denoise_once(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, generator: torch.Generator
     ) -> Motion:
-        """Given motions, noised to ``timesteps`` (B,) and denoised by a single call."""
+        """Normalised rows of motions, noised to ``timesteps`` (B,) and denoised by a single call."""
         signal = alphas_cumprod(timesteps.device)
         noised = []
-        for clean in self.normaliser.encode(hands, objects):
+        for clean in (hands, objects):
             noise = torch.randn(clean.shape, generator=generator)
             noised.append(add_noise(clean, noise.to(clean.device), timesteps, signal))
-        return self._features(self.network(noised[0], noised[1], timesteps, condition))
+        return self._features(self.network(noised[0], noised[1], timesteps, condition), condition)
 
-    def _features(self, motion: Motion) -> Motion:
-        hands, objects = self.normaliser.decode(*motion)
+    def _features(self, coded: Motion, condition: Condition) -> Motion:
+        code, counts = self.network.code, condition.counts
+        rows = code.settled(*self.normaliser.decode(*coded), counts)
+        hands, objects = code.curves(*rows, counts)
+        hands = code.in_world(hands, objects)
         return proper_hands(hands), proper_object(objects)

@@ -1,11 +1,12 @@
 """How many frames a motion described by a sentence lasts.
 
 Text2HOI Sec. 4.1 regresses the length from text and noise with a squared error, which teaches a network to ignore the
-noise. Here the network gives a mean and a spread and the noise scales the spread, trained by Gaussian likelihood: the
-noise keeps its meaning and nothing can collapse.
+noise. The other way here: the network gives a mean and a spread and the noise scales the spread, trained by Gaussian
+likelihood: the noise keeps its meaning and nothing can collapse.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
@@ -14,47 +15,84 @@ from hoidata.batches.dataset import MAX_FRAMES
 from models.common.features import scaled_text
 
 SHORTEST_FRAMES = 8
+EXPECTED_OF = 32  # draws
+WIDEST_DRAW = 2.0  # standard deviations; lengths of one verb have limits, a Gaussian has none
 
 
 @dataclass(frozen=True)
 class LengthConfig:
-    """Sizes; ``width`` is the paper's 512."""
+    """Sizes; ``width`` is the paper's 512, and so is ``noise``, 64.
+
+    drawn_by: "noise" among the inputs, or "spread". text_scaled: features at a length of sqrt(512). told: hand flags.
+    """
 
     text: int = 512
     width: int = 512
-    dropout: float = 0.1
+    dropout: float = 0.0
+    noise: int = 64
+    drawn_by: Literal["noise", "spread"] = "noise"
+    text_scaled: bool = False
+    told: bool = False
+
+
+@dataclass(frozen=True)
+class LengthLossConfig:
+    """jitter: lengths are changed by up to this share (the released training: 0.05)."""
+
+    jitter: float = 0.0
 
 
 class LengthModel(nn.Module):
-    """Mean and log-spread of the length, in units of 150 frames, from a sentence (B, text) and hand flags (B, 2)."""
+    """The length, in units of 150 frames, from a sentence (B, text), hand flags (B, 2), and what is drawn."""
 
     def __init__(self, config: LengthConfig) -> None:
         super().__init__()
         self.config = config
+        spread = config.drawn_by == "spread"
         self.layers = nn.Sequential(
-            nn.Linear(config.text + 2, config.width),
-            nn.ReLU(),
+            nn.Linear(config.text + 2 * config.told + (0 if spread else config.noise), config.width),
+            nn.ReLU() if spread else nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
-            nn.Linear(config.width, 2),
+            nn.Linear(config.width, 2 if spread else 1),
         )
 
-    def forward(self, text: Tensor, active_hands: Tensor) -> tuple[Tensor, Tensor]:
-        mean, log_spread = self.layers(torch.cat((scaled_text(text), active_hands.float()), -1)).unbind(-1)
+    def draw(self, count: int, generator: torch.Generator) -> Tensor:
+        """(count, D) draws from N(0, I)."""
+        return torch.randn(count, 1 if self.config.drawn_by == "spread" else self.config.noise, generator=generator)
+
+    def moments(self, text: Tensor, active_hands: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """(B,) mean and log-spread; of a length that is drawn by noise (B, D) itself, the spread stands for nothing."""
+        text = scaled_text(text) if self.config.text_scaled else text
+        inputs = [text, *([active_hands.float()] if self.config.told else [])]
+        if self.config.drawn_by == "noise":
+            length = self.layers(torch.cat((noise, *inputs), -1))[:, 0].sigmoid()
+            return length, torch.zeros_like(length)
+        mean, log_spread = self.layers(torch.cat(inputs, -1)).unbind(-1)
         # Between 1 and 55 frames, reached smoothly: a hard limit would have no gradient.
         return mean + 0.5, 2 * log_spread.tanh() - 3
 
     @torch.no_grad()
     def expected_frames(self, text: Tensor, active_hands: Tensor) -> Tensor:
         """(B,) expected number of frames, not rounded."""
-        return (self(text, active_hands)[0] * MAX_FRAMES).clamp(SHORTEST_FRAMES, MAX_FRAMES)
+        count = 1 if self.config.drawn_by == "spread" else EXPECTED_OF
+        noise = self.draw(count, torch.Generator().manual_seed(0)).to(text.device)
+        drawn = [self.moments(text, active_hands, own.expand(len(text), -1))[0] for own in noise]
+        return (torch.stack(drawn).mean(0) * MAX_FRAMES).clamp(SHORTEST_FRAMES, MAX_FRAMES)
 
     @torch.no_grad()
     def sample(self, text: Tensor, active_hands: Tensor, generator: torch.Generator) -> Tensor:
         """(B,) whole numbers of frames, 8 to 150, with noise drawn from ``generator``."""
-        mean, log_spread = self(text, active_hands)
-        noise = torch.randn(len(text), generator=generator, device=generator.device)
-        frames = (mean + log_spread.exp() * noise) * MAX_FRAMES
-        return frames.round().clamp(SHORTEST_FRAMES, MAX_FRAMES).long()
+        noise = self.draw(len(text), generator).to(text.device)
+        mean, log_spread = self.moments(text, active_hands, noise)
+        drawn = noise[:, 0].clamp(-WIDEST_DRAW, WIDEST_DRAW)
+        spread = log_spread.exp() * drawn if self.config.drawn_by == "spread" else 0.0
+        return ((mean + spread) * MAX_FRAMES).round().clamp(SHORTEST_FRAMES, MAX_FRAMES).long()
+
+
+def length_error(length: Tensor, frames: Tensor) -> dict[str, Tensor]:
+    """Text2HOI's squared error of lengths (B,) in units of 150 frames."""
+    square = (frames.float() / MAX_FRAMES - length).square().mean()
+    return {"total": square, "square": square}
 
 
 def length_loss(mean: Tensor, log_spread: Tensor, frames: Tensor) -> dict[str, Tensor]:
@@ -67,7 +105,7 @@ def length_loss(mean: Tensor, log_spread: Tensor, frames: Tensor) -> dict[str, T
     return {"total": total, "square": square.mean(), "likelihood": likelihood.mean()}
 
 
-def jittered_frames(lengths: Tensor, generator: torch.Generator) -> Tensor:
-    """Lengths times a factor drawn from 0.95-1.05 (Text2HOI's released training)."""
-    factor = 0.95 + 0.1 * torch.rand(len(lengths), generator=generator)
+def jittered_frames(lengths: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """Lengths times a factor drawn from 1 - ``share`` to 1 + ``share``."""
+    factor = 1 + share * (2 * torch.rand(len(lengths), generator=generator) - 1)
     return lengths * factor.to(lengths.device)

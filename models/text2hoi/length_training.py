@@ -1,42 +1,50 @@
 """Training of the length network: what one step and one validation are."""
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
 from models.common.corpus import Corpus, any_form
-from models.common.family import Losses, Network
-from models.text2hoi.length import LengthConfig, LengthModel, jittered_frames, length_loss
+from models.common.family import Losses, Network, Objective, Setup
+from models.text2hoi.length import (
+    LengthConfig,
+    LengthLossConfig,
+    LengthModel,
+    jittered_frames,
+    length_error,
+    length_loss,
+)
 
 
 class LengthObjective:
-    """Text2HOI Sec. 4.1, with a likelihood in place of the plain squared error."""
+    """Text2HOI Sec. 4.1: the squared error; of a length with a spread, a likelihood."""
 
-    needs_entries = False
+    frames = entries = 0
 
-    def __init__(self, network: LengthModel, corpus: Corpus, device: torch.device) -> None:
-        self.network = network
-        self.held_out = collate(corpus.held_out, with_entries=False).to(device)
+    def __init__(self, network: LengthModel, loss: LengthLossConfig, corpus: Corpus, device: torch.device) -> None:
+        self.network, self.loss, self.device = network, loss, device
+        self.held_out = collate(corpus.held_out).to(device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        frames = jittered_frames(batch.lengths, generator)
-        mean, log_spread = self.network(any_form(batch, generator), batch.active_hands)
-        return length_loss(mean, log_spread, frames)
+        frames = jittered_frames(batch.lengths, self.loss.jitter, generator)
+        noise = self.network.draw(len(batch), generator).to(self.device)
+        mean, log_spread = self.network.moments(any_form(batch, generator), batch.active_hands, noise)
+        spread = self.network.config.drawn_by == "spread"
+        return length_loss(mean, log_spread, frames) if spread else length_error(mean, frames)
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, LengthModel)
         held = self.held_out
         errors = [
             (network.expected_frames(held.text[:, form], held.active_hands) - held.lengths).abs()
             for form in range(held.text.shape[1])
         ]
-        return float(torch.stack(errors).mean())
+        return torch.stack(errors).mean()
 
 
-LENGTH = Network(
-    "length",
-    LengthConfig,
-    LengthModel,
-    lambda setup: (LengthObjective(LengthModel(setup.network).to(setup.device), setup.corpus, setup.device), None),
-)
+def _objective(setup: Setup) -> tuple[Objective, None]:
+    return LengthObjective(LengthModel(setup.network).to(setup.device), setup.loss, setup.corpus, setup.device), None
+
+
+LENGTH = Network("length", LengthConfig, LengthModel, _objective, LengthLossConfig)

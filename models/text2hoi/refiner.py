@@ -1,26 +1,34 @@
 """The hand refiner: moves generated hands out of the object and onto its surface.
 
-Text2HOI Sec. 3.3 and supplement, Table S10: a Transformer over left- and right-hand tokens gives a residual on the
-coarse hands; the object stays. Deviations: everything is seen and corrected in the object's frame, where the same
-touch always looks the same; the displacement to the surface enters with its sign beside the attention map, without
-which inside and outside look alike; only the output layers start at zero (a residual of zero), so every layer learns
-from the first step.
+Text2HOI Sec. 3.3 and supplement, Table S10: a Transformer over left- and right-hand tokens; the object stays. Each
+deviation is a switch, off by default: everything seen and corrected in the object's frame, where the same touch always
+looks the same; the displacement to the surface with its sign beside the attention map, without which inside and outside
+look alike; a residual that starts at zero, of whose layers only the last does, so that all learn from the first step.
 """
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, HAND_POSE_6D, HAND_ROTATIONS_6D, WRIST
-from models.common.features import object_position_m, object_rotmat, proper_hands
+from hoidata.batches.requests import RequestBatch
+from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, WRIST
+from models.common.features import (
+    hands_in_object_frame,
+    hands_in_world,
+    object_position_m,
+    object_rotmat,
+    place_points,
+    proper_hands,
+)
+from models.common.spline import projected
 from models.common.transformer import (
     Encoder,
     TransformerConfig,
     agent_codes,
     attention_mask_of,
     sinusoid,
-    smoothed,
     to_frames,
     to_tokens,
 )
@@ -32,18 +40,24 @@ REACH_M = 0.05
 
 @dataclass(frozen=True)
 class RefinerConfig:
-    """transformer: its sizes. contact_map: also read the raw contact map and the norms of the placed points (paper).
+    """transformer: its sizes. contact_map: read the raw contact map and the norms of the placed points.
 
-    wrist_reach_m, rotation_reach: what an output of one means for the wrist and for a 6D number. smoothing_frames: the
-    residual is smoothed over time by a Gaussian of this deviation, so that corrections never jitter.
+    view: the frame of hands, joints and displacements. attention: of displacements per axis, or of their squares
+    (released). surface_input: signed distances and displacements are read too. output: the hands, or what is added to
+    them; of that, one means wrist_reach_m for the wrist and rotation_reach for a 6D number. knot_frames: the output
+    becomes the nearest spline with a knot every so many frames (0: stays), so that corrections never jitter.
     """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     contact_map: bool = True
     points: int = 1024
-    wrist_reach_m: float = 0.05
-    rotation_reach: float = 0.3
-    smoothing_frames: float = 0.0
+    view: Literal["world", "object"] = "world"
+    attention: Literal["absolute", "square"] = "absolute"
+    surface_input: bool = False
+    output: Literal["hands", "residual"] = "hands"
+    wrist_reach_m: float = 1.0
+    rotation_reach: float = 1.0
+    knot_frames: int = 0
 
 
 @dataclass(frozen=True)
@@ -51,7 +65,7 @@ class CoarseMotion:
     """What the refiner sees: hands (B, 2, F, 99) and object (B, F, 10) in metres; and in the object's frame joints_m
     (B, 2, F, 21, 3), their signed distance_m (B, 2, F, 21) and offset_m to the nearest surface point (B, 2, F, 21, 3).
 
-    present (B, 2, F) masks; points_m (B, N, 3) the object's sampled points; contact_map (B, N) the contact map.
+    present (B, 2, F) masks; asked: the motions' objects and lengths; contact_map (B, N) the contact map.
     """
 
     hands: Tensor
@@ -60,33 +74,13 @@ class CoarseMotion:
     distance_m: Tensor
     offset_m: Tensor
     present: Tensor
-    points_m: Tensor
+    asked: RequestBatch
     contact_map: Tensor
 
 
-def attention_map(offset_m: Tensor) -> Tensor:
+def attention_map(offset_m: Tensor, kind: str = "absolute") -> Tensor:
     """exp(-50 |D|) per axis of the displacement to the nearest surface point (Text2HOI Sec. 3.3; GRIP)."""
-    return torch.exp(-ATTENTION_RATE_PER_M * offset_m.abs())
-
-
-def hands_in_object_frame(hands: Tensor, objects: Tensor) -> Tensor:
-    """Hand features (B, 2, F, 99) relative to the object (B, F, 10): wrist and global rotation; fingers unchanged."""
-    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
-    return _moved(hands, rotation.transpose(-1, -2), position)
-
-
-def hands_in_world(hands: Tensor, objects: Tensor) -> Tensor:
-    """The inverse of :func:`hands_in_object_frame`."""
-    rotation, position = object_rotmat(objects)[:, None], object_position_m(objects)[:, None]
-    back = -(position[..., None, :] @ rotation)[..., 0, :]
-    return _moved(hands, rotation, back)
-
-
-def _moved(hands: Tensor, rotation: Tensor, origin: Tensor) -> Tensor:
-    """Wrist and global 6D turned by ``rotation`` about ``origin``."""
-    wrist = (rotation @ (hands[..., WRIST] - origin)[..., None])[..., 0]
-    columns = rotation @ hands[..., GLOBAL_ORIENT_6D].unflatten(-1, (3, 2))
-    return torch.cat((wrist, columns.flatten(-2), hands[..., HAND_POSE_6D]), -1)
+    return torch.exp(-ATTENTION_RATE_PER_M * (offset_m.abs() if kind == "absolute" else offset_m.square()))
 
 
 class RefinerModel(nn.Module):
@@ -98,11 +92,12 @@ class RefinerModel(nn.Module):
         super().__init__()
         self.config = config
         width, k = config.transformer.width, config.transformer.frames_per_token
-        inputs = HAND_FEATURES + 3 * JOINT_FEATURES + 21 + (2 * config.points if config.contact_map else 0)
+        inputs = HAND_FEATURES + 2 * JOINT_FEATURES + (JOINT_FEATURES + 21) * config.surface_input
+        inputs += 2 * config.points * config.contact_map
         self.hands_in = nn.ModuleList([nn.Linear(inputs * k, width) for _ in range(2)])
         self.encoder = Encoder(config.transformer)
         self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * k) for _ in range(2)])
-        for layer in self.hands_out:
+        for layer in self.hands_out if config.output == "residual" else ():
             nn.init.zeros_(layer.weight)  # pyright: ignore[reportArgumentType]
             nn.init.zeros_(layer.bias)  # pyright: ignore[reportArgumentType]
         reach = torch.full((HAND_FEATURES,), config.rotation_reach)
@@ -112,7 +107,7 @@ class RefinerModel(nn.Module):
     def forward(self, coarse: CoarseMotion) -> Tensor:
         """Hands that are absent, and padding, neither influence anything nor mean anything in the result."""
         k, n_frames = self.config.transformer.frames_per_token, coarse.hands.shape[2]
-        local = hands_in_object_frame(coarse.hands, coarse.object)
+        local = self.seen(coarse.hands, coarse.object)
         inputs = self._inputs(coarse, local) * coarse.present[..., None]
         agents = [layer(to_tokens(inputs[:, side], k)) for side, layer in enumerate(self.hands_in)]
         tokens = torch.stack(agents, 1)
@@ -124,24 +119,35 @@ class RefinerModel(nn.Module):
         attention_mask[:, 0] |= ~attention_mask.any(1)
         both = self.encoder(tokens.flatten(1, 2), attention_mask).unflatten(1, tokens.shape[1:3]).unbind(1)
         change = [to_frames(layer(x), n_frames, k) for layer, x in zip(self.hands_out, both, strict=True)]
-        residual = smoothed(torch.stack(change, 1), coarse.present.any(1), self.config.smoothing_frames)
-        return hands_in_world(local + residual * self.reach, coarse.object)
+        residual = torch.stack(change, 1)
+        if self.config.knot_frames:
+            residual = projected(residual, list(coarse.asked.counts), self.config.knot_frames)
+        hands = local + residual * self.reach if self.config.output == "residual" else residual
+        return hands_in_world(hands, coarse.object) if self.config.view == "object" else hands
+
+    def seen(self, hands: Tensor, objects: Tensor) -> Tensor:
+        """Hands (B, 2, F, 99) of the world in the frame they are seen in, beside objects (B, F, 10)."""
+        return hands_in_object_frame(hands, objects) if self.config.view == "object" else hands
 
     def _inputs(self, coarse: CoarseMotion, local: Tensor) -> Tensor:
-        scaled = torch.cat((local[..., WRIST] * 10, local[..., HAND_ROTATIONS_6D]), -1)
-        offset = coarse.offset_m / (coarse.offset_m.norm(dim=-1, keepdim=True) + REACH_M)
-        parts = [
-            scaled,
-            (coarse.joints_m * 10).flatten(-2),
-            attention_map(coarse.offset_m).flatten(-2),
-            offset.flatten(-2) * 2,
-            (coarse.distance_m / REACH_M).clamp(-2, 2),
-        ]
-        if self.config.contact_map:
-            shape = (*local.shape[:-1], self.config.points)
+        """(B, 2, F, D) all that is read: hands, joints, attention map, and what the config adds."""
+        config, objects = self.config, coarse.object
+        joints, offset = coarse.joints_m, coarse.offset_m
+        if config.view == "world":
+            turn = object_rotmat(objects)[:, None].transpose(-1, -2)
+            joints, offset = joints @ turn + object_position_m(objects)[:, None, :, None], offset @ turn
+        scale = 10 if config.view == "object" else 1
+        parts = [local[..., WRIST] * scale, local[..., HAND_ROTATIONS_6D], (joints * scale).flatten(-2)]
+        parts.append(attention_map(offset, config.attention).flatten(-2))
+        if config.surface_input:
+            towards = coarse.offset_m / (coarse.offset_m.norm(dim=-1, keepdim=True) + REACH_M)
+            parts += [towards.flatten(-2) * 2, (coarse.distance_m / REACH_M).clamp(-2, 2)]
+        if config.contact_map:
+            shape = (*local.shape[:-1], config.points)
             # In the object's frame the norms of the points do not change with the motion.
-            norms = coarse.points_m.norm(dim=-1)[:, None, None].expand(shape)
-            parts += [norms, coarse.contact_map[:, None, None].expand(shape)]
+            own = coarse.asked.points_m[:, None] if config.view == "object" else place_points(coarse.asked, objects)
+            norms = own.norm(dim=-1)
+            parts += [norms[:, None].expand(shape), coarse.contact_map[:, None, None].expand(shape)]
         return torch.cat(parts, -1)
 
 

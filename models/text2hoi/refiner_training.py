@@ -1,19 +1,22 @@
 """Training of the hand refiner on motions made by the frozen generator (Text2HOI eq. 8-11)."""
 
 from dataclasses import dataclass
+from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
+from hoidata.batches.sight import Sight
 from models.common import losses
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
 from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
-from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame
+from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
 from models.text2hoi.surface import Surface
 
 GENERATED_AT_ONCE = 32
@@ -22,16 +25,22 @@ PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")
 
 @dataclass(frozen=True)
 class RefinerLossConfig:
-    """Weights of eq. 9, 10 and 11 (the paper: 1, 1, 5), with lengths in centimetres.
+    """Weights of eq. 9, 10 and 11, with lengths in ``unit_m``.
 
-    frames, vertices: how many frames per clip and vertices per hand the surface losses see. samples: coarse motions
-    made per training clip, half by denoising it once, half sampled in ``sampler_steps``. field_resolution: of the
-    grids.
+    weighting: eq. 9 is the sum of a frame's squared errors; "even" counts their mean. touch: joints near the surface
+    are drawn onto it, as in the paper, or those that truly touch to where they truly are. generated: coarse motions are
+    clips denoised once, whose hands they are to get back, or only half of them; see :class:`RefinerObjective`. frames,
+    vertices: how many frames per clip and vertices per hand the surface losses see. samples: coarse motions made per
+    training clip, sampled ones in ``sampler_steps``. field_resolution: of the grids.
     """
 
     simple_weight: float = 1.0
     penetration_weight: float = 1.0
     contact_weight: float = 5.0
+    unit_m: float = 1.0
+    weighting: Literal["sum", "even"] = "sum"
+    touch: Literal["surface", "truth"] = "surface"
+    generated: Literal["once", "half"] = "once"
     frames: int = 8
     vertices: int = 259
     samples: int = 4
@@ -43,8 +52,8 @@ class RefinerLossConfig:
 class _Coarse:
     """One generated motion of a clip as the refiner sees it, frame first, and the hands to stay near.
 
-    view: the tensors of :class:`CoarseMotion` that have frames, by name, (F, ...). target: (F, 2, 99), relative to the
-    object. true_distance_m: (F, 2, 21) of the joints to the surface in the clip itself.
+    view: the tensors of :class:`CoarseMotion` that have frames, by name, (F, ...). target: (F, 2, 99), as the network
+    sees hands. true_distance_m: (F, 2, 21) of the joints to the surface in the clip itself.
     """
 
     view: dict[str, Tensor]
@@ -67,7 +76,7 @@ class RefinerObjective:
     back to the clip's own hands relative to the object. The others are sampled from noise, as in use, where no true
     hands exist: they are to stay near themselves. All are to touch as the clip does, and not to penetrate."""
 
-    needs_entries = False
+    entries = 0
 
     def __init__(
         self,
@@ -80,39 +89,48 @@ class RefinerObjective:
         seed: int,
     ) -> None:
         self.network, self.weights, self.device = network, weights, device
+        self.frames = weights.frames
         self.generator, self.surface = generator, surface
+        self.targets = Targets(generator.network.code, generator.normaliser, device)
         self.vertices = torch.arange(0, 778, max(1, 778 // weights.vertices), device=device)
         draws = torch.Generator().manual_seed(seed)
         train, held_out = list(corpus.train), corpus.held_out
-        kinds = ["once" if number % 2 == 0 else "sampled" for number in range(weights.samples)]
+        half = weights.generated == "half"
+        kinds = ["sampled" if half and number % 2 else "once" for number in range(weights.samples)]
         self.pool = {sample.clip_id: [] for sample in train}
         for kind in kinds:
             for sample, coarse in zip(train, self._make(train, kind, draws), strict=True):
                 self.pool[sample.clip_id].append(coarse)
-        held = self._make(held_out, "sampled", torch.Generator().manual_seed(0))
-        self.held_out = self._batch(collate(held_out, with_entries=False).to(device), held)
+        held = self._make(held_out, kinds[-1], torch.Generator().manual_seed(0))
+        self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         number = torch.randint(self.weights.samples, (len(batch),), generator=generator).tolist()
         motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, number, strict=True)]
-        return self._losses(self.network, self._batch(batch, motions), generator)
+        return self._losses(self.network, self._batch(batch, motions))
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
+    def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, RefinerModel)
-        found = self._losses(network, self.held_out, torch.Generator().manual_seed(0))
-        return float(found["total"])
+        return self._losses(network, self.held_out)["total"]
 
-    def _losses(self, network: RefinerModel, seen: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
+    def _sight(self, samples: list[ClipSample]) -> Sight:
+        return Sight.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
+
+    def _losses(self, network: RefinerModel, seen: _Comparison) -> dict[str, Tensor]:
         batch, coarse, weights = seen.batch, seen.coarse, self.weights
         refined = network(coarse)
-        change = (hands_in_object_frame(refined, coarse.object) - seen.target) / network.reach
+        change = (network.seen(refined, coarse.object) - seen.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
-        chosen = losses.pick_frames(batch.frames, weights.frames, generator)
+        simple = simple * change.shape[-1] if weights.weighting == "sum" else simple
+        chosen = batch.chosen
         present, true = (losses.take_frames(part, chosen, 2) for part in (coarse.present, seen.true_distance_m))
         skin, inner = self._distances(batch, losses.take_frames(refined, chosen, 2), coarse.object, chosen)
-        penetration = losses.penetration_loss(skin, present)
-        contact = losses.contact_loss(inner, true, present, batch.contact_threshold_m)
+        penetration = losses.penetration_loss(skin, present, weights.unit_m)
+        if weights.touch == "surface":
+            contact = losses.surface_loss(inner, present, batch.contact_threshold_m, weights.unit_m)
+        else:
+            contact = losses.contact_loss(inner, true, present, batch.contact_threshold_m, weights.unit_m)
         total = weights.simple_weight * simple + weights.penetration_weight * penetration
         total = total + weights.contact_weight * contact
         return {"total": total, "simple": simple, "penetration": penetration, "contact": contact}
@@ -135,7 +153,7 @@ class RefinerObjective:
             pad_sequence([getattr(motion, name) for motion in motions], batch_first=True).transpose(1, 2)
             for name in ("target", "true_distance_m")
         )
-        common = {"present": batch.present, "points_m": batch.points_m, "contact_map": batch.contact_map}
+        common = {"present": batch.present, "asked": batch, "contact_map": batch.contact_map}
         return _Comparison(batch, CoarseMotion(object=objects, **hands, **common), target, true)
 
     @torch.no_grad()
@@ -145,11 +163,11 @@ class RefinerObjective:
         made: dict[int, _Coarse] = {}
         for start in range(0, len(order), GENERATED_AT_ONCE):
             rows = order[start : start + GENERATED_AT_ONCE]
-            batch = collate([samples[index] for index in rows], with_entries=False).to(self.device)
+            batch = collate([samples[index] for index in rows]).to(self.device)
             hands, objects = self._generate(batch, kind, draws)
             coarse = self.surface.coarse(batch, hands, objects, batch.contact_map, batch.present)
             own = (batch.hands, batch.object) if kind == "once" else (hands, objects)
-            target = hands_in_object_frame(*own).transpose(1, 2)
+            target = self.network.seen(*own).transpose(1, 2)
             true = self.surface.measure(batch, batch.joints_m, batch.object)[1].transpose(1, 2)
             view = {name: getattr(coarse, name).transpose(1, 2) for name in PER_HAND} | {"object": objects}
             for row, index in enumerate(rows):
@@ -161,13 +179,15 @@ class RefinerObjective:
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
         form = torch.randint(batch.text.shape[1], (len(batch),), generator=draws).to(self.device)
         text = batch.text[torch.arange(len(batch), device=form.device), form]
-        condition = Condition.of(batch, self.generator.network.object_feature(batch.points_m), text, batch.contact_map)
+        network = self.generator.network
+        condition = Condition.of(batch, network.object_feature(batch.points_m), text, batch.contact)
+        rows = self.targets.of(batch)
         if kind == "sampled":
             sampler = SamplerConfig(steps=self.weights.sampler_steps)
-            noise = draw_motion(batch.hands.shape, batch.object.shape, draws)
+            noise = draw_motion(rows.hands.shape, rows.object.shape, draws)
             return self.generator.sample(condition, sampler, noise, draws)
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=draws).to(self.device)
-        return self.generator.denoise_once(batch.hands, batch.object, steps, condition, draws)
+        return self.generator.denoise_once(rows.hands, rows.object, steps, condition, draws)
 
 
 def _refiner_objective(setup: Setup) -> tuple[Objective, None]:

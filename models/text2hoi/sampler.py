@@ -12,22 +12,21 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hoidata.batches.requests import Request, collate_requests
+from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
-from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.hands import HandPair
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.sampling import SamplerConfig, draw_each
-from models.text2hoi.contact import ContactModel
-from models.text2hoi.contact_training import contact_threshold
+from models.text2hoi.contact_training import touched_maps
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import motion_generator
 from models.text2hoi.length import LengthModel
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.refiner import RefinerModel, refine
 from models.text2hoi.surface import Surface
+from models.text2hoi.thresholds import ContactNetwork
 
 AT_ONCE = 256
 
@@ -103,7 +102,7 @@ class Text2Hoi:
     ) -> list[Text2HoiMotion]:
         """Every stage of one motion per request; without refinement ``refined`` is ``coarse``.
 
-        contact_maps: (N,) per request, 0 or 1, in the place of what the contact network would draw.
+        contact_maps: (2, N) by hand, or (N,) for either, 0 or 1, per request: in the place of what would be drawn.
         """
         made: list[Text2HoiMotion] = []
         models = {request.object.name: request.object for request in requests}.values()
@@ -115,10 +114,10 @@ class Text2Hoi:
 
     @torch.no_grad()
     def contact_maps(self, requests: Sequence[Request]) -> list[Tensor]:
-        """(N,) the contact map, 0 or 1, that each motion would be made for."""
+        """(2, N) by hand the contact map, 0 or 1, that each motion would be made for."""
         batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
-        return list(self._contact_maps(batch.points_m, batch.text, batch.active_hands, generators).cpu())
+        return list(self._contact(batch, generators).cpu())
 
     def sample_lengths(self, text: Tensor, active_hands: Tensor, generator: torch.Generator) -> list[int]:
         """Numbers of frames, 8 to 150, for sentences (B, 512) and hand flags (B, 2)."""
@@ -132,13 +131,15 @@ class Text2Hoi:
         batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
         # Drawn even where they are given: the noise of a motion comes after it from the same generator.
-        contact_maps = self._contact_maps(batch.points_m, batch.text, batch.active_hands, generators)
+        contact = self._contact(batch, generators)
         if given is not None:
-            contact_maps = torch.stack(list(given)).to(contact_maps)
+            contact = torch.stack([own.expand(2, -1) for own in given]).to(contact) * batch.active_hands[..., None]
         generator = motion_generator(self.trained["diffusion"])
-        condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact_maps)
-        noise = draw_each(HAND_FEATURES, OBJECT_FEATURES, batch.frames.shape[1], generators)
+        condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact)
+        code = generator.network.code
+        noise = draw_each(code.largest, code.sizes(batch.frames.shape[1]), generators)
         coarse, objects = generator.sample(condition, self.config.sampler, noise, generators)
+        contact_maps = contact.amax(1)
         refined = coarse
         if surface is not None:
             network = self.trained["refiner"].network
@@ -147,16 +148,12 @@ class Text2Hoi:
         parts = zip(coarse, refined, objects, contact_maps, strict=True)
         return [
             Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())
-            for (before, after, thing, contact_map), n in zip(parts, batch.lengths.tolist(), strict=True)
+            for (before, after, thing, contact_map), n in zip(parts, batch.counts, strict=True)
         ]
 
-    def _contact_maps(
-        self, points_m: Tensor, text: Tensor, active_hands: Tensor, generators: Sequence[torch.Generator]
-    ) -> Tensor:
-        """(B, N) one drawn contact map each, 0 or 1; the likeliest points where none reaches the threshold."""
+    def _contact(self, batch: RequestBatch, generators: Sequence[torch.Generator]) -> Tensor:
+        """(B, 2, N) one drawn map for each hand, 0 or 1."""
         network = self.trained["contact"].network
-        assert isinstance(network, ContactModel)
-        latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1).to(self.device)
-        probability = network.sample(points_m, text, active_hands, latents)[:, 0]
-        limit = torch.tensor(contact_threshold(self.trained["contact"]), device=self.device)
-        return (probability >= torch.minimum(probability.amax(1, keepdim=True), limit)).float()
+        assert isinstance(network, ContactNetwork)
+        latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1)
+        return touched_maps(self.trained["contact"], batch, batch.text, latents)

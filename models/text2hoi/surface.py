@@ -33,7 +33,7 @@ class Surface:
         """
         joints = self.hands.joints(hands, batch.betas, batch.template_m)
         local, distance, offset = self.measure(batch, joints, objects)
-        return CoarseMotion(hands, objects, local, distance, offset, present, batch.points_m, contact_map)
+        return CoarseMotion(hands, objects, local, distance, offset, present, batch, contact_map)
 
     def measure(self, batch: RequestBatch, points_m: Tensor, objects: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """For points (B, 2, F, P, 3) of the model frame and objects (B, F, 10): the points in the object's frame, their

@@ -5,7 +5,10 @@ import torch
 
 from hoidata.batches.dataset import ClipSample, collate
 from hoidata.contact.agreement import f1_score
+from models.text2hoi.anchored_contact import AnchoredContact
 from models.text2hoi.contact import ContactModel
+
+ContactNetwork = ContactModel | AnchoredContact
 
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 
@@ -28,13 +31,23 @@ def true_maps(samples: list[ClipSample]) -> np.ndarray:
 
 
 @torch.no_grad()
-def contact_probabilities(network: ContactModel, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
+def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
     """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
-    batch = collate(samples, with_entries=False)
+    batch = collate(samples)
     latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(seed))
-    return network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).mean(1).numpy()
+    return network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2).mean(1).numpy()
 
 
-def choose_contact_threshold(network: ContactModel, held_out: list[ClipSample]) -> float:
+def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]) -> float:
     """The threshold with the best mean F1 of the mean of 32 samples on held-out clips."""
     return best_threshold(contact_probabilities(network, held_out, 32, seed=0), true_maps(held_out))
+
+
+@torch.no_grad()
+def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
+    """The threshold at which single samples touch as large a share of an object as held-out clips do."""
+    batch = collate(held_out)
+    latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(0))
+    found = network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2)
+    share = float(batch.contact.any(1).float().mean())
+    return min(THRESHOLDS, key=lambda threshold: abs(float((found >= threshold).float().mean()) - share))

@@ -220,9 +220,11 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
     console, top = Console(), Tree(_label(tree))
     for child in tree.children:
         _grow(top, child)
-    clips = record.get("clips", {}) if isinstance(record.get("stages"), dict) else {}
+    clips = {} if tree.kind == "motion" else record.get("clips", {})
     branch = top.add("clips it was trained and judged on") if clips else top
-    for split, ids in clips.items():
+    if isinstance(clips, str):
+        branch.add(f"clips seen: {escape(clips)}")
+    for split, ids in clips.items() if isinstance(clips, dict) else ():
         names = branch.add(f"{split}: {len(ids)}")
         for clip_id in ids if show_clips else ids[:3]:
             names.add(escape(clip_id))

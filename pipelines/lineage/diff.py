@@ -13,7 +13,7 @@ _SEED = "train.seed"
 
 def differences(root: Path | None, first: dict[str, Any], second: dict[str, Any]) -> list[str]:
     """The causes, one line each; none where nothing that is recorded differs."""
-    pairs = _paired(first["stages"], second["stages"])
+    pairs = _paired(first.get("stages", {}), second.get("stages", {}))
     found = [line for name, (one, other) in pairs.items() for line in _stage_differences(name, one, other)]
     found += _seed(first, second)
     found += _facts(first, second)
@@ -73,7 +73,8 @@ def _manifests(one: dict, other: dict) -> list[str]:
 
 def _seed(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
     def seed(record: dict[str, Any]) -> Any:
-        return record.get("seed", record["stages"][record["stage"]]["params"].get(_SEED))
+        last = record.get("stages", {}).get(record.get("stage"), {})
+        return record.get("seed", last.get("params", {}).get(_SEED))
 
     return [] if seed(first) == seed(second) else [f"seed: {seed(first)} -> {seed(second)}"]
 
@@ -88,7 +89,7 @@ def _facts(first: dict[str, Any], second: dict[str, Any]) -> list[str]:
 
 
 def _encoder_param(record: dict[str, Any]) -> Any:
-    params = (stage["params"].get("annotate") for stage in record["stages"].values())
+    params = (stage["params"].get("annotate") for stage in record.get("stages", {}).values())
     return next((values.get("encoder") for values in params if isinstance(values, dict)), None)
 
 

@@ -34,6 +34,9 @@ def steps(tree: Node, record: dict[str, Any]) -> list[Step]:
     if tree.kind == "motion":
         inputs = {child.name: child.digest for child in tree.children}
         return [Step("generate", {}, "", inputs, {tree.name: tree.digest})]
+    if imported := record.get("imported"):
+        published = _with("sha256", {f"published {name}": digest for name, digest in imported.items()})
+        return [Step("import", {}, "", published, {tree.name: tree.digest})]
     last = record["stage"]
     algorithm = "md5" if record.get("schema", "").startswith("hoidata.lock") else "sha256"
     found = []

@@ -52,7 +52,7 @@ class Stage:
 
 
 def look_up(values: dict[str, Any], dotted: str) -> Any:
-    """The value at a dotted key (``train.demo.contact``). Raises BadInput naming the keys there are."""
+    """The value at a dotted key (``train.small.contact``). Raises BadInput naming the keys there are."""
     found: Any = values
     for key in dotted.split("."):
         if not isinstance(found, dict) or key not in found:

@@ -46,10 +46,9 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
 
 def _raw_facts(root: Path, facts: dict[str, Any], stages: dict[str, Any]) -> dict[str, Any]:
     """The raw files and frames behind the clips, so that the header tells them where there is no store."""
-    from pipelines.lineage.raw import read_raw, stores_behind
+    from pipelines.lineage.raw import clips_of, read_raw, stores_behind
 
-    wanted = {clip for ids in facts.get("clips", {}).values() for clip in ids}
-    found = {path: read_raw(root, path, wanted) for path in stores_behind({"stages": stages})}
+    found = {path: read_raw(root, path, clips_of(facts)) for path in stores_behind({"stages": stages})}
     return {path: source.as_json() for path, source in found.items() if source is not None}
 
 

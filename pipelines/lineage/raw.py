@@ -95,15 +95,24 @@ def raw_sources(root: Path | None, record: dict[str, Any]) -> list[RawSource]:
         return [raw_from_json(store, values) for store, values in record["raw"].items()]
     if root is None:
         return []
-    wanted = {clip for ids in record["clips"].values() for clip in ids} if "clips" in record else None
+    wanted = clips_of(record) if "clips" in record else None
     sources = (read_raw(root, path, wanted) for path in stores_behind(record))
     return [source for source in sources if source is not None]
+
+
+def clips_of(record: dict[str, Any]) -> set[str]:
+    """The clips a checkpoint learned from or was chosen by; none where a published one only says so in words."""
+    clips = record.get("clips", {})
+    return {clip for ids in clips.values() for clip in ids} if isinstance(clips, dict) else set()
 
 
 def stores_behind(record: dict[str, Any]) -> list[str]:
     """The inputs and outputs of all stages of a record that may be stores of recorded clips."""
     paths = (
-        path for stage in record["stages"].values() for key in ("inputs", "outputs") for path in stage.get(key, ())
+        path
+        for stage in record.get("stages", {}).values()
+        for key in ("inputs", "outputs")
+        for path in stage.get(key, ())
     )
     return sorted({path for path in paths if path.startswith("data/")})
 

@@ -78,9 +78,14 @@ def target_tree(root: Path | None, target: Target) -> Node:
     if target.kind == "motion":
         children = tuple(_named_checkpoint(root, name, digest) for name, digest in target.record.items())
         return Node("motion", target.name, target.status, f"made by {len(children)} networks", children)  # pyright: ignore
-    top = _Comparison(root, target).stage(target.record["stage"])
+    if imported := target.record.get("imported"):
+        children = tuple(
+            Node("data", f"published {name}", "same", digest=f"sha256 {value}") for name, value in imported.items()
+        )
+    else:
+        children = (_Comparison(root, target).stage(target.record["stage"]),)
     detail = "; ".join(filter(None, (_summary(target.record), target.note)))
-    return Node(target.kind, target.name, target.status, detail, (top,), digest=_own_digest(target))  # pyright: ignore
+    return Node(target.kind, target.name, target.status, detail, children, digest=_own_digest(target))  # pyright: ignore
 
 
 def _named_checkpoint(root: Path | None, name: str, recorded: str) -> Node:
@@ -98,8 +103,8 @@ def _named_checkpoint(root: Path | None, name: str, recorded: str) -> Node:
 
 def _own_digest(target: Target) -> str:
     record = target.record
-    outs = record["stages"][record["stage"]].get("outputs", {})
     if target.is_of_lock:
+        outs = record["stages"][record["stage"]]["outputs"]
         return next((f"md5 {md5}" for path, md5 in outs.items() if Path(target.name).is_relative_to(path)), "")
     payload = record.get("seal", {}).get("payload_sha256")
     return f"sha256 {payload}" if payload else ""
@@ -108,7 +113,8 @@ def _own_digest(target: Target) -> str:
 def _summary(record: dict[str, Any]) -> str:
     if "clips" not in record:
         return ""
-    counts = ", ".join(f"{len(ids)} {split}" for split, ids in record["clips"].items())
+    clips = record["clips"]
+    counts = clips if isinstance(clips, str) else ", ".join(f"{len(ids)} {split}" for split, ids in clips.items())
     kind = "synthetic data" if record.get("synthetic") else "real data"
     return f"{record.get('model', '')}, seed {record.get('seed')}, {kind}, clips: {counts}"
 

@@ -8,7 +8,7 @@ from typing import Any
 from hoidata.errors import BadInput
 from pipelines.lineage.locks import Locked, read_locks
 from pipelines.lineage.provenance import read_provenance
-from pipelines.lineage.raw import RawClip, RawSource, raw_sources, read_raw
+from pipelines.lineage.raw import RawClip, RawSource, clips_of, raw_sources, read_raw
 from pipelines.lineage.targets import WEIGHTS
 from pipelines.stages.base import empty_reason
 
@@ -86,9 +86,9 @@ def _seen_by_checkpoint(root: Path, path: Path, words: str) -> set[str]:
         record = read_provenance(path)
     except BadInput:
         return set()
-    learned = {clip for ids in record.get("clips", {}).values() for clip in ids}
+    learned = clips_of(record)
     ids = {clip for source in raw_sources(root, record) for clip in _matching(source, words) if clip in learned}
-    for name in record["stages"][record["stage"]]["inputs"]:
+    for name in record.get("stages", {}).get(record.get("stage"), {}).get("inputs", ()):
         if (below := root / name / WEIGHTS).is_file() and below != path:
             ids |= _seen_by_checkpoint(root, below, words)
     return ids

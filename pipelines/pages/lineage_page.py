@@ -22,7 +22,7 @@ def write_lineage_page(path: Path, tree: Node, record: dict[str, Any], sources: 
         status=status,
         meaning=STATUSES[status],
         tree=tree,
-        quiet=QUIET,
+        loud={node.name for node in tree.walk() if any(below.status not in QUIET for below in node.walk())},
         anchors={name: f"stage-{number}" for number, name in enumerate(stages)},
         libraries=record.get("libraries", {}),
         sources=list(sources),

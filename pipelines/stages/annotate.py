@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-from hoidata.annotation.settings import AnnotationSettings
-from hoidata.contact.settings import read_contact_settings
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, print_counts, write_empty
 
 # Text features of earlier runs, of all datasets and profiles; they spare time and change no output.
@@ -12,17 +10,18 @@ FEATURES = Path(".hoidata", "features")
 
 def run(paths: StagePaths) -> None:
     """Annotate every clip; a dataset without clips gives an empty output."""
-    settings = load_settings(AnnotationSettings, "annotate")
     if reason := empty_reason(paths.clips):
         write_empty(paths.annotation, reason)
         return
+    from hoidata.annotation.settings import AnnotationSettings
     from hoidata.annotation.stage import annotate_store
+    from hoidata.contact.settings import read_contact_settings
     from hoidata.quality.verdicts import left_out_reasons
 
     counts = annotate_store(
         paths.clips,
         paths.annotation,
-        settings,
+        load_settings(AnnotationSettings, "annotate"),
         contact=read_contact_settings(paths.contact),
         hands=load_hands(paths.profile),
         left_out=left_out_reasons(paths.quality),

@@ -55,6 +55,7 @@ class StagePaths:
     splits = _At("data/{profile}/{dataset}/splits")
     checkpoints = _At("checkpoints/{profile}/{dataset}")
     checkpoint = _At("checkpoints/{profile}/{dataset}/{model}")
+    training = _At(".hoidata/training/{profile}/{dataset}/{model}")
     evaluators = _At("evaluators/{profile}/{dataset}")
     samples = _At("samples/{profile}/{dataset}/{family}")
     metrics = _At("metrics/{profile}/{dataset}/{family}.json")

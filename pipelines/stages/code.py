@@ -136,7 +136,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     stage, _, of = name.partition("/")
     section = params.get(stage) or {}
     if stage == "train":
-        return section.get("seed"), (section.get(section.get("size")) or {}).get(of)
+        return section.get("seed"), *[(section.get(section.get(kind)) or {}).get(of) for kind in ("preset", "size")]
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
     return (section, params.get("sample")) if stage == "controls" else section

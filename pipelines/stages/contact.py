@@ -1,15 +1,15 @@
 """Stage contact: contact maps and sparse distances on sampled points of every object."""
 
-from hoidata.contact.settings import ContactSettings
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, print_counts, write_empty
 
 
 def run(paths: StagePaths) -> None:
     """Measure every clip; a dataset without clips gives an empty output."""
-    settings = load_settings(ContactSettings, "contact")
     if reason := empty_reason(paths.clips):
         write_empty(paths.contact, reason)
         return
+    from hoidata.contact.settings import ContactSettings
     from hoidata.contact.stage import contact_store
 
+    settings = load_settings(ContactSettings, "contact")
     print_counts(paths, contact_store(paths.clips, paths.contact, settings, hands=load_hands(paths.profile)))

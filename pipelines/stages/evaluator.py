@@ -18,9 +18,11 @@ def run(paths: StagePaths) -> None:
     if reason:
         write_empty(paths.evaluators, reason)
         return
+    from models.common.repeatable import make_repeatable
     from models.evaluator.stage import train_evaluators
     from pipelines.lineage.provenance import build_provenance
 
+    make_repeatable(threads=1)
     stage = producers(read_graph(Path()))[paths.evaluators.as_posix()].name
     with atomic_folder(paths.evaluators) as part:
         found = train_evaluators(

@@ -18,12 +18,12 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
     """Motions of a family into ``paths.samples``; params: all of params.yaml."""
     from models.common.device import chosen_device
     from models.common.predicting import sample_family
-    from models.common.training import make_repeatable
+    from models.common.repeatable import make_repeatable
     from models.registry import load_family
 
     section = dict(params.get("sample") or {})
     settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
-    make_repeatable(0, threads=2)
+    make_repeatable(threads=1)
     counts = sample_family(
         load_family(family),
         paths.data,

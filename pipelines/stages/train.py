@@ -1,55 +1,79 @@
 """Stage train: one network on one dataset, with the record of what it was made from."""
 
+import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from hoidata.files import sha256_file
 from hoidata.files.atomic import atomic_folder
 from models.registry import load_network
 from pipelines.lineage.graph import producers, read_graph
 from pipelines.lineage.provenance import build_provenance
-from pipelines.params import read_params
+from pipelines.params import laid_over, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 
 
 @dataclass(frozen=True)
 class TrainParams:
-    """size: which of the two budgets to take. Each holds a section per network, whose keys the network checks."""
+    """preset: which method; size: which sizes and budgets, laid over it. Each has a section per network, whose keys the
+    network checks.
 
-    size: Literal["demo", "paper"]
+    processes: how many train one network together; ``training.parts`` says what each step computes.
+    """
+
+    preset: Literal["paper", "released", "ours"]
+    size: Literal["small", "full"]
     seed: int
-    demo: Mapping[str, Any]
     paper: Mapping[str, Any]
+    released: Mapping[str, Any]
+    ours: Mapping[str, Any]
+    small: Mapping[str, Any]
+    full: Mapping[str, Any]
+    processes: int = 1
 
     def of(self, network: str) -> dict[str, Any]:
-        """The network's section in the chosen size, with the seed; a network without one keeps its defaults."""
-        return {**getattr(self, self.size).get(network, {}), "seed": self.seed}
+        """The network's settings by preset and size, with the seed; a network without any keeps its defaults."""
+        method, size = (getattr(self, name).get(network) or {} for name in (self.preset, self.size))
+        return {**laid_over(method, size), "seed": self.seed}
 
 
 def run(paths: StagePaths) -> None:
-    """Train ``paths.model``; a dataset without clips, or without what the network builds on, gives an empty output."""
-    if reason := empty_reason(paths.clips):
+    """Train ``paths.model``; a dataset without clips, or without what the network builds on, gives an empty output.
+
+    A killed training goes on where it was: what it needs for that, and its losses, lie in ``paths.training``.
+    """
+    needed = [paths.checkpoints / name for name in load_network(paths.model).needs]
+    if reason := next(filter(None, map(empty_reason, [paths.clips, *needed])), None):
         write_empty(paths.checkpoint, reason)
         return
+    from models.common.team import run_team
+
+    with atomic_folder(paths.checkpoint) as partial, tempfile.TemporaryDirectory() as meeting:
+        run_team(train, load_settings(TrainParams, "train").processes, Path(meeting) / "team", paths, partial)
+
+
+def train(paths: StagePaths, out: Path) -> None:
+    """One process of the training of ``paths.model`` into ``out``."""
     from models.common.device import chosen_device
+    from models.common.repeatable import make_repeatable
+    from models.common.team import Team
     from models.common.training import train_network
 
-    network = load_network(paths.model)
-    needed = {load_network(name): paths.checkpoints / name for name in network.needs}
-    if reason := next(filter(None, map(empty_reason, needed.values())), None):
-        write_empty(paths.checkpoint, reason)
-        return
-    params = load_settings(TrainParams, "train").of(network.name)
+    network, settings = load_network(paths.model), load_settings(TrainParams, "train")
     stage = producers(read_graph(Path()))[paths.checkpoint.as_posix()].name
-    with atomic_folder(paths.checkpoint) as partial:
-        train_network(
-            network,
-            paths.data,
-            partial,
-            params,
-            load_hands(paths.profile),
-            needed=needed,
-            provenance=lambda facts: build_provenance(Path(), stage, facts),
-            device=chosen_device(read_params(Path()).get("device", "auto")),
-        )
+    code = Path("code", "train", f"{network.name}.json")
+    make_repeatable(threads=1)  # stages run side by side; more processes train one network together
+    train_network(
+        network,
+        paths.data,
+        out,
+        settings.of(network.name),
+        load_hands(paths.profile),
+        needed={load_network(name): paths.checkpoints / name for name in network.needs},
+        provenance=lambda facts: build_provenance(Path(), stage, facts),
+        device=Team.joined().device(chosen_device(read_params(Path()).get("device", "auto"))),
+        progress=paths.training,
+        code=sha256_file(code) if code.is_file() else "",
+    )

@@ -186,7 +186,7 @@ def test_classes_that_are_rare_weigh_more_and_labels_never_learnt_nothing(annota
 def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("evaluators")
     settings = EvaluatorSettings(("paper", "corrected", "text-motion"), seeds=(0, 1, 2), most_steps=8)
-    train_evaluators(annotated_root, out, settings, threads=1)
+    train_evaluators(annotated_root, out, settings)
     return out
 
 
@@ -209,7 +209,7 @@ def test_the_stage_writes_what_the_networks_reach_on_recorded_clips(trained):
 def test_equal_trainings_give_equal_bytes_and_another_seed_other_weights(annotated_root, tmp_path):
     def files(folder, seed):
         settings = EvaluatorSettings(("corrected",), seeds=(seed,), most_steps=3)
-        train_evaluators(annotated_root, tmp_path / folder, settings, threads=1)
+        train_evaluators(annotated_root, tmp_path / folder, settings)
         return (tmp_path / folder / "corrected" / "model.safetensors").read_bytes()
 
     assert files("one", 0) == files("again", 0) != files("other", 1)

@@ -5,7 +5,8 @@ import pytest
 import torch
 import trimesh
 
-from hoidata.batches.dataset import ClipBatch
+from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.batches.sight import Sight
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.signed_distance_grid import DistanceFields
@@ -29,16 +30,15 @@ def test_joints_of_the_features_are_the_stored_joints(batch: ClipBatch, hands: H
     torch.testing.assert_close(same, joints, atol=1e-5, rtol=0)
 
 
-def test_distances_of_chosen_frames_are_those_of_all_frames(batch: ClipBatch) -> None:
-    generator = torch.Generator().manual_seed(0)
-    chosen = losses.pick_frames(batch.frames, 5, generator)
-    assert (chosen < batch.lengths[:, None]).all()
-    rows, distance = losses.entries_of_frames(
-        batch.entries, batch.entry_distance_m, chosen, batch.frames.shape[1], 10_000, generator
+def test_the_entries_of_chosen_frames_are_the_distances_there(batch: ClipBatch) -> None:
+    sight = Sight.drawn(batch.lengths.tolist(), 5, 10_000, np.random.default_rng(0))
+    seen = collate(batch.samples, sight)
+    joints, objects = (
+        losses.take_frames(own, seen.chosen, axis) for own, axis in ((seen.joints_m, 2), (seen.object, 1))
     )
-    joints, objects = losses.take_frames(batch.joints_m, chosen, 2), losses.take_frames(batch.object, chosen, 1)
-    assert len(rows) > 0
-    assert float(losses.distance_map_loss(joints, place_points(batch, objects), rows, distance, 0.02)) < 1e-6
+    points = place_points(seen, objects)
+    assert len(seen.entries) > 0
+    assert float(losses.distance_map_loss(joints, points, seen.entries, seen.entry_distance_m, 0.02)) < 1e-6
 
 
 def test_penetration_counts_only_what_is_inside() -> None:
@@ -144,7 +144,7 @@ def test_length_and_contact_losses_by_hand() -> None:
     wider = length_loss(torch.tensor([0.5]), torch.tensor([1.0]), torch.tensor([150]))
     assert float(wider["likelihood"]) == pytest.approx(1 + 0.125 * np.exp(-2))
     logits, touched, latent = torch.full((1, 4), 20.0), torch.tensor([[1.0, 1, 0, 0]]), torch.ones(1, 2)
-    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig())
+    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig(reduction="mean"))
     # Everything is called touched: 1 - (2 x 2 + 1) / (4 + 2 + 1); half of points wrong by 20; two latents of mean 1.
     expected = [1 - 5 / 7, 10.0, 1.0]
     assert [float(found[name]) for name in ("dice", "cross_entropy", "kl")] == pytest.approx(expected, rel=1e-4)

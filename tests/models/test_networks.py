@@ -1,21 +1,26 @@
 """What the networks promise: masks shut things out, everything learns, the sampler does what its equations say."""
 
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
+from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common.features import Hands, Normaliser
-from models.common.sampling import SamplerConfig, add_noise, alphas_cumprod, draw_motion, noise_schedule, sample_motion
-from models.common.transformer import TransformerConfig, smoothed
-from models.text2hoi.contact import ContactConfig, ContactLossConfig, ContactModel, PointNetConfig, contact_loss
+from models.common.point_net import PointNetConfig
+from models.common.sampling import add_noise, alphas_cumprod
+from models.common.transformer import Encoder, TransformerConfig, packed
+from models.text2hoi.contact import ContactModel, contact_loss
+from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, hands_in_object_frame, hands_in_world
+from models.text2hoi.motion_code import MotionCodeConfig
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
 from models.text2hoi.surface import Surface
 
 SMALL = TransformerConfig(
@@ -26,12 +31,12 @@ POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16))
 
 def diffusion_model(**changes) -> DiffusionModel:
     torch.manual_seed(0)
-    config = DiffusionConfig(SMALL, POINT_NET, contact_input="moments", frames_to_go=True)
+    config = DiffusionConfig(SMALL, POINT_NET, contact_input="tokens", frames_to_go=True, told=True, text_scaled=True)
     return DiffusionModel(replace(config, **changes)).eval()
 
 
 def condition_of(batch: ClipBatch, model: DiffusionModel) -> Condition:
-    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0], batch.contact_map)
+    return Condition.of(batch, model.object_feature(batch.points_m), batch.text[:, 0], batch.contact)
 
 
 def coarse_of(batch: ClipBatch) -> CoarseMotion:
@@ -39,19 +44,93 @@ def coarse_of(batch: ClipBatch) -> CoarseMotion:
     return surface.coarse(batch, batch.hands, batch.object, batch.contact_map, batch.present)
 
 
-@pytest.mark.parametrize("frames_per_token", [1, 2, 5])
-def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, frames_per_token: int) -> None:
-    model = diffusion_model(transformer=replace(SMALL, frames_per_token=frames_per_token))
+MEAN = ContactLossConfig(kl_weight=0.01, reduction="mean")
+SWITCHES = {
+    "paper": {},
+    "tokens of frames": {"transformer": replace(SMALL, frames_per_token=5)},
+    "splines": {"motion": MotionCodeConfig(knot_frames=4, object_knots=2)},
+    "object frame": {"motion": MotionCodeConfig(hand_frame="object")},
+    "contact tokens": {"contact_input": "tokens", "contact_tokens": 4},
+    "projection": {"text_input": "projection"},
+    "condition everywhere": {"condition_everywhere": True},
+    "frames to go": {"frames_to_go": True},
+    "signal scale": {"signal_scale": 0.2},
+    "told": {"told": True},
+    "released": {"hand_head": "hand and object", "centroid": True, "first_code": 1},
+    "no codes": {"codes": "none"},
+    "no contact, no scale": {"contact_input": "none", "scale_input": False},
+}
+
+
+def rows_of(batch: ClipBatch, model: DiffusionModel) -> tuple[Tensor, Tensor]:
+    coded = [model.code.encode(sample) for sample in batch.samples]
+    hands = pad_sequence([own.hands.transpose(0, 1) for own in coded], batch_first=True).transpose(1, 2)
+    return hands, pad_sequence([own.object for own in coded], batch_first=True)
+
+
+@pytest.mark.parametrize("switch", SWITCHES)
+def test_padding_and_absent_hands_change_no_output(batch: ClipBatch, switch: str) -> None:
+    torch.manual_seed(0)
+    model = DiffusionModel(replace(DiffusionConfig(SMALL, POINT_NET), **SWITCHES[switch])).eval()
     condition, steps = condition_of(batch, model), torch.tensor([10, 500, 900])
-    hands, objects = batch.hands.clone(), batch.object.clone()
+    hands, objects = rows_of(batch, model)
+    there, moving = model.code.rows(batch.counts, torch.device("cpu"))
     with torch.no_grad():
         before = model(hands, objects, steps, condition)
         hands[~batch.active_hands] = 100.0
-        hands.transpose(1, 2)[~batch.frames] = -50.0
-        objects[~batch.frames] = 50.0
-        after = model(hands, objects, steps, condition)
-    assert torch.equal(before[0][batch.present], after[0][batch.present])
-    assert torch.equal(before[1][batch.frames], after[1][batch.frames])
+        hands.transpose(1, 2)[~there] = -50.0
+        objects[~moving] = 50.0
+        idle = condition.contact | ~condition.active_hands[..., None]
+        after = model(hands, objects, steps, replace(condition, contact=idle))
+    present = there[:, None] & batch.active_hands[..., None]
+    assert torch.equal(before[0][present], after[0][present])
+    assert torch.equal(before[1][moving], after[1][moving])
+
+
+def test_each_switch_changes_its_part_of_the_weights_only() -> None:
+    """Names of weights that are new, gone or of another shape when one switch is on."""
+    known = shapes(DiffusionConfig(SMALL, POINT_NET))
+    parts = {
+        "paper": set(),
+        "tokens of frames": {"hands_in", "object_in", "hands_out", "object_out"},
+        "splines": {"object_in", "object_out"},
+        "object frame": set(),
+        "contact tokens": {"object_condition_in", "points_in"},
+        "projection": {"text_in"},
+        "condition everywhere": set(),
+        "frames to go": {"to_go_in"},
+        "signal scale": set(),
+        "told": {"extent_in"},
+        "released": {"hands_out", "object_condition_in"},
+        "no codes": set(),
+        "no contact, no scale": {"object_condition_in"},
+    }
+    for switch, changes in SWITCHES.items():
+        found = shapes(replace(DiffusionConfig(SMALL, POINT_NET), **changes))
+        unlike = {name for name in known | found if known.get(name) != found.get(name)}
+        assert {name.split(".")[0] for name in unlike} == parts[switch], switch
+
+
+def shapes(config: DiffusionConfig) -> dict[str, tuple[int, ...]]:
+    return {name: tuple(weight.shape) for name, weight in DiffusionModel(config).named_parameters()}
+
+
+def test_tokens_nobody_attends_to_change_nothing_when_they_are_left_out() -> None:
+    torch.manual_seed(0)
+    encoder, x = Encoder(SMALL).eval(), torch.randn(3, 20, 32)
+    mask = torch.rand(3, 20, generator=torch.Generator().manual_seed(0)) < 0.4
+    mask[:, 0] = True
+    wide = torch.cat((mask, torch.ones(3, 1, dtype=torch.bool)), 1)
+    with torch.no_grad():
+        found = encoder(x, mask)
+        one_at_a_time = torch.cat(
+            [
+                encoder(x[row : row + 1, own], torch.ones(1, int(own.sum()), dtype=torch.bool))[0]
+                for row, own in enumerate(mask)
+            ]
+        )
+    torch.testing.assert_close(found[mask], one_at_a_time, atol=1e-5, rtol=1e-4)
+    assert packed(torch.randn(3, 21, 32), wide)[0].shape[1] == int(wide.sum(1).max())
 
 
 def test_a_clip_gives_the_same_alone_as_padded_in_a_batch(annotated: AnnotatedStore, batch: ClipBatch) -> None:
@@ -70,7 +149,7 @@ def test_hand_flags_length_text_and_contact_are_seen(batch: ClipBatch) -> None:
     condition = condition_of(batch, model)
     changes = {
         "text": condition.text + 1,
-        "contact_map": 1 - condition.contact_map,
+        "contact": ~condition.contact,
         "active_hands": torch.ones_like(condition.active_hands),
     }
     with torch.no_grad():
@@ -87,20 +166,9 @@ def test_the_raw_contact_map_of_the_paper_is_an_option(batch: ClipBatch) -> None
     assert objects.shape == batch.object.shape
 
 
-def test_the_papers_generator_has_the_papers_size() -> None:
-    model = DiffusionModel(DiffusionConfig())
-    trained = sum(parameter.numel() for parameter in model.parameters() if parameter.requires_grad)
-    # Tables S7-S9 by hand: encoder 8 x (4 (512^2 + 512) + 2 (2 x 512) + 512 x 1024 + 1024 + 1024 x 512 + 512), and the
-    # layers around it, with the three inputs that are ours (two hand flags and the length).
-    encoder = 8 * (4 * (512**2 + 512) + 4 * 512 + 2 * 512 * 1024 + 1024 + 512)
-    inputs = 2 * (99 * 512 + 512) + 10 * 512 + 512 + 2 * (512**2 + 512) + 512**2 + 512 + 2049 * 512 + 512
-    outputs = 2 * (512 * 99 + 99) + 512 * 10 + 10
-    assert trained == encoder + inputs + outputs + 3 * 512 + 512
-
-
 def test_a_refiner_starts_as_the_identity_and_every_parameter_learns(batch: ClipBatch) -> None:
     torch.manual_seed(0)
-    model = RefinerModel(RefinerConfig(SMALL, contact_map=True))
+    model = RefinerModel(RefinerConfig(SMALL, view="object", surface_input=True, output="residual"))
     coarse = coarse_of(batch)
     torch.testing.assert_close(model(coarse)[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
     optimiser = torch.optim.SGD(model.parameters(), lr=0.1)
@@ -113,9 +181,12 @@ def test_a_refiner_starts_as_the_identity_and_every_parameter_learns(batch: Clip
     assert without == []
 
 
-def test_refined_hands_do_not_depend_on_padding_or_absent_hands(batch: ClipBatch) -> None:
+@pytest.mark.parametrize("view", ["world", "object"])
+def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
+    batch: ClipBatch, view: Literal["world", "object"]
+) -> None:
     torch.manual_seed(0)
-    model = RefinerModel(RefinerConfig(SMALL, contact_map=False)).eval()
+    model = RefinerModel(RefinerConfig(SMALL, view=view)).eval()
     torch.nn.init.normal_(model.hands_out[0].weight, std=0.1)
     torch.nn.init.normal_(model.hands_out[1].weight, std=0.1)
     coarse = coarse_of(batch)
@@ -125,64 +196,10 @@ def test_refined_hands_do_not_depend_on_padding_or_absent_hands(batch: ClipBatch
         assert torch.equal(model(coarse)[batch.present], model(other)[batch.present])
 
 
-def test_hands_in_the_object_frame_come_back(batch: ClipBatch) -> None:
-    there = hands_in_object_frame(batch.hands, batch.object)
-    back = hands_in_world(there, batch.object)
-    torch.testing.assert_close(back[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
-    wrist = batch.object[:, None, :, :3].expand_as(batch.hands[..., :3])
-    at_origin = torch.cat((wrist, batch.hands[..., 3:]), -1)
-    assert hands_in_object_frame(at_origin, batch.object)[..., :3].abs().max() == 0
-
-
-def test_a_perfect_denoiser_gives_the_clean_motion_back() -> None:
-    generator = torch.Generator().manual_seed(0)
-    truth = torch.randn(3, 2, 7, 99, generator=generator), torch.randn(3, 7, 10, generator=generator)
-    for kind, steps in (("ddim", 1), ("ddim", 20), ("ddpm", 50)):
-        config = SamplerConfig(kind, steps)  # pyright: ignore[reportArgumentType]
-        hands, objects = sample_motion(
-            lambda *_: truth, draw_motion(truth[0].shape, truth[1].shape, generator), config, generator
-        )
-        torch.testing.assert_close(hands, truth[0], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
-        torch.testing.assert_close(objects, truth[1], atol=2e-2 if kind == "ddpm" else 1e-4, rtol=0)
-
-
-def test_the_schedule_is_nichol_and_dhariwals_cosine() -> None:
-    time = torch.arange(1001, dtype=torch.float64) / 1000
-    curve = torch.cos((time + 0.008) / 1.008 * torch.pi / 2) ** 2
-    betas = (1 - curve[1:] / curve[:-1]).clamp_max(0.999)
-    torch.testing.assert_close(alphas_cumprod().double(), (1 - betas).cumprod(0), atol=1e-5, rtol=1e-4)
-
-
-def test_one_ddim_step_is_the_closed_form() -> None:
-    """Song et al. 2021, eq. 12 with sigma 0: x' = sqrt(a') x0 + sqrt(1 - a') (x - sqrt(a) x0) / sqrt(1 - a)."""
-    scheduler, signal = noise_schedule(), alphas_cumprod()
-    scheduler.set_timesteps(10)
-    x, clean = torch.tensor([1.3]), torch.tensor([0.4])
-    now, then = (signal[int(step)] for step in scheduler.timesteps[4:6])
-    expected = then.sqrt() * clean + (1 - then).sqrt() * (x - now.sqrt() * clean) / (1 - now).sqrt()
-    found = scheduler.step(clean, int(scheduler.timesteps[4]), x, return_dict=False)[0]
-    torch.testing.assert_close(found, expected)
-
-
 def test_noise_is_mixed_as_in_the_papers_first_equation() -> None:
     signal = torch.tensor([0.81, 0.36])
     noised = add_noise(torch.ones(2, 3), torch.full((2, 3), 2.0), torch.tensor([0, 1]), signal)
     torch.testing.assert_close(noised[:, 0], torch.tensor([0.9 + 2 * 0.19**0.5, 0.6 + 2 * 0.8]))
-
-
-def test_smoothing_keeps_steady_motion_and_ends_and_never_sees_padding() -> None:
-    frames = torch.arange(30) < torch.tensor([[30], [12]])
-    x = torch.full((2, 2, 30, 5), 3.0)
-    x[1, :, 12:] = 1e6
-    smooth = smoothed(x, frames, 2.0)
-    torch.testing.assert_close(smooth.transpose(1, 2)[frames], torch.full((42, 2, 5), 3.0))
-    spike = torch.zeros(1, 30, 1)
-    spike[0, 15] = 1
-    found = smoothed(spike, frames[:1], 2.0)[0, :, 0]
-    # A Gaussian of deviation 2 has its peak at 1 / (2 sqrt(2 pi)), and its neighbours fall by exp(-1/8).
-    assert float(found[15]) == pytest.approx(0.1995, abs=1e-3)
-    assert float(found[16] / found[15]) == pytest.approx(0.8825, abs=1e-3)
-    assert smoothed(x, frames, 0.0) is x
 
 
 def fitted(parameters, loss, steps: int = 150, rate: float = 3e-3) -> float:
@@ -203,32 +220,34 @@ def two_clips(batch: ClipBatch) -> ClipBatch:
 def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
     torch.manual_seed(0)
     two = two_clips(batch)
-    model = ContactModel(ContactConfig(POINT_NET, (32, 32, 16), 4))
+    model = ContactModel(ContactConfig(POINT_NET, (32, 32, 16), 4, told=True, text_scaled=True))
     noise = torch.randn(2, 4, generator=torch.Generator().manual_seed(0))
 
     def loss() -> Tensor:
         logits, mean, spread = model(two.points_m, two.text[:, 0], two.active_hands, two.contact_map, noise)
-        return contact_loss(logits, two.contact_map, mean, spread, ContactLossConfig())["total"]
+        return contact_loss(logits, two.contact_map, mean, spread, MEAN)["total"]
 
     fitted(model.parameters(), loss, 60, 1e-2)
     model.eval()
-    probability = model.sample(
-        two.points_m,
-        two.text[:, 0],
-        two.active_hands,
-        model.draw_latents(8, len(two), torch.Generator().manual_seed(1)),
-    ).mean(1)
+    probability = (
+        model.sample(
+            two.points_m,
+            two.text[:, 0],
+            two.active_hands,
+            model.draw_latents(8, len(two), torch.Generator().manual_seed(1)),
+        )
+        .amax(2)
+        .mean(1)
+    )
     assert ((probability > 0.5) == (two.contact_map > 0.5)).float().mean() > 0.95
 
 
 def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatch) -> None:
     torch.manual_seed(0)
     two = two_clips(batch)
-    model = LengthModel(LengthConfig(width=64, dropout=0.0))
-    lengths = torch.tensor([40, 120])
-    fitted(
-        model.parameters(), lambda: length_loss(*model(two.text[:, 0], two.active_hands), lengths)["total"], rate=5e-4
-    )
+    model = LengthModel(LengthConfig(width=64, drawn_by="spread", text_scaled=True, told=True))
+    lengths, given = torch.tensor([40, 120]), (two.text[:, 0], two.active_hands, torch.zeros(2, 1))
+    fitted(model.parameters(), lambda: length_loss(*model.moments(*given), lengths)["total"], rate=5e-4)
     torch.testing.assert_close(
         model.expected_frames(two.text[:, 0], two.active_hands), lengths.float(), atol=2.0, rtol=0
     )
@@ -242,7 +261,7 @@ def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatc
 def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
     two = two_clips(batch)
     model = diffusion_model().train()
-    normaliser = Normaliser.of(list(two.samples))
+    normaliser = Normaliser.of(list(zip(two.hands, two.object, two.present, strict=True)))
     hands, objects = normaliser.encode(two.hands, two.object)
     signal, generator = alphas_cumprod(), torch.Generator().manual_seed(0)
     condition = condition_of(two, model)
@@ -255,14 +274,3 @@ def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
 
     first = float(loss().detach())
     assert fitted(model.parameters(), loss, 200) < 0.1 * first
-
-
-def test_normalisation_leaves_out_hands_that_do_not_act_and_comes_back(annotated: AnnotatedStore) -> None:
-    train = list(HoiDataset(annotated, "train"))
-    normaliser = Normaliser.of(train)
-    left = torch.cat([torch.from_numpy(s.hands[0]) for s in train if s.active_hands[0]])
-    torch.testing.assert_close(normaliser.hand_mean[0], left.mean(0), atol=1e-5, rtol=1e-4)
-    both = collate(train)
-    hands, objects = normaliser.decode(*normaliser.encode(both.hands, both.object))
-    torch.testing.assert_close(hands, both.hands, atol=1e-5, rtol=0)
-    torch.testing.assert_close(objects, both.object, atol=1e-5, rtol=0)

@@ -197,9 +197,10 @@ def test_matrix_products_stay_accurate_at_the_chosen_precision() -> None:
 @pytest.mark.parametrize("size", [1, 2, 3, 100])
 def test_every_epoch_meets_every_clip_once(annotated: AnnotatedStore, size: int) -> None:
     dataset = HoiDataset(annotated, "train")
-    stream = batches(dataset, size, torch.Generator().manual_seed(0), with_entries=False)
+    stream = batches(dataset, size, seed=0)
     for _ in range(3):
         met: list[str] = []
         while len(met) < len(dataset):
-            met += [sample.clip_id for sample in next(stream).samples]
+            [(_, batch)] = next(stream)
+            met += [sample.clip_id for sample in batch.samples]
         assert sorted(met) == sorted(dataset.ids)

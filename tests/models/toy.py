@@ -11,13 +11,31 @@ TRANSFORMER = {
 }  # fmt: skip
 BUDGET = {"steps": 2, "batch": 2, "learning_rate": 0.001, "validate_every": 1, "ema_decay": 0.5}
 PARAMS = {
-    "contact": {"network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "latent": 4}, "training": BUDGET},
-    "length": {"network": {"width": 16}, "training": {**BUDGET, "keep_best": True}},
-    "diffusion": {"network": {"transformer": TRANSFORMER, "contact_input": "moments"}, "training": BUDGET},
-    "refiner": {
-        "network": {"transformer": TRANSFORMER, "contact_map": False},
+    "contact": {
+        "network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "drawn_by": "anchor"},
         "training": BUDGET,
-        "loss": {"samples": 2, "sampler_steps": 2, "field_resolution": 16},
+    },
+    "length": {"network": {"width": 16, "drawn_by": "spread", "told": True}, "training": {**BUDGET, "keep_best": True}},
+    "diffusion": {
+        "network": {
+            "transformer": TRANSFORMER,
+            "contact_input": "tokens",
+            "motion": {"knot_frames": 4},
+            "normalised": True,
+            "told": True,
+        },
+        "training": BUDGET,
+    },
+    "refiner": {
+        "network": {
+            "transformer": TRANSFORMER,
+            "contact_map": False,
+            "view": "object",
+            "surface_input": True,
+            "output": "residual",
+        },
+        "training": BUDGET,
+        "loss": {"generated": "half", "samples": 2, "sampler_steps": 2, "field_resolution": 16},
     },
 }
 

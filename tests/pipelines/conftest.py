@@ -23,7 +23,6 @@ PARTS = (
     ".gitattributes",
     ".gitignore",
     "prefect.toml",
-    "prefect.yaml",
     ".dvc/config",
     ".dvc/.gitignore",
 )
@@ -64,7 +63,7 @@ def make_small(folder: Path) -> None:
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
     params = yaml.safe_load((folder / "params.yaml").read_text())
     params["annotate"]["encoder"] = "hash"
-    params["train"]["demo"] = TINY
+    params["train"]["small"] = TINY
     params["sample"] |= TINY_SAMPLE
     write_params(folder, params)
 
@@ -152,5 +151,5 @@ def built(built_once: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="session")
 def project_tools() -> SimpleNamespace:
     """The functions above, for tests: test modules cannot import a conftest."""
-    tools = (copy_project, set_present, write_params, environment, run)
+    tools = (copy_project, make_narrow, set_present, write_params, environment, run)
     return SimpleNamespace(**{tool.__name__: tool for tool in tools})

@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from hoidata.datasets.registry import adapter_names
+from pipelines.deployments import deployment_targets
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import read_params
 from pipelines.stages.__main__ import STAGES
@@ -110,3 +111,19 @@ def test_the_graph_names_no_dataset_and_no_raw_data():
     assert len(text.splitlines()) <= 220
     stages = str(yaml.safe_load(text)["stages"])
     assert [name for name in (*adapter_names(), ".hoidata") if name in stages] == []
+
+
+def test_deployments_are_the_graphs_own_work_by_dataset_and_family(graph):
+    params = read_params(PROJECT)
+    found = deployment_targets(graph, params["profile"], params["datasets"])
+    assert found["full-graph"] == []
+    assert found["annotate-arctic"] == ["annotate@{profile}-arctic"]
+    assert found["evaluate-h2o-mean-pose"] == ["evaluate@{profile}-h2o-mean-pose"]
+    at = "models/text2hoi/dvc.yaml:train"
+    networks = [f"{at}@{{profile}}-grab-contact", f"{at}@{{profile}}-grab-length"]
+    assert sorted(found["train-grab-text2hoi"]) == sorted(
+        [*networks, f"{at}-diffusion@{{profile}}-grab", f"{at}-refiner@{{profile}}-grab"]
+    )
+    assert {target.replace("{profile}", params["profile"]) for targets in found.values() for target in targets} <= set(
+        graph
+    )

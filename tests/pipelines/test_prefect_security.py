@@ -6,9 +6,12 @@ import json
 import os
 import queue
 import shutil
+import signal
 import subprocess
+import sys
 import tempfile
 import threading
+import time
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -19,9 +22,9 @@ import psutil
 import pytest
 
 from hoidata.errors import BadInput, MissingResource
-from pipelines.prefect_key import is_loopback, read_key, write_key
+from pipelines.prefect_key import KEY_FILE, is_loopback, read_key, write_key
 from pipelines.prefect_names import key_for
-from pipelines.prefect_server import api_url, wait_until_healthy
+from pipelines.prefect_server import api_url, stop_running, wait_until_healthy
 from tests.pipelines.prefect_up import hoidata_up, wait_until
 
 FOREIGN = "http://evil.example"
@@ -32,17 +35,8 @@ SOCKETS = (
     "task_runs/subscriptions/scheduled",
     "work_pools/local/workers/connect",
 )
-FLOWS = """
-from pathlib import Path
-from prefect import flow
-
-@flow(name="annotate-arctic")
-def annotate_arctic():
-    (Path(__file__).parents[1] / "flow-ran").touch()
-
-@flow(name="full-graph")
-def full_graph(): ...
-"""
+ENDED = {"COMPLETED", "FAILED", "CRASHED", "CANCELLED"}
+pytestmark = pytest.mark.first
 
 
 def mode(path: Path) -> int:
@@ -123,6 +117,19 @@ def test_the_key_goes_to_no_other_machine_and_not_over_the_users_own(tmp_path, m
     assert key_for(here) is None
 
 
+def test_hoidata_down_ends_what_holds_the_folders_key_and_says_when_nothing_does(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert not stop_running()
+    holding = "import time; from hoidata.files.atomic import exclusive\n"
+    holding += f"with exclusive({str(KEY_FILE)!r}): time.sleep(60)"
+    up = subprocess.Popen([sys.executable, "-c", holding])
+    lock = KEY_FILE.parent / f".{KEY_FILE.name}.lock"
+    while not lock.is_file() or not lock.read_text():
+        time.sleep(0.05)
+    assert stop_running()
+    assert up.wait(5) == -signal.SIGTERM
+
+
 def test_a_stranger_at_the_port_is_not_taken_for_our_server(monkeypatch):
     """He would be sent the key, and the worker would run what he says."""
     monkeypatch.setattr("pipelines.prefect_server.START_TIMEOUT_S", 2)
@@ -137,10 +144,10 @@ def test_a_stranger_at_the_port_is_not_taken_for_our_server(monkeypatch):
 
 @pytest.fixture(scope="module")
 def up(tmp_path_factory, project_tools):
-    """The real server and worker, with a flow that only leaves a file; ``post`` and ``get`` use the project's key."""
+    """The real server and worker in a copy of the project."""
     folder = tmp_path_factory.mktemp("security")
     project = project_tools.copy_project(folder / "project")
-    (project / "pipelines" / "flows.py").write_text(FLOWS)
+    project_tools.make_narrow(project, ["arctic", "manipnet"], ["mean-pose"])  # few deployments are made faster
     with hoidata_up(project, project_tools) as running:
         running.marker = folder / "command-ran"
         running.key = read_key(project / ".prefect" / "api-key")
@@ -335,13 +342,23 @@ def test_the_pool_takes_no_variable_from_a_run_even_with_the_key(up, name):
 
 @pytest.mark.slow
 def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_tools):
-    """After the tests above: the worker that runs this flow has had time for every run they could have started."""
+    """After the tests above: the worker that runs this flow has had time for every run they could have started.
+
+    ``prefect deployment run annotate-arctic`` exactly as typed makes what DVC's target annotate@embedded-arctic is.
+    """
     asked = project_tools.run(up.project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
     assert asked.returncode == 0, asked.stdout + asked.stderr
-    wait_until((up.project / "flow-ran").exists, 120, up.process, up.log)
-    [run] = json.loads(with_key(up, "POST", "/flow_runs/filter", "{}").body)
-    assert run["job_variables"] in (None, {})
+    runs = lambda: json.loads(with_key(up, "POST", "/flow_runs/filter", "{}").body)  # noqa: E731
+    wait_until(lambda: all(run["state_type"] in ENDED for run in runs()), 900, up.process, up.log)
+    [run] = runs()
+    assert (run["state_type"], run["job_variables"] or {}) == ("COMPLETED", {}), up.log.read_text()
+    assert (up.project / "data/embedded/arctic/annotation/text.parquet").is_file()
+    assert not (up.project / "checkpoints").exists()
     assert not up.marker.exists()
+    tasks = {run["name"] for run in json.loads(with_key(up, "POST", "/task_runs/filter", "{}").body)}
+    assert {"code", "convert@embedded-arctic", "annotate@embedded-arctic"} <= tasks
+    artifacts = {found["key"] for found in json.loads(with_key(up, "POST", "/artifacts/filter", "{}").body)}
+    assert artifacts == {"stages", "results"}
 
 
 @pytest.mark.slow

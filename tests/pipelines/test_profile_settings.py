@@ -19,7 +19,7 @@ PROJECT = Path(__file__).parents[2]
 OVERLAY: dict[str, Any] = {
     "annotate": {"encoder": "hash"},
     "split": {"grab": {"by": "subject", "test": ["s2"]}},
-    "train": {"demo": {"refiner": {"training": {"steps": 3}}}},
+    "train": {"small": {"refiner": {"training": {"steps": 3}}}},
     "sample": {"samples": 20},
 }
 
@@ -36,7 +36,7 @@ def test_an_overlay_changes_what_it_names_in_its_profile_and_nothing_else(plain)
     expected: dict[str, Any] = copy.deepcopy(embedded) | {"profile": "study"}
     expected["annotate"]["encoder"] = "hash"
     expected["split"]["grab"] = OVERLAY["split"]["grab"]  # a mapping in the place of a name
-    expected["train"]["demo"]["refiner"]["training"]["steps"] = 3
+    expected["train"]["small"]["refiner"]["training"]["steps"] = 3
     expected["sample"]["samples"] = 20
     assert study == expected
     assert plain == before
@@ -66,7 +66,7 @@ def test_an_empty_section_of_an_overlay_says_nothing(plain):
         ({"study": {"datasets": ["grab"]}}, "profiles.study.datasets: .*at the top of params.yaml"),
         ({"study": {"families": []}}, "profiles.study.families: "),
         ({"study": {"profile": "own"}}, "profiles.study.profile: "),
-        ({"study": {"train": {"size": "paper"}}}, "profiles.study.train.size: "),
+        ({"study": {"train": {"size": "full"}}}, "profiles.study.train.size: "),
     ],
 )
 def test_what_cannot_be_laid_over_is_refused_in_whatever_profile_one_is(plain, profiles, message):
@@ -105,7 +105,7 @@ def test_what_is_written_is_what_the_stage_reads_so_that_equal_settings_are_equa
     study = chosen_params({**plain, "profile": "study"})
     found = profile_settings(plain, study, "train/refiner")
     (value,) = found.values()
-    assert json.loads(value) == [0, study["train"]["demo"]["refiner"]]
+    assert json.loads(value) == [0, study["train"]["ours"]["refiner"], study["train"]["small"]["refiner"]]
     assert profile_settings(plain, study, "train/contact") == {}
     assert profile_settings(plain, chosen_params(plain), "train/refiner") == {}
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, hand_track
+from hoidata.clips.recording import HandRecording, OwnHandTrack
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.manipnet.bvh import BvhMotion, parse_bvh, unpack_text
+from hoidata.datasets.manipnet.bvh import BvhMotion, angles_yxz_to_rotmat, parse_bvh, unpack_text
+from hoidata.datasets.manipnet.hand import HAND_REFERENCE, HAND_SKIN, METRES_PER_UNIT, MIRROR_X, read_hand
 from hoidata.datasets.manipnet.segments import (
     LIFTED_M,
     SHORTEST_FRAMES,
@@ -39,8 +41,6 @@ from hoidata.objects.distance import closest_points
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import ObjectModel
 
-METRES_PER_UNIT = 0.1
-HAND_REFERENCE = "hand/hand_reference.json"
 MESH_FOLDERS = ("objects/Primitive", "objects/Dining", "objects/recovered")
 THUMB_CHAIN = ("THUMB_CMC_FE", "THUMB_CMC_AA", "THUMB_MCP_FE", "THUMB_IP_FE")
 FINGERS = ("INDEX", "MIDDLE", "PINKY", "RING")  # in MANO's order; the files have ring before pinky
@@ -56,6 +56,7 @@ MANO_JOINTS = (
     *THUMB_CHAIN[1:],
 )
 TIP_JOINTS = (*(f"{finger}_DIP_FE" for finger in FINGERS), "THUMB_IP_FE")
+GRAVITY = np.array([0.0, -1.0, 0.0])
 FRAME = WorldFrame("+y", "stated", "Unity's world seen in a mirror with normal x: right-handed, y up")
 CONVENTION = HandConvention(
     translation="wrist",
@@ -68,8 +69,8 @@ PARTS = (
     DatasetPart("object and hand motion", ("sequences/*/*.bvh.gz",), "the data release"),
     DatasetPart("object meshes", ("objects/*/*.obj.gz",), "the data release"),
     DatasetPart("the hand's capsules and tips", (HAND_REFERENCE,), "the data release"),
+    DatasetPart("the hand's skin", (HAND_SKIN,), "the data release", optional=True),
 )
-MIRROR_X = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True)
@@ -168,6 +169,12 @@ class ManipNetAdapter(Described):
                 results.append(replace(clip, clip_id=_clip_id(key, start, stop), verb=verb, sources=sources))
         return results
 
+    def recordings(self, raw: RawTree, key: SequenceKey) -> list[HandRecording]:
+        """All frames with the 17-joint hands of the files; none where the skin's file is missing or not listed."""
+        if not raw.has(HAND_SKIN) or (raw.manifest is not None and HAND_SKIN not in raw.manifest):
+            return []
+        return [read_hand_recording(raw, key)]
+
     def _clip(
         self, key: SequenceKey, recording: Recording, stretch: Interval, betas: np.ndarray, hands: HandPair
     ) -> Clip:
@@ -186,7 +193,7 @@ class ManipNetAdapter(Described):
                 recording.translation_m[frames].astype(np.float32),
             ),
             source_frames=recording.source_frames[frames].astype(np.int32),
-            gravity=np.array([0.0, -1.0, 0.0]),
+            gravity=GRAVITY,
             verb=None,
             object_words=object_words(recording.model.name),
             source_from_world=np.diag([*(MIRROR_X / METRES_PER_UNIT), 1.0]),
@@ -231,6 +238,38 @@ def read_recording(raw: RawTree, name: str) -> Recording:
         ),
         paths=(*hand_paths.values(), object_path, mesh_path, HAND_REFERENCE),
     )
+
+
+def read_hand_recording(raw: RawTree, key: SequenceKey) -> HandRecording:
+    """One sequence with every frame of the files and their own hands. Raises BadInput as ``read_recording`` does."""
+    recording = read_recording(raw, key.name)
+    left, right, thing = (_read_motion(raw, path) for path in recording.paths[:3])
+    usable = np.ones(thing.n_frames, dtype=bool)
+    for cut in recording.cuts:
+        usable[cut.start : cut.stop] = False
+    world = _body("object", thing)
+    return HandRecording(
+        dataset=key.dataset,
+        subject=key.subject,
+        sequence=key.name,
+        fps=recording.source_fps,
+        hand=read_hand(raw, right),
+        hands={"left": _own_hand(left), "right": _own_hand(right)},
+        object=ObjectTrack(
+            recording.model,
+            rotmat_to_rotvec(world.rotation).astype(np.float32),
+            world.position_m.astype(np.float32),
+        ),
+        usable=usable,
+        gravity=GRAVITY,
+        sources=raw.recorded(*recording.paths, HAND_SKIN),
+    )
+
+
+def _own_hand(motion: BvhMotion) -> OwnHandTrack:
+    wrist_m = (motion.root_position + motion.offsets[0]) * METRES_PER_UNIT
+    rotvec = rotmat_to_rotvec(angles_yxz_to_rotmat(motion.angles_yxz_rad))
+    return OwnHandTrack(wrist_m.astype(np.float32), rotvec.astype(np.float32))
 
 
 def keypoints_m(motion: BvhMotion, side: Side, tips: dict[str, np.ndarray]) -> np.ndarray:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from bench.naive import READERS, NaiveHands
 from hoidata.clips import SIDES
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
-from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints
+from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.mesh import load_mesh
 from hoidata.synthetic.check import sequence_figures
 from hoidata.synthetic.corpus import write_raw_sequence, write_shared_files
@@ -180,30 +180,6 @@ def test_h2o_lines_have_the_right_counts_and_numbering(truths, root):
     labelled = np.flatnonzero(labels)
     np.testing.assert_array_equal(labelled, np.arange(*truth.clip) + truth.raw_start)
     assert set(np.array(labels)[labelled]) == {2}  # grab espresso
-
-
-def test_h2o_points_return_to_the_world_through_the_moving_camera(truths, root):
-    truth, pair = truths["h2o"], load_embedded_hands()
-    folder = root / "h2o" / truth.source_key / "cam4"
-    cameras = []
-    for own in (truth.clip[0], truth.clip[1] - 1):
-        frame = truth.raw_start + own
-        camera = _row(folder, "cam_pose", frame).reshape(4, 4)
-        cameras.append(camera)
-        np.testing.assert_allclose(camera[:3, :3] @ camera[:3, :3].T, np.eye(3), atol=1e-12)
-        pose = camera @ _row(folder, "obj_pose_rt", frame)[1:].reshape(4, 4)
-        np.testing.assert_allclose(pose[:3, 3], truth.object.translation_m[own], atol=1e-9)
-        wanted = Rotation.from_rotvec(truth.object.rotvec[own]).as_matrix()
-        np.testing.assert_allclose(pose[:3, :3], wanted, atol=1e-9)
-        points = _row(folder, "hand_pose", frame)[64:]
-        world = points[1:].reshape(21, 3) @ camera[:3, :3].T + camera[:3, 3]
-        joints = track_joints(truth.hands["right"], pair.right)[own]
-        np.testing.assert_allclose(world[0], joints[0], atol=1e-6)
-        np.testing.assert_allclose(world[4], joints[20], atol=1e-6)  # thumb tip
-        np.testing.assert_allclose(world[8], joints[16], atol=1e-6)  # index tip
-        np.testing.assert_allclose(world[20], joints[18], atol=1e-6)  # little finger's tip
-    assert np.abs(cameras[0] - cameras[1]).max() > 1e-3
-    assert len(TIP_VERTICES) == 5
 
 
 def test_arctic_parts_and_meshes_belong_together(truths, root):

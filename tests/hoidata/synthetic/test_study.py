@@ -129,10 +129,9 @@ def _digests(root) -> dict[str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("dataset", DATASETS)
-def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(dataset, made, tmp_path):
-    write_corpus(dataset, tmp_path / "together", 1, "study-small", jobs=2)
-    assert _digests(made[dataset][0]) == _digests(tmp_path / "together")
+def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(made, tmp_path):
+    write_corpus("arctic", tmp_path / "together", 1, "study-small", jobs=2)
+    assert _digests(made["arctic"][0]) == _digests(tmp_path / "together")
 
 
 @pytest.mark.slow

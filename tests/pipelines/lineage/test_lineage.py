@@ -1,6 +1,7 @@
 """Provenance and its comparison with today, on a graph of two stages in a temporary folder."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -53,8 +54,9 @@ TRAIN = "models/text2hoi/dvc.yaml:train@grab-contact"
 FACTS = {"model": "contact", "seed": 0, "clips": {"train": ["grab/s1/a", "grab/s1/b"]}, "synthetic": True}
 
 
-@pytest.fixture
-def root(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("written")
     for name, text in {
         "dvc.yaml": GRAPH,
         "models/text2hoi/dvc.yaml": FAMILY,
@@ -67,12 +69,17 @@ def root(tmp_path: Path) -> Path:
         "pipelines/stages/train.py": "from models.text2hoi import contact",
         "data/grab/clips.npz": "clips",
     }.items():
-        path = tmp_path / name
+        path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text)
-    Repo.init(str(tmp_path), no_scm=True).close()
-    write_code(tmp_path)
-    return tmp_path
+    Repo.init(str(folder), no_scm=True).close()
+    write_code(folder)
+    return folder
+
+
+@pytest.fixture
+def root(written: Path, tmp_path: Path) -> Path:
+    return shutil.copytree(written, tmp_path / "project")
 
 
 @pytest.fixture

@@ -115,7 +115,7 @@ def hands():
     return load_embedded_hands()
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def page_clip():
     return make_page_clip
 

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import cache
 from html import unescape
 
 import numpy as np
@@ -32,8 +33,8 @@ SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject
 SHA256 = "5e88" * 16
 
 
-@pytest.fixture
-def dataset(hands, page_clip, tmp_path):
+@pytest.fixture(scope="module")
+def written(page_clip, tmp_path_factory):
     """Three annotated clips: both hands with a hinged box, a right hand that leaves for five frames, hands far away."""
     both = replace(page_clip(left=True, hinged=True), clip_id="test/s1/lid", labelled_hand="right")
     right = page_clip()
@@ -56,9 +57,21 @@ def dataset(hands, page_clip, tmp_path):
         gravity=None,
         gravity_note="still",
     )
-    root = tmp_path / "grab"
-    write_annotated(root, [both, right, far], "grab", SPLIT, THRESHOLD_M, quality=True)
-    return load_annotated(root, hands)
+    root = tmp_path_factory.mktemp("written") / "grab"
+    return write_annotated(root, [both, right, far], "grab", SPLIT, THRESHOLD_M, quality=True)
+
+
+@pytest.fixture
+def dataset(written, hands, tmp_path):
+    """A copy that a test may change."""
+    return load_annotated(shutil.copytree(written, tmp_path / "grab"), hands)
+
+
+@pytest.fixture(scope="module")
+def page(written, hands, tmp_path_factory):
+    """Call it with a clip's id: the page of the clip as it was written, made once."""
+    folder, annotated = tmp_path_factory.mktemp("pages"), load_annotated(written, hands)
+    return cache(lambda clip_id: write_clip_page(folder / page_name(clip_id), annotated, clip_id, hands))
 
 
 def world_points(annotated, clip):
@@ -141,10 +154,11 @@ def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
     assert not series.surface["left"].touched.any()
 
 
-def test_page_shows_the_same_whether_the_stage_surface_ran_or_not(dataset, hands, tmp_path):
-    without = write_clip_page(tmp_path / "without.html", dataset, "test/s1/lid", hands)
+@pytest.mark.slow
+def test_page_shows_the_same_whether_the_stage_surface_ran_or_not(dataset, page, hands, tmp_path):
     surface_store(dataset.root / "clips", dataset.root / "surface", progress=False)
-    assert write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands).read_text() == without.read_text()
+    after = write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands)
+    assert after.read_text() == page("test/s1/lid").read_text()
 
 
 def test_page_reads_what_the_stage_wrote_and_measures_what_quality_control_left_out(dataset, hands):
@@ -211,8 +225,8 @@ def test_every_painted_mesh_of_the_glb_finds_its_points_where_its_vertices_are(d
         np.testing.assert_allclose(place.max(axis=0), vertices.max(axis=0), atol=0.012)
 
 
-def test_page_tells_words_evidence_quality_split_and_sources(dataset, hands, tmp_path):
-    text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/box", hands).read_text()
+def test_page_tells_words_evidence_quality_split_and_sources(dataset, page):
+    text = page("test/s2/box").read_text()
     for sentence in dataset.sentences("test/s2/box"):
         assert sentence in text
     assert f'<td>s2/&lt;box&gt;.npz</td><td class="number">12,345</td><td>{SHA256}</td>' in text
@@ -227,13 +241,14 @@ def test_page_tells_words_evidence_quality_split_and_sources(dataset, hands, tmp
     assert "SYNTHETIC" in text
 
 
-def test_page_says_where_annotator_and_distances_disagree(dataset, hands, tmp_path):
-    text = write_clip_page(tmp_path / "page.html", dataset, "test/s1/lid", hands).read_text()
+def test_page_says_where_annotator_and_distances_disagree(page):
+    text = page("test/s1/lid").read_text()
     assert "annotator named: right, which DISAGREES" in text
     assert "with a hinge" in text
     assert text.count('<div class="readout"') == 7
 
 
+@pytest.mark.slow
 def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(dataset, hands, tmp_path):
     contact = read_contact_settings(dataset.root / "contact")
     annotate_store(
@@ -250,6 +265,7 @@ def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(da
         assert "<h2>Hand type: right</h2>" in text
 
 
+@pytest.mark.slow
 def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp_path):
     """A box lifted by 20 cm under the hand, of which its source says no word."""
     clips, rule = [replace(page_clip(), verb=None)], {**SPLIT, "test": []}
@@ -258,8 +274,8 @@ def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp
     assert re.search(r"<dd>lift, derived from the motion \(.+\): the source has no label</dd>", text)
 
 
-def test_clip_without_words_says_why_and_still_has_its_page(dataset, hands, tmp_path):
-    text = write_clip_page(tmp_path / "page.html", dataset, "test/s2/far", hands).read_text()
+def test_clip_without_words_says_why_and_still_has_its_page(page):
+    text = page("test/s2/far").read_text()
     assert "No sentences: no joint within 9 cm of the object" in text
     assert "<h2>Hand type: none</h2>" in text
     assert '<td>right</td><td class="number">19 of 24</td><td>no</td>' in text
@@ -267,8 +283,8 @@ def test_clip_without_words_says_why_and_still_has_its_page(dataset, hands, tmp_
     assert "No hand comes within 9 cm of the object." in text
 
 
-def test_page_repeats_byte_for_byte_and_fetches_nothing(dataset, hands, tmp_path):
-    first, second = (write_clip_page(tmp_path / name, dataset, "test/s1/lid", hands) for name in "ab")
+def test_page_repeats_byte_for_byte_and_fetches_nothing(dataset, page, hands, tmp_path):
+    first, second = page("test/s1/lid"), write_clip_page(tmp_path / "again.html", dataset, "test/s1/lid", hands)
     assert first.read_bytes() == second.read_bytes()
     own_part = first.read_text().replace(three_javascript(), "")
     assert not re.search(r"https?://|@import|url\((?!#)", own_part)
@@ -307,11 +323,11 @@ def test_page_names_are_safe_file_names():
 
 
 @pytest.mark.slow
-def test_curves_and_contact_follow_the_player_in_chromium(dataset, hands, tmp_path):
+def test_curves_and_contact_follow_the_player_in_chromium(dataset, page, hands, tmp_path):
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         pytest.skip("no chromium on PATH: the page was not opened")
-    page = write_clip_page(tmp_path / "page.html", dataset, "test/s1/lid", hands)
+    page = page("test/s1/lid")
     switches = [
         "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
         "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=6000", "--dump-dom",

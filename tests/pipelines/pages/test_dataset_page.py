@@ -1,6 +1,7 @@
 """The page of one dataset: counts, examples, what was left out; and `hoidata show`, which finds a clip by its id."""
 
 import re
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -23,8 +24,8 @@ SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject
 LEFT_OUT = Quarantined("grab/s1/mug_1", "s1/mug_1.npz", "finite numbers", "NaN in <frame 3>", "download it again")
 
 
-@pytest.fixture
-def project(hands, page_clip, tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def written(page_clip, tmp_path_factory):
     """A project folder with one dataset of four clips: the last one's hand is far from its object."""
     right, both = page_clip(), page_clip(left=True, hinged=True, frames=30)
     far = {**right.hands, "right": replace(right.hands["right"], wrist_m=right.hands["right"].wrist_m + 1.0)}
@@ -34,13 +35,20 @@ def project(hands, page_clip, tmp_path, monkeypatch):
         replace(both, clip_id="grab/s2/lid_1", subject="s2", verb="open", object_words="lidded <box>"),
         replace(right, clip_id="grab/s1/box_far", hands=far),
     ]
-    root = tmp_path / "data" / "embedded" / "grab"
-    write_annotated(root, [*clips, LEFT_OUT], "grab", SPLIT, 0.09, quality=True)
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump({"datasets": ["h2o", "grab"], "profile": "embedded"}))
-    (tmp_path / "manifests" / "embedded").mkdir(parents=True)
-    (tmp_path / "manifests" / "embedded" / "hand.json").write_text('{"present": true}')
+    folder = tmp_path_factory.mktemp("written")
+    write_annotated(folder / "data" / "embedded" / "grab", [*clips, LEFT_OUT], "grab", SPLIT, 0.09, quality=True)
+    (folder / "params.yaml").write_text(yaml.safe_dump({"datasets": ["h2o", "grab"], "profile": "embedded"}))
+    (folder / "manifests" / "embedded").mkdir(parents=True)
+    (folder / "manifests" / "embedded" / "hand.json").write_text('{"present": true}')
+    return folder
+
+
+@pytest.fixture
+def project(written, tmp_path, monkeypatch):
+    """The dataset's folder in a copy of it, which is the current folder."""
+    shutil.copytree(written, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    return root
+    return tmp_path / "data" / "embedded" / "grab"
 
 
 def test_bars_count_every_clip_most_frequent_first():

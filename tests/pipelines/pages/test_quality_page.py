@@ -19,14 +19,14 @@ LIMITS = {name: asdict(limit) for name, limit in DEFAULT_LIMITS.items()}
 JUMP = "largest sudden step of a corner of the object: 1.74 m at frame 19, above 0.2 m"
 
 
-@pytest.fixture
-def folders(hands, page_clip, tmp_path):
+@pytest.fixture(scope="module")
+def folders(hands, page_clip, tmp_path_factory):
     """A dataset of three clips: the second jumps, the third has an open mesh."""
     clips = [replace(page_clip(frames=40), clip_id=f"test/s1/{number}") for number in range(3)]
     clips[1] = jumping(clips[1], 20, 1.0)
     model = clips[2].object.model
     clips[2] = with_object(clips[2], model=replace(model, name="open box", faces=model.faces[1:]))
-    folders = ReportFolders.of("embedded", tmp_path)
+    folders = ReportFolders.of("embedded", tmp_path_factory.mktemp("quality"))
     write_store(folders.data / "grab" / "clips", clips, generated_info("grab", hands))
     quality_store(folders.data / "grab" / "clips", folders.data / "grab" / "quality", progress=False)
     return folders

@@ -36,18 +36,18 @@ class ToyNetwork(nn.Module):
 class ToyObjective:
     """Squared error to the recorded features."""
 
-    needs_entries = False
+    frames = entries = 0
 
     def __init__(self, setup: Setup) -> None:
         self.network = ToyNetwork(setup.network).to(setup.device)
-        self.held_out = collate(setup.corpus.held_out, with_entries=False).to(setup.device)
+        self.held_out = collate(setup.corpus.held_out).to(setup.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         return {"total": self._error(self.network, batch)}
 
     @torch.no_grad()
-    def validation(self, network: nn.Module) -> float:
-        return float(self._error(network, self.held_out))
+    def validation(self, network: nn.Module) -> Tensor:
+        return self._error(network, self.held_out)
 
     def _error(self, network: nn.Module, batch: ClipBatch) -> Tensor:
         assert isinstance(network, ToyNetwork)

@@ -1,0 +1,130 @@
+"""Whole recordings of a store as arrays, and back: ``arrays/recordings.npz`` and ``arrays/source_hands.npz``."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import SIDES, ObjectTrack, SourceFile
+from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.files import canonical_json, sha256_bytes
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.tracked_hand import JointCapsules, Skin, TrackedHand
+from hoidata.objects.model import ObjectModel
+from hoidata.store.fields import RECORDINGS, SOURCE_HANDS
+
+_DIGITS = 16
+
+
+class RecordingWriter:
+    """Collects the arrays of recordings and, once each, those of their hands."""
+
+    def __init__(self) -> None:
+        self.arrays: dict[str, np.ndarray] = {}
+        self.hands: dict[str, np.ndarray] = {}
+        self.facts: dict[str, dict[str, Any]] = {}
+        self.hand_facts: dict[str, dict[str, Any]] = {}
+
+    def add(self, recording: HandRecording, object_key: Any, source_files: list[int]) -> None:
+        """A second recording of a sequence takes the place of the first."""
+        named = _recording_arrays(recording)
+        for field in RECORDINGS.fields:
+            self.arrays[f"{recording.sequence}/{field.name}"] = np.ascontiguousarray(named[field.name], field.dtype)
+        self.facts[recording.sequence] = {
+            "subject": recording.subject,
+            "fps": recording.fps,
+            "frames": recording.n_frames,
+            "object": object_key,
+            "hand": self._add_hand(recording.hand),
+            "gravity": recording.gravity.tolist(),
+            "source_files": source_files,
+        }
+
+    def _add_hand(self, hand: TrackedHand) -> str:
+        arrays = {f.name: np.ascontiguousarray(_hand_arrays(hand)[f.name], f.dtype) for f in SOURCE_HANDS.fields}
+        names = {"layout": hand.layout, "joints": list(hand.joint_names), "middle_knuckle": hand.middle_knuckle}
+        parts = [canonical_json(names).encode(), *(array.tobytes() for array in arrays.values())]
+        key = sha256_bytes(b"".join(parts))[:_DIGITS]
+        self.hands |= {f"{key}/{name}": array for name, array in arrays.items()}
+        self.hand_facts[key] = names
+        return key
+
+
+def _recording_arrays(recording: HandRecording) -> dict[str, np.ndarray]:
+    track = recording.object
+    hinge = np.zeros(track.n_frames) if track.hinge_rad is None else track.hinge_rad
+    named = {"object_rotvec": track.rotvec, "object_translation_m": track.translation_m, "object_hinge_rad": hinge}
+    for side, hand in recording.hands.items():
+        named |= {f"{side}_wrist_m": hand.wrist_m, f"{side}_rotvec": hand.rotvec}
+    return named | {"usable": recording.usable}
+
+
+def read_recording(
+    name: str,
+    dataset: str,
+    facts: Mapping[str, Any],
+    arrays: Mapping[str, np.ndarray],
+    hand: TrackedHand,
+    model: ObjectModel,
+    sources: tuple[SourceFile, ...],
+) -> HandRecording:
+    """The recording of one sequence; facts are those of info.json, arrays the members of recordings.npz."""
+    own = {field.name: arrays[f"{name}/{field.name}"].copy() for field in RECORDINGS.fields}
+    hinge = own["object_hinge_rad"] if model.is_articulated else None
+    return HandRecording(
+        dataset=dataset,
+        subject=facts["subject"],
+        sequence=name,
+        fps=facts["fps"],
+        hand=hand,
+        hands={side: OwnHandTrack(own[f"{side}_wrist_m"], own[f"{side}_rotvec"]) for side in SIDES},
+        object=ObjectTrack(model, own["object_rotvec"], own["object_translation_m"], hinge),
+        usable=own["usable"],
+        gravity=np.array(facts["gravity"]),
+        sources=sources,
+    )
+
+
+def _hand_arrays(hand: TrackedHand) -> dict[str, np.ndarray]:
+    skin, capsules = hand.skin, hand.capsules
+    if skin.corrective_m is not None:
+        raise ValueError("a hand with pose blend shapes is stored by its model's digest, not by its arrays")
+    return {
+        "parents": hand.parents,
+        "offset_m": hand.offset_m,
+        "rest_rotmats": hand.rest_rotmats,
+        "skin_point_m": skin.point_m,
+        "skin_normal": skin.normal,
+        "skin_weight": skin.weight,
+        "joint_from_skin": skin.joint_from_skin.rotation,
+        "joint_from_skin_m": skin.joint_from_skin.translation,
+        "tip_joint": hand.tip_joint,
+        "capsule_joint": capsules.joint,
+        "capsule_start_m": capsules.start_m,
+        "capsule_end_m": capsules.end_m,
+        "capsule_radius_m": capsules.radius_m,
+        "wrist_from_canonical": hand.wrist_from_canonical,
+        "hinge_axis": hand.hinge_axis,
+        "limit_rad": hand.limit_rad,
+    }
+
+
+def read_hand(key: str, facts: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> TrackedHand:
+    """A right hand; facts are those of info.json, arrays the members of source_hands.npz."""
+    own = {field.name: arrays[f"{key}/{field.name}"].copy() for field in SOURCE_HANDS.fields}
+    to_joint = RigidTransform(own["joint_from_skin"], own["joint_from_skin_m"])
+    return TrackedHand(
+        side="right",
+        layout=facts["layout"],
+        joint_names=tuple(facts["joints"]),
+        parents=own["parents"],
+        offset_m=own["offset_m"],
+        rest_rotmats=own["rest_rotmats"],
+        skin=Skin(own["skin_point_m"], own["skin_normal"], own["skin_weight"], to_joint),
+        tip_joint=own["tip_joint"],
+        capsules=JointCapsules(*(own[f"capsule_{name}"] for name in ("joint", "start_m", "end_m", "radius_m"))),
+        middle_knuckle=facts["middle_knuckle"],
+        wrist_from_canonical=own["wrist_from_canonical"],
+        hinge_axis=own["hinge_axis"],
+        limit_rad=own["limit_rad"],
+    )

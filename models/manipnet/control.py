@@ -1,0 +1,69 @@
+"""What ManipNet is given: the motion of both wrists and of an object, at any rate, asked at any time."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from hoidata.clips.clip import SIDES, Side
+from hoidata.clips.recording import HandRecording
+from hoidata.geometry.transform import RigidTransform
+from hoidata.objects.model import ObjectModel
+
+_ON_FRAME = 1e-6  # of a frame: times this near to a frame are that frame's
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """One rigid body, world frame. time_s: (frame,) rising. rotmats: (frame, 3, 3); position_m: (frame, 3)."""
+
+    time_s: np.ndarray
+    rotmats: np.ndarray
+    position_m: np.ndarray
+
+    def at(self, time_s: np.ndarray) -> RigidTransform:
+        """``world_from_body`` at times of any shape: turned by slerp, moved straight, held beyond the ends."""
+        time = np.clip(time_s, self.time_s[0], self.time_s[-1])
+        place = np.interp(time, self.time_s, np.arange(len(self.time_s)))
+        frame = np.rint(place).astype(np.int64)
+        if (np.abs(place - frame) < _ON_FRAME).all():
+            return RigidTransform(self.rotmats[frame], self.position_m[frame])
+        turn = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
+        columns = [np.interp(place, np.arange(len(self.time_s)), column) for column in self.position_m.T]
+        return RigidTransform(turn, np.stack(columns, axis=-1))
+
+    @cached_property
+    def _slerp(self) -> Slerp:
+        return Slerp(self.time_s, Rotation.from_matrix(self.rotmats))
+
+
+@dataclass(frozen=True, eq=False)
+class Control:
+    """Wrists and object of one recording. wrists: world_from_wrist by side. thing: world_from_object.
+
+    model: the object's mesh. hinge_rad: (frame,) at ``thing.time_s`` for a hinged object, else None.
+    """
+
+    wrists: dict[Side, Motion]
+    thing: Motion
+    model: ObjectModel
+    hinge_rad: np.ndarray | None = None
+
+    def hinge_at(self, time_s: np.ndarray) -> np.ndarray | None:
+        """Angles at times of any shape, radians."""
+        if self.hinge_rad is None:
+            return None
+        return np.interp(time_s, self.thing.time_s, self.hinge_rad)
+
+
+def recording_control(recording: HandRecording) -> Control:
+    """What a recording with its source's own hands gives the network, at its own rate, time 0 in its first frame."""
+    thing, time_s = recording.object, recording.time_s
+    wrists: dict[Side, Motion] = {}
+    for side in SIDES:
+        pose = recording.world_from_wrist(side)
+        wrists[side] = Motion(time_s, pose.rotation, pose.translation)
+    body = thing.world_from_object
+    hinge = None if thing.hinge_rad is None else thing.hinge_rad.astype(np.float64)
+    return Control(wrists, Motion(time_s, body.rotation, body.translation), thing.model, hinge)

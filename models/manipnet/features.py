@@ -1,0 +1,230 @@
+"""What the network reads and writes: pose, trajectory and sensors of one hand, all in canonical axes of its wrist.
+
+Sizes for ManipNet's 17-joint hand: pose 192, trajectory 336, sensors 1,822 (2,350 in all); output 192 + 22 = 214.
+Metres and right-handed axes; ``released_inputs`` and ``released_outputs`` turn to the release's layout.
+"""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from hoidata.clips.clip import SIDES, Side
+from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.tracked_hand import N_TIPS, HandState, TrackedHand
+from hoidata.objects.mesh import mass_properties
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import SurfaceIndex
+from hoidata.sensors import OURS, SensorSettings, sense
+from hoidata.sensors.settings import CELLS
+from models.manipnet.control import Control, Motion
+
+_RELEASED_UNIT = 10.0  # decimetres
+SAMPLE_NUMBERS = 16
+_SMOOTHED_SAMPLES, _SMOOTHING = 5, 2.5
+
+
+@dataclass(frozen=True)
+class FeatureSettings:
+    """step_s: from one pose to the next. past_s, future_s, spacing_s: samples of the trajectory around now.
+
+    velocity_axes: of the object's angular velocity relative to the wrist: the wrist's now, or the object's.
+    object_place: what stands for the object's position. smooth: the release's smoothing of trajectories in training.
+    range_m: distances of the output are clamped to 0 and this and divided by it; less_radius: less that of the
+    capsule that begins at the joint.
+    """
+
+    step_s: float = 1 / 60
+    past_s: float = 0.5
+    future_s: float = 0.5
+    spacing_s: float = 0.05
+    velocity_axes: Literal["wrist", "object"] = "wrist"
+    object_place: Literal["box", "mass"] = "box"
+    smooth: bool = False
+    range_m: float = 0.03
+    less_radius: bool = True
+    sensors: SensorSettings = OURS
+
+    @property
+    def samples_s(self) -> np.ndarray:
+        """(sample,) times around now, 0 among them."""
+        past, future = (round(length / self.spacing_s) for length in (self.past_s, self.future_s))
+        return np.arange(-past, future + 1) * self.spacing_s
+
+
+class HandInputs(NamedTuple):
+    """pose: (frame, 192); trajectory: (frame, 336); sensors: (frame, 1822); of other hands their own sizes."""
+
+    pose: np.ndarray
+    trajectory: np.ndarray
+    sensors: np.ndarray
+
+
+def pose_features(hand: TrackedHand, state: HandState) -> np.ndarray:
+    """(frame, 9 joint + 15 + 6 palm capsule): 192. Canonical axes, metres, in the order
+
+    joint positions, tips in the hand's order, palm capsule starts, their ends, then per joint its z axis and y axis.
+    state: the hand in its wrist's frame.
+    """
+    canonical, palm = hand.wrist_from_canonical, hand.palm_capsules
+    places = [state.joint_m, state.tip_m, state.capsule_start_m[:, palm], state.capsule_end_m[:, palm]]
+    axes = canonical.T @ state.joint_rotmats @ canonical
+    vectors = np.concatenate([np.concatenate(places, axis=1) @ canonical, _axis_rows(axes)], axis=1)
+    return vectors.reshape(len(vectors), -1)
+
+
+def _axis_rows(rotmats: np.ndarray) -> np.ndarray:
+    """(frame, 2 joint, 3): z axis, then y axis of each (frame, joint, 3, 3)."""
+    return rotmats[..., [2, 1]].swapaxes(-1, -2).reshape(len(rotmats), -1, 3)
+
+
+def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray) -> np.ndarray:
+    """(frame, joint, 3, 3) wrist_from_joint, from the axes in pose features or network output (frame, 192 or more).
+
+    Axes are made orthonormal: z as given, y as near as it can be. ``hand.finger_rotmats`` makes them local.
+    """
+    first = 3 * (hand.n_points + 2 * len(hand.palm_capsules))
+    axes = np.reshape(pose[:, first : first + 6 * hand.n_joints], (len(pose), hand.n_joints, 2, 3))
+    z = axes[..., 0, :] / np.linalg.norm(axes[..., 0, :], axis=-1, keepdims=True)
+    y = axes[..., 1, :] - (axes[..., 1, :] * z).sum(-1, keepdims=True) * z
+    y = y / np.linalg.norm(y, axis=-1, keepdims=True)
+    canonical = hand.wrist_from_canonical
+    return canonical @ np.stack([np.cross(y, z), y, z], axis=-1) @ canonical.T
+
+
+def trajectory_features(
+    control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray, settings: FeatureSettings
+) -> np.ndarray:
+    """(frame, 21 x 16): per sample distance of the other wrist; own wrist position, z axis, y axis; the object's
+    position and angular velocity (rad/s). Metres, canonical axes of the own wrist at ``time_s (frame,)``.
+    """
+    own, other = control.wrists[side], control.wrists[SIDES[1 - SIDES.index(side)]]
+    canonical = hand.wrist_from_canonical
+    start, stop = own.time_s[0], own.time_s[-1]
+    samples = np.clip(time_s[:, None] + settings.samples_s, start, stop)
+    now, wrist, thing = own.at(time_s), own.at(samples), control.thing.at(samples)
+    wrist_from_world = now.inverse()
+    away = np.linalg.norm(other.at(samples).translation - now.translation[:, None], axis=-1, keepdims=True)
+    axes = canonical.T @ (now.rotation[:, None].swapaxes(-1, -2) @ wrist.rotation) @ canonical
+    middle = (thing @ object_place(control.model, settings)[None])[:, :, 0]
+    turning = _angular_velocity(control.thing, own, samples, now, settings)
+    if settings.velocity_axes == "wrist":
+        turning = np.linalg.det(canonical) * turning @ canonical  # a mirror turns axial vectors round
+    else:
+        turning = turning * ([1.0, 1.0, 1.0] if hand.side == "right" else [1.0, -1.0, -1.0])
+    places = [(wrist_from_world @ points) @ canonical for points in (wrist.translation, middle)]
+    rows = np.concatenate([away, places[0], axes[..., 2], axes[..., 1], places[1], turning], axis=-1)
+    return (_smoothed(rows) if settings.smooth else rows).reshape(len(time_s), -1)
+
+
+def object_place(model: ObjectModel, settings: FeatureSettings) -> np.ndarray:
+    """(3,) what stands for the object's position, object frame, hinge at 0: its box's centre, or its mass's."""
+    if settings.object_place == "mass":
+        return mass_properties(model.vertices_m, model.faces).centre_m
+    return (model.vertices_m.min(axis=0) + model.vertices_m.max(axis=0)) / 2
+
+
+def _angular_velocity(
+    thing: Motion, own: Motion, samples_s: np.ndarray, now: RigidTransform, settings: FeatureSettings
+) -> np.ndarray:
+    """(frame, sample, 3) rad/s of the object relative to the wrist, from one step before."""
+    before_s = np.maximum(samples_s - settings.step_s, own.time_s[0])
+    here, before = (
+        own.at(times).rotation.swapaxes(-1, -2) @ thing.at(times).rotation for times in (samples_s, before_s)
+    )
+    if settings.velocity_axes == "object":
+        return rotmat_to_rotvec(before.swapaxes(-1, -2) @ here) / settings.step_s
+    turn = rotmat_to_rotvec(here @ before.swapaxes(-1, -2)) / settings.step_s
+    now_from_then = now.rotation[:, None].swapaxes(-1, -2) @ own.at(samples_s).rotation
+    return (now_from_then @ turn[..., None])[..., 0]
+
+
+def _smoothed(rows: np.ndarray) -> np.ndarray:
+    """The release's filter over samples (frame, sample, number): in place, so it smooths what is smooth already."""
+    rows = rows.copy()
+    for sample in range(rows.shape[1]):
+        around = np.arange(max(sample - _SMOOTHED_SAMPLES, 0), min(sample + _SMOOTHED_SAMPLES + 1, rows.shape[1]))
+        weight = np.exp(-(((around - sample) / _SMOOTHING) ** 2))
+        rows[:, sample] = np.einsum("s,fsn->fn", weight / weight.sum(), rows[:, around])
+    return rows
+
+
+def object_from_wrist(
+    control: Control, side: Side, time_s: np.ndarray, settings: FeatureSettings
+) -> tuple[RigidTransform, np.ndarray | None]:
+    """(frame, time) transforms and hinge angles for ``sense``, at ``time_s (frame,)`` and the future times after it."""
+    times = time_s[:, None] + np.array(settings.sensors.times_s)
+    wrist, thing = control.wrists[side].at(times), control.thing.at(times)
+    turn = thing.rotation.swapaxes(-1, -2)
+    way = (turn @ (wrist.translation - thing.translation)[..., None])[..., 0]
+    return RigidTransform(turn @ wrist.rotation, way), control.hinge_at(times)
+
+
+def hand_inputs(
+    control: Control,
+    side: Side,
+    hand: TrackedHand,
+    state: HandState,
+    time_s: np.ndarray,
+    surface: SurfaceIndex,
+    settings: FeatureSettings,
+) -> HandInputs:
+    """All inputs of one hand at ``time_s (frame,)``. state: (frame,) in its wrist's frame; hand: that side's."""
+    seen, hinge_rad = object_from_wrist(control, side, time_s, settings)
+    sensed = sense(hand, state, seen, hinge_rad, surface, settings.sensors)
+    trajectory = trajectory_features(control, side, hand, time_s, settings)
+    return HandInputs(pose_features(hand, state), trajectory, sensed.flat())
+
+
+def output_distances(hand: TrackedHand, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
+    """(frame, 22) in 0 to 1, of signed distances (frame, 22) of joints and tips (``Sensed.distance_m[:, 0]``)."""
+    radius = hand.point_radius_m if settings.less_radius else 0.0
+    return np.clip((distance_m - radius) / settings.range_m, 0.0, 1.0)
+
+
+def outputs(hand: TrackedHand, state: HandState, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
+    """(frame, 214): pose features and distances of the next frame, in its own wrist's frame: what is learnt."""
+    return np.concatenate([pose_features(hand, state), output_distances(hand, distance_m, settings)], axis=1)
+
+
+class Relabelled(NamedTuple):
+    """Numbers of one layout in another: ``values[:, order] * scale``; folded into mean, deviation and matrices."""
+
+    order: np.ndarray
+    scale: np.ndarray
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        return values[..., self.order] * self.scale
+
+    def back(self, values: np.ndarray) -> np.ndarray:
+        """From the other layout to this one."""
+        return (values / self.scale)[..., np.argsort(self.order)]
+
+
+_MIRROR = np.array([-1.0, 1.0, 1.0])
+
+
+def released_inputs(hand: TrackedHand, settings: FeatureSettings) -> Relabelled:
+    """Inputs in the release's layout: decimetres, axes left-handed by a mirror in x."""
+    times, place = len(settings.sensors.times_s), _RELEASED_UNIT * _MIRROR
+    sample = np.concatenate([[_RELEASED_UNIT], place, _MIRROR, _MIRROR, place, -_MIRROR])
+    trajectory = np.tile(sample, len(settings.samples_s))
+    ways = np.full(times * (hand.n_sensors + hand.n_points), _RELEASED_UNIT)
+    cells = np.arange(CELLS**3).reshape(CELLS, CELLS, CELLS)[::-1].ravel()
+    parts = [_pose_scale(hand), trajectory, np.ones(CELLS**3), ways, np.tile(_MIRROR, hand.n_points)]
+    scale = np.concatenate(parts)
+    first, order = len(parts[0]) + len(parts[1]), np.arange(len(scale))
+    order[first : first + CELLS**3] = first + cells
+    return Relabelled(order, scale)
+
+
+def released_outputs(hand: TrackedHand) -> Relabelled:
+    """Outputs in the release's layout; its distances are shares already."""
+    scale = np.concatenate([_pose_scale(hand), np.ones(hand.n_points)])
+    return Relabelled(np.arange(len(scale)), scale)
+
+
+def _pose_scale(hand: TrackedHand) -> np.ndarray:
+    places = hand.n_joints + N_TIPS + 2 * len(hand.palm_capsules)
+    return np.concatenate([np.tile(_RELEASED_UNIT * _MIRROR, places), np.tile(_MIRROR, 2 * hand.n_joints)])

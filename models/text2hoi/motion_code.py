@@ -1,0 +1,132 @@
+"""What the diffusion network denoises: the numbers that stand for a motion, and the way back.
+
+Text2HOI denoises the features of every frame, hands in the world. Two switches change that: hands may be given in the
+frame the object has at the same moment, where a hand that holds still on a moving object is constant; and curves may
+stand for frames, as control points of B-splines (``models.common.spline``).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hoidata.batches.dataset import MAX_FRAMES, ClipSample
+from hoidata.clips.features import HAND_POSE_6D, OBJECT_HINGE, OBJECT_POSITION
+from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from models.common.features import hand_rotmats, hands_in_object_frame, hands_in_world, object_rotmat
+from models.common.sampling import Motion
+from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
+
+# What is like a metre of movement: 0.1 of a rotation's numbers per centimetre; fingers, of which there are many, more.
+OBJECT_REACH = torch.tensor([1.0] * 3 + [10.0] * 7)
+HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
+
+
+@dataclass(frozen=True)
+class MotionCodeConfig:
+    """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
+    per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
+    object, or a hand on it, that is generated with knots nearer than this to each other stands still (0: as generated).
+
+    convention: what rotations mean; "own", or that of a dataset in the authors' code, for networks they trained:
+    GRAB's objects are transposed, ARCTIC's fingers are offsets from ``finger_mean_rad``, 45 numbers for each hand.
+    """
+
+    knot_frames: int = 0
+    object_knots: int = 1
+    hand_frame: Literal["world", "object"] = "world"
+    convention: Literal["own", "h2o", "grab", "arctic"] = "own"
+    finger_mean_rad: tuple[float, ...] = ()
+    rest_m: float = 0.0
+
+
+@dataclass(frozen=True)
+class CodedClip:
+    """One recorded clip: hands (2, K, 99), object (L, 10), and where each hand is there (2, K) bool."""
+
+    hands: Tensor
+    object: Tensor
+    present: Tensor
+
+
+@dataclass(frozen=True)
+class MotionCode:
+    """Motions of hands (B, 2, F, 99) and object (B, F, 10) as rows (B, 2, K, 99) and (B, L, 10), and back."""
+
+    config: MotionCodeConfig
+
+    def sizes(self, n_frames: int) -> tuple[int, int]:
+        """Rows of a hand and of the object in a motion of ``n_frames``."""
+        if not self.config.knot_frames:
+            return n_frames, n_frames
+        intervals = intervals_of(n_frames, self.config.knot_frames)
+        return intervals + 3, intervals * self.config.object_knots + 3
+
+    @property
+    def largest(self) -> tuple[int, int]:
+        """Rows of the longest motion there can be."""
+        return self.sizes(MAX_FRAMES)
+
+    def rows(self, counts: Sequence[int], device: torch.device) -> tuple[Tensor, Tensor]:
+        """(B, K) and (B, L) bool: the rows that motions of so many frames have."""
+        sizes = np.array([self.sizes(n) for n in counts])
+        hand, thing = (torch.from_numpy(np.arange(own.max()) < own[:, None]).to(device) for own in sizes.T)
+        return hand, thing
+
+    def encode(self, sample: ClipSample) -> CodedClip:
+        """A recorded clip's rows."""
+        hands, thing = self.converted(torch.from_numpy(sample.hands), torch.from_numpy(sample.object), -1)
+        present = torch.from_numpy(sample.valid & sample.active_hands[:, None])
+        if self.config.hand_frame == "object":
+            hands = hands_in_object_frame(hands[None], thing[None])[0]
+        if not self.config.knot_frames:
+            return CodedClip(hands, thing, present)
+        intervals = intervals_of(len(thing), self.config.knot_frames)
+        curves = torch.stack([fit_spline(hand, own, intervals) for hand, own in zip(hands, present, strict=True)])
+        objects = fit_spline(thing, torch.ones(len(thing)), intervals * self.config.object_knots)
+        # A control point moves four intervals; it is there where the hand is in any frame of them.
+        touched = stacked_bases([len(thing)], [intervals], len(thing), torch.device("cpu"))[0].T > 0
+        return CodedClip(curves, objects, (present.float() @ touched.T.float()) > 0)
+
+    def curves(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
+        """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper."""
+        if not self.config.knot_frames:
+            return self.converted(hands, objects, 1)
+        n_frames = max(counts)
+        knots = [intervals_of(n, self.config.knot_frames) for n in counts]
+        hands = spline_values(hands, stacked_bases(list(counts), knots, n_frames, hands.device))
+        knots = [n * self.config.object_knots for n in knots]
+        return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
+
+    def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
+        """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
+        if self.config.convention == "grab":
+            turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
+            objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
+        if self.config.convention == "arctic":
+            mean = torch.tensor(self.config.finger_mean_rad, device=hands.device).reshape(2, 1, 15, 3)
+            fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
+            fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
+            hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
+        return hands, objects
+
+    def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
+        """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
+        if not (self.config.rest_m and self.config.knot_frames):
+            return hands, objects
+        present, there = self.rows(counts, hands.device)
+        if self.config.hand_frame == "object":
+            reach = self.config.rest_m * HAND_REACH.to(hands)
+            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
+        return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
+
+    def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
+        """Hands (B, 2, F, 99) of ``curves`` in the model frame."""
+        return hands_in_world(hands, objects) if self.config.hand_frame == "object" else hands
+
+    def in_object_frame(self, hands: Tensor, objects: Tensor) -> Tensor:
+        """Hands (B, 2, F, 99) of ``curves`` in the object's frame."""
+        return hands if self.config.hand_frame == "object" else hands_in_object_frame(hands, objects)

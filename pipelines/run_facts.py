@@ -1,0 +1,38 @@
+"""What a person reads after a run: clips, what was left out, leading figures of every row, where the pages are."""
+
+import json
+from pathlib import Path
+
+from pipelines.pages.metrics_table import markdown_table
+from pipelines.params import read_params
+
+LEADING = ("action_named", "contact_f1", "joint_error_mm", "deep_share", "jitter_m_s3")
+
+
+def describe_results(project: Path, profile: str) -> str:
+    """Markdown: a row of counts per dataset, a table of leading figures for each that was measured, and the report."""
+    params = read_params(project)
+    lines = ["| dataset | clips | left out while converting | train | validation | test |", "|---|---|---|---|---|---|"]
+    tables: list[str] = []
+    for dataset in params["datasets"]:
+        data, metrics = project / "data" / profile / dataset, project / "metrics" / profile / dataset
+        if (data / "clips/meta/info.json").is_file():
+            lines.append(_counts(dataset, data))
+        families = [name for name in params["families"] if _measured(metrics / f"{name}.json")]
+        if families:
+            tables += [f"### {dataset}", markdown_table(metrics, families, LEADING)]
+    report = project / "report" / profile / "index.html"
+    where = f"Report: {report.resolve()}" if report.is_file() else "The report has not been made yet."
+    return "\n\n".join(["\n".join(lines), *tables, where])
+
+
+def _counts(dataset: str, data: Path) -> str:
+    counts = json.loads((data / "clips/meta/info.json").read_text())["counts"]
+    splits = data / "splits/info.json"
+    parts = json.loads(splits.read_text()).get("chosen", {}).get("clips", {}) if splits.is_file() else {}
+    numbers = [parts.get(name, "") for name in ("train", "validation", "test")]
+    return f"| {' | '.join(map(str, (dataset, counts['clips'], counts['quarantined'], *numbers)))} |"
+
+
+def _measured(path: Path) -> bool:
+    return path.is_file() and "figures" in json.loads(path.read_text())

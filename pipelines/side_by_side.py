@@ -1,0 +1,231 @@
+"""The graph side by side: DVC runs single stages as soon as their inputs are ready.
+
+Which stages there are, their order and what is stale is asked of DVC; nothing of it is written down here.
+"""
+
+import contextvars
+import json
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hoidata.files.atomic import exclusive, write_whole
+
+CODE = "code"
+RUN = Path(".hoidata/repro")
+LOGS = Path(".hoidata/logs")
+DURATIONS = Path(".hoidata/durations.json")
+# What every run of a single stage would import anew, about a second each time.
+PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
+TAIL = 15
+Upstream = Mapping[str, frozenset[str]]
+RunStage = Callable[[str], int]
+
+
+@dataclass
+class Run:
+    """What happened: seconds of each stage that was tried, exit codes of those that failed, seconds in all."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    failed: dict[str, int] = field(default_factory=dict)
+    wall: float = 0.0
+
+
+def reproduce_side_by_side(
+    targets: list[str], jobs: int, wrap: Callable[[RunStage], RunStage] | None = None, force: bool = False
+) -> Run:
+    """Bring the targets (all when empty) up to date, up to ``jobs`` stages at once. Bytes do not depend on ``jobs``.
+
+    wrap: makes of the function that runs one stage the one that is called for each, for instance a Prefect task.
+    force: run the targets (all that is needed when empty) even where DVC finds nothing changed.
+    A stage that fails stops what follows from it and nothing else. Raises BadInput when another run is under way here.
+    """
+    # Left in the opposite order: running stages are stopped before the threads that wait for them are.
+    with exclusive(RUN, wait_s=0), ThreadPoolExecutor(jobs) as pool, _Children(max(1, _cores() // jobs)) as children:
+        run_stage = wrap(children.run) if wrap else children.run
+        start, run = time.monotonic(), Run()
+        if _timed(CODE, run_stage, run) == 0:
+            upstream = stale_stages(targets, children.forced if force else None)
+            run_all(upstream, pool, jobs, run_stage, run)
+            write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
+        run.wall = time.monotonic() - start
+        return run
+
+
+def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str, frozenset[str]]:
+    """Stages the targets need that DVC finds changed, and all that follow from them, each with those it waits for.
+
+    forced: filled with the names of the targets, which then count as changed.
+    """
+    import networkx
+    from dvc.repo import Repo
+    from dvc.repo.reproduce import collect_stages, get_active_graph, plan_repro
+
+    with Repo() as repo, repo.lock:
+        graph = get_active_graph(repo.index.graph)
+        asked = collect_stages(repo, targets or ["dvc.yaml"])
+        stages = plan_repro(graph, asked)
+        needed = graph.subgraph(stages)
+        if forced is not None:
+            forced.update(stage.addressing for stage in (asked if targets else stages))
+        known = {CODE, *(forced or ())}
+        changed = [stage for stage in stages if stage.addressing not in known and stage.changed()]
+        changed += [stage for stage in stages if stage.addressing in known - {CODE}]
+        stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
+        return {
+            stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
+            for stage in stages
+            if stage in stale
+        }
+
+
+def run_all(upstream: Upstream, pool: ThreadPoolExecutor, jobs: int, run_stage: RunStage, run: Run) -> None:
+    """Run every stage once those it waits for are done; first the one with the longest way to the end behind it."""
+    remaining = _remaining_seconds(upstream, read_durations())
+    waiting = dict(upstream)
+    running: dict[Future[int], str] = {}
+    while waiting or running:
+        unfinished = waiting.keys() | set(running.values())
+        ready = sorted((name for name in waiting if not waiting[name] & unfinished), key=lambda name: -remaining[name])
+        for name in ready[: jobs - len(running)]:
+            del waiting[name]
+            context = contextvars.copy_context()
+            running[pool.submit(context.run, _timed, name, run_stage, run)] = name
+        for future in wait(running, return_when=FIRST_COMPLETED).done:
+            name = running.pop(future)
+            if future.result():
+                waiting = _without_followers(waiting, name)
+            _tell(name, run, len(upstream))
+
+
+def describe_run(run: Run) -> str:
+    """Where the time went, by kind of stage, and which stages failed."""
+    kinds: dict[str, list[float]] = {}
+    for name, seconds in run.seconds.items():
+        kinds.setdefault(name.split(":")[-1].split("@")[0], []).append(seconds)
+    rows = sorted(kinds.items(), key=lambda row: -sum(row[1]))
+    lines = [f"{kind:16} {len(seconds):4} stages {sum(seconds):8.1f} s" for kind, seconds in rows]
+    lines.append(
+        f"{'all':16} {len(run.seconds):4} stages {sum(run.seconds.values()):8.1f} s, in {run.wall:.1f} s by the clock"
+    )
+    lines += [f"failed: {name}; all it said: {log_of(name)}" for name in run.failed]
+    return "\n".join(lines)
+
+
+def _timed(name: str, run_stage: RunStage, run: Run) -> int:
+    start = time.monotonic()
+    code = run_stage(name)
+    run.seconds[name] = time.monotonic() - start
+    if code:
+        run.failed[name] = code
+    return code
+
+
+def _tell(name: str, run: Run, number: int) -> None:
+    """One line per finished stage, and what a failed one said last."""
+    done = len(run.seconds) - 1
+    print(f"[{done}/{number}] {name}: {'FAILED after ' * (name in run.failed)}{run.seconds[name]:.1f} s", flush=True)
+    if name in run.failed:
+        lines = log_of(name).read_text(errors="replace").splitlines()[-TAIL:] if log_of(name).is_file() else []
+        print("\n".join(f"    {line}" for line in lines), file=sys.stderr, flush=True)
+
+
+def _without_followers(waiting: Upstream, failed: str) -> dict[str, frozenset[str]]:
+    """The stages that do not wait, directly or through others, for the one that failed."""
+    lost = {failed}
+    while more := {name for name, needs in waiting.items() if name not in lost and needs & lost}:
+        lost |= more
+    return {name: needs for name, needs in waiting.items() if name not in lost}
+
+
+def _remaining_seconds(upstream: Upstream, known: Mapping[str, float]) -> dict[str, float]:
+    """For each stage the seconds of the longest chain that starts with it; 1 where nothing is known."""
+    followers: dict[str, list[str]] = {name: [] for name in upstream}
+    for name, needs in upstream.items():
+        for need in needs:
+            followers[need].append(name)
+    seconds: dict[str, float] = {}
+
+    def fill(name: str) -> float:
+        if name not in seconds:
+            seconds[name] = known.get(name, 1.0) + max(map(fill, followers[name]), default=0.0)
+        return seconds[name]
+
+    for name in upstream:
+        fill(name)
+    return seconds
+
+
+def read_durations() -> dict[str, float]:
+    """Seconds of every stage when it last ran; nothing where that is not known."""
+    try:
+        return {str(name): float(value) for name, value in json.loads(DURATIONS.read_text()).items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}  # only the order of stages depends on it
+
+
+def log_of(name: str) -> Path:
+    """Where what a stage printed is kept."""
+    return LOGS / f"{name.replace('/', '-').replace(':', '-')}.log"
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0))
+
+
+class _Children:
+    """Processes that run DVC for one stage each, forked from one that has it loaded; none outlives this one's end."""
+
+    def __init__(self, cores: int) -> None:
+        self.cores = cores
+        self.context = multiprocessing.get_context("forkserver")
+        self.processes: set[Any] = set()
+        self.forced: set[str] = set()
+
+    def __enter__(self) -> "_Children":
+        self.context.set_forkserver_preload(PRELOADED)
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, _stop)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Stop what is still at work, as after Ctrl-C: the outputs of unfinished stages stay what they were."""
+        for process in self.processes:
+            if process.is_alive():
+                os.killpg(process.pid, signal.SIGINT)
+
+    def run(self, name: str) -> int:
+        """DVC's exit code for one stage; what it prints goes to the stage's log."""
+        LOGS.mkdir(parents=True, exist_ok=True)
+        process = self.context.Process(
+            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, self.cores)
+        )
+        process.start()
+        self.processes.add(process)
+        process.join()
+        return process.exitcode or 0
+
+
+def _stop(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _run_single_stage(project: Path, name: str, force: bool, cores: int) -> None:
+    """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
+    from dvc.cli import main
+
+    os.setpgrp()
+    os.chdir(project)
+    os.environ["HOIDATA_JOBS"] = str(cores)
+    with log_of(name).open("wb") as output:
+        os.dup2(output.fileno(), 1)
+        os.dup2(output.fileno(), 2)
+    sys.exit(main(["--wait-for-lock", "repro", "--single-item", *["--force"] * force, name]))

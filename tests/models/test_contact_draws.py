@@ -1,0 +1,113 @@
+"""Contact as tokens and as draws: order-free, one map for each hand, and more than one answer where there is more."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from hoidata.batches.dataset import ClipBatch
+from models.common.point_net import PointNetConfig
+from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss, picked
+from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
+from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens, spread_out
+
+POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16), align=False)
+
+
+def network() -> AnchoredContact:
+    torch.manual_seed(0)
+    return AnchoredContact(ContactConfig(POINT_NET, (32, 32, 16), drawn_by="anchor"))
+
+
+def test_contact_tokens_do_not_depend_on_the_order_of_points(batch: ClipBatch) -> None:
+    order = torch.randperm(batch.points_m.shape[1], generator=torch.Generator().manual_seed(0))
+    given = batch.points_m, batch.normals, batch.part, batch.contact
+    mixed = (*(part[:, order] for part in given[:3]), batch.contact[..., order])
+    tokens, there = contact_tokens(*given, 5)
+    other, also = contact_tokens(*mixed, 5)
+    assert torch.equal(there, also)
+    torch.testing.assert_close(tokens[there], other[also])
+
+
+def test_contact_tokens_lie_on_the_points_they_stand_for_and_say_which_hand_touches(batch: ClipBatch) -> None:
+    tokens, there = contact_tokens(batch.points_m, batch.normals, batch.part, batch.contact, 5)
+    assert tokens.shape == (3, 15, TOKEN_FEATURES)
+    for row, sample in enumerate(batch.samples):
+        for number in there[row].nonzero()[:, 0].tolist():
+            kind = number // 5
+            assert tokens[row, number, 10:].tolist() == [float(k == kind) for k in range(3)]
+            point = (batch.points_m[row] - tokens[row, number, 3:6] / 10).norm(dim=-1).argmin()
+            touched = torch.from_numpy(sample.contact)[:, point]
+            assert touched[kind] if kind < 2 else not touched.any()
+        counts = there[row].reshape(3, 5).sum(1).tolist()
+        assert counts == [min(5, n) for n in (*sample.contact.sum(1), (~sample.contact.any(0)).sum())]
+
+
+def test_points_are_spread_out_over_their_kind() -> None:
+    points = torch.stack((torch.linspace(0, 1, 101), torch.zeros(101), torch.zeros(101)), -1)[None]
+    kinds = torch.ones(1, 1, 101, dtype=torch.bool)
+    chosen, there = spread_out(points, kinds, 3)
+    assert there.all()
+    assert sorted(points[0, chosen[0, 0], 0].tolist()) == pytest.approx([0, 0.5, 1])
+
+
+def test_draws_fall_in_proportion_to_their_weights() -> None:
+    weights = torch.tensor([0.0, 3.0, 0.0, 1.0])
+    draws = torch.linspace(0, 1, 10_001)[:-1]
+    found = picked(weights, draws)
+    counts = torch.bincount(found, minlength=4) / len(draws)
+    torch.testing.assert_close(counts, weights / 4, atol=1e-3, rtol=0)
+    assert picked(torch.zeros(4), torch.tensor([0.5])).item() < 4
+
+
+def test_a_hand_that_does_not_act_has_no_map_and_flags_change_the_maps(batch: ClipBatch) -> None:
+    model = network().eval()
+    latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
+    found = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents)
+    assert found.shape == (3, 2, 2, batch.points_m.shape[1])
+    idle = ~batch.active_hands[:, None].expand(-1, 2, -1)
+    assert not found[idle].any()
+    other = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands.flip(1), latents)
+    assert not torch.allclose(found.amax(2)[0], other.amax(2)[0])
+
+
+def test_a_clips_maps_do_not_depend_on_the_others_in_the_batch(batch: ClipBatch) -> None:
+    model = network().eval()
+    latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
+    many = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents)
+    one = model.sample(batch.points_m[1:2], batch.text[1:2, 0], batch.active_hands[1:2], latents[:, 1:2])
+    torch.testing.assert_close(many[1:2], one, atol=1e-5, rtol=1e-4)
+
+
+def test_an_anchored_network_learns_two_regions_as_two_answers(batch: ClipBatch) -> None:
+    """One object, one sentence, touched at the top in half of the clips and at the bottom in the other half."""
+    torch.manual_seed(0)
+    right = next(row for row, own in enumerate(batch.active_hands.tolist()) if own == [False, True])
+    points = batch.points_m[right].expand(8, -1, -1)
+    high = points[..., 2] > points[..., 2].median()
+    top = torch.arange(8)[:, None] % 2 == 0
+    contact = torch.stack((torch.zeros_like(high), high == top), 1).float()
+    active_hands = batch.active_hands[right].expand(8, -1)
+    given = replace(batch, active_hands=active_hands)
+    text = batch.text[right, 0].expand(8, -1)
+    model, generator = network(), torch.Generator().manual_seed(0)
+    optimiser = torch.optim.Adam(model.parameters(), lr=1e-2)
+    for _ in range(150):
+        some = torch.randperm(points.shape[1], generator=generator)[:256]
+        touch, logits = model.losses(points[:, some], text, given, contact[..., some], generator)
+        optimiser.zero_grad()
+        by_hand_loss(touch, logits, contact[..., some], active_hands, ContactLossConfig(touch_weight=1.0))[
+            "total"
+        ].backward()
+        optimiser.step()
+    latents = model.eval().draw_latents(16, 1, torch.Generator().manual_seed(1))
+    maps = model.sample(points[:1], text[:1], active_hands[:1], latents)[0, :, 1] > 0.5
+    kinds = [best_of(contact_map, contact[:2, 1] > 0) for contact_map in maps]
+    assert {place for place, _ in kinds} == {0, 1}
+    assert sum(f1 for _, f1 in kinds) / len(kinds) > 0.8
+
+
+def best_of(found: Tensor, truths: Tensor) -> tuple[int, float]:
+    f1 = [float(2 * (found & true).sum() / (found.sum() + true.sum())) for true in truths]
+    return max(enumerate(f1), key=lambda pair: pair[1])

@@ -1,0 +1,168 @@
+"""Two clips are learnt by heart in two minutes, and it is the words that tell them apart (issue's F3)."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
+from hoidata.contact.agreement import f1_score
+from hoidata.store.annotated import load_annotated
+from models.common.corpus import Corpus
+from models.common.family import Network, Setup
+from models.common.features import Hands
+from models.common.sampling import Motion, SamplerConfig, draw_motion
+from models.common.training import Plan, fit
+from models.registry import load_network
+from models.text2hoi.diffusion import Condition, MotionGenerator
+from models.text2hoi.diffusion_training import Targets
+from models.text2hoi.refiner import RefinerModel, refine
+from models.text2hoi.refiner_training import RefinerObjective
+from models.text2hoi.surface import Surface
+from models.text2hoi.thresholds import best_threshold, contact_probabilities, true_maps
+from pipelines.stages.base import load_settings
+from pipelines.stages.train import TrainParams
+from tests.builders.stores import write_annotated
+from tests.models.conftest import BOX, make_clip
+from tests.models.conftest import Plan as ToyPlan
+
+DELIVERED = load_settings(TrainParams, "train")
+STEPS = {"contact": (300, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
+
+
+@dataclass(frozen=True)
+class Learnt:
+    """What was learnt of two clips of one box and one hand that differ in verb, length and path."""
+
+    corpus: Corpus
+    clips: list[ClipSample]
+    networks: dict[str, nn.Module]
+    generator: MotionGenerator
+    hands: Hands
+
+
+@pytest.fixture(scope="module")
+def learnt(tmp_path_factory: pytest.TempPathFactory) -> Learnt:
+    plans = [ToyPlan("s1", "lift", BOX, False, True, 48), ToyPlan("s1", "pass", BOX, False, True, 90)]
+    made = [make_clip(number, plan) for number, plan in enumerate(plans)]
+    annotated = load_annotated(write_annotated(tmp_path_factory.mktemp("two"), made))
+    clips = HoiDataset(annotated, "train", crop="start")
+    corpus, hands = Corpus(annotated, clips, clips), Hands(annotated.store.hand_pair())
+    networks, normaliser = dict[str, nn.Module](), None
+    for name in STEPS:
+        networks[name], normaliser = learn(load_network(name), corpus, hands, networks)
+    assert normaliser is not None
+    generator = MotionGenerator(networks["diffusion"], normaliser)  # pyright: ignore[reportArgumentType]
+    return Learnt(corpus, list(clips), networks, generator, hands)
+
+
+def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module]) -> tuple[nn.Module, Any]:
+    """The network with the delivered settings but for its budget, and without dropout, which is against knowing."""
+    plan = Plan.of(network, DELIVERED.of(network.name))
+    config = replace(plan.network, dropout=0.0) if hasattr(plan.network, "dropout") else plan.network
+    steps, size, rate = STEPS[network.name]
+    trained = {name: SimpleNamespace(network=own) for name, own in before.items()}
+    torch.manual_seed(0)
+    setup = Setup(config, plan.loss, 0, corpus, hands, torch.device("cpu"), trained)
+    objective, normaliser = network.objective(setup)
+    budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 20, "validate_every": steps}
+    training = replace(plan.training, **budget, ema_decay=0.98, weight_decay=0.0, keep_best=False)
+    return fit(objective, corpus, training, 0, torch.device("cpu"))[0], normaliser
+
+
+@pytest.mark.slow
+def test_contact_and_length_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
+    batch, maps = collate(learnt.clips), true_maps(learnt.clips)
+    found = contact_probabilities(learnt.networks["contact"], learnt.clips, 16, 0)  # pyright: ignore[reportArgumentType]
+    threshold = best_threshold(found, maps)
+    assert min(f1_score(own >= threshold, true) for own, true in zip(found, maps, strict=True)) >= 0.95
+    frames = learnt.networks["length"].expected_frames(batch.text[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
+    torch.testing.assert_close(frames, batch.lengths.float(), atol=1.0, rtol=0)
+    exchanged = learnt.networks["length"].expected_frames(batch.text.flip(0)[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
+    torch.testing.assert_close(exchanged, frames.flip(0))
+
+
+@pytest.mark.slow
+def test_motions_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
+    batch = collate(learnt.clips)
+    rows = Targets(learnt.generator.network.code, learnt.generator.normaliser, torch.device("cpu")).of(batch)
+    steps, draws = torch.full((2,), 100), torch.Generator().manual_seed(0)
+    made = learnt.generator.denoise_once(rows.hands, rows.object, steps, condition(learnt, batch, batch.text), draws)
+    assert joint_error_m(learnt, batch, *made) < 0.005
+
+
+@pytest.mark.slow
+def test_exchanged_prompts_exchange_the_paths_of_the_object(learnt: Learnt) -> None:
+    batch = collate(learnt.clips)
+    code, draws = learnt.generator.network.code, torch.Generator().manual_seed(0)
+    rows = code.sizes(int(batch.lengths.max()))
+    noise = draw_motion((2, 2, rows[0], 99), (2, rows[1], 10), draws)
+    for order, verbs in (([0, 1], [0, 1]), ([1, 0], [1, 0])):
+        # Words, and the length they ask for; where to touch stays as it was.
+        asked = condition(learnt, batch, batch.text[order])
+        asked = replace(asked, lengths=batch.lengths[order], counts=tuple(batch.counts[row] for row in order))
+        _, objects = learnt.generator.sample(asked, SamplerConfig(), noise, draws)
+        # The box is lifted along z or passed along x, by 20 cm.
+        last = torch.stack([own[n - 1, :3] for own, n in zip(objects, batch.lengths[order], strict=True)])
+        assert [int(end[2] < end[0]) for end in last] == verbs
+
+
+@dataclass(frozen=True)
+class Planted(MotionGenerator):
+    """A generator that is right but for its wrists, which are off by 10 mm."""
+
+    def denoise_once(
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, generator: torch.Generator
+    ) -> Motion:
+        del timesteps
+        own, moved = self._features((hands, objects), condition)
+        return planted(own, generator), moved
+
+
+def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
+    """Hands (B, 2, F, 99) with wrists moved 10 mm in a direction that turns slowly."""
+    first, last = torch.randn(2, *hands.shape[:2], 1, 3, generator=generator)
+    share = torch.linspace(0, 1, hands.shape[2])[:, None]
+    away = torch.nn.functional.normalize(first + (last - first) * share, dim=-1)
+    return torch.cat((hands[..., :3] + 0.01 * away, hands[..., 3:]), -1)
+
+
+@pytest.mark.slow
+def test_the_refiner_takes_planted_noise_away(learnt: Learnt) -> None:
+    network, clips = load_network("refiner"), learnt.clips
+    plan = Plan.of(network, DELIVERED.of("refiner"))
+    loss = replace(plan.loss, samples=1, penetration_weight=0.0, field_resolution=24)
+    generator = Planted(learnt.generator.network, learnt.generator.normaliser)
+    surface = Surface.of(learnt.hands, [clips[0].object_model], 24, torch.device("cpu"))
+    torch.manual_seed(0)
+    given = loss, learnt.corpus, generator, surface, torch.device("cpu"), 0
+    objective = RefinerObjective(RefinerModel(plan.network), *given)
+    draws = torch.Generator().manual_seed(1)
+    pools = [objective._make(clips, "once", draws) for _ in range(24)]
+    objective.pool = {clip.clip_id: [pool[row] for pool in pools] for row, clip in enumerate(clips)}
+    objective.weights = replace(loss, samples=len(pools))
+    training = replace(plan.training, steps=500, batch=2, validate_every=500, keep_best=False, learning_rate=2e-3)
+    refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
+    assert isinstance(refiner, RefinerModel)
+    batch = collate(clips)
+    coarse = planted(batch.hands, torch.Generator().manual_seed(2))
+    seen = surface.coarse(batch, coarse, batch.object, batch.contact_map, batch.present)
+    apart = [(hands - batch.hands)[..., :3].norm(dim=-1) for hands in (coarse, refine(refiner, seen))]
+    off = [float(distance[batch.present].mean()) for distance in apart]
+    assert off[0] == pytest.approx(0.01, rel=1e-3)
+    assert off[1] <= 0.2 * off[0]
+
+
+def condition(learnt: Learnt, batch: ClipBatch, text: Tensor) -> Condition:
+    network = learnt.generator.network
+    return Condition.of(batch, network.object_feature(batch.points_m), text[:, 0], batch.contact)
+
+
+def joint_error_m(learnt: Learnt, batch: ClipBatch, hands: Tensor, objects: Tensor) -> float:
+    del objects
+    joints = learnt.hands.joints(hands, batch.betas, batch.template_m)
+    return float((joints - batch.joints_m).norm(dim=-1)[batch.present].mean())

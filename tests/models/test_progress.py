@@ -1,0 +1,166 @@
+"""A training that was killed, shared or watched gives what an undisturbed one gives."""
+
+import json
+import multiprocessing
+import os
+import signal
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+from safetensors.torch import load_file
+
+from hoidata.batches.dataset import HoiDataset
+from hoidata.store.annotated import AnnotatedStore
+from models.common.corpus import Wanted, batches
+from models.common.family import Network, Setup
+from models.common.team import Team, run_team
+from models.common.training import train_network
+from models.registry import load_network
+from tests.models.toy import PARAMS
+
+STEPS, SAVED_EVERY = 8, 2
+
+
+def train(name: str, root: Path, out: Path, *, progress: Path | None = None, die_at: int = 0, **training) -> None:
+    """A short training of one network with these settings beside the toy's; killed (-9) at the start of a step."""
+    params = {**PARAMS[name], "training": {**PARAMS[name]["training"], **training}}
+    network = load_network(name)
+    needed = {load_network(other): out.parent / "needed" / other for other in network.needs}
+    network = mortal(network, die_at) if die_at else network
+    train_network(network, root, out, params, needed=needed, progress=progress)
+
+
+def mortal(network: Network, die_at: int) -> Network:
+    """The network with an objective that ends the process when asked for the losses of its ``die_at``-th step."""
+
+    def objective(setup: Setup):
+        made, normaliser = network.objective(setup)
+        count, losses = iter(range(1, die_at + 1)), made.losses
+
+        def counted(batch, generator):
+            if next(count) == die_at:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return losses(batch, generator)
+
+        setattr(made, "losses", counted)  # noqa: B010 (pyright knows losses as a method)
+        return made, normaliser
+
+    return replace(network, objective=objective)
+
+
+def killed(*given, **named) -> None:
+    process = multiprocessing.get_context("fork").Process(target=train, args=given, kwargs=named)
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+
+
+@pytest.fixture
+def out(trained: Path, tmp_path: Path) -> Path:
+    (tmp_path / "needed").symlink_to(trained)
+    return tmp_path
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("name", PARAMS)
+def test_a_training_killed_three_times_writes_the_bytes_of_an_undisturbed_one(
+    annotated_root: Path, out: Path, name: str, capfd: pytest.CaptureFixture
+) -> None:
+    settings = {"steps": STEPS, "save_every": SAVED_EVERY, "validate_every": 3, "keep_best": True, "ema_decay": 0.9}
+    train(name, annotated_root, out / "whole", **settings)
+    done, random = 0, np.random.default_rng([*name.encode()])
+    for die_at in sorted(random.choice(np.arange(2, STEPS + 1), 3, replace=False).tolist()):
+        killed(name, annotated_root, out / "broken", progress=out / "progress", die_at=die_at - done, **settings)
+        assert not (out / "broken").exists()
+        done = (die_at - 1) // SAVED_EVERY * SAVED_EVERY
+    train(name, annotated_root, out / "broken", progress=out / "progress", **settings)
+    for file in ("model.safetensors", "log.csv"):
+        assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
+    assert not (out / "progress").exists()
+    assert ("goes on after step" in capfd.readouterr().err) == (done > 0)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+def test_losses_are_readable_while_it_runs_and_a_state_of_other_settings_or_no_state_is_said(
+    annotated_root: Path, out: Path, capfd: pytest.CaptureFixture
+) -> None:
+    settings = {"steps": STEPS, "save_every": SAVED_EVERY, "validate_every": 1}
+    killed("length", annotated_root, out / "new", progress=out / "progress", die_at=4, **settings)
+    header, *rows = (out / "progress" / "log.csv").read_text().splitlines()
+    assert header.startswith("step,validation,train_total")
+    assert [row.split(",")[0] for row in rows] == ["1", "2", "3"]
+    with safe_open(out / "progress" / "state.safetensors", framework="pt") as stored:
+        assert json.loads(stored.metadata()["hoidata"])["step"] == 2
+    other = {**settings, "learning_rate": 0.5}
+    for spoil, said in ((None, "other settings, data or code"), (b"no state", "cannot be read")):
+        if spoil:
+            killed("length", annotated_root, out / "new", progress=out / "progress", die_at=4, **settings)
+            (out / "progress" / "state.safetensors").write_bytes(spoil)
+        train("length", annotated_root, out / "found", progress=out / "progress", **other)
+        train("length", annotated_root, out / "expected", **other)
+        assert said in capfd.readouterr().err
+        assert (out / "found" / "log.csv").read_bytes() == (out / "expected" / "log.csv").read_bytes()
+
+
+def test_training_leaves_the_process_as_it_found_it(annotated_root: Path, tmp_path: Path) -> None:
+    def settings() -> tuple:
+        algorithms = torch.are_deterministic_algorithms_enabled()
+        return torch.get_num_threads(), torch.get_float32_matmul_precision(), algorithms, torch.initial_seed()
+
+    before, drawn = settings(), torch.get_rng_state()
+    train("length", annotated_root, tmp_path / "out")
+    assert settings() == before
+    assert torch.equal(torch.get_rng_state(), drawn)
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_weights_of_one_and_write_one_file(annotated_root: Path, out: Path) -> None:
+    names = ("contact", "diffusion")
+    run_team(train_all, 2, out / "meeting", names, annotated_root, out / "two")
+    train_all(names, annotated_root, out / "one")
+    for name in names:
+        assert [path.name for path in sorted((out / "two" / name).iterdir())] == ["log.csv", "model.safetensors"]
+        one, two = (load_file(out / folder / name / "model.safetensors") for folder in ("one", "two"))
+        assert one.keys() == two.keys()
+        assert max(float((one[key].double() - two[key].double()).abs().max()) for key in one) <= 1e-5
+    assert (out / "two" / "written").read_text() == "0"
+
+
+def train_all(names: tuple[str, ...], root: Path, out: Path) -> None:
+    """20 steps of each network in two parts per batch; each process notes itself where it may write."""
+    torch.set_num_threads(1)
+    for name in names:
+        network = load_network(name)
+        needed = {load_network(other): out.parent / "needed" / other for other in network.needs}
+        budget = {**PARAMS[name]["training"], "steps": 20, "parts": 2, "validate_every": 10}
+        train_network(network, root, out / name, {**PARAMS[name], "training": budget}, needed=needed)
+    if Team.joined().writes:
+        (out / "written").write_text(str(Team.joined().rank))
+
+
+def test_parts_of_a_batch_are_its_clips_and_verbs_can_be_drawn_alike(annotated: AnnotatedStore) -> None:
+    dataset = HoiDataset(annotated, "train")
+    whole, parted = (next(batches(dataset, 3, 0, Wanted(parts=range(of), of=of))) for of in (1, 2))
+    ids = [[sample.clip_id for sample in batch.samples] for _, batch in parted]
+    assert [sorted(own) for own in ids] == [sorted(set(own)) for own in ids]
+    assert sorted(chain.from_iterable(ids)) == sorted(sample.clip_id for sample in whole[0][1].samples)
+    alone = next(batches(dataset, 3, 0, Wanted(parts=[1], of=2)))
+    assert [sample.clip_id for sample in alone[0][1].samples] == ids[1]
+    twice = HoiDataset(annotated, "train")
+    twice.ids = [dataset.ids[0]] * 5 + dataset.ids[1:2]
+    stream = batches(twice, 1, 0, Wanted(balance="verb"))
+    verbs = [next(stream)[0][1].samples[0].verb for _ in range(200)]
+    assert 80 < verbs.count("pass") < 120
+
+
+def test_a_training_that_gains_no_more_stops(annotated_root: Path, tmp_path: Path) -> None:
+    settings = {"steps": 50, "validate_every": 1, "patience": 3, "learning_rate": 0.0}
+    train("length", annotated_root, tmp_path / "out", **settings)
+    rows = (tmp_path / "out" / "log.csv").read_text().splitlines()[1:]
+    assert [row.split(",")[0] for row in rows] == ["1", "2", "3", "4"]

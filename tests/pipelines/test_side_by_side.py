@@ -1,0 +1,162 @@
+"""Stages side by side: in the order DVC's graph asks for, as many at once as said; what failures and signals cost."""
+
+import signal
+import subprocess
+import sys
+import threading
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hoidata.errors import BadInput
+from hoidata.files.atomic import exclusive
+from pipelines.side_by_side import RUN, Run, describe_run, log_of, reproduce_side_by_side, run_all, stale_stages
+
+PROJECT = Path(__file__).parents[2]
+pytestmark = [
+    pytest.mark.filterwarnings("ignore::DeprecationWarning"),  # DVC's own libraries
+    pytest.mark.filterwarnings("ignore::ResourceWarning"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
+# d needs b and c, which need a: b and c can run at once. e stands alone.
+GRAPH = {"a": [], "b": ["a"], "c": ["a"], "d": ["b", "c"], "e": []}
+
+
+class Recorder:
+    """Runs nothing: notes when each stage begins and ends, and how many are at work at once."""
+
+    def __init__(self, failing: frozenset[str] = frozenset()) -> None:
+        self.failing, self.events, self.at_work, self.most = failing, [], 0, 0
+        self.lock = threading.Lock()
+
+    def __call__(self, name: str) -> int:
+        with self.lock:
+            self.at_work += 1
+            self.most = max(self.most, self.at_work)
+            self.events.append(("begin", name))
+        time.sleep(0.002)
+        with self.lock:
+            self.at_work -= 1
+            self.events.append(("end", name))
+        return int(name in self.failing)
+
+
+@pytest.fixture(autouse=True)
+def _in_a_folder_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def run_graph(upstream: dict[str, frozenset[str]], jobs: int, recorder: Recorder) -> Run:
+    run = Run(seconds={"code": 0.0})
+    with ThreadPoolExecutor(jobs) as pool:
+        run_all(upstream, pool, jobs, recorder, run)
+    return run
+
+
+@st.composite
+def graphs(draw):
+    """Any graph without a circle: each stage needs some of those named before it."""
+    names = [f"s{number}" for number in range(draw(st.integers(1, 12)))]
+    picks = [draw(st.sets(st.sampled_from(names[:index]))) if index else set() for index in range(len(names))]
+    return dict(zip(names, map(frozenset, picks), strict=True))
+
+
+@settings(max_examples=40, deadline=None)
+@given(graphs(), st.integers(1, 4))
+def test_every_stage_runs_once_after_all_it_needs_and_no_more_at_once_than_said(upstream, jobs):
+    recorder = Recorder()
+    run_graph(upstream, jobs, recorder)
+    assert sorted(name for event, name in recorder.events if event == "begin") == sorted(upstream)
+    for name, needs in upstream.items():
+        begin = recorder.events.index(("begin", name))
+        assert all(recorder.events.index(("end", need)) < begin for need in needs)
+    assert recorder.most <= jobs
+
+
+@settings(max_examples=40, deadline=None)
+@given(graphs(), st.data())
+def test_what_follows_from_a_failure_is_left_and_everything_else_is_done(upstream, data):
+    failing = data.draw(st.sampled_from(sorted(upstream)))
+    recorder = Recorder(frozenset({failing}))
+    run = run_graph(upstream, 2, recorder)
+    lost = {failing}
+    for name, needs in upstream.items():  # they stand in an order that suits
+        if needs & lost:
+            lost.add(name)
+    assert set(run.seconds) == set(upstream) - lost | {failing, "code"}
+    assert list(run.failed) == [failing]
+    assert failing in describe_run(run)
+
+
+def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
+    """A DVC project of GRAPH: each stage joins what it needs and its own source to one text."""
+    body = "import sys, time, pathlib; t = [pathlib.Path(p).read_text() for p in sys.argv[2:]]; "
+    body += f"time.sleep({sleep}); pathlib.Path(sys.argv[1]).write_text('(' + ' '.join(t) + ')'); "
+    body += "print('made', sys.argv[1])"
+    (folder / "make.py").write_text(body)
+    (folder / "code.txt").write_text("code")
+    stages = {"code": {"cmd": "cat code.txt > code", "always_changed": True, "outs": [{"code": {"cache": False}}]}}
+    for name, needs in GRAPH.items():
+        (folder / f"{name}.src").write_text(name)
+        deps = [f"{name}.src", *(f"{need}.out" for need in needs)]
+        cmd = f"{sys.executable} make.py {name}.out {' '.join(deps)}"
+        stages[name] = {"cmd": cmd, "deps": ["code", *deps], "outs": [{f"{name}.out": {"persist": True}}]}
+    (folder / "dvc.yaml").write_text(yaml.safe_dump({"stages": stages}))
+    subprocess.run([sys.executable, "-m", "dvc", "init", "--no-scm", "-q"], cwd=folder, check=True)
+    (folder / ".hoidata").mkdir()
+    return folder
+
+
+@pytest.mark.slow
+def test_a_project_comes_up_to_date_as_by_dvc_repro_and_a_second_run_has_nothing_to_do(tmp_path):
+    tiny_project(tmp_path)
+    run = reproduce_side_by_side([], jobs=2)
+    assert sorted(run.seconds) == sorted(["code", *GRAPH])
+    assert (tmp_path / "d.out").read_text() == "(d (b (a)) (c (a)))"
+    assert "made d.out" in log_of("d").read_text()
+    status = subprocess.run([sys.executable, "-m", "dvc", "repro"], capture_output=True, text=True)
+    assert "Running stage 'd'" not in status.stdout
+    assert list(reproduce_side_by_side([], jobs=2).seconds) == ["code"]
+    (tmp_path / "b.src").write_text("B")
+    assert stale_stages([]) == {"b": frozenset(), "d": frozenset("b")}
+    assert stale_stages(["c"]) == {}
+    assert sorted(reproduce_side_by_side(["d"], jobs=1).seconds) == ["b", "code", "d"]
+    assert sorted(reproduce_side_by_side(["b"], jobs=1, force=True).seconds) == ["b", "code"]
+    assert "made b.out" in log_of("b").read_text()
+
+
+@pytest.mark.slow
+def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_stay(tmp_path, capfd):
+    tiny_project(tmp_path)
+    reproduce_side_by_side([], jobs=2)
+    (tmp_path / "b.src").write_bytes(b"\xff\xfe")
+    (tmp_path / "e.src").write_text("E")
+    run = reproduce_side_by_side([], jobs=2)
+    assert set(run.failed) == {"b"}
+    assert (tmp_path / "b.out").read_text() == "(b (a))"
+    assert (tmp_path / "e.out").read_text() == "(E)"
+    assert "UnicodeDecodeError" in capfd.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
+def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes(tmp_path, sent):
+    tiny_project(tmp_path, sleep=20)
+    command = "from pipelines.side_by_side import reproduce_side_by_side as r; r([], 2)"
+    start = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {command}"
+    process = subprocess.Popen([sys.executable, "-c", start], cwd=tmp_path, env={"PYTHONPATH": str(PROJECT)})
+    while not log_of("a").is_file() or "make.py" not in log_of("a").read_text():
+        time.sleep(0.1)
+    with pytest.raises(BadInput, match="at work on it"):
+        reproduce_side_by_side([], jobs=1)
+    process.send_signal(sent)
+    assert process.wait(timeout=15) != 0
+    with exclusive(RUN, wait_s=0):
+        assert not (tmp_path / "a.out").exists()
+    (tmp_path / "make.py").write_text((tmp_path / "make.py").read_text().replace("time.sleep(20)", "None"))
+    assert reproduce_side_by_side([], jobs=2).failed == {}
