@@ -12,6 +12,8 @@ from bench import (
     evaluate,
     evaluator,
     kernels,
+    manipnet,
+    manipnet_speed,
     physics,
     realism,
     samplers,
@@ -36,6 +38,8 @@ BENCHMARKS = {
     "samplers": samplers.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
+    "fingers": manipnet_speed.main,
+    "manipnet": manipnet.main,
 }
 
 

@@ -7,6 +7,7 @@ import typer
 from hoidata.errors import HoidataError
 from pipelines.commands import (
     adapters,
+    animate,
     controls,
     corpus,
     evaluate,
@@ -49,6 +50,7 @@ app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
 app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
+app.command("animate")(animate.animate)
 app.command("show")(show.show)
 
 

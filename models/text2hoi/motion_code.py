@@ -117,7 +117,7 @@ class MotionCode:
             turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
             objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
         if self.config.convention == "arctic":
-            mean = torch.tensor(self.config.finger_mean_rad, device=hands.device).reshape(2, 1, 15, 3)
+            mean = torch.tensor(self.config.finger_mean_rad).to(hands.device).reshape(2, 1, 15, 3)
             fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
             fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
             hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)

@@ -110,8 +110,8 @@ class RefinerObjective:
         self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
-        number = torch.randint(self.weights.samples, (len(batch),), generator=generator).tolist()
-        motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, number, strict=True)]
+        numbers = np.random.default_rng(generator.initial_seed()).integers(self.weights.samples, size=len(batch))
+        motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, numbers, strict=True)]
         return self._losses(self.network, self._batch(batch, motions))
 
     @torch.no_grad()
