@@ -53,6 +53,7 @@ def split_of(paths: StagePaths) -> dict[str, int]:
     return chosen["clips"]
 
 
+@pytest.mark.slow
 def test_a_dataset_from_a_folder_outside_the_repository_takes_three_lines(here: Path, tmp_path: Path) -> None:
     root = kitchen.write_kitchen(tmp_path / "raw", load_embedded_hands())
     facts = kitchen.write_dataset(tmp_path / "mine") / "facts.toml"

@@ -102,6 +102,7 @@ class AdapterContract:
         (key,) = (key for key in adapter.sequences(raw.root) if str(key) == self.spoilt)
         return adapter.load(raw, key, load_embedded_hands())
 
+    @pytest.mark.slow
     def test_it_keeps_every_rule_of_the_conformance_check(self, root: Path) -> None:
         """Hands of these trees touch nothing, so warnings about touch are of no account."""
         findings = check_adapter(get_adapter(self.name), root, load_embedded_hands(), worker=False)

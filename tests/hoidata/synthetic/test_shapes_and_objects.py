@@ -58,6 +58,7 @@ def test_a_profile_must_start_and_end_on_the_axis():
 
 
 @pytest.mark.parametrize(("dataset", "name"), ALL)
+@pytest.mark.slow
 def test_every_part_of_every_object_is_one_closed_solid(dataset, name):
     for part in _closed_parts(dataset, name):
         assert part.is_watertight
@@ -68,6 +69,7 @@ def test_every_part_of_every_object_is_one_closed_solid(dataset, name):
     assert mass_properties(model.vertices_m, model.faces).source == "solid"
 
 
+@pytest.mark.slow
 def test_objects_have_real_names_and_differ_in_shape_and_size():
     names = {dataset: [spec.name for spec in specs] for dataset, specs in OBJECTS.items()}
     assert set(names["h2o"]) <= {noun for _, noun in ACTIONS}
@@ -77,6 +79,7 @@ def test_objects_have_real_names_and_differ_in_shape_and_size():
     assert len(volumes) == len(ALL) >= 16
 
 
+@pytest.mark.slow
 def test_some_meshes_are_dense_and_even_and_some_coarse():
     dense, coarse = 0, 0
     for key in ALL:
@@ -102,6 +105,7 @@ def test_arctic_objects_turn_about_minus_z_through_their_origin_without_cutting_
 
 
 @pytest.mark.parametrize("key", [("grab", "mug"), ("h2o", "book"), ("grab", "toruslarge"), ("h2o", "spray")])
+@pytest.mark.slow
 def test_the_search_field_agrees_with_the_mesh_to_half_a_millimetre_near_its_faces(key):
     model = object_model(*key)
     field = grid_field(model.vertices_m, model.faces)

@@ -154,6 +154,7 @@ def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
     assert not series.surface["left"].touched.any()
 
 
+@pytest.mark.slow
 def test_page_shows_the_same_whether_the_stage_surface_ran_or_not(dataset, page, hands, tmp_path):
     surface_store(dataset.root / "clips", dataset.root / "surface", progress=False)
     after = write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands)
@@ -247,6 +248,7 @@ def test_page_says_where_annotator_and_distances_disagree(page):
     assert text.count('<div class="readout"') == 7
 
 
+@pytest.mark.slow
 def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(dataset, hands, tmp_path):
     contact = read_contact_settings(dataset.root / "contact")
     annotate_store(
@@ -263,6 +265,7 @@ def test_page_says_whose_word_the_hand_type_is_where_the_annotators_is_wanted(da
         assert "<h2>Hand type: right</h2>" in text
 
 
+@pytest.mark.slow
 def test_verb_derived_from_the_motion_is_marked_as_derived(page_clip, hands, tmp_path):
     """A box lifted by 20 cm under the hand, of which its source says no word."""
     clips, rule = [replace(page_clip(), verb=None)], {**SPLIT, "test": []}

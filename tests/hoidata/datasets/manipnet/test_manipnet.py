@@ -64,6 +64,7 @@ def test_the_way_back_leads_to_the_files_own_numbers(carried: tuple[RawTree, Cli
     np.testing.assert_allclose(corner * 10 * MIRROR, [-0.9 + sway - 0.5, 4.0, -0.4], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_frozen_and_jumping_stretches_are_cut_out_and_listed(tmp_path: Path) -> None:
     left, right, thing = lift_rows(1200)
     for rows in (left, right, thing):
@@ -80,6 +81,7 @@ def test_frozen_and_jumping_stretches_are_cut_out_and_listed(tmp_path: Path) -> 
     assert len(clips) >= 3
 
 
+@pytest.mark.slow
 def test_a_wrist_far_from_the_object_is_cut_out(tmp_path: Path) -> None:
     left, right, thing = lift_rows()
     for frame in range(500, 600):
