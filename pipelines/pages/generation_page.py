@@ -79,9 +79,8 @@ def write_generation(
         name = f"motion-{number}" if (number := motion.evidence["number"]) else "motion"
         made_from = checkpoint_digests(motion, checkpoints)
         write_npz(folder / f"{name}.npz", motion_arrays(motion, hands, made_from))
-        write_glb(
-            folder / f"{name}.glb", motion.clip, hands, _paint(motion, motion.contact), {"checkpoints": made_from}
-        )
+        paint = _paint(motion, motion.contact)
+        write_glb(folder / f"{name}.glb", motion.clip, hands, paint, extras={"checkpoints": made_from})
         paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
     first = motions[0]
     write_page(
