@@ -6,7 +6,23 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 
 import sys
 
-from bench import adapters, evaluate, evaluator, kernels, physics, realism, scale, sensors, store, surface, text
+from bench import (
+    adapters,
+    batches,
+    evaluate,
+    evaluator,
+    kernels,
+    manipnet,
+    manipnet_speed,
+    physics,
+    realism,
+    samplers,
+    scale,
+    sensors,
+    store,
+    surface,
+    text,
+)
 
 BENCHMARKS = {
     "adapters": adapters.main,
@@ -18,8 +34,12 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
+    "batches": batches.main,
+    "samplers": samplers.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
+    "fingers": manipnet_speed.main,
+    "manipnet": manipnet.main,
 }
 
 

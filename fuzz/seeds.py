@@ -14,6 +14,7 @@ import numpy as np
 from fuzz.structure import npy_bytes
 from hoidata.hands import load_embedded_hands
 
+TRAJECTORY_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
 
 
@@ -468,3 +469,56 @@ def near_ply(text: bool) -> list[bytes]:
         (b"element face 3", b"element face 0"),
     )
     return [whole.replace(old, new) for old, new in changes if old in whole] + [b"ply\nend_header\n", whole[:-3]]
+
+
+def trajectory_tables() -> list[bytes]:
+    """A table that is good, then one of every kind that is refused."""
+    names = ["time_s", *(f"{body}_{part}" for body in ("object", "right") for part in TRAJECTORY_PARTS)]
+    row = "0,0,0,1,0,0,0,0.1,0,0,1,0,0,0"
+    good = [",".join(names), *(f"{number / 30:.4f},{row}" for number in range(4))]
+    hinged = [good[0] + ",hinge_rad", *(line + ",0.5" for line in good[1:])]
+    late = [good[0], *(f"{step},{row}" for step in (0, 33, 66, 100))]
+    frames = [good[0], *(f"{step},{row}" for step in range(4))]
+    falling = [good[0], *(f"{step},{row}" for step in (0, 0.1, 0.05))]
+    changed = [
+        *("\n".join(good).replace(old, new) for old, new in ((",1,0,0,0,0.1", ",2,0,0,0,0.1"), ("0.0333", "x"))),
+        *("\n".join(good).replace(old, new) for old, new in (("0.0333", "nan"), ("right_qz", "right_q"))),
+        *("\n".join(good).replace(old, new) for old, new in (("object_x", "object_y"), ("0.0333,", "0.0333,1,"))),
+        *("\n".join(good).replace(old, new) for old, new in (("time_s", "time"), ("right_", "wrist_"))),
+    ]
+    return [
+        *("\n".join(lines).encode() for lines in (good, hinged, late, frames, falling)),
+        *map(str.encode, changed),
+        b"\xff",
+        b"",
+    ]
+
+
+def trajectory_texts() -> list[bytes]:
+    """ManipNet's demo files: object, left wrist, right wrist."""
+    row = ",".join(["0,0,0,1,0.5,1,2"] * 3)
+    rows = ("120", *([row] * 4)), ("0.1", row), ("120", row + ",1", row), ("x",)
+    return [*("\n".join(lines).encode() for lines in rows), b""]
+
+
+def trajectory_archives() -> list[bytes]:
+    time_s, still = np.arange(4) / 30, np.tile([1.0, 0, 0, 0], (4, 1))
+    arrays = {"time_s": time_s, "object_position": np.zeros((4, 3)), "object_quaternion": still}
+    arrays |= {"left_position": np.ones((4, 3)), "left_quaternion": still}
+    others = [
+        arrays | {"hinge_rad": time_s},
+        {name: array for name, array in arrays.items() if name != "object_quaternion"},
+        {name: array for name, array in arrays.items() if name != "time_s"},
+        {name: array for name, array in arrays.items() if "left" not in name},
+        arrays | {"left_position": np.ones((4, 2))},
+        arrays | {"left_quaternion": 2 * still},
+        arrays | {"time_s": 33 * np.arange(4)},
+        arrays | {"time_s": np.zeros(4)},
+    ]
+    return [_archive(values) for values in (arrays, *others)]
+
+
+def _archive(arrays: dict[str, np.ndarray]) -> bytes:
+    stream = io.BytesIO()
+    np.savez(stream, **arrays)
+    return stream.getvalue()

@@ -43,6 +43,7 @@ from hoidata.hands import mano, model
 from hoidata.objects import mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
+from models.manipnet import trajectory_files
 from pipelines import params
 from pipelines.lineage import manifests
 from pipelines.stages import base
@@ -108,7 +109,16 @@ def on_disk(name: str, parse: Callable[[Path], Any]) -> Callable[[bytes], Any]:
 
 
 def all_targets() -> dict[str, Target]:
-    groups = (_pickles(), _numpy_files(), _hand_files(), _meshes(), _texts(), _json_files(), _settings())
+    groups = (
+        _pickles(),
+        _numpy_files(),
+        _hand_files(),
+        _meshes(),
+        _texts(),
+        _trajectories(),
+        _json_files(),
+        _settings(),
+    )
     return {target.name: target for group in groups for target in group}
 
 
@@ -333,6 +343,54 @@ def _texts() -> list[Target]:
             lambda data: arctic_files.parse_descriptions(data, "description.txt"),
             (arctic_files.parse_descriptions, arctic_files.parse_description),
             (b"1-2 grab, both hand\n", b"left", b"-", b"\n", "٣".encode(), b"\xff"),
+        ),
+    ]
+
+
+def _trajectories() -> list[Target]:
+    shared = (
+        trajectory_files.from_arrays,
+        trajectory_files._array,
+        trajectory_files._check_times,
+        trajectory_files._body,
+    )
+    words = (
+        b",",
+        b"\n",
+        b"nan",
+        b"1e400",
+        b"-",
+        b'"',
+        b"time_s",
+        b"object_qw",
+        b"left_x",
+        b"hinge_rad",
+        b"\xff",
+        b"\0",
+    )
+    rows = (trajectory_files._numbers, *shared)
+    return [
+        Target(
+            "trajectories-csv",
+            seeds.trajectory_tables,
+            lambda data: trajectory_files.parse_csv(data, "a.csv"),
+            (trajectory_files.parse_csv, *rows),
+            words,
+        ),
+        Target(
+            "trajectories-manipnet",
+            seeds.trajectory_texts,
+            lambda data: trajectory_files.parse_manipnet(data, "a.txt"),
+            (trajectory_files.parse_manipnet, trajectory_files._numbers),
+            words,
+        ),
+        Target(
+            "trajectories-npz",
+            seeds.trajectory_archives,
+            on_disk("a.npz", lambda path: trajectory_files.from_arrays(numpy_files.load_npz_arrays(path), "a.npz")),
+            shared,
+            (b"PK\x03\x04", b".npy", b"(1, 3)", b"<f8", b"|O"),
+            zip_mutation(npy_mutation(mutate)),
         ),
     ]
 

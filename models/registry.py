@@ -22,6 +22,7 @@ FAMILIES = {
     "mean-motion": "models.baselines.families:MEAN_MOTION",
     "mean-pose": "models.baselines.families:MEAN_POSE",
     "ground-truth": "models.baselines.families:GROUND_TRUTH",
+    "manipnet": "models.manipnet.family:FINGERS",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
@@ -44,7 +45,10 @@ NETWORKS = {
     "length": "models.text2hoi.length_training:LENGTH",
     "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
     "refiner": "models.text2hoi.refiner_training:REFINER",
+    "manipnet": "models.manipnet.training:MANIPNET",
 }
+# Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
+IF_LISTED = ("manipnet",)
 
 
 def family_names() -> list[str]:

@@ -7,11 +7,13 @@ import typer
 from hoidata.errors import HoidataError
 from pipelines.commands import (
     adapters,
+    animate,
     controls,
     corpus,
     evaluate,
     generate,
     graph,
+    import_checkpoint,
     inspect,
     raw,
     settings,
@@ -46,7 +48,9 @@ app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
+app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
+app.command("animate")(animate.animate)
 app.command("show")(show.show)
 
 

@@ -22,6 +22,18 @@ class ObjectPoints:
 
 
 @dataclass(frozen=True)
+class Trajectories:
+    """What a recording without fingers knows, in the model frame; rows as in ``hoidata.clips.features``.
+
+    wrists: (2, F, 9) position and 6D turn of each wrist. valid: (2, F) bool, where it was tracked. object: (F, 10).
+    """
+
+    wrists: np.ndarray
+    valid: np.ndarray
+    object: np.ndarray
+
+
+@dataclass(frozen=True)
 class Request:
     """One motion that is asked for; nothing in it was recorded but what the asker knows.
 
@@ -30,6 +42,7 @@ class Request:
     right. n_frames: at 30 fps. seed: of everything that is drawn. number: which of several motions asked for alike.
     betas: (2, 10) hand shapes; template_m: (2, 778, 3) personal rest meshes, or None.
     world_from_model: (4, 4) where the motion is to lie; models work z up, the object at the origin in the first frame.
+    trajectories: of wrists and object, for families that only add the fingers; the others take nothing from there.
     """
 
     motion_id: str
@@ -45,6 +58,7 @@ class Request:
     betas: np.ndarray = field(default_factory=lambda: np.zeros((2, 10), np.float32))
     template_m: np.ndarray | None = None
     world_from_model: np.ndarray = field(default_factory=lambda: np.eye(4))
+    trajectories: Trajectories | None = None
 
 
 @dataclass(frozen=True)

@@ -47,10 +47,9 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
 
     At least 3 frames are needed for accelerations.
     """
-    looked_at = np.flatnonzero(scene.lifted if frames is None else frames)
-    near = _near(scene, looked_at.tobytes(), variant.tolerance_m)
-    near = near.at_middle() if variant.at_centre else near
-    contacts = near._replace(frame=looked_at[near.frame])
+    frames = scene.lifted if frames is None else frames
+    looked_at, near = np.flatnonzero(frames), contacts_in(scene, frames, variant.tolerance_m)
+    contacts = near.at_middle() if variant.at_centre else near
     penetration = np.full(scene.n_frames, np.nan)
     penetration[looked_at] = 0.0
     np.maximum.at(penetration, contacts.frame, contacts.depth_m)
@@ -59,6 +58,13 @@ def score(scene: Scene, variant: Variant, frames: np.ndarray | None = None) -> R
     inside = contacts.depth_m[contacts.depth_m > 0]
     mean_depth = float(inside.mean()) if len(inside) else float("nan")
     return Realism(scored, residual, residual < variant.limit, penetration, mean_depth)
+
+
+def contacts_in(scene: Scene, frames: np.ndarray, tolerance_m: float = 0.0) -> CapsuleContacts:
+    """Capsules that touch in frames (frame,) bool, numbered as in the scene; kept for the next to ask."""
+    looked_at = np.flatnonzero(frames)
+    near = _near(scene, looked_at.tobytes(), tolerance_m)
+    return near._replace(frame=looked_at[near.frame])
 
 
 @lru_cache(maxsize=2)

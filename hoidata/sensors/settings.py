@@ -17,7 +17,7 @@ class SensorSettings:
     times_s: when proximity and distance are measured, 0 (now) first; the present hand is carried by the wrist's future.
     cell_m: edge of an ambient cell. ambient_offset_m: middle of the cube from the middle finger's knuckle, along the
     wrist's axes. ambient_turn: the cells turn with that knuckle's joint, or with the wrist.
-    reach_m: how far rays and distances go; depth_m: how deep distances go.
+    reach_m: how far rays and distances go; depth_m: how deep distances go (1 m: all the way).
     inside: a ray of a sensor inside the object starts behind it, and comes forward ("forward"), or looks "backward".
     behind_m: how far behind such a ray starts, or how far it looks back. touching_m: sensors this near count as inside,
     but as at 0 where their ray meets nothing.
@@ -28,7 +28,7 @@ class SensorSettings:
     ambient_offset_m: tuple[float, float, float] = (0.04, 0.0, -0.09)
     ambient_turn: Literal["knuckle", "wrist"] = "knuckle"
     reach_m: float = 0.1
-    depth_m: float = float("inf")
+    depth_m: float = 1.0
     inside: Literal["forward", "backward"] = "forward"
     behind_m: float = 0.02
     touching_m: float = 0.001

@@ -109,8 +109,8 @@ def _checksum_problems(folder: Path, path: str) -> Iterator[BadInput]:
 
 
 def _member_problems(where: str, field: Field, array: np.ndarray) -> Iterator[BadInput]:
-    first = field.shape[0]
-    shape = (first if isinstance(first, int) else len(array) if array.ndim else 0, *field.row_shape)
+    own = (*array.shape, *[0] * (len(field.shape) - array.ndim))
+    shape = tuple(n if isinstance(n, int) else m for n, m in zip(field.shape, own, strict=False))
     if array.dtype != np.dtype(field.dtype):
         yield BadInput(where, field.dtype, f"{array.dtype}", REMEDY)
     elif array.shape != shape:

@@ -13,8 +13,9 @@ import torch
 from rich.progress import track
 
 from hoidata.batches.dataset import ClipSample, HoiDataset
-from hoidata.batches.requests import Request
+from hoidata.batches.requests import Request, Trajectories
 from hoidata.clips.clip import Clip
+from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import write_asked
@@ -96,6 +97,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
 
     A motion's seed does not depend on which other clips there are.
     """
+    given = Trajectories(sample.hands[..., : GLOBAL_ORIENT_6D.stop], sample.valid, sample.object)
     return [
         Request(
             motion_id=f"{sample.clip_id}~{number}",
@@ -111,6 +113,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             betas=sample.betas,
             template_m=sample.template_m,
             world_from_model=sample.world_from_model,
+            trajectories=given,
         )
         for number in range(config.samples)
     ]

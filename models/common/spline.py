@@ -12,6 +12,8 @@ from torch import Tensor
 
 # Keeps control points determined where few frames, or none, say what they are.
 STIFFNESS = 1e-6
+# How much more neighbours at rest are held together than each is held to its own place.
+REST = 30.0
 
 
 def intervals_of(n_frames: int, knot_frames: int) -> int:
@@ -53,6 +55,22 @@ def stacked_bases(lengths: list[int], intervals: list[int], n_frames: int, devic
         bases[row, :length, : count + 3] = own
         bases[row, length:, : count + 3] = own[-1]
     return bases.to(device)
+
+
+def settled(points: Tensor, there: Tensor, reach: Tensor, rounds: int = 8) -> Tensor:
+    """Control points (..., K, D) of which neighbours that hardly differ are drawn together, and no others.
+
+    there (..., K) bool: the points there are. reach (D,): differences well below it are noise, well above it movement.
+    Least squares with the weights of Geman and McClure (1987), found by reweighting: points that move keep their place.
+    """
+    diff = torch.eye(points.shape[-2], device=points.device).diff(dim=0)
+    both, found = there[..., 1:] & there[..., :-1], points
+    for _ in range(rounds):
+        apart = (found.diff(dim=-2) / reach).square().sum(-1)
+        weight = REST * both / (1 + apart).square()
+        normal = torch.eye(points.shape[-2], device=points.device) + diff.T @ (weight[..., None] * diff)
+        found = torch.linalg.solve(normal, points)
+    return found
 
 
 def projected(x: Tensor, lengths: list[int], knot_frames: int) -> Tensor:

@@ -60,8 +60,10 @@ class Control:
 def recording_control(recording: HandRecording) -> Control:
     """What a recording with its source's own hands gives the network, at its own rate, time 0 in its first frame."""
     thing, time_s = recording.object, recording.time_s
-    poses = {side: recording.world_from_wrist(side) for side in SIDES}
-    wrists: dict[Side, Motion] = {side: Motion(time_s, pose.rotation, pose.translation) for side, pose in poses.items()}
+    wrists: dict[Side, Motion] = {}
+    for side in SIDES:
+        pose = recording.world_from_wrist(side)
+        wrists[side] = Motion(time_s, pose.rotation, pose.translation)
     body = thing.world_from_object
     hinge = None if thing.hinge_rad is None else thing.hinge_rad.astype(np.float64)
     return Control(wrists, Motion(time_s, body.rotation, body.translation), thing.model, hinge)

@@ -1,10 +1,12 @@
-"""Contact drawn as a touch and what goes with it: first one touched point for each hand, then both hands' maps.
+"""Contact drawn as touches and what goes with them: a few touched points for each hand, then both hands' maps.
 
 Text2HOI draws a Gaussian latent, which a network trained on few clips learns to ignore: two samples agree. A point that
-is touched is a latent with a meaning, on any object: which points may be touched is a distribution over the surface
-(soft cross-entropy, no collapse), and given one of them little is left open. The right hand's point is drawn knowing
-the left's; maps come by hand, so hand flags decide which there are.
+is touched is a latent with a meaning, on any object: which points may be touched next is a distribution over the
+surface (soft cross-entropy, no collapse), and given a few of them little is left open. The right hand's are drawn
+knowing the left's; maps come by hand, so hand flags decide which there are.
 """
+
+from itertools import product
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +21,8 @@ SIDES = 2
 ANCHOR_FEATURES = 8
 WAVES = (1.0, 2.0, 4.0)
 REACHES = (0.1, 0.2, 0.4)
+FAR = 10.0
+ANCHOR_STRIDE = 4  # every fourth of the sampled points may become an anchor
 Cloud = tuple[Tensor, Tensor, Tensor]
 
 
@@ -52,70 +56,72 @@ class AnchoredContact(nn.Module):
         clip = torch.cat((overall, scale, scaled_text(text), active_hands.float()), -1)
         return points, local, self.from_clip(clip)
 
-    def logits(self, cloud: Cloud, anchors: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Of touches and of maps, (B, 2, N) each; anchors (B, 2) rows of points, known (B, 2) which of them count."""
+    def logits(self, cloud: Cloud, at: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
+        """Of touches and of maps, (B, 2, N) each; at (B, 2, A, 3): anchors, known (B, 2, A): which of them count."""
         points, local, clip = cloud
-        at = points.gather(1, anchors[..., None].expand(-1, -1, 3))
-        offset = points[:, :, None] - at[:, None]
-        flags = known[:, None, :, None].expand(*offset.shape[:3], 1).to(points.dtype)
-        distance = offset.norm(dim=-1, keepdim=True)
-        bells = [torch.exp(-0.5 * (distance / reach).square()) for reach in REACHES]
-        near = torch.cat((offset, distance, torch.ones_like(flags), *bells), -1) * flags
+        distance = torch.cdist(points[:, None], at).masked_fill(~known[:, :, None], FAR)
+        nearest, which = distance.min(-1)
+        offset = points[:, None] - at.gather(2, which[..., None].expand(-1, -1, -1, 3))
+        bells = [torch.exp(-0.5 * (distance / reach).square()).sum(-1) for reach in REACHES]
+        share = known.to(points.dtype).mean(-1)[..., None].expand_as(nearest)
+        near = torch.cat((offset, torch.stack((nearest, share, *bells), -1)), -1) * known.any(-1)[..., None, None]
         waves = [wave(points * (torch.pi * rate)) for rate in WAVES for wave in (torch.sin, torch.cos)]
-        mixed = self.from_point(torch.cat((local, points, *waves, near.flatten(2)), -1)) + clip[:, None]
+        seen = (local, points, *waves, near.transpose(1, 2).flatten(2))
+        mixed = self.from_point(torch.cat(seen, -1)) + clip[:, None]
         touch, contact = self.rest(mixed).transpose(1, 2).split(SIDES, 1)
         return touch, contact
 
     def losses(
         self, points_m: Tensor, text: Tensor, batch: RequestBatch, contact: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, Tensor]:
-        """Cross-entropy of touches; and logits of the maps given one true touch of each hand, drawn evenly.
+        """Cross-entropy of the next touch of one hand; and logits of the maps given all anchors, drawn evenly.
 
-        contact (B, 2, N) float: the true maps. A hand without any touched point has no anchor.
+        The left hand's next touch is told some of its own, the right's also all of the left's. contact (B, 2, N) float:
+        the true maps. A hand without any touched point has no anchor.
         """
-        cloud = self.see(points_m, text, batch.active_hands)
-        known = contact.any(-1) & batch.active_hands
-        draw = torch.rand(len(contact), SIDES, generator=generator).to(contact.device)
-        anchors = picked(contact, draw)
-        wanted = contact / contact.sum(-1, keepdim=True).clamp_min(1)
-        first = self.touches(cloud, anchors, torch.zeros_like(known))
-        told = self.knowing_left(cloud, first, anchors, known)
-        touch = -((wanted * told).sum(-1) * known).sum() / known.sum().clamp_min(1)
-        return touch, self.logits(cloud, anchors, known)[1]
+        cloud, count, device = self.see(points_m, text, batch.active_hands), self.config.anchors, contact.device
+        there = contact.any(-1) & batch.active_hands
+        rows = picked(contact, torch.rand(len(contact), SIDES, count, generator=generator).to(device))
+        anchors = cloud[0][:, None].expand(-1, SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
+        draws = torch.rand(len(contact), 2, generator=generator).to(device)
+        right = there[:, 1] & (~there[:, 0] | (draws[:, 0] < 0.5))
+        next_one = (draws[:, 1] * count).long()
+        some = torch.arange(count, device=device) < next_one[:, None]
+        known = torch.stack((some | right[:, None], some & right[:, None]), 1) & there[..., None]
+        side = right.long()[:, None, None]
+        told = self.logits(cloud, anchors, known)[0].log_softmax(-1).take_along_dim(side, 1)[:, 0]
+        wanted = contact.take_along_dim(side, 1)[:, 0]
+        wanted = wanted / wanted.sum(-1, keepdim=True).clamp_min(1)
+        touch = -(wanted * told).sum() / there.any(-1).sum().clamp_min(1)
+        return touch, self.logits(cloud, anchors, there[..., None].expand_as(known))[1]
 
     @torch.no_grad()
     def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2), even draws from 0 to 1."""
+        """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2, A), even draws from 0 to 1."""
         cloud, maps = self.see(points_m, text, active_hands), []
-        first = self.touches(cloud, torch.zeros_like(active_hands, dtype=torch.long), torch.zeros_like(active_hands))
+        some = cloud[0][:, ::ANCHOR_STRIDE], cloud[1][:, ::ANCHOR_STRIDE], cloud[2]
+        clips = torch.arange(len(points_m), device=points_m.device)
         for draw in latents:
-            anchors = picked(first.exp(), draw)
-            anchors[:, 1] = picked(self.knowing_left(cloud, first, anchors, active_hands).exp(), draw)[:, 1]
-            maps.append(self.logits(cloud, anchors, active_hands)[1].sigmoid() * active_hands[..., None])
+            anchors = points_m.new_zeros(*draw.shape, 3)
+            known = torch.zeros_like(draw, dtype=torch.bool)
+            for side, number in product(range(SIDES), range(self.config.anchors)):
+                touch = self.logits(some, anchors, known)[0][:, side].softmax(-1)
+                anchors[:, side, number] = some[0][clips, picked(touch, draw[:, side, number, None])[:, 0]]
+                known[:, side, number] = active_hands[:, side]
+            maps.append(self.logits(cloud, anchors, known)[1].sigmoid() * active_hands[..., None])
         return torch.stack(maps, 1)
 
-    def touches(self, cloud: Cloud, anchors: Tensor, known: Tensor) -> Tensor:
-        """(B, 2, N) log-probability of each hand's next touch; arguments as in ``logits``."""
-        return self.logits(cloud, anchors, known)[0].log_softmax(-1)
-
-    def knowing_left(self, cloud: Cloud, first: Tensor, anchors: Tensor, known: Tensor) -> Tensor:
-        """``first``, touches without any anchor, but the right hand's told the left's anchor where both act."""
-        both = known.all(-1)[:, None]
-        after = self.touches(cloud, anchors, torch.cat((both, torch.zeros_like(both)), 1))
-        return torch.stack((first[:, 0], torch.where(both, after[:, 1], first[:, 1])), 1)
-
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
-        """(count, clip, 2) draws that choose the touches."""
-        return torch.rand(count, n_clips, SIDES, generator=generator)
+        """(count, clip, 2, A) draws that choose the touches."""
+        return torch.rand(count, n_clips, SIDES, self.config.anchors, generator=generator)
 
 
-def picked(weights: Tensor, draw: Tensor) -> Tensor:
-    """(...,) places drawn in proportion to weights (..., N) by even draws (...,) from 0 to 1; 0 where all are zero."""
+def picked(weights: Tensor, draws: Tensor) -> Tensor:
+    """(..., K) places drawn in proportion to weights (..., N) by even draws (..., K) from 0 to 1; none is beyond N."""
     places = torch.arange(weights.shape[-1], device=weights.device)
     cumulative = weights @ (places[:, None] <= places).to(weights.dtype)  # cumsum on a GPU has no order it keeps to
-    return torch.searchsorted(cumulative, draw[..., None] * cumulative[..., -1:], right=True)[..., 0].clamp_max(
-        weights.shape[-1] - 1
-    )
+    found = torch.searchsorted(cumulative, draws * cumulative[..., -1:], right=True)
+    return found.clamp_max(weights.shape[-1] - 1)
 
 
 def by_hand_loss(

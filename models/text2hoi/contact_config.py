@@ -14,8 +14,8 @@ class ContactConfig:
 
     encoder_dropout: before the last layer of z's encoder. text_scaled: sentence features at a length of sqrt(512), not
     as the encoder gives them. told: what the decoder knows beside Table S6: the points' places, and which hands act.
-    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or an anchor,
-    one touched point for each hand (``anchored_contact``), which gives a map for each.
+    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or anchors,
+    touched points of each hand drawn one after the other (``anchored_contact``), which gives a map for each.
     """
 
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
@@ -27,6 +27,7 @@ class ContactConfig:
     text_scaled: bool = False
     told: bool = False
     drawn_by: Literal["latent", "anchor"] = "latent"
+    anchors: int = 4
 
 
 @dataclass(frozen=True)

@@ -36,13 +36,13 @@ def spread_out(points_m: Tensor, kinds: Tensor, count: int) -> tuple[Tensor, Ten
     """
     weight = kinds.to(points_m.dtype)
     middle = weight @ points_m / weight.sum(-1, keepdim=True).clamp_min(1)
-    apart = (points_m[:, None] - middle[:, :, None]).norm(dim=-1).masked_fill(~kinds, -1.0)
+    apart = torch.cdist(middle, points_m).masked_fill(~kinds, -1.0)
     farthest = apart.argmax(-1)
     nearest, chosen, there = apart.clone().masked_fill(kinds, torch.inf), [], []
     for _ in range(count):
         there.append(nearest.gather(-1, farthest[..., None])[..., 0] > 0)
         chosen.append(farthest)
         picked = points_m.gather(1, farthest[..., None].expand(-1, -1, 3))
-        nearest = torch.minimum(nearest, (points_m[:, None] - picked[:, :, None]).norm(dim=-1)).masked_fill(~kinds, -1)
+        nearest = torch.minimum(nearest, torch.cdist(picked, points_m)).masked_fill(~kinds, -1)
         farthest = nearest.argmax(-1)
     return torch.stack(chosen, -1), torch.stack(there, -1)

@@ -13,7 +13,7 @@ from models.common.family import Losses, Network, Objective, Setup
 from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss
 from models.text2hoi.contact import ContactModel, contact_loss, turned_and_scaled
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.thresholds import ContactNetwork, choose_contact_threshold
+from models.text2hoi.thresholds import ContactNetwork, choose_contact_threshold, choose_draw_threshold
 
 DrawContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
 
@@ -56,19 +56,25 @@ def contact_network(config: ContactConfig) -> ContactModel | AnchoredContact:
 
 
 def contact_threshold(checkpoint: Checkpoint) -> float:
-    """The probability from which a point counts as touched, chosen on validation clips with the contact network."""
+    """The mean probability of samples from which a point counts as touched, chosen on validation clips."""
     return float(checkpoint.info["results"]["contact_threshold"])
 
 
+def draw_threshold(checkpoint: Checkpoint) -> float:
+    """The same for the probability in one sample: best for means is too low for anchors, whose samples differ."""
+    results = checkpoint.info["results"]
+    return float(results.get("draw_threshold", results["contact_threshold"]))
+
+
 def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-    """(B, 2, N) one map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, D) as the network draws them.
+    """(B, 2, N) a map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, ...) as the network draws them.
 
     Where no point reaches the threshold the likeliest ones count.
     """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
     probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device))[:, 0]
-    limit = probability.amax(-1, keepdim=True).clamp_max(contact_threshold(checkpoint))
+    limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
     return ((probability >= limit) & batch.active_hands[..., None]).float()
 
 
@@ -88,7 +94,10 @@ def _objective(setup: Setup) -> tuple[Objective, None]:
 
 def _results(network: nn.Module, corpus: Corpus) -> dict[str, float]:
     assert isinstance(network, ContactModel | AnchoredContact)
-    return {"contact_threshold": choose_contact_threshold(network, corpus.held_out)}
+    found = {"contact_threshold": choose_contact_threshold(network, corpus.held_out)}
+    if isinstance(network, AnchoredContact):
+        found["draw_threshold"] = choose_draw_threshold(network, corpus.held_out)
+    return found
 
 
 CONTACT = Network("contact", ContactConfig, contact_network, _objective, ContactLossConfig, results=_results)

@@ -44,7 +44,8 @@ class DiffusionLossConfig:
     distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
     mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
     the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
-    ``touch_weight`` more.
+    ``touch_weight`` more. thin_contact: each clip is shown a share of its touched points, as a drawn contact map may be
+    as sparse, and no two steps the same.
     """
 
     distance_weight: float = 1.0
@@ -57,6 +58,7 @@ class DiffusionLossConfig:
     velocity_weight: float = 0.0
     joint_weight: float = 0.0
     touch_weight: float = 4.0
+    thin_contact: bool = False
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,10 @@ class DiffusionObjective:
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
         keep = torch.rand(len(batch), 2, generator=generator) >= self.network.config.condition_dropout
         text = any_form(batch, generator)
-        predicted = self._denoised(self.network, batch, target, text, steps, generator, keep.float())
+        contact = self._shown(batch, text, generator)
+        if weights.thin_contact:
+            contact = contact.bool() & thinned(contact.shape, generator).to(self.device)
+        predicted = self._denoised(self.network, batch, target, text, contact, steps, generator, keep.float())
         found = {"simple": self._simple(predicted, target)}
         factors = {"simple": 1.0, "velocity": weights.velocity_weight, "joints": weights.joint_weight}
         factors |= {"distance_map": weights.distance_weight, "relative_orientation": weights.orientation_weight}
@@ -155,9 +160,14 @@ class DiffusionObjective:
         target = self.targets.of(held)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(held),), step, device=self.device)
-            predicted = self._denoised(network, held, target, held.text[:, 0], steps, generator, None)
+            seen = held.text[:, 0], self._shown(held, held.text[:, 0], generator)
+            predicted = self._denoised(network, held, target, *seen, steps, generator, None)
             total += self._simple(predicted, target)
         return total / len(VALIDATION_STEPS)
+
+    def _shown(self, batch: ClipBatch, text: Tensor, generator: torch.Generator) -> Tensor:
+        """(B, 2, N) bool: the contact maps that motions are shown."""
+        return batch.contact if self.drawn is None else self.drawn(batch, text, generator).bool()
 
     def _denoised(
         self,
@@ -165,6 +175,7 @@ class DiffusionObjective:
         batch: ClipBatch,
         target: _Target,
         text: Tensor,
+        contact: Tensor,
         steps: Tensor,
         generator: torch.Generator,
         keep: Tensor | None,
@@ -172,7 +183,6 @@ class DiffusionObjective:
         clean = target.hands, target.object
         noise = [torch.randn(part.shape, generator=generator).to(self.device) for part in clean]
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
-        contact = self.drawn(batch, text, generator) if self.drawn else batch.contact
         condition = Condition.of(batch, self._object_features(network, batch), text, contact)
         return network(noised[0], noised[1], steps, condition, None if keep is None else keep.to(self.device))
 
@@ -222,6 +232,12 @@ class DiffusionObjective:
                 turns[0], bodies[0], turns[1], bodies[1], present
             )
         return found
+
+
+def thinned(shape: Sequence[int], generator: torch.Generator) -> Tensor:
+    """(B, ...) bool: of each clip a share between a fifth and all is True."""
+    share = 0.2 + 0.8 * torch.rand(shape[0], *[1] * (len(shape) - 1), generator=generator)
+    return torch.rand(*shape, generator=generator) < share
 
 
 def feature_shares(weighting: str, device: torch.device) -> tuple[Tensor, Tensor]:

@@ -14,20 +14,33 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
-from models.common.features import hands_in_object_frame, hands_in_world
+from hoidata.clips.features import HAND_POSE_6D, OBJECT_HINGE, OBJECT_POSITION
+from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from models.common.features import hand_rotmats, hands_in_object_frame, hands_in_world, object_rotmat
 from models.common.sampling import Motion
-from models.common.spline import fit_spline, intervals_of, spline_values, stacked_bases
+from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
+
+# What is like a metre of movement: 0.1 of a rotation's numbers per centimetre; fingers, of which there are many, more.
+OBJECT_REACH = torch.tensor([1.0] * 3 + [10.0] * 7)
+HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
 
 
 @dataclass(frozen=True)
 class MotionCodeConfig:
     """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
-    per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given.
+    per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
+    object, or a hand on it, that is generated with knots nearer than this to each other stands still (0: as generated).
+
+    convention: what rotations mean; "own", or that of a dataset in the authors' code, for networks they trained:
+    GRAB's objects are transposed, ARCTIC's fingers are offsets from ``finger_mean_rad``, 45 numbers for each hand.
     """
 
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
+    rest_m: float = 0.0
+    convention: Literal["own", "h2o", "grab", "arctic"] = "own"
+    finger_mean_rad: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -65,7 +78,7 @@ class MotionCode:
 
     def encode(self, sample: ClipSample) -> CodedClip:
         """A recorded clip's rows."""
-        hands, thing = torch.from_numpy(sample.hands), torch.from_numpy(sample.object)
+        hands, thing = self.converted(torch.from_numpy(sample.hands), torch.from_numpy(sample.object), -1)
         present = torch.from_numpy(sample.valid & sample.active_hands[:, None])
         if self.config.hand_frame == "object":
             hands = hands_in_object_frame(hands[None], thing[None])[0]
@@ -81,12 +94,34 @@ class MotionCode:
     def curves(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper."""
         if not self.config.knot_frames:
-            return hands, objects
+            return self.converted(hands, objects, 1)
         n_frames = max(counts)
         knots = [intervals_of(n, self.config.knot_frames) for n in counts]
         hands = spline_values(hands, stacked_bases(list(counts), knots, n_frames, hands.device))
         knots = [n * self.config.object_knots for n in knots]
         return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
+
+    def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
+        """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
+        if not (self.config.rest_m and self.config.knot_frames):
+            return hands, objects
+        present, there = self.rows(counts, hands.device)
+        if self.config.hand_frame == "object":
+            reach = self.config.rest_m * HAND_REACH.to(hands)
+            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
+        return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
+
+    def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
+        """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
+        if self.config.convention == "grab":
+            turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
+            objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
+        if self.config.convention == "arctic":
+            mean = torch.tensor(self.config.finger_mean_rad).to(hands.device).reshape(2, 1, 15, 3)
+            fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
+            fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
+            hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
+        return hands, objects
 
     def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the model frame."""

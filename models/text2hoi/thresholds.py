@@ -41,3 +41,13 @@ def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], co
 def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]) -> float:
     """The threshold with the best mean F1 of the mean of 32 samples on held-out clips."""
     return best_threshold(contact_probabilities(network, held_out, 32, seed=0), true_maps(held_out))
+
+
+@torch.no_grad()
+def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
+    """The threshold at which single samples touch as large a share of an object as held-out clips do."""
+    batch = collate(held_out)
+    latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(0))
+    found = network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2)
+    share = float(batch.contact.any(1).float().mean())
+    return min(THRESHOLDS, key=lambda threshold: abs(float((found >= threshold).float().mean()) - share))

@@ -99,7 +99,10 @@ def _print_tree(tree, provenance: dict, show_clips: bool) -> None:
     for child in tree.children:
         _grow(top, child)
     branch = top.add("clips it was trained and judged on")
-    for split, ids in provenance.get("clips", {}).items():
+    known = provenance.get("clips", {})
+    if isinstance(known, str):
+        branch.add(f"clips seen: {known}")
+    for split, ids in known.items() if isinstance(known, dict) else ():
         names = branch.add(f"{split}: {len(ids)}")
         for clip_id in ids if show_clips else ids[:3]:
             names.add(clip_id)

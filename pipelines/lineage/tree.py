@@ -55,6 +55,9 @@ class _Comparison:
 def lineage_tree(root: Path, checkpoint: Path) -> tuple[Node, dict[str, Any]]:
     """The tree behind ``checkpoint``, compared with the working tree at ``root``, and the provenance it came from."""
     provenance = read_provenance(checkpoint)
+    if imported := provenance.get("imported"):
+        files = tuple(Node("data", f"published {kind}", "same", _short(digest)) for kind, digest in imported.items())
+        return Node("checkpoint", checkpoint.as_posix(), "same", _summary(provenance), files), provenance
     stages = provenance["stages"]
     made_by = {path: name for name, record in stages.items() for path in record.get("outputs", ())}
     comparison = _Comparison(root, stages, read_params(root), made_by, read_graph(root), code_today(root))
@@ -78,7 +81,7 @@ def tree_as_json(tree: Node) -> dict[str, Any]:
 
 def _summary(provenance: dict[str, Any]) -> str:
     clips = provenance.get("clips", {})
-    counts = ", ".join(f"{len(ids)} {split}" for split, ids in clips.items())
+    counts = clips if isinstance(clips, str) else ", ".join(f"{len(ids)} {split}" for split, ids in clips.items())
     kind = "synthetic data" if provenance.get("synthetic") else "real data"
     return f"{provenance.get('model', '')}, seed {provenance.get('seed')}, {kind}, clips: {counts}"
 

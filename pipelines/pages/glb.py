@@ -6,13 +6,15 @@ four strongest joint weights of a vertex (the embedded hand has no more). A hand
 one that comes and goes is scaled to zero where it means nothing. The node "world" turns gravity to glTF's -y.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pygltflib as gltf
 from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.files import write_whole
 from hoidata.hands import JOINT_NAMES, HandModel, HandPair
 from hoidata.hands.embedded import vertex_normals
@@ -21,18 +23,33 @@ from pipelines.pages.gltf import GltfBuilder, linear_from_srgb
 from pipelines.pages.surface import ContactPaint, Surface, display_surface
 
 HAND_COLOURS = {"left": (0.47, 0.62, 0.78), "right": (0.90, 0.69, 0.53)}
+GHOST_COLOUR, GHOST_OPACITY = (0.35, 0.62, 0.42), 0.38
 OBJECT_COLOUR = (0.84, 0.83, 0.80)
 MOVING_PART_COLOUR = (0.72, 0.74, 0.74)
 OTHER_OBJECT_COLOUR = (0.90, 0.90, 0.89)
 CONTACT_COLOURS = ((0.0, OBJECT_COLOUR), (0.5, (0.95, 0.62, 0.25)), (1.0, (0.78, 0.12, 0.14)))
 
 
-def write_glb(path: str | Path, clip: Clip, hands: HandPair, contact: ContactPaint | None = None) -> Path:
-    """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable."""
-    return write_whole(path, glb_bytes(clip, hands, contact))
+def write_glb(
+    path: str | Path,
+    clip: Clip,
+    hands: HandPair,
+    contact: ContactPaint | None = None,
+    ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
+) -> Path:
+    """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable.
+
+    ghosts: hands to see through, to compare with those of the clip.
+    """
+    return write_whole(path, glb_bytes(clip, hands, contact, ghosts))
 
 
-def glb_bytes(clip: Clip, hands: HandPair | None, contact: ContactPaint | None = None) -> bytes:
+def glb_bytes(
+    clip: Clip,
+    hands: HandPair | None,
+    contact: ContactPaint | None = None,
+    ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
+) -> bytes:
     """The bytes of ``write_glb``; hands None: the objects alone."""
     builder = GltfBuilder(clip.clip_id, {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS})
     world = builder.node("world", None, rotation=upright_rotation(clip.gravity).as_quat().round(9).tolist())
@@ -43,6 +60,9 @@ def glb_bytes(clip: Clip, hands: HandPair | None, contact: ContactPaint | None =
     for side in SIDES:
         if hands is not None and clip.hands[side].valid.any():
             _add_hand(builder, world, times, hands[side], clip.hands[side])
+    for side, track in ghosts.items():
+        if hands is not None and track.valid.any():
+            _add_hand(builder, world, times, hands[side], track, "recorded ", GHOST_COLOUR, GHOST_OPACITY)
     return builder.to_bytes()
 
 
@@ -82,12 +102,22 @@ def strongest_weights(skin_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.where(weights > 0, joints, 0).astype(np.uint8), weights.astype(np.float32)
 
 
-def _add_hand(builder: GltfBuilder, world: int, times: int, model: HandModel, track: HandTrack) -> None:
+def _add_hand(
+    builder: GltfBuilder,
+    world: int,
+    times: int,
+    model: HandModel,
+    track: HandTrack,
+    prefix: str = "",
+    colour: tuple[float, float, float] | None = None,
+    opacity: float = 1.0,
+) -> None:
+    name = f"{prefix}{model.side}"
     vertices, rest_joints = rest_hand(model, track)
-    nodes = _add_skeleton(builder, world, model, rest_joints)
+    nodes = _add_skeleton(builder, world, model, rest_joints, name)
     inverse_bind = np.tile(np.eye(4), (16, 1, 1))
     inverse_bind[:, :3, 3] = -rest_joints
-    skin = builder.skin(f"{model.side} skin", nodes, inverse_bind)
+    skin = builder.skin(f"{name} skin", nodes, inverse_bind)
     joints, weights = strongest_weights(np.asarray(model.skin_weights))
     faces = np.asarray(model.faces, dtype=np.int64)
     attributes = {
@@ -96,18 +126,20 @@ def _add_hand(builder: GltfBuilder, world: int, times: int, model: HandModel, tr
         "WEIGHTS_0": builder.array(weights, gltf.ARRAY_BUFFER),
     }
     indices = builder.array(faces.reshape(-1).astype(np.uint32), gltf.ELEMENT_ARRAY_BUFFER)
-    material = builder.material(f"{model.side} hand", HAND_COLOURS[model.side])
-    mesh = builder.mesh(f"{model.side} hand", attributes, indices, material)
-    builder.node(f"{model.side} hand", None, mesh=mesh, skin=skin)
+    material = builder.material(f"{name} hand", colour or HAND_COLOURS[model.side], opacity=opacity)
+    mesh = builder.mesh(f"{name} hand", attributes, indices, material)
+    builder.node(f"{name} hand", None, mesh=mesh, skin=skin)
     _animate_hand(builder, times, nodes, track)
 
 
-def _add_skeleton(builder: GltfBuilder, world: int, model: HandModel, rest_joints: np.ndarray) -> list[int]:
+def _add_skeleton(
+    builder: GltfBuilder, world: int, model: HandModel, rest_joints: np.ndarray, hand_name: str
+) -> list[int]:
     nodes: list[int] = []
     for joint, name in enumerate(JOINT_NAMES[:16]):
         parent = world if joint == 0 else nodes[int(model.parents[joint])]
         offset = rest_joints[joint] if joint == 0 else rest_joints[joint] - rest_joints[int(model.parents[joint])]
-        nodes.append(builder.node(f"{model.side} {name}", parent, translation=np.float32(offset).tolist()))
+        nodes.append(builder.node(f"{hand_name} {name}", parent, translation=np.float32(offset).tolist()))
     return nodes
 
 

@@ -51,14 +51,17 @@ class GltfBuilder:
         siblings.append(index)
         return index
 
-    def material(self, name: str, colour: tuple[float, float, float], roughness: float = 0.75) -> int:
+    def material(
+        self, name: str, colour: tuple[float, float, float], roughness: float = 0.75, opacity: float = 1.0
+    ) -> int:
         """Matt material; colour as sRGB numbers in [0, 1]."""
         surface = gltf.PbrMetallicRoughness(
-            baseColorFactor=[*linear_from_srgb(np.array(colour)).round(5).tolist(), 1.0],
+            baseColorFactor=[*linear_from_srgb(np.array(colour)).round(5).tolist(), opacity],
             metallicFactor=0.0,
             roughnessFactor=roughness,
         )
-        self.document.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface, alphaCutoff=None))
+        mode = {"alphaMode": gltf.BLEND} if opacity < 1 else {}
+        self.document.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface, alphaCutoff=None, **mode))
         return len(self.document.materials) - 1
 
     def mesh(self, name: str, attributes: dict[str, int], indices: int, material: int) -> int:

@@ -4,18 +4,20 @@ three.js and its GLTFLoader (MIT) lie in ``vendor``, where their version and lic
 """
 
 import base64
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from hoidata.clips.clip import SIDES, Clip
+from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.files import write_whole
 from hoidata.hands import HandPair
-from pipelines.pages.glb import HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
+from pipelines.pages.glb import GHOST_COLOUR, HAND_COLOURS, MOVING_PART_COLOUR, OBJECT_COLOUR, glb_bytes
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import View, still_view, view_of
 
@@ -49,14 +51,18 @@ def motion_player(
     caption: str = "",
     contact: ContactPaint | None = None,
     contact_label: str = "",
+    ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
 ) -> Player:
-    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it. contact_label: its meaning."""
+    """A player of ``clip``: the valid hands, the object, and ``contact`` painted on it. contact_label: its meaning.
+
+    ghosts: hands to see through, those of the recording.
+    """
     return Player(
-        glb=glb_bytes(clip, hands, contact),
+        glb=glb_bytes(clip, hands, contact, ghosts),
         title=title,
         view=view_of(clip, hands),
         caption=caption,
-        legend=_legend(clip),
+        legend=_legend(clip) + ((("as recorded", css_colour(GHOST_COLOUR)),) if ghosts else ()),
         contact_label=contact_label if contact is not None else "",
     )
 

@@ -12,7 +12,7 @@ from typing import Any
 from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from models.registry import NETWORKS, family_module, family_names, network_modules
+from models.registry import IF_LISTED, NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.params import chosen_params, read_file, read_params
 from pipelines.stages.base import StagePaths, write_json
@@ -103,8 +103,13 @@ def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
 
 
 def own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
-    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same."""
+    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same.
+
+    Of a family or network that is made only where it is listed: whether it is.
+    """
     stage, _, dataset = name.partition("/")
+    if stage in ("train", "sample") and dataset in IF_LISTED:
+        return {"params.yaml families": canonical_json(dataset in params["families"])}
     if stage not in SECTIONS_OF_DATASETS:
         return {}
     keys, value = (*SECTIONS_OF_DATASETS[stage], dataset), params

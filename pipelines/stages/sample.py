@@ -4,11 +4,12 @@ from pathlib import Path
 
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, write_empty
+from pipelines.stages.listed import off_reason
 
 
 def run(paths: StagePaths) -> None:
     """Write the motions; a dataset without clips, or a family that is not trained, gives an empty output."""
-    if reason := empty_reason(paths.clips):
+    if reason := off_reason(paths.family) or empty_reason(paths.clips):
         write_empty(paths.samples, reason)
         return
     sample(paths, read_params(Path()), paths.family)

@@ -6,8 +6,10 @@ import shutil
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from hoidata.datasets import RawTree, SequenceKey
+from hoidata.datasets.manipnet.adapter import HAND_JOINTS
 
 # A right hand in the files' axes: fingers to -x, thumb side +y, palm to -z. "~" is "-" on the right, "" on the left.
 HAND = """HIERARCHY
@@ -120,3 +122,38 @@ def write_two(root: Path) -> Path:
     thing.unlink()
     shutil.copy(root / "objects/Primitive/tetra_large.obj.gz", root / "objects/Primitive/cube_large.obj.gz")
     return root
+
+
+def write_skin(root: Path, seed: int = 0) -> dict[str, np.ndarray]:
+    """A skin of random points on random bones, and a reference with all capsules; the skin's arrays. Right hand."""
+    random = np.random.default_rng(seed)
+    poses = np.tile(np.eye(4), (17, 1, 1))
+    poses[1:, :3, :3] = Rotation.from_rotvec(random.normal(0, 0.3, (16, 3))).as_matrix()
+    poses[1:, :3, 3] = random.normal(0, 0.5, (16, 3))
+    poses[:2] = np.eye(4)  # both are the wrist
+    normals = random.normal(size=(788, 3))
+    weights = random.dirichlet(np.ones(4), 788)
+    weights[:, 3] = 0
+    skin = {
+        "vertices": random.normal(0, 0.5, (788, 3)),
+        "normals": normals / np.linalg.norm(normals, axis=1, keepdims=True),
+        "bone_weights": weights / weights.sum(axis=1, keepdims=True),
+        "bind_poses": poses,
+    }
+    arrays = {name: array.astype(np.float32) for name, array in skin.items()}
+    arrays["bone_indices"] = random.permuted(np.tile(np.arange(17), (788, 1)), axis=1)[:, :4].astype(np.int32)
+    np.savez(root / "hand" / "right_hand_skin.npz", **arrays)
+    capsules = [
+        {
+            "joint": joint,
+            "start_local": random.normal(0, 0.1, 3).tolist(),
+            "end_local": TIPS.get(joint, random.normal(0, 0.1, 3).tolist()),
+            "radius": float(random.uniform(0.07, 0.2)),
+        }
+        for joint in ["WRIST"] * 4 + [name for name in HAND_JOINTS if name not in ("WRIST", "THUMB_CMC_FE")]
+    ]
+    sensors = sorted(random.choice(788, 104, replace=False).tolist())
+    (root / "hand" / "hand_reference.json").write_text(
+        json.dumps({"capsules": capsules, "proximity_vertices": sensors})
+    )
+    return arrays

@@ -6,7 +6,6 @@ torch's FakeTensorMode knows shape and device of every tensor but no value: a ho
 GPU.
 """
 
-import copy
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -28,7 +27,7 @@ from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.corpus import Corpus
 from models.common.family import Network, Setup
-from models.common.features import Hands
+from models.common.features import Hands, Normaliser
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.sampling import SamplerConfig
 from models.text2hoi.networks import NETWORKS
@@ -38,6 +37,7 @@ from tests.models.toy import PARAMS, POINT_NET, TRANSFORMER
 BACKEND = "nodata"
 _setup_privateuseone_for_python_backend(BACKEND)
 DEVICE = torch.device(f"{BACKEND}:0")
+TO = torch.Tensor.to
 # The paper's way of everything, at the toy's sizes.
 PAPER: dict[str, dict[str, Any]] = {
     "contact": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8]},
@@ -53,9 +53,22 @@ def moved(module: nn.Module, device: Any) -> nn.Module:
         for table in (part._parameters, part._buffers):
             for name, old in table.items():
                 if old is not None:
-                    new = old.detach().to(device)
+                    new = torch.empty(old.shape, dtype=old.dtype, device=device)
                     table[name] = nn.Parameter(new, old.requires_grad) if isinstance(old, nn.Parameter) else new
     return module
+
+
+def sent(tensor: torch.Tensor, *given: Any, **named: Any) -> torch.Tensor:
+    """``Tensor.to`` from the CPU to the device, for which torch would look at small tensors' values."""
+    there = any(isinstance(own, torch.device | torch.Tensor) and _device(own) == DEVICE for own in given)
+    if not there or tensor.device.type != "cpu" or tensor.requires_grad:
+        return TO(tensor, *given, **named)
+    dtype = next((own.dtype for own in given if isinstance(own, torch.Tensor)), tensor.dtype)
+    return torch.empty(tensor.shape, dtype=dtype, device=DEVICE)
+
+
+def _device(own: torch.device | torch.Tensor) -> torch.device:
+    return own.device if isinstance(own, torch.Tensor) else own
 
 
 def paths(root: Path, checkpoints: Path) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -76,9 +89,12 @@ def paths(root: Path, checkpoints: Path) -> Iterator[tuple[str, Callable[[], obj
 
 
 def on_device(stored: dict[str, Checkpoint]) -> dict[str, Checkpoint]:
-    """Checkpoints as ``load_checkpoint`` gives them there; files cannot be read where tensors hold no data."""
+    """Networks as ``load_checkpoint`` gives them there; files cannot be read where tensors hold no data."""
+    made = {network.name: network.build(stored[network.name].network.config) for network in NETWORKS}
     return {
-        name: Checkpoint(copy.deepcopy(own.network).to(DEVICE), own.normaliser and own.normaliser.to(DEVICE), own.info)
+        name: Checkpoint(
+            made[name].to(DEVICE).eval().requires_grad_(False), own.normaliser and own.normaliser.to(DEVICE), own.info
+        )
         for name, own in stored.items()
     }
 
@@ -119,6 +135,9 @@ def lengths(stored: dict[str, Checkpoint], requests: list[Request]) -> None:
 
 def main() -> None:
     setattr(nn.Module, "to", moved)  # noqa: B010 (pyright knows it as a method)
+    setattr(torch.Tensor, "to", sent)  # noqa: B010
+    # Read from the clips' values, on the host, once before the first step.
+    setattr(Normaliser, "of", lambda clips: Normaliser.nothing())  # noqa: B010
     every = [("a value that is waited for", lambda: float(torch.zeros((), device=DEVICE))),
              ("tensors of two devices", lambda: torch.zeros(2, device=DEVICE) + torch.zeros(2))]  # fmt: skip
     every += paths(*map(Path, sys.argv[1:]))

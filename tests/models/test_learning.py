@@ -10,16 +10,20 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
+from hoidata.contact.agreement import f1_score
 from hoidata.store.annotated import load_annotated
 from models.common.corpus import Corpus
 from models.common.family import Network, Setup
 from models.common.features import Hands
-from models.common.sampling import SamplerConfig, draw_motion
+from models.common.sampling import Motion, SamplerConfig, draw_motion
 from models.common.training import Plan, fit
 from models.registry import load_network
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
-from models.text2hoi.thresholds import best_threshold, contact_probabilities, f1_score, true_maps
+from models.text2hoi.refiner import RefinerModel, refine
+from models.text2hoi.refiner_training import RefinerObjective
+from models.text2hoi.surface import Surface
+from models.text2hoi.thresholds import best_threshold, contact_probabilities, true_maps
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
 from tests.builders.stores import write_annotated
@@ -27,13 +31,14 @@ from tests.models.conftest import BOX, make_clip
 from tests.models.conftest import Plan as ToyPlan
 
 DELIVERED = load_settings(TrainParams, "train")
-STEPS = {"contact": (300, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
+STEPS = {"contact": (400, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
 
 
 @dataclass(frozen=True)
 class Learnt:
     """What was learnt of two clips of one box and one hand that differ in verb, length and path."""
 
+    corpus: Corpus
     clips: list[ClipSample]
     networks: dict[str, nn.Module]
     generator: MotionGenerator
@@ -52,7 +57,7 @@ def learnt(tmp_path_factory: pytest.TempPathFactory) -> Learnt:
         networks[name], normaliser = learn(load_network(name), corpus, hands, networks)
     assert normaliser is not None
     generator = MotionGenerator(networks["diffusion"], normaliser)  # pyright: ignore[reportArgumentType]
-    return Learnt(list(clips), networks, generator, hands)
+    return Learnt(corpus, list(clips), networks, generator, hands)
 
 
 def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module]) -> tuple[nn.Module, Any]:
@@ -62,7 +67,8 @@ def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, n
     steps, size, rate = STEPS[network.name]
     trained = {name: SimpleNamespace(network=own) for name, own in before.items()}
     torch.manual_seed(0)
-    setup = Setup(config, plan.loss, 0, corpus, hands, torch.device("cpu"), trained)
+    loss = replace(plan.loss, points=1024) if network.name == "contact" else plan.loss
+    setup = Setup(config, loss, 0, corpus, hands, torch.device("cpu"), trained)
     objective, normaliser = network.objective(setup)
     budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 20, "validate_every": steps}
     training = replace(plan.training, **budget, ema_decay=0.98, weight_decay=0.0, keep_best=False)
@@ -104,6 +110,52 @@ def test_exchanged_prompts_exchange_the_paths_of_the_object(learnt: Learnt) -> N
         # The box is lifted along z or passed along x, by 20 cm.
         last = torch.stack([own[n - 1, :3] for own, n in zip(objects, batch.lengths[order], strict=True)])
         assert [int(end[2] < end[0]) for end in last] == verbs
+
+
+@dataclass(frozen=True)
+class Planted(MotionGenerator):
+    """A generator that is right but for its wrists, which are off by 10 mm."""
+
+    def denoise_once(
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, generator: torch.Generator
+    ) -> Motion:
+        del timesteps
+        own, moved = self._features((hands, objects), condition)
+        return planted(own, generator), moved
+
+
+def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
+    """Hands (B, 2, F, 99) with wrists moved 10 mm in a direction that turns slowly."""
+    first, last = torch.randn(2, *hands.shape[:2], 1, 3, generator=generator)
+    share = torch.linspace(0, 1, hands.shape[2])[:, None]
+    away = torch.nn.functional.normalize(first + (last - first) * share, dim=-1)
+    return torch.cat((hands[..., :3] + 0.01 * away, hands[..., 3:]), -1)
+
+
+@pytest.mark.slow
+def test_the_refiner_takes_planted_noise_away(learnt: Learnt) -> None:
+    network, clips = load_network("refiner"), learnt.clips
+    plan = Plan.of(network, DELIVERED.of("refiner"))
+    loss = replace(plan.loss, samples=1, penetration_weight=0.0, field_resolution=24)
+    generator = Planted(learnt.generator.network, learnt.generator.normaliser)
+    surface = Surface.of(learnt.hands, [clips[0].object_model], 24, torch.device("cpu"))
+    torch.manual_seed(0)
+    given = loss, learnt.corpus, generator, surface, torch.device("cpu"), 0
+    objective = RefinerObjective(RefinerModel(plan.network), *given)
+    draws = torch.Generator().manual_seed(1)
+    pools = [objective._make(clips, "once", draws) for _ in range(120)]
+    objective.pool = {clip.clip_id: [pool[row] for pool in pools] for row, clip in enumerate(clips)}
+    objective.weights = replace(loss, samples=len(pools))
+    training = replace(plan.training, steps=1200, batch=2, validate_every=1200, keep_best=False, learning_rate=2e-3)
+    refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
+    assert isinstance(refiner, RefinerModel)
+    batch = collate(clips)
+    coarse = planted(batch.hands, torch.Generator().manual_seed(2))
+    seen = surface.coarse(batch, coarse, batch.object, batch.contact_map, batch.present)
+    apart = [(hands - batch.hands)[..., :3].norm(dim=-1) for hands in (coarse, refine(refiner, seen))]
+    off = [float(distance[batch.present].mean()) for distance in apart]
+    assert off[0] == pytest.approx(0.01, rel=1e-3)
+    assert off[1] <= 0.2 * off[0]
 
 
 def condition(learnt: Learnt, batch: ClipBatch, text: Tensor) -> Condition:

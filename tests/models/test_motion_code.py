@@ -12,7 +12,7 @@ from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.store.annotated import AnnotatedStore
 from models.common.features import Normaliser, hands_in_object_frame, hands_in_world, proper_hands
-from models.common.spline import fit_spline, intervals_of, projected, spline_basis, stacked_bases
+from models.common.spline import fit_spline, intervals_of, projected, settled, spline_basis, stacked_bases
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 
 OURS = MotionCodeConfig(knot_frames=4, object_knots=2, hand_frame="object")
@@ -133,3 +133,16 @@ def test_the_two_frames_of_hands_are_each_others_inverse(batch: ClipBatch) -> No
     there = hands_in_object_frame(batch.hands, batch.object)
     back = hands_in_world(there, batch.object)
     torch.testing.assert_close(back[batch.present], batch.hands[batch.present], atol=1e-5, rtol=0)
+
+
+def test_rows_that_hardly_differ_come_to_rest_and_a_path_keeps_its_way() -> None:
+    path = torch.cat((torch.zeros(8), torch.linspace(0, 0.2, 6)[1:], torch.full((8,), 0.2)))[:, None].repeat(1, 3)
+    noise = 0.001 * torch.randn(path.shape, generator=torch.Generator().manual_seed(0))
+    there = torch.ones(len(path), dtype=torch.bool)
+    found = settled(path + noise, there, torch.full((3,), 0.004))
+    crawl = [float(rows[:8].diff(dim=0).norm(dim=-1).mean()) for rows in (path + noise, found)]
+    assert crawl[1] < 0.2 * crawl[0]
+    assert float((found - path).norm(dim=-1).max()) < 0.005
+    there[12:] = False
+    cut = settled((path + noise)[:12], there[:12], torch.full((3,), 0.004))
+    torch.testing.assert_close(settled(path + noise, there, torch.full((3,), 0.004))[:12], cut)

@@ -1,0 +1,359 @@
+"""Fingers for the wrists and objects of the real ManipNet recordings: the paper's table, with the controls it lacks.
+
+``python -m bench manipnet`` with HOIDATA_MANIPNET: the data folder. HOIDATA_BENCH_SEEDS: how many trainings of each
+row (1 if not given); HOIDATA_BENCH_SIZE: small or full. What was computed is kept in .hoidata/manipnet (never
+committed: the data is CC BY-NC) and taken up again, so a run may be stopped at any time.
+
+Objects seen: of five successive tenths of a recording three train, the last tests, 0.5 s around what is not trained on
+left out. Objects unseen: every recording left out in turn; the first test tenths of it are rolled out.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from bench.harness import show
+from bench.manipnet_recordings import NAMES, RATE_HZ, TEST, TRAIN, HandRecording, read_hands
+from hoidata.clips.clip import SIDES, Side
+from hoidata.files import write_whole
+from hoidata.hands.tracked_hand import HandState
+from hoidata.physics.capsules import CapsuleContacts
+from hoidata.physics.realism import LARGEST_PENETRATION_M, VARIANTS, contacts_in, score, smoothness_m_s2
+from models.common.training import TrainingConfig
+from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared
+from models.manipnet.features import FeatureSettings
+from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
+from models.manipnet.network import ManipNet, NetworkConfig
+from models.manipnet.rollout import Predictor, Rule, Task, roll_out
+
+KEPT = Path(".hoidata/manipnet")
+SETTINGS = FeatureSettings(step_s=1 / RATE_HZ)
+SIZES = {
+    "small": (NetworkConfig(encoder=128), TrainingConfig(2500, 128, 1e-3, 0.0, "cosine", 50)),
+    "full": (NetworkConfig(), TrainingConfig(20000, 32, 1e-4, 0.0)),
+}
+VARIANTS_OF_OURS: dict[str, dict[str, Any]] = {
+    "ours": {},
+    "trained as the paper": {"astray": False},
+    "no sensors": {"without": ("sensors",)},
+    "no ambient": {"without": ("ambient",)},
+    "no distance": {"without": ("distance",)},
+    "no proximity": {"without": ("proximity",)},
+    "no signed distance": {"without": ("signed-distance",)},
+    "no future sensing": {"without": ("future",)},
+    "short trajectory": {"without": ("long-future",)},
+    "ResNet": {"kind": "resnet"},
+    "MLP": {"kind": "mlp"},
+}
+UNSEEN = ("ours", "no sensors", "no ambient", "no distance")
+NEAREST = 10
+AWAY_M = 0.02
+LEAD_FRAMES = RATE_HZ // 2  # a rollout begins so long before the first frame that counts
+Fingers = dict[Side, np.ndarray]
+
+
+class Piece(NamedTuple):
+    """An interval that is tested, usable throughout. frames: what is rolled out; scored: (frame,) bool of those."""
+
+    recording: HandRecording
+    frames: slice
+    scored: np.ndarray
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What trains and what tests: (recording, (frame,) bool) each. name: for what is kept."""
+
+    name: str
+    train: tuple[tuple[HandRecording, np.ndarray], ...]
+    pieces: tuple[Piece, ...]
+
+
+def main() -> None:
+    root = os.environ.get("HOIDATA_MANIPNET")
+    if not root:
+        print("HOIDATA_MANIPNET is not set: the table needs the real recordings")
+        return
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    torch.use_deterministic_algorithms(True)
+    recordings = [read_hands(Path(root), name) for name in NAMES]
+    size, seeds = os.environ.get("HOIDATA_BENCH_SIZE", "small"), int(os.environ.get("HOIDATA_BENCH_SEEDS", "1"))
+    seen = seen_trial(recordings)
+    rows = table(seen, VARIANTS_OF_OURS, size, seeds)
+    show_rows(f"Objects seen, {size} network, {seeds} seeds", rows)
+    for trial in unseen_trials(recordings):
+        show_rows(trial.name, table(trial, {name: VARIANTS_OF_OURS[name] for name in UNSEEN}, size, seeds))
+
+
+def seen_trial(recordings: Sequence[HandRecording]) -> Trial:
+    train = tuple((one, one.trains & one.usable) for one in recordings)
+    return Trial("seen", train, tuple(piece for one in recordings for piece in pieces(one, TEST)))
+
+
+def unseen_trials(recordings: Sequence[HandRecording]) -> list[Trial]:
+    """Each recording left out in turn, all of its test and validation tenths rolled out."""
+    trials = []
+    for out in recordings:
+        train = tuple((one, one.usable) for one in recordings if one is not out)
+        trials.append(Trial(f"unseen {out.name}", train, tuple(pieces(out, (*TRAIN[:1], *TEST)))))
+    return trials
+
+
+def pieces(recording: HandRecording, kinds: tuple[int, ...]) -> list[Piece]:
+    """The intervals of these tenths in which the object is lifted, with a lead that is not scored."""
+    tenths, found = recording.tenths(kinds), []
+    for start, stop in recording.intervals(tenths):
+        first = start
+        while first > 0 and first > start - LEAD_FRAMES and recording.usable[first - 1]:
+            first -= 1
+        scored = (recording.lifted & tenths)[first:stop]
+        scored[:LEAD_FRAMES] = False
+        if scored.sum() >= 3:
+            found.append(Piece(recording, slice(first, stop), scored))
+    return found
+
+
+def table(
+    trial: Trial, variants: dict[str, dict[str, Any]], size: str, seeds: int
+) -> dict[str, list[dict[str, float]]]:
+    """Figures of every row, one dictionary per seed."""
+    rows = {name: [figures] for name, figures in kept(f"{trial.name} controls", lambda: controls(trial)).items()}
+    for name, changes in variants.items():
+        for seed in range(seeds):
+            key = f"{trial.name} {name} {size} {seed}"
+            for rule, figures in kept(key, lambda c=changes, s=seed: trained_row(trial, c, size, s)).items():
+                rows.setdefault(f"{name}{'' if rule == 'off' else ', IK'}", []).append(figures)
+    return rows
+
+
+def trained_row(trial: Trial, changes: dict[str, Any], size: str, seed: int) -> dict[str, dict[str, float]]:
+    """Train one network and roll it out, without and with post-processing."""
+    began, changes = time.process_time(), dict(changes)
+    network, training = SIZES[size]
+    astray = changes.pop("astray", True)
+    config = replace(network, features=SETTINGS, **changes)
+    examples = examples_of(trial, astray)
+    torch.manual_seed(seed)
+    model = prepared(config, trial.train[0][0].hands["right"], examples)
+    fit_examples(model, examples, training, seed)
+    trained_s = time.process_time() - began
+    found = {}
+    for rule in ("off", "released"):
+        found[rule] = measured(trial, rolled(trial, model, rule)) | {"train_s": trained_s}
+    return found
+
+
+_EXAMPLES: dict[tuple[str, Side, bool], Examples] = {}
+
+
+def examples_of(trial: Trial, astray: bool) -> list[Examples]:
+    """Training steps of both hands; those of a recording are computed once and cut. astray: also from other poses."""
+    found = []
+    for recording, frames in trial.train:
+        for side in SIDES:
+            for kind in (False, True)[: 1 + astray]:
+                every = _recorded_examples(recording, side, kind)
+                chosen = frames[every.frame] & frames[every.frame + 1]
+                found.append(Examples(*(array[chosen] for array in every)))
+    return found
+
+
+def _recorded_examples(recording: HandRecording, side: Side, astray: bool) -> Examples:
+    key = (recording.name, side, astray)
+    if key not in _EXAMPLES:
+        path = KEPT / f"examples-{recording.name}-{side}{'-astray' * astray}.npz"
+        if not path.is_file():
+            fingers, hand = recording.fingers[side], recording.hands[side]
+            # Of frames that may train alone: no test pose is met, not even as a way to go wrong.
+            pool = np.concatenate([fingers[recording.trains & recording.usable], hand.rest_rotmats[None]])
+            made = hand_examples(
+                recording.control,
+                side,
+                recording.hands[side],
+                recording.fingers[side],
+                recording.time_s,
+                recording.usable,
+                recording.surface,
+                SETTINGS,
+                other_poses(fingers, pool, NAMES.index(recording.name)) if astray else None,
+            )
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, **made._asdict())
+        with np.load(path) as stored:
+            _EXAMPLES[key] = Examples(**stored)
+    return _EXAMPLES[key]
+
+
+def rolled(trial: Trial, model: ManipNet, rule: Rule) -> list[Fingers]:
+    """Both hands of every piece from the neutral pose on."""
+    tasks = [
+        Task(one.hands[side], side, one.control, one.time_s[frames], one.hands[side].rest_rotmats)
+        for one, frames, _ in trial.pieces
+        for side in SIDES
+    ]
+    made = roll_out(Predictor(model, rule), tasks)
+    return [dict(zip(SIDES, made[2 * number : 2 * number + 2], strict=True)) for number in range(len(trial.pieces))]
+
+
+def controls(trial: Trial) -> dict[str, dict[str, float]]:
+    """Rows without a network."""
+    fingers = [as_right(one.hands[side], one.fingers[side][frames]) for one, frames in trial.train for side in SIDES]
+    hand = trial.train[0][0].hands["right"]
+    inputs = [_control_inputs(one, side, frames) for one, frames in trial.train for side in SIDES]
+    lookup, mean = Lookup.of(hand, SETTINGS, inputs, fingers), mean_rotmats(np.concatenate(fingers))
+
+    def both(pose: Callable[[Piece, Side], np.ndarray]) -> dict[str, float]:
+        return measured(trial, [{side: pose(piece, side) for side in SIDES} for piece in trial.pieces])
+
+    def held(pose: np.ndarray) -> Callable[[Piece, Side], np.ndarray]:
+        return lambda piece, side: np.tile(as_right(piece.recording.hands[side], pose), (len(piece.scored), 1, 1, 1))
+
+    def looked_up(count: int) -> Callable[[Piece, Side], np.ndarray]:
+        def pose(piece: Piece, side: Side) -> np.ndarray:
+            found = lookup.poses(_control_inputs(piece.recording, side, piece.frames), count)
+            return as_right(piece.recording.hands[side], found)
+
+        return pose
+
+    raw = [{side: piece.recording.fingers[side][piece.frames] for side in SIDES} for piece in trial.pieces]
+    return {
+        "raw data": measured(trial, raw),
+        "raw hands 2 cm away": measured(trial, raw, AWAY_M),
+        "neutral pose": both(held(hand.rest_rotmats)),
+        "mean training pose": both(held(mean)),
+        "frozen at the first scored frame": both(_frozen),
+        "nearest training frame": both(looked_up(1)),
+        f"mean of {NEAREST} nearest": both(looked_up(NEAREST)),
+    }
+
+
+def _frozen(piece: Piece, side: Side) -> np.ndarray:
+    own = piece.recording.fingers[side][piece.frames]
+    return np.repeat(own[np.flatnonzero(piece.scored)[:1]], len(own), axis=0)
+
+
+def _control_inputs(recording: HandRecording, side: Side, frames: np.ndarray | slice) -> np.ndarray:
+    hand = recording.hands[side]
+    return control_inputs(recording.control, side, hand, recording.time_s[frames], recording.surface, SETTINGS)
+
+
+def measured(trial: Trial, fingers: Sequence[Fingers], away_m: float = 0.0) -> dict[str, float]:
+    """Figures over all pieces: sums and counts of scored frames, then shares and means."""
+    sums: dict[str, float] = {}
+    for piece, made in zip(trial.pieces, fingers, strict=True):
+        for name, value in _piece_sums(piece, made, away_m).items():
+            sums[name] = sums.get(name, 0.0) + value
+    pairs = 2 * max(sums["touching"] + sums["touching_raw"], 1)
+    return {
+        "joint_mm": 1000 * sums["joint"] / sums["hand_frames"],
+        "tip_mm": 1000 * sums["tip"] / sums["hand_frames"],
+        "si": 100 * sums["SI"] / max(sums["sound"], 1),
+        "si_of_all": 100 * sums["SI"] / sums["frames"],
+        "released": 100 * sums["as released"] / max(sums["sound"], 1),
+        "deep": 100 * (1 - sums["sound"] / sums["frames"]),
+        "penetration_cm": 100 * sums["depth"] / max(sums["overlaps"], 1),
+        "smooth_cm_s2": 100 * sums["acceleration"] / max(sums["hands"], 1),
+        "capsule_f1": 200 * 2 * sums["touching_both"] / pairs,
+        "frames": sums["frames"],
+    }
+
+
+def _piece_sums(piece: Piece, made: Fingers, away_m: float) -> dict[str, float]:
+    recording, frames, scored = piece
+    raw_fingers = {side: recording.fingers[side][frames] for side in SIDES}
+    states = recording.states(made, frames)
+    if away_m:
+        states = {side: _moved_away(recording, frames, state, away_m) for side, state in states.items()}
+    scene = recording.scene(states, frames)
+    errors = [joint_errors_m(recording.hands[side], made[side][scored], raw_fingers[side][scored]) for side in SIDES]
+    results = {name: score(scene, variant, scored) for name, variant in VARIANTS.items()}
+    depth = results["SI"].penetration_m[scored]
+    contacts = contacts_in(scene, scored)
+    touching, touching_raw = _touching(contacts), _touching_raw(piece)
+    motions = [recording.motion(state.taken(scored)) for state in states.values()]
+    inside = contacts.depth_m[contacts.depth_m > 0]
+    return {
+        "joint": float(sum(error.mean(axis=1).sum() for error in errors)),
+        "tip": float(sum(error[:, -5:].mean(axis=1).sum() for error in errors)),
+        "hand_frames": float(sum(len(error) for error in errors)),
+        "frames": float(scored.sum()),
+        "sound": float((depth < LARGEST_PENETRATION_M).sum()),
+        "depth": float(inside.sum()),
+        "overlaps": float(len(inside)),
+        "touching": float(len(touching)),
+        "touching_raw": float(len(touching_raw)),
+        "touching_both": float(len(touching & touching_raw)),
+        "acceleration": float(sum(smoothness_m_s2(*motion, RATE_HZ) for motion in motions)),
+        "hands": float(len(motions)),
+    } | {name: float(result.passed.sum()) for name, result in results.items()}
+
+
+_RAW_TOUCHING: dict[tuple[str, int], set[tuple[int, int]]] = {}
+
+
+def _touching_raw(piece: Piece) -> set[tuple[int, int]]:
+    """What touches in the recording; every row is held against it."""
+    recording, frames, scored = piece
+    key = (recording.name, frames.start)
+    if key not in _RAW_TOUCHING:
+        raw = {side: recording.fingers[side][frames] for side in SIDES}
+        _RAW_TOUCHING[key] = _touching(contacts_in(recording.scene(recording.states(raw, frames), frames), scored))
+    return _RAW_TOUCHING[key]
+
+
+def _touching(contacts: CapsuleContacts) -> set[tuple[int, int]]:
+    """Frame and capsule of all overlaps."""
+    return set(zip(contacts.frame.tolist(), contacts.capsule.tolist(), strict=True))
+
+
+def _moved_away(recording: HandRecording, frames: slice, state: HandState, way_m: float) -> HandState:
+    """The hand moved straight away from the middle of the object."""
+    thing = recording.control.thing
+    centre = thing.rotmats[frames] @ recording.control.model.vertices_m.mean(axis=0) + thing.position_m[frames]
+    away = state.joint_m.mean(axis=1) - centre
+    shift = way_m * (away / np.linalg.norm(away, axis=1, keepdims=True))[:, None]
+    moved = {name: getattr(state, name) + shift for name in state._fields if name.endswith("_m")}
+    return state._replace(**moved)
+
+
+def kept(key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    """What was computed under a key before with the same settings, else what is computed now."""
+    digest = sha256(f"{key} {SIZES} {SETTINGS}".encode()).hexdigest()[:12]
+    path = KEPT / f"{key.replace(' ', '-').replace(',', '')}-{digest}.json"
+    if not path.is_file():
+        began = time.perf_counter()
+        write_whole(path, json.dumps(make(), indent=1))
+        print(f"{key}: {time.perf_counter() - began:.0f} s", flush=True)
+    return json.loads(path.read_text())
+
+
+COLUMNS = {
+    "joint_mm": "joints mm",
+    "tip_mm": "tips mm",
+    "si": "SI %",
+    "si_of_all": "deep = failed",
+    "released": "released %",
+    "deep": "deep %",
+    "penetration_cm": "depth cm",
+    "smooth_cm_s2": "cm/s2",
+    "capsule_f1": "capsule F1",
+}
+
+
+def show_rows(title: str, rows: dict[str, list[dict[str, float]]]) -> None:
+    frames = int(next(iter(rows.values()))[0]["frames"])
+    lines = [[name, *(_cell([one[key] for one in figures]) for key in COLUMNS)] for name, figures in rows.items()]
+    show(f"{title}, {frames} scored frames", ["row", *COLUMNS.values()], lines)
+
+
+def _cell(values: Sequence[float]) -> str:
+    spread = f" ±{np.std(values):.2f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.2f}{spread}"

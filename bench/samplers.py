@@ -1,0 +1,93 @@
+"""What a motion of Text2HOI's size costs: strided samplers, tokens that are cut, guidance in one call; on the CPU.
+
+``python -m bench samplers``. The baseline is a stock ``nn.TransformerEncoder`` of the same size over all 451 tokens
+with a mask, called 1,000 times: it is timed on a few calls and scaled. Weights are random; both compute the same sizes.
+"""
+
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from bench.harness import medians, show
+from models.common.precision import compute_in_bfloat16
+from models.common.sampling import SamplerConfig, sample_motion
+from models.common.transformer import TransformerConfig
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, guided
+
+FRAMES, STOCK_STEPS, RUNS = 150, 1000, 3
+
+
+def main() -> None:
+    torch.manual_seed(0)
+    size = TransformerConfig()
+    model, stock = DiffusionModel(DiffusionConfig(size)).eval(), stock_encoder(size)
+    calls: dict[str, Callable[[], object]] = {
+        "both hands, 150 frames": one_call(model, (True, True), FRAMES),
+        "the same, guided": one_call(model, (True, True), FRAMES, guidance=2.0),
+        "one hand, 60 frames": one_call(model, (False, True), 60),
+        "stock encoder, 451 tokens masked": stock_call(stock, size, 60),
+    }
+    with torch.no_grad():
+        times = medians(calls, RUNS)
+        whole = times["both hands, 150 frames"].processor
+        rows = [[name, f"{own.processor * 1e3:.0f}", f"{own.processor / whole:.2f}"] for name, own in times.items()]
+        show("One call of the denoiser, one motion", ["call", "processor ms", "of the first"], rows)
+        stock_s = times["stock encoder, 451 tokens masked"].processor * STOCK_STEPS
+        rows = [["stock encoder, 1,000 masked steps (scaled)", f"{stock_s:.1f}", "1"]]
+        for kind, steps in (("ddpm", 50), ("ddim", 50), ("ddim", 20), ("dpm++", 20), ("dpm++", 10)):
+            seconds = motion_s(model, SamplerConfig(kind, steps))
+            rows.append([f"{kind}, {steps} steps", f"{seconds:.1f}", f"{stock_s / seconds:.0f}"])
+        show("One motion of 150 frames and both hands", ["way", "processor s", "times faster"], rows)
+        exact = run(model, SamplerConfig("dpm++", 10))
+        compute_in_bfloat16(model)
+        apart = (run(model, SamplerConfig("dpm++", 10)) - exact)[..., :3].abs().max()
+        print(f"bfloat16 in the Transformer moves wrists by up to {float(apart) * 1e3:.2f} (thousandths of a unit)")
+
+
+def stock_encoder(size: TransformerConfig) -> nn.TransformerEncoder:
+    layer = nn.TransformerEncoderLayer(size.width, size.heads, size.feed_forward, 0.0, "gelu", batch_first=True)
+    return nn.TransformerEncoder(layer, size.layers, enable_nested_tensor=False).eval()
+
+
+def stock_call(stock: nn.TransformerEncoder, size: TransformerConfig, there: int) -> Callable[[], object]:
+    """All tokens of 150 frames and three agents, of which a motion of ``there`` frames and one hand uses some."""
+    tokens, mask = torch.randn(1, 1 + 3 * FRAMES, size.width), torch.zeros(1, 1 + 3 * FRAMES, dtype=torch.bool)
+    mask[:, 1 + 3 * there :] = True
+    return lambda: stock(tokens, src_key_padding_mask=mask)
+
+
+def condition(active: tuple[bool, bool], frames: int) -> Condition:
+    points = torch.randn(1, 1024, 3) * 0.05
+    return Condition(
+        torch.randn(1, 512), torch.randn(1, 1024), points, torch.randn(1, 1024, 3),
+        torch.zeros(1, 1024, dtype=torch.long), torch.zeros(1, 2, 1024, dtype=torch.bool),
+        torch.tensor([active]), torch.tensor([frames]), (frames,), active,
+    )  # fmt: skip
+
+
+def one_call(
+    model: DiffusionModel, active: tuple[bool, bool], frames: int, guidance: float = 1.0
+) -> Callable[[], tuple[Tensor, Tensor]]:
+    denoise = guided(model, condition(active, frames), guidance)
+    hands, objects, steps = torch.randn(1, 2, frames, 99), torch.randn(1, frames, 10), torch.full((1,), 500)
+    return lambda: denoise(hands, objects, steps)
+
+
+def run(model: DiffusionModel, config: SamplerConfig) -> Tensor:
+    """Hands of one motion, always from the same noise."""
+    draws = torch.Generator().manual_seed(0)
+    torch.manual_seed(1)
+    noise = torch.randn(1, 2, FRAMES, 99, generator=draws), torch.randn(1, FRAMES, 10, generator=draws)
+    return sample_motion(guided(model, condition((True, True), FRAMES), 1.0), noise, config, draws)[0]
+
+
+def motion_s(model: DiffusionModel, config: SamplerConfig) -> float:
+    start = time.process_time()
+    run(model, config)
+    return time.process_time() - start
+
+
+if __name__ == "__main__":
+    main()

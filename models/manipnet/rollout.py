@@ -1,0 +1,182 @@
+"""Running ManipNet: each hand frame by frame, its pose the next frame's input (Sec. 6.4).
+
+No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step,
+``roll_out`` whole clips of many hands at once, ``stream.Stream`` frames as they come. Rotations are predicted and
+joints placed by forward kinematics: bones keep their length, which the release's do not.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+
+from hoidata.clips.clip import Side
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.tracked_hand import HandState, TrackedHand
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.sensors import sense
+from models.manipnet.control import Control
+from models.manipnet.features import (
+    FeatureSettings,
+    joint_rotmats_of,
+    object_from_wrist,
+    pose_features,
+    trajectory_features,
+)
+from models.manipnet.inverse_kinematics import Limits, reach, target_points
+from models.manipnet.network import ManipNet
+from models.manipnet.targets import Nearest, Targets, paper_targets, released_targets
+
+Rule = Literal["off", "paper", "released"]
+OVERLAP_SHARE, OVERLAP_WEIGHT = 0.3, 0.3  # the demo's second pass: a joint moves by this share of a capsule's depth
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """A trained network and how it is run. rule: of post-processing."""
+
+    network: ManipNet
+    rule: Rule = "released"
+
+    @property
+    def settings(self) -> FeatureSettings:
+        return self.network.config.features
+
+    def limits(self, hand: TrackedHand) -> Limits:
+        """How far the joints of a hand may turn: as far as in training, and as far as its hinges do."""
+        low, high = (array.double().numpy() for array in (self.network.low_rad, self.network.high_rad))
+        return Limits.of(hand, low, high)
+
+    @torch.no_grad()
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Outputs (hand, 214) of inputs (hand, 2350)."""
+        return self.network(torch.from_numpy(rows.astype(np.float32))).double().numpy()
+
+
+@dataclass(frozen=True, eq=False)
+class Situation:
+    """What is given of one hand in one frame. trajectory: (336,) features. object_from_wrist: (time,) now and later.
+
+    hinge_rad: (time,) of a hinged object, else None.
+    """
+
+    trajectory: np.ndarray
+    object_from_wrist: RigidTransform
+    hinge_rad: np.ndarray | None
+
+
+def situation(control: Control, side: Side, hand: TrackedHand, time_s: float, settings: FeatureSettings) -> Situation:
+    """What is given at one time. Not for many at once: last bits would depend on how many, and a stream has one."""
+    now = np.array([time_s])
+    placed, hinge = object_from_wrist(control, side, now, settings)
+    trajectory = trajectory_features(control, side, hand, now, settings)
+    return Situation(trajectory[0], placed[0], None if hinge is None else hinge[0])
+
+
+@dataclass
+class Follower:
+    """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) as they are now, from the start pose on."""
+
+    predictor: Predictor
+    hand: TrackedHand
+    surface: SurfaceIndex
+    finger_rotmats: np.ndarray
+    limits: Limits = field(init=False)
+    state: HandState = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.limits = self.predictor.limits(self.hand)
+        self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
+
+    def inputs(self, now: Situation) -> np.ndarray:
+        """(2350,) what the network sees."""
+        hinge = None if now.hinge_rad is None else now.hinge_rad[None]
+        at = now.object_from_wrist
+        placed = RigidTransform(at.rotation[None], at.translation[None])
+        sensed = sense(self.hand, self.state, placed, hinge, self.surface, self.predictor.settings.sensors)
+        return np.concatenate([pose_features(self.hand, self.state)[0], now.trajectory, sensed.flat()[0]])
+
+    def advance(self, output: np.ndarray, then: Situation) -> None:
+        """Take the pose of an output (214,) for the next frame, post-processed."""
+        fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
+        self._take(self.limits.within(fingers))
+        if self.predictor.rule != "off":
+            self._correct(output, then)
+
+    def _take(self, finger_rotmats: np.ndarray) -> None:
+        self.finger_rotmats = finger_rotmats
+        self.state = self.hand.state(finger_rotmats)
+
+    def _correct(self, output: np.ndarray, then: Situation) -> None:
+        hand, settings = self.hand, self.predictor.settings
+        radius = hand.point_radius_m if settings.less_radius else np.zeros(hand.n_points)
+        predicted, points = np.clip(output[-hand.n_points :], 0, 1), self.state.point_m[0]
+        rule = paper_targets if self.predictor.rule == "paper" else released_targets
+        targets = rule(points, predicted, radius, settings.range_m, self._nearest(points, then))
+        moved = np.zeros(hand.n_points)
+        moved[target_points(hand)] = 1
+        self._reach(targets.point_m, targets.weight * moved)
+        if self.predictor.rule == "released":
+            apart = self._out_of_capsules(then)
+            self._reach(apart.point_m, apart.weight * moved)
+
+    def _reach(self, target_m: np.ndarray, weight: np.ndarray) -> None:
+        if weight.any():
+            self._take(reach(self.hand, self.limits, self.state, target_m, weight))
+
+    def _out_of_capsules(self, then: Situation) -> Targets:
+        """The second pass: joints whose capsule overlaps the object, moved out by a share of its depth."""
+        hand, points = self.hand, self.state.point_m[0]
+        middle = (self.state.capsule_start_m[0] + self.state.capsule_end_m[0]) / 2
+        found = self._nearest(middle, then)
+        depth = np.maximum(hand.capsules.radius_m - found.distance_m, 0) * (hand.capsules.joint > 0)
+        target, weight = points.copy(), np.zeros(len(points))
+        for capsule in np.flatnonzero(depth):
+            # A capsule hangs between its joint and the one after it: the latter moves it.
+            after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
+            tip = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
+            moved = np.concatenate([after, tip])
+            target[moved] += OVERLAP_SHARE * depth[capsule] * found.normal[capsule]
+            weight[moved] = OVERLAP_WEIGHT
+        return Targets(target, weight)
+
+    def _nearest(self, points_m: np.ndarray, then: Situation) -> Nearest:
+        """What the object is like at points (point, 3) of the wrist's frame."""
+        placed = then.object_from_wrist[0]
+        hinge = None if then.hinge_rad is None else then.hinge_rad[:1]
+        found = self.surface.nearest((placed @ points_m)[None], hinge)
+        back = placed.inverse()
+        return Nearest(found.distance_m[0], back @ found.closest_m[0], back.turn(found.normal[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A hand to follow through a clip. start: (joint - 1, 3, 3) finger rotations at the first of ``time_s``."""
+
+    hand: TrackedHand
+    side: Side
+    control: Control
+    time_s: np.ndarray
+    start: np.ndarray
+
+
+def roll_out(predictor: Predictor, tasks: Sequence[Task]) -> list[np.ndarray]:
+    """Finger rotations (frame, joint - 1, 3, 3) of each task, the start pose first; times are a step apart.
+
+    The hands of a frame share one call of the network, whose last bits depend on how many they are.
+    """
+    given = [
+        [situation(task.control, task.side, task.hand, time_s, predictor.settings) for time_s in task.time_s]
+        for task in tasks
+    ]
+    followers = [Follower(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
+    made = [[follower.finger_rotmats[0]] for follower in followers]
+    for frame in range(1, max(map(len, given), default=0)):
+        running = [number for number, frames in enumerate(given) if frame < len(frames)]
+        rows = np.stack([followers[number].inputs(given[number][frame - 1]) for number in running])
+        for number, output in zip(running, predictor(rows), strict=True):
+            followers[number].advance(output, given[number][frame])
+            made[number].append(followers[number].finger_rotmats[0])
+    return [np.stack(poses) for poses in made]

@@ -1,0 +1,49 @@
+"""``hoidata animate``: fingers for trajectories of wrists and an object, or anew for frames of a clip."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from pipelines.commands.project import current_profile, enter_project
+
+
+def animate(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="TRAJECTORIES|CLIP", help="A .csv, .npz or ManipNet .txt file (README), or a stored clip's id."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
+    object: Annotated[str, typer.Option("--object", help="A mesh file (OBJ, PLY, STL, GLB) of the trajectories.")] = "",
+    fingers: Annotated[Literal["left", "right", "both"], typer.Option(help="Which hands.")] = "both",
+    frames: Annotated[str, typer.Option(help="Of a clip, like 30:90; all when left out.")] = "",
+    model: Annotated[str, typer.Option(help="Dataset whose network to use; the clip's own, or the first.")] = "",
+    rule: Annotated[Literal["paper", "released", "off"], typer.Option(help="Of post-processing.")] = "released",
+    trajectory_unit: Annotated[str, typer.Option(help="Of positions in .csv and .npz: m, cm, mm, dm, inch.")] = "m",
+    wrist_axes: Annotated[
+        Literal["model", "canonical"],
+        typer.Option(help="Of wrists in .csv and .npz: the hand model's, or x to the fingers, y to the thumb."),
+    ] = "model",
+    world_up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y or z; only shown.")] = "",
+    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm or inch; metres when left out.")] = "",
+    hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
+    profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
+) -> None:
+    """Wrists and object stay as they are given; writes arrays, an animated GLB and a page that plays it."""
+    here = Path.cwd()
+    project = enter_project()
+    from hoidata.clips.clip import SIDES
+    from pipelines.animation import AnimateWish, animate_files
+    from pipelines.generation import MeshWish
+    from pipelines.params import read_params
+
+    paths = [str(here / name) if name and (here / name).is_file() else name for name in (what, object)]
+    sides = tuple(side for side in SIDES if fingers in (side, "both"))
+    wish = AnimateWish(
+        sides, frames, model, rule, paths[1], trajectory_unit, wrist_axes, world_up, MeshWish(unit, "", hinge)
+    )
+    datasets = tuple(read_params(project)["datasets"])
+    for path in animate_files(paths[0], wish, profile or current_profile(), datasets, out):
+        typer.echo(path)

@@ -1,0 +1,87 @@
+"""Promises of ManipNet's network: the paper's layers, and variants that differ where the paper says."""
+
+import numpy as np
+import pytest
+import torch
+
+from models.manipnet.network import DenseBlock, ManipNet, NetworkConfig
+
+SMALL = NetworkConfig(pose=6, trajectory=5, sensors=7, output=4, encoder=8)
+
+
+def numpy_block(block: DenseBlock, a: np.ndarray) -> np.ndarray:
+    """Sec. 6.2 as it is printed, for an input that has been through its ReLU."""
+    state = {name: value.double().numpy() for name, value in block.state_dict().items()}
+    skips = {"manipnet": (1, 1), "resnet": (1, 0), "mlp": (0, 0)}[block.kind]
+    h1 = a @ state["first.weight"].T + state["first.bias"] + skips[0] * a
+    r = np.where(h1 > 0, h1, 0)
+    return r @ state["second.weight"].T + state["second.bias"] + skips[0] * r + skips[1] * a
+
+
+def test_full_size_has_the_papers_number_of_parameters() -> None:
+    # By hand: 2350 x 512 + 3 x 512, four times 1536 x 1536 + 1536, 214 x 1536 + 214.
+    network = ManipNet(NetworkConfig())
+    assert sum(parameter.numel() for parameter in network.parameters()) == 10_976_982
+
+
+@pytest.mark.parametrize("kind", ["manipnet", "resnet", "mlp"])
+def test_the_block_is_the_printed_equation(kind) -> None:
+    torch.manual_seed(0)
+    block = DenseBlock(12, kind, 0.7).eval()
+    torch.nn.init.normal_(block.first.bias)
+    a = torch.rand(5, 12)
+    assert np.allclose(block(a).detach().numpy(), numpy_block(block, a.double().numpy()), atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["manipnet", "resnet", "mlp"])
+def test_the_network_is_the_printed_one(kind) -> None:
+    torch.manual_seed(0)
+    network = ManipNet(NetworkConfig(6, 5, 7, 4, 8, kind=kind)).eval()
+    network.learn_normalisation(
+        torch.randn(50, 18) * 3 + 1, torch.randn(50, 4) * 2 - 1, (torch.zeros(18), torch.zeros(4))
+    )
+    inputs = torch.randn(3, 18)
+    z = ((inputs - network.input_mean) / network.input_scale).double().numpy()
+    state = {name: value.double().numpy() for name, value in network.state_dict().items()}
+    pieces = np.split(z, [6, 11], axis=1)
+    a = np.concatenate(
+        [piece @ state[f"encoders.{i}.weight"].T + state[f"encoders.{i}.bias"] for i, piece in enumerate(pieces)],
+        axis=1,
+    )
+    for block in network.blocks:
+        a = numpy_block(block, np.maximum(a, 0))
+    y = a @ state["decoder.weight"].T + state["decoder.bias"]
+    expected = y * state["output_scale"] + state["output_mean"]
+    assert np.allclose(network(inputs).detach().numpy(), expected, atol=1e-5)
+
+
+def test_every_linear_layer_loses_inputs_in_training() -> None:
+    network, seen = ManipNet(SMALL).train(), []
+    for layer in network.modules():
+        if isinstance(layer, torch.nn.Linear):
+            layer.register_forward_pre_hook(lambda layer, given: seen.append((given[0] == 0).float().mean()))
+    network.normalised(torch.randn(4000, 18))
+    # Three encoders lose 30 %; behind a ReLU it is more.
+    assert len(seen) == 8
+    assert min(seen) > 0.28
+    assert max(seen[:3]) < 0.32
+
+
+def test_numbers_that_are_switched_off_change_nothing() -> None:
+    network = ManipNet(SMALL).eval()
+    network.kept[11:14] = 0
+    inputs = torch.randn(2, 18)
+    changed = inputs.clone()
+    changed[:, 11:14] += 5
+    assert torch.equal(network(inputs), network(changed))
+    changed[:, 14] += 5
+    assert not torch.equal(network(inputs), network(changed))
+
+
+def test_a_number_that_hardly_varies_is_scaled_by_the_floor() -> None:
+    network = ManipNet(SMALL)
+    rows = torch.randn(100, 18)
+    rows[:, 3] = 0.5 + 1e-4 * rows[:, 3]
+    network.learn_normalisation(rows, torch.randn(100, 4), (torch.full((18,), 0.05), torch.zeros(4)))
+    assert network.input_scale[3] == 0.05
+    assert network.input_scale[4] > 0.5

@@ -1,0 +1,135 @@
+"""Promises of the readers of trajectories, and of what is said when they cannot be meant."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fuzz.seeds import trajectory_tables
+from hoidata.clips.clip import SIDES
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.sensors.mano_hand import mano_hand
+from models.manipnet.animate import given_control, interpolated, led_to
+from models.manipnet.trajectory_files import PARTS, parse_csv, parse_manipnet, read_trajectories
+from tests.builders.objects import box_model, notebook
+
+HANDS = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
+BOX = box_model((0.06, 0.06, 0.1))
+FRAMES = 6
+WORLD = Rotation.from_rotvec([-1.3, -0.6, 0.0])
+
+
+def table(scale: float = 1.0, order: str = "wxyz", step: float = 1 / 30, away_m: float = 0.0) -> str:
+    """A right hand that moves with a box it holds, turned so that fingers and palm look to it."""
+    looks = HANDS["right"].wrist_from_canonical
+    # Canonical x (fingers) to -y of the world, canonical z (back of the hand) to +z; the palm above the box.
+    world_from_canonical = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
+    wrist = Rotation.from_matrix(world_from_canonical @ looks.T)
+    names = "time_s," + ",".join(f"{body}_{p}" for body in ("object", "right") for p in PARTS)
+    lines = [names]
+    for frame in range(FRAMES):
+        thing = np.array([0.01 * frame, 0, 0.5])
+        hand = thing + np.array([0.0, 0.08 + away_m, 0.07])
+        turn = [Rotation.from_rotvec([0, 0, 0.02 * frame]), wrist]
+        # The whole scene turned: quaternions that say the same in any order would be no test of it.
+        thing, hand, turn = WORLD.apply(thing), WORLD.apply(hand), [WORLD * one for one in turn]
+        quaternions = [one.as_quat() if order == "xyzw" else one.as_quat()[[3, 0, 1, 2]] for one in turn]
+        numbers = [frame * step, *thing * scale, *quaternions[0], *hand * scale, *quaternions[1]]
+        lines.append(",".join(f"{number:.9g}" for number in numbers))
+    return "\n".join(lines)
+
+
+def given(text: str, model=BOX):
+    return given_control(parse_csv(text.encode(), "mine.csv"), model, HANDS)
+
+
+def test_a_table_is_read_as_it_is_written_in_any_order_of_columns() -> None:
+    found = parse_csv(table().encode(), "mine.csv")
+    np.testing.assert_allclose(found.time_s, np.arange(FRAMES) / 30, atol=1e-8)
+    np.testing.assert_allclose(found.thing.position_m[3], WORLD.apply([0.03, 0, 0.5]), atol=1e-8)
+    turn = (WORLD * Rotation.from_rotvec([0, 0, 0.06])).as_matrix()
+    np.testing.assert_allclose(found.thing.rotmats[3], turn, atol=1e-8)
+    columns = np.array([line.split(",") for line in table().splitlines()])
+    shuffled = "\n".join(",".join(row) for row in columns[:, np.random.default_rng(0).permutation(15)])
+    again = parse_csv(shuffled.encode(), "mine.csv")
+    np.testing.assert_array_equal(again.wrists["right"].rotmats, found.wrists["right"].rotmats)
+    assert given(table()).active == ["right"]
+
+
+def test_npz_and_csv_say_the_same_and_units_are_metres_afterwards(tmp_path: Path) -> None:
+    found = parse_csv(table().encode(), "mine.csv")
+    quaternion = Rotation.from_matrix(found.wrists["right"].rotmats).as_quat()[:, [3, 0, 1, 2]]
+    thing = Rotation.from_matrix(found.thing.rotmats).as_quat()[:, [3, 0, 1, 2]]
+    np.savez(
+        tmp_path / "mine.npz",
+        time_s=found.time_s,
+        object_position=1000 * found.thing.position_m,
+        object_quaternion=thing,
+        right_position=1000 * found.wrists["right"].position_m,
+        right_quaternion=quaternion,
+    )
+    again = read_trajectories(tmp_path / "mine.npz", "mm")
+    np.testing.assert_allclose(again.wrists["right"].position_m, found.wrists["right"].position_m, atol=1e-12)
+    np.testing.assert_allclose(again.thing.rotmats, found.thing.rotmats, atol=1e-9)
+
+
+def test_manipnets_text_is_seen_in_the_mirror_in_metres_at_the_box_centre() -> None:
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    row = ",".join(map(str, [*turn.as_quat(), 1.0, 2.0, 3.0]))
+    found = parse_manipnet("\n".join(["120", *[",".join([row, row, row])] * 4]).encode(), "demo.txt")
+    flip = np.diag([-1.0, 1, 1])
+    np.testing.assert_allclose(found.thing.position_m[0], [-0.1, 0.2, 0.3])
+    np.testing.assert_allclose(found.wrists["left"].rotmats[0], flip @ turn.as_matrix() @ flip, atol=1e-12)
+    assert (found.axes, found.at_box, found.up) == ("canonical", True, (0.0, 1.0, 0.0))
+    np.testing.assert_allclose(np.diff(found.time_s), 1 / 120)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (table().replace("right_qz", "right_q"), "none named right_qz"),
+        (table(step=1000 / 30), "milliseconds"),
+        (table(step=1.0), "frame numbers"),
+        (table(scale=1000.0), "--trajectory-unit mm"),
+        (table(order="xyzw"), "order w, x, y, z"),
+        (table(away_m=0.6), "a palm that comes within"),
+        (table().replace("time_s", "seconds"), "time_s"),
+        (table().splitlines()[0], "3 to"),
+    ],
+)
+def test_what_cannot_be_meant_is_told_with_a_remedy(text: str, words: str) -> None:
+    with pytest.raises(BadInput, match=words):
+        given(text)
+
+
+def test_a_hinged_object_needs_angles_and_an_open_mesh_is_said_to_have_no_inside() -> None:
+    with pytest.raises(BadInput, match="hinge_rad"):
+        given(table(), notebook(0.02))
+    sheet = box_model((0.06, 0.06, 0.1))
+    faces = sheet.faces[:6]
+    noted = given(table(), type(sheet)("sheet", sheet.vertices_m, faces, sheet.part))
+    assert any("no inside" in note for note in noted.notes)
+
+
+def test_every_damaged_table_is_refused_and_the_good_ones_are_not() -> None:
+    good, hinged, *bad = trajectory_tables()
+    assert parse_csv(good, "a.csv").hinge_rad is None
+    assert parse_csv(hinged, "a.csv").hinge_rad is not None
+    for data in bad:
+        with pytest.raises(BadInput):
+            parse_csv(data, "a.csv")
+
+
+def test_a_gap_is_led_to_where_the_recording_goes_on() -> None:
+    draws = np.random.default_rng(0)
+    made = Rotation.from_rotvec(draws.normal(0, 0.3, (20 * 15, 3))).as_matrix().reshape(20, 15, 3, 3)
+    goal = Rotation.from_rotvec(draws.normal(0, 0.3, (15, 3))).as_matrix()
+    led = led_to(made, goal, 8)
+    np.testing.assert_allclose(led[-1], goal, atol=1e-9)
+    np.testing.assert_array_equal(led[:12], made[:12])
+    between = interpolated(made[0], goal, 3)
+    angle = Rotation.from_matrix(made[0, 4].T @ goal[4]).magnitude()
+    steps = [Rotation.from_matrix(made[0, 4].T @ pose[4]).magnitude() / angle for pose in between]
+    np.testing.assert_allclose(steps, [0.25, 0.5, 0.75], atol=1e-6)
