@@ -139,9 +139,7 @@ def sense_all(asked: Asked, index: SurfaceIndex) -> Sensed:
 
 def row(asked: Asked) -> list[str]:
     start = time.process_time()
-    index = SurfaceIndex(asked.model)
-    for surface in index.filled.values():
-        _ = surface.grid
+    index = SurfaceIndex(asked.model).prepare()
     built = time.process_time() - start
     n_frames, batches, single = len(asked.state.joint_m), [], []
     for _ in range(RUNS):

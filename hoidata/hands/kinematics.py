@@ -25,6 +25,10 @@ class HandKinematics(nn.Module):
     joint_regressor: Tensor
     rest_joints_m: Tensor
     joint_directions: Tensor
+    # Where to look, beside the data on its device: a list would be sent there at every call.
+    parents: Tensor
+    levels: Tensor
+    tip_vertices: Tensor
 
     def __init__(self, model: HandModel, dtype: torch.dtype = torch.float32) -> None:
         super().__init__()
@@ -33,6 +37,8 @@ class HandKinematics(nn.Module):
         arrays["rest_joints_m"] = model.joint_regressor @ model.template_m
         for name, value in arrays.items():
             self.register_buffer(name, torch.as_tensor(value, dtype=dtype).contiguous(), persistent=False)
+        for name, places in (("parents", PARENTS[1:]), ("levels", _LEVELS), ("tip_vertices", TIP_VERTICES)):
+            self.register_buffer(name, torch.tensor(places), persistent=False)
         self.mesh = _Skin(model, range(len(model.template_m)), dtype)
         self.tips = _Skin(model, TIP_VERTICES, dtype)
 
@@ -53,7 +59,7 @@ class HandKinematics(nn.Module):
         """Vertices (batch, 778, 3) and joints (batch, 21, 3); arguments as in ``joints``."""
         rotations, positions, rest = self._chain(wrist_m, rotmats, betas, template_m)
         vertices = self.mesh(rotmats, betas, rotations, positions, rest, template_m)
-        return vertices, torch.cat((positions, vertices[:, list(TIP_VERTICES)]), 1)
+        return vertices, torch.cat((positions, vertices[:, self.tip_vertices]), 1)
 
     def _chain(
         self, wrist_m: Tensor, rotmats: Tensor, betas: Tensor, template_m: Tensor | None
@@ -61,12 +67,12 @@ class HandKinematics(nn.Module):
         """World rotations (batch, 16, 3, 3) and positions (batch, 16, 3) of the joints, and the rest joints."""
         base = self.rest_joints_m if template_m is None else self.joint_regressor @ template_m
         rest = base + (betas @ self.joint_directions).reshape(-1, N_ROTATIONS, 3)
-        bones = (rest[:, 1:] - rest[:, list(PARENTS[1:])]).expand(len(wrist_m), -1, -1)
+        bones = (rest[:, 1:] - rest[:, self.parents]).expand(len(wrist_m), -1, -1)
         rotations, positions = [rotmats[:, :1].expand(-1, 5, -1, -1)], [wrist_m[:, None].expand(-1, 5, -1)]
-        for level in _LEVELS:
-            bone = bones[:, [joint - 1 for joint in level], :, None]
+        for level in self.levels:
+            bone = bones[:, level - 1, :, None]
             positions.append(positions[-1] + (rotations[-1] @ bone)[..., 0])
-            rotations.append(rotations[-1] @ rotmats[:, list(level)])
+            rotations.append(rotations[-1] @ rotmats[:, level])
         fingers_rotation = torch.stack(rotations[1:], 2).flatten(1, 2)
         fingers_position = torch.stack(positions[1:], 2).flatten(1, 2)
         return (
@@ -83,10 +89,12 @@ class _Skin(nn.Module):
     weights: Tensor
     shape: Tensor
     pose: Tensor
+    rows: Tensor
 
     def __init__(self, model: HandModel, vertices: Sequence[int], dtype: torch.dtype) -> None:
         super().__init__()
         self.vertices = list(vertices)
+        self.register_buffer("rows", torch.tensor(self.vertices), persistent=False)
         self.is_whole = len(self.vertices) == len(model.template_m)
         shape = model.shape_directions[self.vertices].transpose(2, 1, 0).reshape(N_SHAPE, -1)
         pose = model.pose_directions[self.vertices].transpose(2, 1, 0).reshape(model.pose_directions.shape[2], -1)
@@ -122,4 +130,4 @@ class _Skin(nn.Module):
     def _template(self, template_m: Tensor | None) -> Tensor:
         if template_m is None:
             return self.template
-        return (template_m if self.is_whole else template_m[..., self.vertices, :]).transpose(-1, -2)
+        return (template_m if self.is_whole else template_m[..., self.rows, :]).transpose(-1, -2)

@@ -1,7 +1,8 @@
 """A hand of any skeleton, as sensors, feature vectors and post-processing need it: one interface for all of them.
 
 Joints in a tree, five fingertips, skin points with normals (the proximity sensors), capsules, hinges and their limits.
-``hoidata.sensors.mano_hand`` makes one of the MANO layout, ``hoidata.sensors.manipnet_hand`` ManipNet's own.
+``hoidata.sensors.mano_hand`` makes one of the MANO layout; ManipNet's own comes from its adapter, by way of the store
+(``HandRecording.hand``).
 
 Three kinds of axes: the world; the wrist's (``state`` answers in them); and canonical ones, the same for every hand:
 x to the fingers, y to the thumb, z out of the back of the hand. The left hand's are seen in a mirror, so that a left

@@ -78,10 +78,13 @@ class PartSurface:
         return signed
 
     def nearest(self, positions_m: np.ndarray) -> SignedDistance:
-        """Signed distance and nearest place; ``normal`` is the gradient of the distance, outward, of length 1."""
+        """Signed distance and nearest place; ``normal`` is the gradient of the distance, outward, of length 1.
+
+        Of positions that are not finite the distance is infinite, the rest NaN.
+        """
         signed = self.signed_m(positions_m)
         distance = np.abs(signed)
-        closest, triangle = np.empty((len(positions_m), 3)), np.empty(len(positions_m), np.int64)
+        closest, triangle = np.full((len(positions_m), 3), np.nan), np.zeros(len(positions_m), np.int64)
         nearest_triangles(self.tree, positions_m, distance, closest, triangle)
         way = positions_m - closest
         away = distance > ON_SURFACE_M
@@ -181,6 +184,12 @@ class SurfaceIndex:
     def filled(self) -> dict[int, PartSurface]:
         """By part the solid's surface, with its repairs, or the open mesh where there is no solid."""
         return {part: self._closed.get(part, surface) for part, surface in self._surfaces.items()}
+
+    def prepare(self) -> "SurfaceIndex":
+        """Make all grids now, 0.1-0.5 s for each part, for whoever cannot wait later; gives itself back."""
+        for surface in {**self._surfaces, **self.filled}.values():
+            _ = surface.grid
+        return self
 
     @property
     def solid_trees(self) -> dict[int, TriangleTree]:

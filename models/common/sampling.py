@@ -48,7 +48,7 @@ def signal_shares() -> tuple[float, ...]:
 
 def alphas_cumprod(device: torch.device | str = "cpu") -> Tensor:
     """(1000,) float32 of :func:`signal_shares`."""
-    return torch.tensor(signal_shares(), device=device)
+    return torch.tensor(signal_shares()).to(device)
 
 
 def timesteps(steps: int) -> list[int]:

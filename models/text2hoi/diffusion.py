@@ -218,7 +218,8 @@ class DiffusionModel(nn.Module):
         hands = hands * known.hand_rows[..., None]
         agents = [self.hands_in[side](to_tokens(hands[:, side], k)) for side in known.sides]
         agents.append(self.object_in(to_tokens(objects * known.object_rows[..., None], wide)))
-        codes = agent_codes(self.config.transformer.width, hands.device)[[*known.sides, 2]]
+        codes = agent_codes(self.config.transformer.width, hands.device)
+        codes = torch.stack([codes[agent] for agent in (*known.sides, 2)])
         codes = codes if self.config.codes == "frames and agents" else torch.zeros_like(codes)
         tokens = [x + code + self._codes(known.lengths, x.shape[1]) for x, code in zip(agents, codes, strict=True)]
         masks = [attention_mask_of(known.hand_rows[:, side], k) for side in known.sides]

@@ -44,8 +44,8 @@ class DiffusionLossConfig:
     distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
     mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
     the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
-    ``touch_weight`` more. thin_contact: each clip is shown a share of its own touched points, as a drawn map may be as
-    sparse, and no two steps the same.
+    ``touch_weight`` more. thin_contact: each clip is shown a share of its touched points, as a drawn contact map may be
+    as sparse, and no two steps the same.
     """
 
     distance_weight: float = 1.0
@@ -141,7 +141,7 @@ class DiffusionObjective:
         text = any_form(batch, generator)
         contact = self._shown(batch, text, generator)
         if weights.thin_contact:
-            contact = contact & thinned(contact.shape, generator).to(self.device)
+            contact = contact.bool() & thinned(contact.shape, generator).to(self.device)
         predicted = self._denoised(self.network, batch, target, text, contact, steps, generator, keep.float())
         found = {"simple": self._simple(predicted, target)}
         factors = {"simple": 1.0, "velocity": weights.velocity_weight, "joints": weights.joint_weight}
@@ -160,9 +160,8 @@ class DiffusionObjective:
         target = self.targets.of(held)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(held),), step, device=self.device)
-            text = held.text[:, 0]
-            contact = self._shown(held, text, generator)
-            predicted = self._denoised(network, held, target, text, contact, steps, generator, None)
+            seen = held.text[:, 0], self._shown(held, held.text[:, 0], generator)
+            predicted = self._denoised(network, held, target, *seen, steps, generator, None)
             total += self._simple(predicted, target)
         return total / len(VALIDATION_STEPS)
 

@@ -38,9 +38,9 @@ class MotionCodeConfig:
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
+    rest_m: float = 0.0
     convention: Literal["own", "h2o", "grab", "arctic"] = "own"
     finger_mean_rad: tuple[float, ...] = ()
-    rest_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -101,18 +101,6 @@ class MotionCode:
         knots = [n * self.config.object_knots for n in knots]
         return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
 
-    def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
-        """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
-        if self.config.convention == "grab":
-            turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
-            objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
-        if self.config.convention == "arctic":
-            mean = torch.tensor(self.config.finger_mean_rad, device=hands.device).reshape(2, 1, 15, 3)
-            fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
-            fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
-            hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
-        return hands, objects
-
     def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
         if not (self.config.rest_m and self.config.knot_frames):
@@ -122,6 +110,18 @@ class MotionCode:
             reach = self.config.rest_m * HAND_REACH.to(hands)
             hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
         return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
+
+    def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
+        """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
+        if self.config.convention == "grab":
+            turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
+            objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
+        if self.config.convention == "arctic":
+            mean = torch.tensor(self.config.finger_mean_rad).to(hands.device).reshape(2, 1, 15, 3)
+            fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
+            fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
+            hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
+        return hands, objects
 
     def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the model frame."""

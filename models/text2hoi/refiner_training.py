@@ -1,6 +1,6 @@
 """Training of the hand refiner on motions made by the frozen generator (Text2HOI eq. 8-11)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -29,9 +29,10 @@ class RefinerLossConfig:
 
     weighting: eq. 9 is the sum of a frame's squared errors; "even" counts their mean. touch: joints near the surface
     are drawn onto it, as in the paper, or those that truly touch to where they truly are. generated: coarse motions are
-    clips denoised once, whose hands they are to get back, or only half of them; see :class:`RefinerObjective`. frames,
-    vertices: how many frames per clip and vertices per hand the surface losses see. samples: coarse motions made per
-    training clip, sampled ones in ``sampler_steps``. field_resolution: of the grids.
+    clips denoised once, whose hands they are to get back, or only half of them; see :class:`RefinerObjective`.
+    exchanged: the other half is made for contact maps of other clips of the object by the same hands, as no generator
+    knows by heart. frames, vertices: how many frames per clip and vertices per hand the surface losses see. samples:
+    coarse motions made per training clip, sampled ones in ``sampler_steps``. field_resolution: of the grids.
     """
 
     simple_weight: float = 1.0
@@ -41,6 +42,7 @@ class RefinerLossConfig:
     weighting: Literal["sum", "even"] = "sum"
     touch: Literal["surface", "truth"] = "surface"
     generated: Literal["once", "half"] = "once"
+    exchanged: bool = False
     frames: int = 8
     vertices: int = 259
     samples: int = 4
@@ -95,6 +97,9 @@ class RefinerObjective:
         self.vertices = torch.arange(0, 778, max(1, 778 // weights.vertices), device=device)
         draws = torch.Generator().manual_seed(seed)
         train, held_out = list(corpus.train), corpus.held_out
+        self.alike: dict[tuple[str, str], list[np.ndarray]] = {}
+        for sample in train:
+            self.alike.setdefault((sample.object_key, sample.hand_type), []).append(sample.contact)
         half = weights.generated == "half"
         kinds = ["sampled" if half and number % 2 else "once" for number in range(weights.samples)]
         self.pool = {sample.clip_id: [] for sample in train}
@@ -105,8 +110,8 @@ class RefinerObjective:
         self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
-        number = torch.randint(self.weights.samples, (len(batch),), generator=generator).tolist()
-        motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, number, strict=True)]
+        numbers = np.random.default_rng(generator.initial_seed()).integers(self.weights.samples, size=len(batch))
+        motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, numbers, strict=True)]
         return self._losses(self.network, self._batch(batch, motions))
 
     @torch.no_grad()
@@ -176,6 +181,14 @@ class RefinerObjective:
                 made[index] = _Coarse(parts, target[row, :stop].clone(), true[row, :stop].clone())
         return [made[index] for index in range(len(samples))]
 
+    def _exchanged(self, batch: ClipBatch, draws: torch.Generator) -> Tensor:
+        """(B, 2, N) bool: for every clip the contact of a training clip of its object by the same hands, or its own."""
+        chosen = []
+        for sample in batch.samples:
+            alike = self.alike.get((sample.object_key, sample.hand_type)) or [sample.contact]
+            chosen.append(torch.from_numpy(alike[int(torch.randint(len(alike), (), generator=draws))]))
+        return torch.stack(chosen).to(self.device)
+
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
         form = torch.randint(batch.text.shape[1], (len(batch),), generator=draws).to(self.device)
         text = batch.text[torch.arange(len(batch), device=form.device), form]
@@ -183,6 +196,8 @@ class RefinerObjective:
         condition = Condition.of(batch, network.object_feature(batch.points_m), text, batch.contact)
         rows = self.targets.of(batch)
         if kind == "sampled":
+            if self.weights.exchanged:
+                condition = replace(condition, contact=self._exchanged(batch, draws))
             sampler = SamplerConfig(steps=self.weights.sampler_steps)
             noise = draw_motion(rows.hands.shape, rows.object.shape, draws)
             return self.generator.sample(condition, sampler, noise, draws)

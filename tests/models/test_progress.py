@@ -15,6 +15,7 @@ from safetensors import safe_open
 from safetensors.torch import load_file
 
 from hoidata.batches.dataset import HoiDataset
+from hoidata.errors import BadInput
 from hoidata.store.annotated import AnnotatedStore
 from models.common.corpus import Wanted, batches
 from models.common.family import Network, Setup
@@ -164,3 +165,21 @@ def test_a_training_that_gains_no_more_stops(annotated_root: Path, tmp_path: Pat
     train("length", annotated_root, tmp_path / "out", **settings)
     rows = (tmp_path / "out" / "log.csv").read_text().splitlines()[1:]
     assert [row.split(",")[0] for row in rows] == ["1", "2", "3", "4"]
+
+
+def test_a_training_in_bfloat16_keeps_its_weights_in_float32_and_learns_nearly_the_same(
+    annotated_root: Path, out: Path
+) -> None:
+    for precision in ("float32", "bfloat16"):
+        train("diffusion", annotated_root, out / precision, precision=precision, steps=4)
+    exact, lower = (load_file(out / precision / "model.safetensors") for precision in ("float32", "bfloat16"))
+    assert {value.dtype for value in lower.values()} == {value.dtype for value in exact.values()}
+    weights = [name for name in exact if name.startswith("weights.encoder")]
+    assert any(not torch.equal(exact[name], lower[name]) for name in weights)
+    assert max(float((exact[name] - lower[name]).abs().max()) for name in weights) < 0.02
+
+
+def test_parts_that_processes_cannot_share_are_refused() -> None:
+    with pytest.raises(BadInput, match="a multiple of the 2 processes, got 3"):
+        Team(0, 2).own_parts(3)
+    assert [list(Team(rank, 2).own_parts(4)) for rank in (0, 1)] == [[0, 2], [1, 3]]

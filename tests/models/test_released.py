@@ -22,6 +22,7 @@ from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import DIFFUSION
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.released import import_released
+from pipelines.lineage.tree import lineage_tree
 
 D, HEADS, LAYERS = 512, 4, 8
 Named = dict[str, np.ndarray]
@@ -242,7 +243,15 @@ def test_imported_networks_answer_as_the_published_ones_would(
             if batch.active_hands[row, side]:
                 np.testing.assert_allclose(hands[row, side, :count].numpy(), own, atol=1e-4)
         np.testing.assert_allclose(objects[row, :count, :numbers].numpy(), thing, atol=1e-4)
-    assert denoiser.info["provenance"]["clips"] == read.facts["clips_seen"] == "unknown"
+    assert read.facts["clips_seen"] == "unknown"
+    tree, provenance = lineage_tree(tmp_path, tmp_path / "diffusion" / "model.safetensors")
+    assert provenance["clips"] == "unknown"
+    assert "clips: unknown" in tree.detail
+    assert [child.name for child in tree.children] == [
+        "published contact",
+        "published generator",
+        "published point_net",
+    ]
 
 
 def test_numbers_of_each_dataset_come_back_from_the_authors_convention(batch: ClipBatch) -> None:

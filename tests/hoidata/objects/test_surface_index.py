@@ -243,3 +243,16 @@ def test_every_label_and_depth_on_manipnet_s_meshes_equals_libigl_s() -> None:
             np.testing.assert_allclose(index.depth_m(few[None], None)[0], np.where(inside, depth, 0), atol=1e-12)
         asked += len(places)
     assert asked >= 150_000
+
+
+def test_nearest_places_and_gradients_are_those_of_a_ball_and_nothing_is_said_of_nan():
+    ball = SurfaceIndex(model_of(trimesh.creation.icosphere(5, 0.05)))
+    positions = np.random.default_rng(0).normal(0, 0.05, (2, 50, 3))
+    found = ball.nearest(positions, None)
+    length = np.linalg.norm(positions, axis=-1)
+    np.testing.assert_allclose(found.distance_m, length - 0.05, atol=1e-4)
+    np.testing.assert_allclose(found.normal, positions / length[..., None], atol=0.05)
+    np.testing.assert_allclose(found.closest_m + found.distance_m[..., None] * found.normal, positions, atol=1e-12)
+    lost = ball.nearest(np.full((1, 1, 3), np.nan), None)
+    assert np.isinf(lost.distance_m).all()
+    assert np.isnan(lost.closest_m).all()
