@@ -51,7 +51,8 @@ def save_checkpoint(
     if normaliser is not None:
         tensors |= {_NORMALISER + name: tensor for name, tensor in normaliser.tensors().items()}
     tensors = {name: tensors[name].detach().cpu().contiguous() for name in sorted(tensors)}
-    known = {"format": FORMAT, "model": model_name, "config": plain_config(network.config), "seal": OPEN_SEAL, **info}
+    own = {"format": FORMAT, "model": model_name, "config": plain_config(network.config)}
+    known = {**own, **info, "seal": OPEN_SEAL}  # never the seal of the file the facts were read from
     return write_whole(Path(folder) / FILE_NAME, sealed(save(tensors, metadata={METADATA_KEY: canonical_json(known)})))
 
 
