@@ -37,7 +37,7 @@ from models.manipnet.rollout import Predictor, Rule, Task, roll_out
 KEPT = Path(".hoidata/manipnet")
 SETTINGS = FeatureSettings(step_s=1 / RATE_HZ)
 SIZES = {
-    "small": (NetworkConfig(encoder=128), TrainingConfig(2500, 128, 1e-3, 0.0, "cosine", 50)),
+    "small": (NetworkConfig(encoder=128), TrainingConfig(3500, 128, 1e-3, 0.0, "cosine", 50)),
     "full": (NetworkConfig(), TrainingConfig(20000, 32, 1e-4, 0.0)),
 }
 VARIANTS_OF_OURS: dict[str, dict[str, Any]] = {

@@ -238,16 +238,16 @@ def nearest_by_trimesh(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def rays_by_trimesh(mesh: Mesh, start: np.ndarray, ahead: np.ndarray) -> list[np.ndarray]:
-    triangle, ray, place = (np.asarray(found) for found in mesh.trimesh.ray.intersects_id(
-        start, ahead, return_locations=True))  # fmt: skip
-    way = np.linalg.norm(place.reshape(-1, 3) - start[ray], axis=1)
+    found = mesh.trimesh.ray.intersects_id(start, ahead, return_locations=True)
+    triangle, ray, place = np.asarray(found[0]), np.asarray(found[1]), np.asarray(found[-1]).reshape(-1, 3)
+    way = np.linalg.norm(place - start[ray], axis=1)
     return [np.stack([triangle[ray == one], way[ray == one]], axis=1) for one in range(len(start))]
 
 
 def nearest_by_libigl(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_PSEUDONORMAL
     distance, _, closest = igl.signed_distance(points, mesh.vertices_m, mesh.faces, kind)[:3]
-    return distance, closest
+    return np.asarray(distance), np.asarray(closest)
 
 
 def rays_by_libigl(mesh: Mesh, start: np.ndarray, ahead: np.ndarray) -> list[np.ndarray]:

@@ -15,6 +15,7 @@ from pipelines.commands import (
     graph,
     import_checkpoint,
     inspect,
+    lineage,
     raw,
     settings,
     share,
@@ -33,6 +34,7 @@ app = typer.Typer(
 app.add_typer(synth.app, name="synth", help="The corpora made here: write them, check their physics.")
 app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list them, check that one keeps the rules.")
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
+app.add_typer(lineage.app, name="lineage")
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)
 app.command("down")(graph.down)
@@ -40,7 +42,6 @@ app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
 app.command("validate")(store.validate)
 app.command("migrate")(store.migrate)
-app.command("lineage")(inspect.lineage)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)

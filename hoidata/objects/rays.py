@@ -11,6 +11,7 @@ from numba import njit
 from hoidata.objects.triangle_tree import DEEPEST
 
 ENTERING, LEAVING, EITHER = -1, 1, 0
+_CLEARLY = 1e-9
 _WIDER = 1 + 1e-9  # boxes are left out only when they are clearly missed
 
 
@@ -29,10 +30,10 @@ def first_hits(tree, start_m, direction, reach_m, facing, way_m):  # pragma: no 
             way_m[ray] = found
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _first_hit(tree, start, way, reach, facing, stack, ways):  # pragma: no cover (compiled)
     """Way to the first triangle met within ``reach``; -1 where there is none. way: the ray's direction."""
-    box, link, over, axes = tree[1], tree[2], 1 / way, _axes(way)
+    box, link, over, axes = tree[1], tree[2], (1 / way[0], 1 / way[1], 1 / way[2]), _axes(way)
     best, hit, waiting = reach, -1.0, 1
     stack[0], ways[0] = 0, _way_to_box(box, 0, start, over)
     while waiting:
@@ -51,7 +52,7 @@ def _first_hit(tree, start, way, reach, facing, stack, ways):  # pragma: no cove
                     stack[waiting], ways[waiting] = child, child_way
                     waiting += 1
             continue
-        found = _hit_in_leaf(tree[4], tree[5], link[node, 1], link[node, 2], start, axes, facing, best)
+        found = _hit_in_leaf(tree, link[node, 1], link[node, 2], start, way, axes, facing, best)
         if found >= 0:
             best, hit = found, found
     return hit
@@ -60,8 +61,8 @@ def _first_hit(tree, start, way, reach, facing, stack, ways):  # pragma: no cove
 @njit(cache=True, inline="always")
 def _axes(way):  # pragma: no cover (compiled)
     """The axis a ray runs along most, last, and the two others, so that orientation stays; its shear along them."""
-    size = np.abs(way)
-    kz = 0 if size[0] >= size[1] and size[0] >= size[2] else 1 if size[1] >= size[2] else 2
+    x, y, z = abs(way[0]), abs(way[1]), abs(way[2])
+    kz = 0 if x >= y and x >= z else 1 if y >= z else 2
     kx, ky = (kz + 1) % 3, (kz + 2) % 3
     if way[kz] < 0:
         kx, ky = ky, kx
@@ -69,11 +70,14 @@ def _axes(way):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _hit_in_leaf(corner, vertices_m, first, last, start, axes, facing, best):  # pragma: no cover (compiled)
+def _hit_in_leaf(tree, first, last, start, way, axes, facing, best):  # pragma: no cover (compiled)
     """Way to the first of some triangles that is met within ``best``; -1 where none is."""
+    triangle, corner, vertices_m = tree[0], tree[4], tree[5]
     kx, ky, kz, shear_x, shear_y, speed = axes
     hit = -1.0
     for number in range(first, last):
+        if _is_missed(triangle, number, start, way, facing, best):
+            continue
         ax, ay, az = _sheared(vertices_m, corner[number, 0], start, kx, ky, kz, shear_x, shear_y)
         bx, by, bz = _sheared(vertices_m, corner[number, 1], start, kx, ky, kz, shear_x, shear_y)
         cx, cy, cz = _sheared(vertices_m, corner[number, 2], start, kx, ky, kz, shear_x, shear_y)
@@ -81,10 +85,24 @@ def _hit_in_leaf(corner, vertices_m, first, last, start, axes, facing, best):  #
         area = u + v + w
         if min(u, v, w) < 0 < max(u, v, w) or area == 0 or area * facing > 0:
             continue
-        way = (u * az + v * bz + w * cz) / area / speed
-        if 0 <= way <= best:
-            best, hit = way, way
+        far = (u * az + v * bz + w * cz) / area / speed
+        if 0 <= far <= best:
+            best, hit = far, far
     return hit
+
+
+@njit(cache=True, inline="always")
+def _is_missed(triangle, number, start, way, facing, best):  # pragma: no cover (compiled)
+    """Whether a ray clearly meets a triangle's plane from the wrong side, behind its start or beyond ``best``."""
+    nx, ny, nz = triangle[9, number], triangle[10, number], triangle[11, number]
+    along = nx * way[0] + ny * way[1] + nz * way[2]
+    if facing * along < -_CLEARLY:
+        return True
+    height = nx * (triangle[0, number] - start[0]) + ny * (triangle[1, number] - start[1])
+    height += nz * (triangle[2, number] - start[2])
+    if along < 0:
+        along, height = -along, -height
+    return height < -_CLEARLY or height > along * best + _CLEARLY
 
 
 @njit(cache=True, inline="always")

@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, write_whole
+from hoidata.files.sealed import METADATA_KEY, OPEN_SEAL, check_seal, sealed
 from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
 from models.common.features import Normaliser
 
 FORMAT = 1
-METADATA_KEY = "hoidata"
 FILE_NAME = "model.safetensors"
 EMPTY_NAME = "empty.json"
 _WEIGHTS, _NORMALISER = "weights.", "normaliser."
@@ -51,8 +51,9 @@ def save_checkpoint(
     if normaliser is not None:
         tensors |= {_NORMALISER + name: tensor for name, tensor in normaliser.tensors().items()}
     tensors = {name: tensors[name].detach().cpu().contiguous() for name in sorted(tensors)}
-    known = {"format": FORMAT, "model": model_name, "config": plain_config(network.config), **info}
-    return write_whole(Path(folder) / FILE_NAME, save(tensors, metadata={METADATA_KEY: canonical_json(known)}))
+    own = {"format": FORMAT, "model": model_name, "config": plain_config(network.config)}
+    known = {**own, **info, "seal": OPEN_SEAL}  # never the seal of the file the facts were read from
+    return write_whole(Path(folder) / FILE_NAME, sealed(save(tensors, metadata={METADATA_KEY: canonical_json(known)})))
 
 
 def read_info(path: str | Path) -> dict[str, Any]:
@@ -79,6 +80,7 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
     if not path.is_file():
         raise BadInput(path, "a trained model", empty_reason(path.parent) or "no file", "run `dvc repro`")
     info = read_info(path)
+    check_seal(path)
     if info.get("model") != network.name:
         remedy = "point to the right folder"
         raise BadInput(path, f"a checkpoint of {network.name}", f"one of {info.get('model')}", remedy)

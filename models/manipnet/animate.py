@@ -52,8 +52,8 @@ def given_control(found: TrajectoryFile, model: ObjectModel, hands: Mapping[Side
     }
     away = Motion(found.time_s[:1], np.eye(3)[None], thing.position_m[:1] + np.array([UNSEEN_M, 0, 0]))
     control = Control({side: wrists.get(side, away) for side in SIDES}, body, model, found.hinge_rad)
-    nearest = {side: _nearest_m(control, side, hands[side]) for side in wrists}
-    active = [side for side in SIDES if nearest.get(side, np.inf) < NEAR_M]
+    nearest: dict[Side, float] = {side: _nearest_m(control, side, hands[side]) for side in found.wrists}
+    active: list[Side] = [side for side in SIDES if nearest.get(side, np.inf) < NEAR_M]
     if not active:
         _refuse_far(found, control, hands, nearest)
     for side in active:
@@ -134,7 +134,7 @@ def at_30_fps(control: Control) -> Control:
         placed = motion.at(time_s)
         return Motion(time_s, placed.rotation, placed.translation)
 
-    wrists = {side: slowed(motion) for side, motion in control.wrists.items()}
+    wrists: dict[Side, Motion] = {side: slowed(motion) for side, motion in control.wrists.items()}
     return Control(wrists, slowed(control.thing), control.model, hinge)
 
 
@@ -210,13 +210,13 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
             words: str, synthetic: bool) -> Clip:  # fmt: skip
     """A clip of trajectories at 30 fps with these fingers (frame, 15, 3, 3); other hands are not there."""
     n_frames = len(control.thing.time_s)
-    tracks = {}
+    tracks: dict[Side, HandTrack] = {}
     for side in SIDES:
         wrist, there = control.wrists[side].at(control.thing.time_s), side in fingers
         pose = rotmat_to_rotvec(fingers[side]).reshape(n_frames, -1) if there else np.zeros((n_frames, 45))
         turn = rotmat_to_rotvec(wrist.rotation)
-        arrays = (array.astype(np.float32) for array in (wrist.translation, turn, pose, np.zeros((1, 10))))
-        tracks[side] = HandTrack(*arrays, np.full(n_frames, there))
+        place, turn, pose = (array.astype(np.float32) for array in (wrist.translation, turn, pose))
+        tracks[side] = HandTrack(place, turn, pose, np.zeros((1, 10), np.float32), np.full(n_frames, there))
     thing = control.thing
     placed = (rotmat_to_rotvec(thing.rotmats).astype(np.float32), thing.position_m.astype(np.float32))
     hinge = None if control.hinge_rad is None else control.hinge_rad.astype(np.float32)

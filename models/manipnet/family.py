@@ -85,9 +85,11 @@ class Fingers:
     ) -> dict[Side, np.ndarray]:
         """(frame, 15, 3, 3) of each side from the neutral pose on; a hand that takes no part stays in it."""
         time_s = control.thing.time_s
-        active = [side for side, is_active in zip(SIDES, active_hands, strict=True) if is_active]
+        active: list[Side] = [side for side, is_active in zip(SIDES, active_hands, strict=True) if is_active]
         tasks = [Task(hands[side], side, control, time_s, hands[side].rest_rotmats) for side in active]
-        still = {side: np.tile(hands[side].rest_rotmats, (len(time_s), 1, 1, 1)) for side in SIDES}
+        still: dict[Side, np.ndarray] = {
+            side: np.tile(hands[side].rest_rotmats, (len(time_s), 1, 1, 1)) for side in SIDES
+        }
         return still | dict(zip(active, roll_out(self.predictor, tasks), strict=True))
 
     def follow(self, sample: ClipSample) -> dict[Side, np.ndarray]:

@@ -70,8 +70,8 @@ def reach(
     from_last = state.joint_rotmats[0, last].swapaxes(-1, -2)
     tips = (from_last @ (state.tip_m[0] - state.joint_m[0, last])[..., None])[..., 0]
     fingers = hand.finger_rotmats(state.joint_rotmats)[0]
-    ends = [np.ascontiguousarray(values) for values in (limits.rest, limits.low_rad, limits.high_rad)]
-    return _reach(fingers, _chains(hand), hand.offset_m, tips, *ends, target_m, weight, steps)[None]
+    rest, low, high = (np.ascontiguousarray(values) for values in (limits.rest, limits.low_rad, limits.high_rad))
+    return _reach(fingers, _chains(hand), hand.offset_m, tips, rest, low, high, target_m, weight, steps)[None]
 
 
 @lru_cache(maxsize=64)

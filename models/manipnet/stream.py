@@ -46,7 +46,9 @@ class Stream:
     ) -> None:
         self.predictor, self.hands, self.models = predictor, hands, models
         surfaces = {side: surface_index(models[side]) for side in hands}
-        self.followers = {side: Follower(predictor, hands[side], surfaces[side], start[side]) for side in hands}
+        self.followers: dict[Side, Follower] = {
+            side: Follower(predictor, hands[side], surfaces[side], start[side]) for side in hands
+        }
         self.frames: list[TrackedFrame] = []
         self.made = 0
         self.first_s = 0.0
@@ -85,7 +87,7 @@ class Stream:
         return self.first_s + number / (1 / self.predictor.settings.step_s)  # as the times of clips round
 
     def _poses(self) -> dict[Side, np.ndarray]:
-        return {side: follower.finger_rotmats[0] for side, follower in self.followers.items()}
+        return {side: self.followers[side].finger_rotmats[0] for side in self.hands}
 
     def _situations(self, time_s: float) -> dict[Side, Situation]:
         settings = self.predictor.settings

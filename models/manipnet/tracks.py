@@ -32,7 +32,7 @@ def control_of(given: Trajectories, model: ObjectModel) -> Control:
     time_s = np.arange(len(given.object)) / FPS
     thing = given.object.astype(np.float64)
     hinge = thing[:, OBJECT_HINGE] if model.is_articulated else None
-    wrists = {side: _wrist(given, row, time_s) for row, side in enumerate(SIDES)}
+    wrists: dict[Side, Motion] = {side: _wrist(given, row, time_s) for row, side in enumerate(SIDES)}
     body = Motion(time_s, rot6d_to_rotmat(thing[:, OBJECT_ROTATION_6D]), thing[:, OBJECT_POSITION])
     return Control(wrists, body, model, hinge)
 
@@ -60,11 +60,8 @@ def finger_rotmats_of(hand_features: np.ndarray) -> np.ndarray:
 
 def hands_of(pair: HandPair, betas: np.ndarray, template_m: np.ndarray | None) -> Mapping[Side, TrackedHand]:
     """Both hands of a person: betas (2, 10), personal rest meshes (2, 778, 3) or None."""
-    templates = (None, None) if template_m is None else template_m
-    return {
-        side: _tracked(pair, side, betas[row].tobytes(), None if templates[row] is None else templates[row].tobytes())
-        for row, side in enumerate(SIDES)
-    }
+    templates = [None, None] if template_m is None else [own.tobytes() for own in template_m]
+    return {side: _tracked(pair, side, betas[row].tobytes(), templates[row]) for row, side in enumerate(SIDES)}
 
 
 @lru_cache(maxsize=64)

@@ -110,7 +110,8 @@ def from_arrays(arrays: Mapping[str, np.ndarray], where: str, unit_m: float = 1.
         raise BadInput(where, "an array time_s", f"{', '.join(arrays) or 'none'}"[:200], "add the time of every frame")
     time_s = _array(arrays, "time_s", (), where)
     _check_times(time_s, where)
-    wrists = {side: _body(arrays, side, len(time_s), where, unit_m) for side in SIDES if f"{side}_position" in arrays}
+    there: list[Side] = [side for side in SIDES if f"{side}_position" in arrays]
+    wrists: dict[Side, Body] = {side: _body(arrays, side, len(time_s), where, unit_m) for side in there}
     if not wrists:
         raise BadInput(where, "the wrist of a hand, left or right", "neither", "add left_... or right_...")
     thing = _body(arrays, "object", len(time_s), where, unit_m)

@@ -106,9 +106,10 @@ def read_weights(path: Path) -> Weights:
         raise BadInput(path, "a checkpoint file of Text2HOI", "no file", "check the path")
     stored = load_torch_zip(path)
     model = stored.get("model") if isinstance(stored, Mapping) else None
-    named = isinstance(model, Mapping) and all(isinstance(name, str) for name in model)
-    if not named or not all(isinstance(value, Tensor) for value in model.values()):
-        raise BadInput(path, "weights by name under 'model'", str(type(stored).__name__), "pass another")
+    if not isinstance(model, Mapping) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in model.items()
+    ):
+        raise BadInput(path, "weights by name under 'model'", str(type(stored).__name__), "pass Text2HOI's files")
     return {name: value.float() if value.is_floating_point() else value for name, value in model.items()}
 
 

@@ -40,7 +40,7 @@ def animate(
     from pipelines.params import read_params
 
     paths = [str(here / name) if name and (here / name).is_file() else name for name in (what, object)]
-    sides = tuple(side for side in SIDES if fingers in (side, "both"))
+    sides = SIDES if fingers == "both" else (fingers,)
     wish = AnimateWish(
         sides, frames, model, rule, paths[1], trajectory_unit, wrist_axes, world_up, MeshWish(unit, "", hinge)
     )

@@ -1,4 +1,4 @@
-"""``hoidata doctor``, ``info`` and ``lineage``: what is here and where it comes from."""
+"""``hoidata doctor`` and ``info``: what is here."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +7,6 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-from rich.tree import Tree
 
 from pipelines.commands.project import enter_project
 
@@ -60,68 +59,3 @@ def _print_rows(console, heads: tuple[str, ...], rows: list[tuple[str, ...]], sh
     console.print(table)
     if shown is not None and len(rows) > shown:
         console.print(f"and {len(rows) - shown:,} more (--all lists them)")
-
-
-def lineage(
-    checkpoint: Annotated[Path, typer.Argument(help="A model.safetensors, or its folder.", resolve_path=True)],
-    json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a tree.")] = False,
-    clips: Annotated[bool, typer.Option("--clips", help="List the ids of the clips it was trained on.")] = False,
-) -> None:
-    """Print what a checkpoint was made from. Exit code 0 when all of it is still the same today, 1 when not."""
-    project = enter_project()
-    from pipelines.lineage.tree import lineage_tree, overall_status
-
-    file = checkpoint / "model.safetensors" if checkpoint.is_dir() else checkpoint
-    file = file.relative_to(project) if file.is_relative_to(project) else file
-    tree, provenance = lineage_tree(Path(), file)
-    if json:
-        _print_json(tree, provenance)
-    else:
-        _print_tree(tree, provenance, clips)
-    raise typer.Exit(0 if overall_status(tree) == "same" else 1)
-
-
-def _print_json(tree, provenance: dict) -> None:
-    import json as json_module
-
-    from pipelines.lineage.tree import overall_status, tree_as_json
-
-    kept = ("stage", "model", "config", "seed", "synthetic", "libraries", "clips", "params_digest", "code_digest")
-    facts = {key: provenance[key] for key in kept if key in provenance}
-    values = {"schema": "hoidata.lineage/1", "status": overall_status(tree), **facts, "tree": tree_as_json(tree)}
-    typer.echo(json_module.dumps(values, indent=2, ensure_ascii=False))
-
-
-def _print_tree(tree, provenance: dict, show_clips: bool) -> None:
-    from pipelines.lineage.tree import overall_status
-
-    console, top = Console(), Tree(_label(tree))
-    for child in tree.children:
-        _grow(top, child)
-    branch = top.add("clips it was trained and judged on")
-    known = provenance.get("clips", {})
-    if isinstance(known, str):
-        branch.add(f"clips seen: {known}")
-    for split, ids in known.items() if isinstance(known, dict) else ():
-        names = branch.add(f"{split}: {len(ids)}")
-        for clip_id in ids if show_clips else ids[:3]:
-            names.add(clip_id)
-        if len(ids) > 3 and not show_clips:
-            names.add(f"and {len(ids) - 3} more (--clips lists all)")
-    console.print(top, soft_wrap=True)
-    versions = ", ".join(f"{name} {version}" for name, version in provenance.get("libraries", {}).items())
-    console.print(f"libraries: {versions}", soft_wrap=True, highlight=False)
-    console.print(f"status: {overall_status(tree)}", highlight=False)
-
-
-def _grow(parent, node) -> None:
-    branch = parent.add(_label(node))
-    for child in node.children:
-        if node.kind != "code" or child.status != "same":
-            _grow(branch, child)
-
-
-def _label(node) -> str:
-    colour = {"same": "green", "changed": "yellow", "missing": "red"}[node.status]
-    detail = f" [dim]{escape(node.detail)}[/]" if node.detail else ""
-    return f"{node.kind} [bold]{escape(node.name)}[/] [{colour}]{node.status}[/]{detail}"

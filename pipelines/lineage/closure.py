@@ -4,7 +4,9 @@ Imports are read from the source and nothing is run; what a module picks by name
 """
 
 import ast
+import json
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.metadata import EntryPoint, entry_points
@@ -12,8 +14,12 @@ from importlib.util import find_spec
 from itertools import accumulate
 from pathlib import Path
 
+from hoidata.files.atomic import write_whole
 from hoidata.files.digest import sha256_file
 
+# An import statement: the module after ``from`` or None, how many folders up, the names.
+Statement = tuple[str | None, int, list[str]]
+KNOWN_IMPORTS = Path(".hoidata/imports.json")
 OWN_PACKAGES = ("hoidata", "models", "pipelines")
 ENTRY_POINT_GROUPS = ("hoidata.adapters", "hoidata.families")
 # Lie in packages, and no module reads them.
@@ -36,11 +42,14 @@ class Choice:
 class SourceTree:
     """The packages of the project at ``root`` and those that entry points add; each file is read once.
 
-    outside: packages whose folder lies elsewhere, by name (``hoidata.datasets.kitchen``).
+    outside: packages whose folder lies elsewhere, by name (``hoidata.datasets.kitchen``). What a file imports is kept
+    by the file's digest in ``.hoidata``, which may be deleted: parsing it again takes ten times as long.
     """
 
     def __init__(self, root: Path, outside: Mapping[str, Path] | None = None) -> None:
         self._root, self._outside = root, outside or {}
+        self._known = _read_imports(root / KNOWN_IMPORTS)
+        self._used: dict[str, list[Statement]] = {}
         self._sources: dict[str, Path | None] = {}
         self._imports: dict[str, tuple[str, ...]] = {}
         self._data: dict[str, list[tuple[str, Path]]] = {}
@@ -64,6 +73,13 @@ class SourceTree:
             found |= picked[by]
         digests = {key: self._digest(path) for key, path in found.items()}
         return digests | {key: version for name in sources for key, version in self._distribution(name).items()}
+
+    def keep_imports(self) -> None:
+        """Keep what was parsed for the next time, where that is new and can be written."""
+        path = self._root / KNOWN_IMPORTS
+        if path.parent.is_dir() and not self._used.keys() <= self._known.keys():
+            with suppress(OSError):
+                write_whole(path, json.dumps(self._known | self._used))
 
     def modules_below(self, package: str) -> list[str]:
         """All modules of a package of the project, sorted; none where there is no such folder."""
@@ -91,13 +107,20 @@ class SourceTree:
         """The packages a module lies in and all that its imports name, also what turns out to be no module."""
         if name not in self._imports:
             source = self._source(name)
-            statements = _imports(ast.parse(source.read_bytes())) if source else ()
+            statements = self._statements(source) if source else ()
             package = name if source and source.name == "__init__.py" else name.rpartition(".")[0]
             named = {item for statement in statements for item in _named(statement, package)}
             # Importing a.b.c runs a, a.b and a.b.c.
             chains = (accumulate(item.split("."), "{}.{}".format) for item in {*named, name})
             self._imports[name] = tuple(sorted(set().union(*chains)))
         return self._imports[name]
+
+    def _statements(self, source: Path) -> list[Statement]:
+        digest = self._digest(source)
+        if digest not in self._used:
+            known = self._known.get(digest)
+            self._used[digest] = list(_imports(ast.parse(source.read_bytes()))) if known is None else known
+        return self._used[digest]
 
     def _folder(self, package: str) -> Path | None:
         """Where the files of a package lie, if it is one that counts; also of a package that is a single module."""
@@ -176,13 +199,26 @@ def _data_files(folder: Path) -> Iterator[Path]:
             yield item
 
 
-def _imports(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
+def _read_imports(path: Path) -> dict[str, list[Statement]]:
+    try:
+        values = json.loads(path.read_bytes())
+        return {
+            digest: [(base, int(level), list(names)) for base, level, names in found]
+            for digest, found in values.items()
+        }
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _imports(tree: ast.AST) -> Iterator[Statement]:
     """Every import statement, but for those that only a type checker follows."""
     waiting = [tree]
     while waiting:
         node = waiting.pop()
-        if isinstance(node, ast.Import | ast.ImportFrom):
-            yield node
+        if isinstance(node, ast.Import):
+            yield None, 0, [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or "", node.level, [alias.name for alias in node.names]
         elif isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
             waiting += node.orelse
         else:
@@ -190,12 +226,12 @@ def _imports(tree: ast.AST) -> Iterator[ast.Import | ast.ImportFrom]:
             waiting += [child for child in below if isinstance(child, ast.stmt | ast.ExceptHandler | ast.match_case)]
 
 
-def _named(statement: ast.Import | ast.ImportFrom, package: str) -> list[str]:
+def _named(statement: Statement, package: str) -> list[str]:
     """What a statement may import; of ``from a import b`` both, as b may be a module or something in a."""
-    if isinstance(statement, ast.Import):
-        return [alias.name for alias in statement.names]
-    base = statement.module or ""
-    if statement.level:
-        above = package.split(".")[: len(package.split(".")) - statement.level + 1]
+    base, level, names = statement
+    if base is None:
+        return names
+    if level:
+        above = package.split(".")[: len(package.split(".")) - level + 1]
         base = ".".join(filter(None, [*above, base]))
-    return [base, *(f"{base}.{alias.name}" for alias in statement.names)]
+    return [base, *(f"{base}.{name}" for name in names)]

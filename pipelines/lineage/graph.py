@@ -1,11 +1,34 @@
 """The stages as DVC resolves them from all dvc.yaml of the project."""
 
 import os
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from hoidata.errors import BadInput
+from pipelines.params import read_file
+
+# What ``written_graph`` knows of a stage in dvc.yaml; DVC is asked where there is anything else.
+_KNOWN = {
+    "desc",
+    "wdir",
+    "matrix",
+    "cmd",
+    "deps",
+    "params",
+    "outs",
+    "metrics",
+    "plots",
+    "always_changed",
+    "frozen",
+    "meta",
+}
+_REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
 
 @dataclass(frozen=True)
@@ -50,6 +73,64 @@ def read_graph(root: Path) -> dict[str, Stage]:
     except DvcException as error:
         raise BadInput("dvc.yaml", "stages that DVC can read", str(error), "see what `dvc status` says") from error
     return {stage.name: stage for stage in stages}
+
+
+def written_graph(root: Path) -> dict[str, Stage]:
+    """What ``read_graph`` gives, in a tenth of the time: of what this project's dvc.yaml use, and else from DVC."""
+    params = read_file(root / "params.yaml")
+    try:
+        stages = [stage for file in ("dvc.yaml", *_family_files(root)) for stage in _written(root, file, params)]
+    except (yaml.YAMLError, BadInput, ValueError, TypeError, AttributeError, KeyError, OSError):
+        return read_graph(root)
+    return {stage.name: stage for stage in stages}
+
+
+def _family_files(root: Path) -> list[str]:
+    return sorted(path.relative_to(root).as_posix() for path in root.glob("models/*/dvc.yaml"))
+
+
+def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
+    """The stages of one dvc.yaml, matrix resolved. Raises ValueError for what is not understood here."""
+    with open(root / file, "rb") as stream:
+        stages = yaml.load(stream, getattr(yaml, "CSafeLoader", yaml.SafeLoader))["stages"]
+    prefix = "" if file == "dvc.yaml" else f"{file}:"
+    for name, body in stages.items():
+        if unknown := body.keys() - _KNOWN:
+            raise ValueError(f"{file}: {name}: {unknown}")
+        base = Path(file).parent / body.get("wdir", ".")
+        for item in _items(body.get("matrix") or {}, params):
+            values = {**params, "item": item}
+            paths, names, outs = (_listed(body, keys, values) for keys in (("deps",), ("params",), _OUTS))
+            suffix = f"@{'-'.join(map(str, item.values()))}" if item else ""
+            yield Stage(f"{prefix}{name}{suffix}", _below(base, paths), tuple(names), _below(base, outs))
+
+
+_OUTS = ("outs", "metrics", "plots")
+
+
+def _items(matrix: dict[str, Any], params: dict[str, Any]) -> list[dict[str, str]]:
+    """The combinations of a matrix, as DVC numbers them."""
+    lists = [values if isinstance(values, list) else look_up(params, values.strip("${}")) for values in matrix.values()]
+    filled = [[_filled(str(value), params) for value in values] for values in lists]
+    return [dict(zip(matrix, combination, strict=True)) for combination in product(*filled)]
+
+
+def _listed(body: dict[str, Any], keys: tuple[str, ...], values: dict[str, Any]) -> list[str]:
+    """The names in lists of a stage, with or without settings of their own, references filled in."""
+    entries = [entry for key in keys for entry in body.get(key) or ()]
+    names = [next(iter(entry)) if isinstance(entry, dict) else entry for entry in entries]
+    return [_filled(name, values) for name in names]
+
+
+def _filled(text: str, values: dict[str, Any]) -> str:
+    filled = _REFERENCE.sub(lambda match: str(look_up(values, match[1])), text)
+    if "${" in filled:
+        raise ValueError(text)
+    return filled
+
+
+def _below(base: Path, paths: list[str]) -> tuple[str, ...]:
+    return tuple(os.path.normpath(base / path) for path in paths)
 
 
 def producers(graph: dict[str, Stage]) -> dict[str, Stage]:

@@ -9,21 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
+from hoidata.files.sealed import read_metadata
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.lineage.graph import Stage, look_up, producers, read_graph
 from pipelines.params import read_params
 
 SCHEMA = "hoidata.provenance/1"
-METADATA_KEY = "hoidata"
 LIBRARIES = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "lemminflect", "safetensors")
-MAX_HEADER_BYTES = 100_000_000
 
 
 def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict[str, Any]:
     """The provenance of what ``stage_name`` is about to make from the working tree at ``root``.
 
     facts: what the stage itself knows (model, config, seed, clips by split, synthetic). Every stage behind it is
-    recorded with the values of its params and the digests of its code, inputs and outputs.
+    recorded with the values of its params and the digests of its code, inputs and outputs; of the clips, the raw files
+    and frames they are.
     """
     graph = read_graph(root)
     if stage_name not in graph:
@@ -40,7 +40,16 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
         "code_digest": value_digest(stages[stage_name]["code"]),
         "libraries": library_versions(),
         "stages": stages,
+        "raw": _raw_facts(root, facts, stages),
     }
+
+
+def _raw_facts(root: Path, facts: dict[str, Any], stages: dict[str, Any]) -> dict[str, Any]:
+    """The raw files and frames behind the clips, so that the header tells them where there is no store."""
+    from pipelines.lineage.raw import clips_of, read_raw, stores_behind
+
+    found = {path: read_raw(root, path, clips_of(facts)) for path in stores_behind({"stages": stages})}
+    return {path: source.as_json() for path, source in found.items() if source is not None}
 
 
 def _stages_behind(graph: dict[str, Stage], name: str) -> list[str]:
@@ -72,26 +81,12 @@ def library_versions() -> dict[str, str]:
     return {name: version(name) for name in LIBRARIES}
 
 
-def read_checkpoint_metadata(path: Path) -> dict[str, Any]:
-    """The ``hoidata`` entry of a safetensors file's header, read without torch. Raises BadInput when there is none."""
-    with open(path, "rb") as stream:
-        length = int.from_bytes(stream.read(8), "little")
-        if not 2 <= length <= MAX_HEADER_BYTES:
-            raise BadInput(path, "a safetensors file", f"a header of {length} bytes", "train it again")
-        header = stream.read(length)
-    try:
-        metadata = json.loads(header)["__metadata__"]
-        return json.loads(metadata[METADATA_KEY])
-    except (ValueError, KeyError, TypeError) as error:
-        raise BadInput(path, "a checkpoint with hoidata's provenance", "none", "train it with `dvc repro`") from error
-
-
 def read_provenance(path: Path) -> dict[str, Any]:
     """The provenance a checkpoint carries. Raises BadInput when there is none of a schema known here."""
     if not path.is_file():
         raise BadInput(path, "a checkpoint", "no file", "make it with `dvc repro`")
-    values = read_checkpoint_metadata(path)
-    values = values.get("provenance", values)
+    metadata = read_metadata(path)
+    values = {**metadata.get("provenance", metadata), "seal": metadata.get("seal") or {}}
     if values.get("schema") != SCHEMA:
         raise BadInput(path, f"provenance of schema {SCHEMA}", str(values.get("schema")), "train it with `dvc repro`")
     return values

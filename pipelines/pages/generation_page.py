@@ -10,8 +10,10 @@ from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.contact.agreement import f1_score
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.arrays import write_npz
+from hoidata.files.digest import canonical_json
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.user_mesh import thinned
+from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
@@ -23,6 +25,7 @@ MOST_FACES_DRAWN = 30_000
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
 ARRAYS = {
     "text": "the sentence",
+    "checkpoints": "JSON: SHA-256 of each network's file by its path; `hoidata lineage motion.npz` reads it",
     "fps": "frames per second",
     "seed": "what the motion was drawn from",
     "gravity": "(3,) direction things fall; empty where unknown",
@@ -74,8 +77,10 @@ def write_generation(
     paths = []
     for motion in motions:
         name = f"motion-{number}" if (number := motion.evidence["number"]) else "motion"
-        write_npz(folder / f"{name}.npz", motion_arrays(motion, hands))
-        write_glb(folder / f"{name}.glb", motion.clip, hands, _paint(motion, motion.contact))
+        made_from = checkpoint_digests(motion, checkpoints)
+        write_npz(folder / f"{name}.npz", motion_arrays(motion, hands, made_from))
+        paint = _paint(motion, motion.contact)
+        write_glb(folder / f"{name}.glb", motion.clip, hands, paint, extras={"checkpoints": made_from})
         paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
     first = motions[0]
     write_page(
@@ -87,7 +92,7 @@ def write_generation(
         motions=[_shown(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
         facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
         files=[(path.name, _FILE_WORDS[path.suffix]) for path in paths],
-        arrays=[(name, ARRAYS[name]) for name in motion_arrays(first, hands)],
+        arrays=[(name, ARRAYS[name]) for name in motion_arrays(first, hands, {})],
         has_players=True,
     )
     return [*paths, folder / "index.html"]
@@ -160,8 +165,14 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     ]
 
 
-def motion_arrays(motion: GeneratedMotion, hands: HandPair) -> dict[str, np.ndarray]:
-    """The arrays of motion.npz, as ``ARRAYS`` explains them.
+def checkpoint_digests(motion: GeneratedMotion, folder: str) -> dict[str, str]:
+    """SHA-256 of each network's file that made a motion, by its path below ``folder``."""
+    names = motion.evidence["checkpoints"]
+    return {f"{folder}/{name}/{FILE_NAME}": digest for name, digest in sorted(names.items())}
+
+
+def motion_arrays(motion: GeneratedMotion, hands: HandPair, made_from: dict[str, str]) -> dict[str, np.ndarray]:
+    """The arrays of motion.npz, as ``ARRAYS`` explains them. made_from: see ``checkpoint_digests``.
 
     Metres, radians, 30 fps, the clip's world frame. Rows of a hand where ``valid`` is False are zero.
     """
@@ -173,6 +184,7 @@ def motion_arrays(motion: GeneratedMotion, hands: HandPair) -> dict[str, np.ndar
     )
     arrays = {
         "text": np.array(str(motion.evidence["text"])),
+        "checkpoints": np.array(canonical_json(made_from)),
         "fps": np.array(FPS),
         "seed": np.array(motion.evidence["seed"]),
         "gravity": np.zeros(0) if clip.gravity is None else np.asarray(clip.gravity),

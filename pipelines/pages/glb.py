@@ -36,12 +36,14 @@ def write_glb(
     hands: HandPair,
     contact: ContactPaint | None = None,
     ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
+    extras: dict | None = None,
 ) -> Path:
     """Write ``clip`` as an animated, self-contained GLB; ``contact`` is painted on the object. Repeatable.
 
-    ghosts: hands to see through, to compare with those of the clip.
+    ghosts: hands to see through, to compare with those of the clip. extras: further facts for the asset's own, as JSON
+    values.
     """
-    return write_whole(path, glb_bytes(clip, hands, contact, ghosts))
+    return write_whole(path, glb_bytes(clip, hands, contact, ghosts, extras))
 
 
 def glb_bytes(
@@ -49,9 +51,11 @@ def glb_bytes(
     hands: HandPair | None,
     contact: ContactPaint | None = None,
     ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
+    extras: dict | None = None,
 ) -> bytes:
     """The bytes of ``write_glb``; hands None: the objects alone."""
-    builder = GltfBuilder(clip.clip_id, {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS})
+    facts = {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS}
+    builder = GltfBuilder(clip.clip_id, facts | (extras or {}))
     world = builder.node("world", None, rotation=upright_rotation(clip.gravity).as_quat().round(9).tolist())
     times = builder.array((np.arange(clip.n_frames) / FPS).astype(np.float32), bounds=True)
     _add_object(builder, world, times, "object", clip.object, contact)

@@ -60,8 +60,10 @@ class GltfBuilder:
             metallicFactor=0.0,
             roughnessFactor=roughness,
         )
-        mode = {"alphaMode": gltf.BLEND} if opacity < 1 else {}
-        self.document.materials.append(gltf.Material(name=name, pbrMetallicRoughness=surface, alphaCutoff=None, **mode))
+        material = gltf.Material(name=name, pbrMetallicRoughness=surface, alphaCutoff=None)
+        if opacity < 1:
+            material.alphaMode = gltf.BLEND
+        self.document.materials.append(material)
         return len(self.document.materials) - 1
 
     def mesh(self, name: str, attributes: dict[str, int], indices: int, material: int) -> int:

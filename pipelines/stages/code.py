@@ -5,6 +5,7 @@ What params.yaml sets for one dataset stands there too, so that it concerns that
 chosen profile sets otherwise than all profiles do, which DVC does not see in the sections.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -61,18 +62,24 @@ def write_code(root: Path) -> None:
             write_json(partial / Path(path).relative_to(CODE), digests)
 
 
-def code_today(root: Path) -> dict[str, dict[str, str]]:
-    """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``)."""
+def code_today(root: Path, only: Collection[str] | None = None) -> dict[str, dict[str, str]]:
+    """What belongs into each file of ``code/`` as the code is now, by its path (``code/convert/grab.json``).
+
+    only: these files alone.
+    """
     plain = read_file(root / "params.yaml")
     params = chosen_params(plain)
     tree = SourceTree(root, {f"{DATASETS}.{name}": folder for name, folder in outside_folders().items()})
-    starts = closures(params, tree).items()
-    return {
-        f"{CODE / name}.json": tree.closure([start.module], start.chosen)
+    starts = {f"{CODE / name}.json": (name, start) for name, start in closures(params, tree).items()}
+    found = {
+        path: tree.closure([start.module], start.chosen)
         | own_settings(params, name)
         | profile_settings(plain, params, name)
-        for name, start in starts
+        for path, (name, start) in starts.items()
+        if only is None or path in only
     }
+    tree.keep_imports()
+    return found
 
 
 def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:

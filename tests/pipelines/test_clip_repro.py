@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from pipelines.lineage.provenance import read_checkpoint_metadata
+from hoidata.files.sealed import read_metadata
 
 pytestmark = [
     pytest.mark.slow,
@@ -84,7 +84,7 @@ def test_features_and_checkpoints_say_that_they_are_clips(before_and_after) -> N
     features = np.load(folder / "data/embedded/grab/annotation/embeddings.npz")["features"]
     assert features.shape[1] == 512
     assert np.ptp(features, axis=0).max() > 0
-    metadata = read_checkpoint_metadata(folder / "checkpoints/embedded/grab/contact/model.safetensors")
+    metadata = read_metadata(folder / "checkpoints/embedded/grab/contact/model.safetensors")
     assert metadata["facts"]["encoder"] == identity
     kept = folder / ".hoidata/features"
     assert len(list(kept.iterdir())) == 2  # the first encoder's features lie apart

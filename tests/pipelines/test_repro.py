@@ -10,8 +10,8 @@ import yaml
 from typer.testing import CliRunner
 
 from hoidata.errors import BadInput
+from hoidata.files.sealed import read_metadata
 from pipelines.cli import app
-from pipelines.lineage.provenance import read_checkpoint_metadata
 
 pytestmark = [pytest.mark.slow, pytest.mark.first]
 MODELS = ("contact", "length", "diffusion", "refiner")
@@ -31,7 +31,7 @@ def test_all_models_of_the_present_dataset_are_trained_and_those_of_the_others_a
 
 def test_each_checkpoint_records_what_it_was_trained_on(built):
     for model in MODELS:
-        metadata = read_checkpoint_metadata(built / "checkpoints/embedded/grab" / model / "model.safetensors")
+        metadata = read_metadata(built / "checkpoints/embedded/grab" / model / "model.safetensors")
         provenance = metadata["provenance"]
         assert provenance["synthetic"] is True
         assert provenance["datasets"] == {"grab": 4}
@@ -58,6 +58,23 @@ def test_lineage_names_everything_behind_each_checkpoint(built, monkeypatch):
             f"train.small.{model}",
         ):
             assert f'"name": "{name}"' in result.stdout
+
+
+def test_lineage_check_finds_every_output_as_dvc_wrote_it(built, project_tools):
+    result = project_tools.run(built, "hoidata", "lineage", "check")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert result.stdout.endswith(", 0 not as they were written\n")
+
+
+def test_lineage_rerun_trains_the_same_weights_in_a_clean_clone(built, project_tools):
+    identity = ("-c", "user.name=t", "-c", "user.email=t@example.org")
+    for words in (("add", "-A"), ("commit", "--quiet", "-m", "run")):
+        assert project_tools.run(built, "git", *identity, *words).returncode == 0
+    try:
+        result = project_tools.run(built, "hoidata", "lineage", "rerun", "checkpoints/embedded/grab/length")
+        assert result.stdout.endswith("\nsame\n"), result.stdout + result.stderr
+    finally:
+        assert project_tools.run(built, "git", "update-ref", "-d", "HEAD").returncode == 0
 
 
 def test_lineage_says_what_has_changed_since(built, project_tools):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.lineage.provenance import read_checkpoint_metadata
+from hoidata.files.sealed import read_metadata
 
 pytestmark = pytest.mark.slow
 FOLDER = Path(__file__).with_name("toy_family")
@@ -49,7 +49,7 @@ def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(built: Path
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
     assert set(re.findall(r"Running stage '([^']+)'", result.stdout)) == {"code", "report@embedded", *OWN_STAGES}
 
-    metadata = read_checkpoint_metadata(project / "checkpoints/embedded/grab/toy/model.safetensors")
+    metadata = read_metadata(project / "checkpoints/embedded/grab/toy/model.safetensors")
     assert metadata["provenance"]["datasets"] == {"grab": 4}
     figures = json.loads((project / "metrics/embedded/grab/toy.json").read_text())
     assert figures["motions"] == 2 * figures["held_out_clips"] > 0

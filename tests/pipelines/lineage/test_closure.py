@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.lineage.closure import Choice, SourceTree
+from pipelines.lineage.closure import KNOWN_IMPORTS, Choice, SourceTree
 
 STAGE = """import numpy
 
@@ -124,3 +124,17 @@ def test_a_package_that_registers_an_adapter_counts_with_its_files_and_version(r
     found = tree.closure(["toy_hoi.adapter"], {})
     assert found["distribution toy-hoi"] == "1.2"
     assert {"toy_hoi/adapter.py", "toy_hoi/words.py", "hoidata/room/beside.py"} <= set(found)
+
+
+@pytest.mark.parametrize("damage", ["", "[]", '{"x": 1}', '{"x": [[1, 2]]}'])
+def test_kept_imports_change_no_answer_and_damaged_ones_are_parsed_again(root, damage):
+    (root / ".hoidata").mkdir()
+    for _ in range(2):
+        tree = SourceTree(root)
+        assert set(tree.closure(["hoidata.stage"], {})) == OF_STAGE
+        tree.keep_imports()
+    assert (root / KNOWN_IMPORTS).is_file()
+    (root / "hoidata/room/beside.py").write_text("import hoidata.typed")
+    assert "hoidata/typed.py" in SourceTree(root).closure(["hoidata.stage"], {})
+    (root / KNOWN_IMPORTS).write_text(damage)
+    assert "hoidata/typed.py" in SourceTree(root).closure(["hoidata.stage"], {})

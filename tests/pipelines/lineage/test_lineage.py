@@ -12,7 +12,7 @@ from safetensors.numpy import save_file
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json
 from pipelines.lineage.digests import path_digest
-from pipelines.lineage.graph import look_up, read_graph
+from pipelines.lineage.graph import look_up, read_graph, written_graph
 from pipelines.lineage.provenance import build_provenance, read_provenance
 from pipelines.lineage.tree import lineage_tree, overall_status, tree_as_json
 from pipelines.stages.code import write_code
@@ -104,6 +104,19 @@ def test_graph_holds_the_stages_of_all_families_with_their_addresses(root):
     assert (stage.data, stage.params) == (("data/grab",), ("train.demo.contact",))
     assert stage.code == ("code/train/contact.json",)
     assert graph["convert@grab"].outs == ("data/grab",)
+
+
+@pytest.mark.parametrize("place", ["this project", "a small one"])
+def test_the_graph_read_without_dvc_is_the_one_dvc_reads(root, place):
+    at = Path(__file__).parents[3] if place == "this project" else root
+    assert written_graph(at) == read_graph(at)
+
+
+def test_of_a_graph_with_what_is_not_understood_here_dvc_is_asked(root):
+    (root / "dvc.yaml").write_text(
+        "stages: {each: {foreach: [a, b], do: {cmd: 'echo ${item}', outs: ['${item}.txt']}}}"
+    )
+    assert {"each@a", "each@b"} <= written_graph(root).keys()
 
 
 def test_a_graph_dvc_cannot_read_is_refused(root):

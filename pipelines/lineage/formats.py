@@ -1,0 +1,160 @@
+"""A lineage in the forms of others: Mermaid, OpenLineage events, PROV-JSON. All come from the record alone."""
+
+import uuid
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import quote
+
+from pipelines.lineage.digests import value_digest
+from pipelines.lineage.tree import Node
+
+PRODUCER = "urn:hoidata:lineage"
+NAMESPACE = "hoidata"
+_RUN_EVENT = "https://openlineage.io/spec/2-0-2/OpenLineage.json#/$defs/RunEvent"
+_VERSION_FACET = (
+    "https://openlineage.io/spec/facets/1-0-1/DatasetVersionDatasetFacet.json#/$defs/DatasetVersionDatasetFacet"
+)
+_STATUS_COLOURS = {"same": "#e5f5e5", "recorded": "#eeeeee", "uncommitted": "#fff4cc", "changed": "#fff4cc"}
+_BAD_COLOUR = "#fadbd8"
+
+
+@dataclass(frozen=True)
+class Step:
+    """One run of a stage. inputs and outputs: digest with its algorithm, by path."""
+
+    name: str
+    params: dict[str, Any]
+    code_digest: str
+    inputs: dict[str, str]
+    outputs: dict[str, str]
+
+
+def steps(tree: Node, record: dict[str, Any]) -> list[Step]:
+    """The runs behind a lineage, the last one first; a motion's is the one that generated it."""
+    if tree.kind == "motion":
+        inputs = {child.name: child.digest for child in tree.children}
+        return [Step("generate", {}, "", inputs, {tree.name: tree.digest})]
+    if imported := record.get("imported"):
+        published = _with("sha256", {f"published {name}": digest for name, digest in imported.items()})
+        return [Step("import", {}, "", published, {tree.name: tree.digest})]
+    last = record["stage"]
+    algorithm = "md5" if record.get("schema", "").startswith("hoidata.lock") else "sha256"
+    found = []
+    for name in _latest_first(record):
+        stage = record["stages"][name]
+        outputs = {tree.name: tree.digest} if name == last else _with(algorithm, stage.get("outputs", {}))
+        inputs = _with(algorithm, stage["inputs"])
+        found.append(Step(name, stage["params"], value_digest(stage["code"]), inputs, outputs))
+    return found
+
+
+def _latest_first(record: dict[str, Any]) -> list[str]:
+    """The stages so that each stands before those it is made from."""
+    stages = record["stages"]
+    made_by = {path: name for name, stage in stages.items() for path in stage.get("outputs", ())}
+    done: dict[str, None] = {}
+
+    def visit(name: str) -> None:
+        for path in stages[name]["inputs"]:
+            if path in made_by and made_by[path] not in done:
+                visit(made_by[path])
+        done[name] = None
+
+    visit(record["stage"])
+    return list(reversed(done))
+
+
+def _with(algorithm: str, digests: dict[str, str | None]) -> dict[str, str]:
+    return {path: f"{algorithm} {digest}" if digest else "" for path, digest in digests.items()}
+
+
+def mermaid(tree: Node, record: dict[str, Any]) -> str:
+    """A flowchart: stages as boxes, files as rounded ones, coloured by what became of them."""
+    names: dict[str, str] = {}
+    status = {node.name: node.status for node in tree.walk() if not node.repeated}
+    boxes, arrows = [], []
+
+    def box(name: str, shape: tuple[str, str]) -> str:
+        if name not in names:
+            names[name] = f"n{len(names)}"
+            boxes.append(f'    {names[name]}{shape[0]}"{_mermaid_text(name)}"{shape[1]}')
+            colour = _STATUS_COLOURS.get(status.get(name, "same"), _BAD_COLOUR)
+            boxes.append(f"    style {names[name]} fill:{colour}")
+        return names[name]
+
+    for step in steps(tree, record):
+        stage = box(step.name, ("[", "]"))
+        arrows += [f"    {box(path, ('(', ')'))} --> {stage}" for path in step.inputs]
+        arrows += [f"    {stage} --> {box(path, ('(', ')'))}" for path in step.outputs]
+    return "\n".join(["flowchart LR", *boxes, *dict.fromkeys(arrows)]) + "\n"
+
+
+def _mermaid_text(text: str) -> str:
+    """Text in quotes: whatever is not plain goes as a character code."""
+    return "".join(char if char.isalnum() or char in "/._-@: " else f"#{ord(char)};" for char in text)
+
+
+def openlineage(tree: Node, record: dict[str, Any], when: str) -> list[dict[str, Any]]:
+    """One COMPLETE event per run, the earliest stage first. when: ISO time; a record holds none."""
+    return [_event(step, when) for step in reversed(steps(tree, record))]
+
+
+def _event(step: Step, when: str) -> dict[str, Any]:
+    run = uuid.uuid5(
+        uuid.NAMESPACE_URL, f"{PRODUCER}:{value_digest([step.name, step.params, step.code_digest, step.inputs])}"
+    )
+    facet = {"_producer": PRODUCER, "_schemaURL": f"{PRODUCER}:run-facet:1"}
+    return {
+        "eventType": "COMPLETE",
+        "eventTime": when,
+        "producer": PRODUCER,
+        "schemaURL": _RUN_EVENT,
+        "run": {
+            "runId": str(run),
+            "facets": {"hoidata": {**facet, "params": step.params, "codeDigest": step.code_digest}},
+        },
+        "job": {"namespace": NAMESPACE, "name": step.name},
+        "inputs": [_dataset(path, digest) for path, digest in step.inputs.items()],
+        "outputs": [_dataset(path, digest) for path, digest in step.outputs.items()],
+    }
+
+
+def _dataset(path: str, digest: str) -> dict[str, Any]:
+    version = {"_producer": PRODUCER, "_schemaURL": _VERSION_FACET, "datasetVersion": digest}
+    return {"namespace": NAMESPACE, "name": path, "facets": {"version": version} if digest else {}}
+
+
+def prov(tree: Node, record: dict[str, Any]) -> dict[str, Any]:
+    """PROV-JSON: files are entities, runs activities, hoidata the agent; code is an entity of its own."""
+    document: dict[str, Any] = {
+        "prefix": {"hoi": f"{PRODUCER}:", "prov": "http://www.w3.org/ns/prov#"},
+        "entity": {},
+        "activity": {},
+        "agent": {"hoi:hoidata": {"prov:type": {"$": "prov:SoftwareAgent", "type": "prov:QUALIFIED_NAME"}}},
+        "used": {},
+        "wasGeneratedBy": {},
+        "wasAssociatedWith": {},
+    }
+    for step in steps(tree, record):
+        activity = _qualified("run", step.name)
+        document["activity"][activity] = {f"hoi:{key}": str(value) for key, value in step.params.items()}
+        code = {_qualified("code", step.code_digest): ""} if step.code_digest else {}
+        used = {_qualified("file", path): digest for path, digest in step.inputs.items()} | code
+        made = {_qualified("file", path): digest for path, digest in step.outputs.items()}
+        document["entity"] |= {name: {"hoi:digest": digest} if digest else {} for name, digest in (used | made).items()}
+        links = (
+            ("used", used, "prov:activity", "prov:entity"),
+            ("wasGeneratedBy", made, "prov:activity", "prov:entity"),
+        )
+        for relation, entities, of, what in links:
+            for name in entities:
+                document[relation][f"_:{relation}{len(document[relation])}"] = {of: activity, what: name}
+        document["wasAssociatedWith"][f"_:by{len(document['activity'])}"] = {
+            "prov:activity": activity,
+            "prov:agent": "hoi:hoidata",
+        }
+    return document
+
+
+def _qualified(kind: str, name: str) -> str:
+    return f"hoi:{kind}/{quote(name, safe='/@')}"

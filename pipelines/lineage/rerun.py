@@ -1,0 +1,77 @@
+"""Train a checkpoint again in a clean clone, and compare its tensors."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from hoidata.errors import BadInput, HoidataError
+from hoidata.files.sealed import payload_digest
+from pipelines.lineage.locks import read_locks
+from pipelines.lineage.targets import WEIGHTS, Target
+
+
+def rerun(root: Path, target: Target, commit: str = "HEAD") -> tuple[str, str]:
+    """The payload digest of a checkpoint, and that of the same stage run again with the code of a commit.
+
+    The clone gets the inputs as they lie here, and the settings of the commit under the profile chosen here. Raises
+    BadInput for what is no checkpoint of this project, HoidataError where the stage fails.
+    """
+    stage = target.record.get("stage", "")
+    out = Path(target.name).parent
+    words = _arguments(root, out.as_posix(), stage)
+    if target.kind != "checkpoint" or not words:
+        raise BadInput(
+            target.name, "a checkpoint made by a stage of this project", target.kind, "name one below checkpoints/"
+        )
+    with TemporaryDirectory(prefix="hoidata-rerun-") as folder:
+        clone = Path(folder) / "clone"
+        _run(root, "git", "clone", "--quiet", "--no-hardlinks", str(root.resolve()), str(clone))
+        _run(clone, "git", "checkout", "--quiet", _resolved(root, commit))
+        _link_inputs(root, clone, out)
+        python = (sys.executable, "-m", "pipelines.stages")
+        _run(clone, *python, "code")
+        _run(clone, *python, *words)
+        return payload_digest(root / target.name), payload_digest(clone / out / WEIGHTS)
+
+
+def _arguments(root: Path, out: str, stage: str) -> list[str]:
+    """What ``pipelines.stages`` is called with for the checkpoint in ``out``, by its place in the project."""
+    parts = Path(out).parts
+    if len(parts) != 4 or parts[0] != "checkpoints" or stage not in read_locks(root):
+        return []
+    return ["train", "--profile", parts[1], "--dataset", parts[2], "--model", parts[3]]
+
+
+def _resolved(root: Path, commit: str) -> str:
+    done = subprocess.run(
+        ["git", "rev-parse", "--verify", f"{commit}^{{commit}}"], cwd=root, capture_output=True, text=True
+    )
+    if done.returncode:
+        raise BadInput(commit, "a commit of this project", "none", "name one that `git log` shows")
+    return done.stdout.strip()
+
+
+def _link_inputs(root: Path, clone: Path, out: Path) -> None:
+    """Data, manifests git ignores, the other checkpoints and the chosen profile."""
+    from pipelines.params import read_params
+
+    _, profile, dataset, _ = out.parts
+    chosen, params = read_params(root)["profile"], clone / "params.yaml"
+    text = params.read_text()
+    params.write_text(text.replace(f"profile: {read_params(clone)['profile']}", f"profile: {chosen}", 1))
+    links = [Path("data") / profile / dataset, Path("manifests") / profile]
+    links += [path.relative_to(root) for path in (root / out.parent).iterdir() if path.name != out.name]
+    for path in links:
+        if (root / path).exists() and not (clone / path).exists():
+            (clone / path).parent.mkdir(parents=True, exist_ok=True)
+            (clone / path).symlink_to((root / path).resolve())
+
+
+def _run(folder: Path, *command: str) -> None:
+    environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+    if done.returncode:
+        lines = (done.stderr or done.stdout).strip().splitlines()
+        raise HoidataError(f"{' '.join(command)}: exit code {done.returncode}: {lines[-1] if lines else ''}")

@@ -1,0 +1,242 @@
+"""What ``hoidata lineage`` says of each piece in staged situations, on a project after a run."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from hoidata.errors import BadInput
+from hoidata.files.digest import canonical_json, sha256_file
+from hoidata.files.sealed import payload_digest
+from pipelines.lineage.check import check
+from pipelines.lineage.locks import dvc_digest
+from pipelines.lineage.raw import raw_sources
+from pipelines.lineage.targets import find_target
+from pipelines.lineage.tree import overall_status, target_tree
+
+CONTACT = "checkpoints/embedded/grab/contact/model.safetensors"
+CLIPS = "data/embedded/grab/clips"
+RAW = ".hoidata/raw/embedded/grab"
+ADAPTER = "hoidata/datasets/grab/adapter.py"
+
+
+def found(root: Path | None, words: str = CONTACT, here: Path | None = None) -> dict[str, str]:
+    """Each piece that is not as recorded, with its verdict."""
+    tree = target_tree(root, find_target(root, words, here or root))
+    return {
+        f"{node.kind} {node.name}": node.status for node in tree.walk() if node.status != "same" and not node.repeated
+    }
+
+
+def set_param(root: Path, value: float) -> None:
+    params = yaml.safe_load((root / "params.yaml").read_text())
+    params["train"]["demo"]["contact"]["lr"] = value
+    (root / "params.yaml").write_text(yaml.safe_dump(params))
+
+
+def flip(path: Path, number: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[number] ^= 1
+    path.write_bytes(data)
+
+
+SITUATIONS = {
+    "nothing": (lambda ran: None, {}),
+    "an edited param": (lambda ran: set_param(ran.root, 0.5), {"param train.demo.contact": "changed"}),
+    "a param of another network": (
+        lambda ran: ran.write({"params.yaml": (ran.root / "params.yaml").read_text().replace("0.2", "0.9")}),
+        {},
+    ),
+    "edited code that matters": (
+        lambda ran: ran.write({ADAPTER: "SCALE = 2"}),
+        {f"code {ADAPTER}": "changed", "code code": "changed"},
+    ),
+    "edited code that does not matter": (lambda ran: ran.write({"models/text2hoi/unused.py": "1"}), {}),
+    "an edited raw file": (lambda ran: ran.write({f"{RAW}/tools/mug.ply": "longer"}), {"raw RAW": "changed"}),
+    "a missing raw file": (lambda ran: (ran.root / RAW / "tools/mug.ply").unlink(), {"raw RAW": "missing"}),
+    "raw files gone": (lambda ran: shutil.rmtree(ran.root / RAW), {"raw RAW": "missing"}),
+    "a missing manifest": (
+        lambda ran: (ran.root / "manifests/embedded/grab.json").unlink(),
+        {"manifest manifests/embedded/grab.json": "missing"},
+    ),
+    "a flipped bit in the weights": (lambda ran: flip(ran.root / CONTACT, -1), {f"checkpoint {CONTACT}": "tampered"}),
+    "a flipped bit in the header": (lambda ran: flip(ran.root / CONTACT, 400), {f"checkpoint {CONTACT}": "tampered"}),
+    "a header that cannot be read": (lambda ran: flip(ran.root / CONTACT, 8), {f"checkpoint {CONTACT}": "tampered"}),
+    "a flipped bit in a store": (
+        lambda ran: flip(next((ran.root / CLIPS / "arrays").glob("frames-*.npz")), 200),
+        {f"data {CLIPS}": "tampered"},
+    ),
+    "a store that is gone": (lambda ran: shutil.rmtree(ran.root / CLIPS), {f"data {CLIPS}": "missing"}),
+}
+
+
+@pytest.mark.parametrize("situation", SITUATIONS)
+def test_each_staged_situation_gets_its_verdict(ran, situation):
+    change, expected = SITUATIONS[situation]
+    change(ran)
+    expected = {key.replace("RAW", (ran.root / RAW).as_posix()): status for key, status in expected.items()}
+    assert found(ran.root) == expected
+    worst = overall_status(target_tree(ran.root, find_target(ran.root, CONTACT, ran.root)))
+    assert worst == (next(iter(expected.values())) if expected else "same")
+
+
+def test_weights_made_zero_are_tampered_although_the_header_is_whole(ran):
+    path = ran.root / CONTACT
+    data = path.read_bytes()
+    path.write_bytes(data[:-16] + bytes(np.ones(4, np.float32)))
+    target = find_target(ran.root, CONTACT, ran.root)
+    assert (target.status, target.note) == ("tampered", "the weights are not what was written")
+
+
+def test_what_was_trained_with_edits_nobody_committed_is_uncommitted_until_they_are(ran):
+    ran.write({ADAPTER: "SCALE = 3"})
+    set_param(ran.root, 0.7)
+    ran.again()
+    expected = {f"code {ADAPTER}": "uncommitted", "code code": "uncommitted", "param train.demo.contact": "uncommitted"}
+    assert found(ran.root) == expected
+    ran.commit()
+    assert found(ran.root) == {}
+
+
+def test_a_checkpoint_of_an_older_commit_names_the_commit_that_held_its_code_and_params(ran):
+    then = ran.git("rev-parse", "HEAD").strip()
+    kept = shutil.copytree((ran.root / CONTACT).parent, ran.root.parent / "kept")
+    ran.write({ADAPTER: "SCALE = 2"})
+    set_param(ran.root, 0.5)
+    ran.again()
+    ran.commit()
+    target = find_target(ran.root, str(kept))
+    assert (target.status, target.note[-17:]) == ("same", f"commit {then[:10]}")
+    nodes = {node.name: node for node in target_tree(ran.root, target).walk()}
+    assert nodes[ADAPTER].status == nodes["train.demo.contact"].status == "changed"
+    assert nodes[ADAPTER].detail == f"as recorded in commit {then[:10]}"
+    assert nodes["train.demo.contact"].detail == f"lr: 0.1 -> 0.5 (as recorded in commit {then[:10]})"
+
+
+def test_a_digest_of_an_older_run_is_found_in_git(ran):
+    digest = dvc_digest((ran.root / CONTACT).parent)
+    then = ran.git("rev-parse", "HEAD").strip()
+    set_param(ran.root, 0.5)
+    ran.again()
+    ran.commit()
+    target = find_target(ran.root, digest)
+    assert (target.kind, target.status) == ("checkpoint", "missing")
+    assert then[:10] in target.note
+    assert found(ran.root, digest)["param train.demo.contact"] == "changed"
+
+
+@pytest.mark.parametrize("digest", [payload_digest, sha256_file, dvc_digest])
+def test_a_checkpoint_is_found_by_each_of_its_digests_and_their_beginnings(ran, digest):
+    for length in (64, 12):
+        target = find_target(ran.root, digest(ran.root / CONTACT)[:length])
+        assert target.kind == "checkpoint"
+        assert target.record["schema"] == "hoidata.provenance/1"
+
+
+def test_a_digest_of_nothing_and_a_path_of_nothing_are_refused(ran):
+    for words in ("0123456789ab", "checkpoints/none", "params.yaml"):
+        with pytest.raises(BadInput):
+            find_target(ran.root, words, ran.root)
+
+
+def test_a_file_copied_out_is_known_and_one_no_lock_knows_is_an_orphan(ran, tmp_path):
+    copied = Path(shutil.copytree((ran.root / CONTACT).parent, tmp_path / "copied"))
+    assert found(ran.root, str(copied)) == {}
+    for lock in (ran.root / "dvc.lock", ran.root / "models/text2hoi/dvc.lock"):
+        lock.write_text("schema: '2.0'\nstages: {}\n")
+    assert found(ran.root, str(copied)) == {}, "the commit still knows it"
+    shutil.rmtree(ran.root / ".git")
+    assert found(ran.root, str(copied)) == {f"checkpoint {copied / 'model.safetensors'}": "orphan"}
+
+
+def test_outside_any_project_the_header_tells_all_and_nothing_is_compared(ran, tmp_path):
+    path = tmp_path / "elsewhere.safetensors"
+    shutil.copy(ran.root / CONTACT, path)
+    shutil.rmtree(ran.root)
+    target = find_target(None, str(path))
+    tree = target_tree(None, target)
+    assert (tree.status, overall_status(tree)) == ("same", "recorded")
+    assert {f"code {ADAPTER}", "param train.seed", f"data {CLIPS}"} <= {
+        f"{node.kind} {node.name}" for node in tree.walk()
+    }
+    source = raw_sources(None, target.record)[0]
+    assert [clip.clip_id for clip in source.clips] == ["grab/s1/mug_lift", "grab/s1/cup_pour"]
+    assert sorted(source.digests) == ["grab/s1/cup_pour.npz", "grab/s1/mug_lift.npz", "tools/cup.ply", "tools/mug.ply"]
+    assert source.clips[0].frames == (60, 68)
+    flip(path, -1)
+    assert overall_status(target_tree(None, find_target(None, str(path)))) == "tampered"
+
+
+def test_the_users_own_raw_files_that_are_gone_are_licensed_data_one_needs(ran, monkeypatch):
+    monkeypatch.chdir(ran.root)
+    listed = json.loads((ran.root / "data/embedded/grab/raw.json").read_text())
+    ran.write({"data/embedded/grab/raw.json": json.dumps(listed | {"source": "files"})})
+    ran.again()
+    ran.commit()
+    assert found(ran.root) == {"raw grab": "needs licensed data"}
+    monkeypatch.setenv("HOIDATA_GRAB", str(ran.root / RAW))
+    assert found(ran.root) == {}
+
+
+def test_an_adapter_of_another_package_counts_like_our_own(project_builder, tmp_path, monkeypatch):
+    site, root = tmp_path / "site", tmp_path / "project"
+    entry = "[hoidata.adapters]\ngrab = toy_reader.adapter:Toy\n"
+    for name, text in {
+        "toy_reader/__init__.py": "",
+        "toy_reader/adapter.py": "SCALE = 1",
+        "toy_reader-1.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: toy-reader\nVersion: 1.0\n",
+        "toy_reader-1.0.dist-info/entry_points.txt": entry,
+    }.items():
+        (site / name).parent.mkdir(parents=True, exist_ok=True)
+        (site / name).write_text(text)
+    root.mkdir()
+    monkeypatch.syspath_prepend(str(site))
+    project_builder.build(root, {name: text for name, text in project_builder.code.items() if name != ADAPTER})
+    assert found(root) == {}
+    (site / "toy_reader/adapter.py").write_text("SCALE = 2")
+    assert found(root) == {"code toy_reader/adapter.py": "changed", "code code": "changed"}
+
+
+@pytest.mark.parametrize("name", [CLIPS, "samples/embedded/grab/text2hoi/clips", "metrics/embedded/grab/text2hoi.json"])
+def test_stores_samples_and_metrics_have_a_lineage_too(ran, name):
+    assert found(ran.root, name) == {}
+    ran.write({ADAPTER: "SCALE = 2"})
+    assert found(ran.root, name)["code code"] == "changed"
+    path = ran.root / name
+    victim = path if path.is_file() else path / "meta/info.json"
+    victim.write_text(victim.read_text() + " ")
+    assert found(ran.root, name)[f"data {name}"] == "tampered"
+
+
+def test_a_generated_motion_leads_to_the_networks_that_made_it(ran):
+    motion = ran.root / "generated/motion.npz"
+    motion.parent.mkdir()
+    np.savez(motion, checkpoints=np.array(canonical_json({CONTACT: sha256_file(ran.root / CONTACT)})))
+    assert found(ran.root, "generated") == {}
+    flip(ran.root / CONTACT, -1)
+    assert found(ran.root, "generated") == {f"checkpoint {CONTACT}": "tampered"}
+    ran.again(weights=1.0)
+    assert found(ran.root, "generated") == {f"checkpoint {CONTACT}": "changed"}
+    (ran.root / CONTACT).unlink()
+    assert found(ran.root, "generated") == {f"checkpoint {CONTACT}": "missing"}
+    assert set(found(None, str(motion)).values()) == {"recorded"}
+
+
+@pytest.mark.parametrize(
+    ("victim", "piece"),
+    [
+        (CONTACT, f"checkpoint {CONTACT}"),
+        (f"{CLIPS}/meta/info.json", f"data {CLIPS}"),
+        (f"{RAW}/tools/mug.ply", "raw "),
+    ],
+)
+def test_check_reads_every_byte_again_and_names_what_is_not_as_written(ran, victim, piece):
+    assert {node.status for node in check(ran.root)} == {"same"}
+    flip(ran.root / victim, -1)
+    wrong = [node for node in check(ran.root) if node.status != "same"]
+    assert any(f"{node.kind} {node.name}".startswith(piece) for node in wrong)
+    behind = find_target(ran.root, "checkpoints/embedded/grab/length", ran.root)
+    assert all("contact" not in node.name for node in check(ran.root, behind))
