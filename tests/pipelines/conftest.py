@@ -63,7 +63,7 @@ def make_small(folder: Path) -> None:
         path.write_text(path.read_text().replace('"size": "full"', '"size": "small"'))
     params = yaml.safe_load((folder / "params.yaml").read_text())
     params["annotate"]["encoder"] = "hash"
-    params["train"]["small"] = TINY
+    params["train"]["small"] |= TINY
     params["sample"] |= TINY_SAMPLE
     write_params(folder, params)
 
