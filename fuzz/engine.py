@@ -99,7 +99,8 @@ def _run(target: Target, seed: int, executions: int, seconds: float, own: Path) 
     mutator = {"custom_mutator": lambda *given: _mutated(target, *given)} if target.structure else {}
     longest = max(target.longest, *(path.stat().st_size for path in (own / "corpus").iterdir()))
     options = {
-        "runs": executions, "max_total_time": int(seconds), "seed": seed + 1, "max_len": longest, "timeout": HANG_S,
+        # Whole seconds; 0 would mean no limit at all.
+        "runs": executions, "max_total_time": max(1, round(seconds)), "seed": seed + 1, "max_len": longest, "timeout": HANG_S,
         "rss_limit_mb": 0, "print_final_stats": 1, "artifact_prefix": f"{own}/", "dict": own / "words",
     }  # fmt: skip
     flags = [f"-{name}={value}" for name, value in options.items()]

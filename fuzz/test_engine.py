@@ -21,7 +21,7 @@ from hoidata.errors import BadInput, HoidataError
 
 pytestmark = pytest.mark.first
 PROJECT = Path(__file__).parents[1]
-SECONDS_EACH = 0.8
+SECONDS_EACH = 1
 
 
 def branching(data: bytes) -> int:
