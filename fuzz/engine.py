@@ -98,9 +98,9 @@ def _run(target: Target, seed: int, executions: int, seconds: float, own: Path) 
     _guide_by(target.code)
     mutator = {"custom_mutator": lambda *given: _mutated(target, *given)} if target.structure else {}
     longest = max(target.longest, *(path.stat().st_size for path in (own / "corpus").iterdir()))
+    whole_seconds = max(1, round(seconds))  # 0 would mean no limit at all
     options = {
-        # Whole seconds; 0 would mean no limit at all.
-        "runs": executions, "max_total_time": max(1, round(seconds)), "seed": seed + 1, "max_len": longest, "timeout": HANG_S,
+        "runs": executions, "max_total_time": whole_seconds, "seed": seed + 1, "max_len": longest, "timeout": HANG_S,
         "rss_limit_mb": 0, "print_final_stats": 1, "artifact_prefix": f"{own}/", "dict": own / "words",
     }  # fmt: skip
     flags = [f"-{name}={value}" for name, value in options.items()]
