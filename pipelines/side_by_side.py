@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive, write_whole
 
 CODE = "code"
@@ -52,7 +53,9 @@ def reproduce_side_by_side(
     with exclusive(RUN, wait_s=0), ThreadPoolExecutor(jobs) as pool, _Children(max(1, _cores() // jobs)) as children:
         run_stage = wrap(children.run) if wrap else children.run
         start, run = time.monotonic(), Run()
-        if _timed(CODE, run_stage, run) == 0:
+        if _timed(CODE, run_stage, run):
+            _tell(CODE, run, 0)
+        else:
             upstream = stale_stages(targets, children.forced if force else None)
             run_all(upstream, pool, jobs, run_stage, run)
             write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
@@ -63,8 +66,19 @@ def reproduce_side_by_side(
 def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str, frozenset[str]]:
     """Stages the targets need that DVC finds changed, and all that follow from them, each with those it waits for.
 
-    forced: filled with the names of the targets, which then count as changed.
+    forced: filled with the names of the targets, which then count as changed. Raises BadInput for targets that DVC
+    does not know, and while another DVC command holds the project.
     """
+    from dvc.exceptions import DvcException
+
+    try:
+        return _ask_dvc(targets, forced)
+    except DvcException as error:
+        got, remedy = str(error), "`dvc stage list --all` names all targets"
+        raise BadInput(" ".join(targets) or "dvc.yaml", "stages that DVC can run", got, remedy) from error
+
+
+def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset[str]]:
     import networkx
     from dvc.repo import Repo
     from dvc.repo.reproduce import collect_stages, get_active_graph, plan_repro

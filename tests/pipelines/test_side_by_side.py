@@ -122,6 +122,8 @@ def test_a_project_comes_up_to_date_as_by_dvc_repro_and_a_second_run_has_nothing
     status = subprocess.run([sys.executable, "-m", "dvc", "repro"], capture_output=True, text=True)
     assert "Running stage 'd'" not in status.stdout
     assert list(reproduce_side_by_side([], jobs=2).seconds) == ["code"]
+    with pytest.raises(BadInput, match="'x' not found"):
+        reproduce_side_by_side(["x"], jobs=2)
     (tmp_path / "b.src").write_text("B")
     assert stale_stages([]) == {"b": frozenset(), "d": frozenset("b")}
     assert stale_stages(["c"]) == {}
@@ -141,6 +143,9 @@ def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_
     assert (tmp_path / "b.out").read_text() == "(b (a))"
     assert (tmp_path / "e.out").read_text() == "(E)"
     assert "UnicodeDecodeError" in capfd.readouterr().err
+    (tmp_path / "code.txt").unlink()
+    assert reproduce_side_by_side([], jobs=2).failed == {"code": 255}
+    assert "code.txt" in capfd.readouterr().err
 
 
 @pytest.mark.slow
