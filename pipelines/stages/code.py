@@ -144,7 +144,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
         return section.get("seed"), *[(section.get(section.get(kind)) or {}).get(of) for kind in ("preset", "size")]
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
-    return (section, params.get("sample")) if stage == "controls" else section
+    return (section, params.get("sample"), params.get("evaluate")) if stage == "controls" else section
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
