@@ -30,7 +30,7 @@ DEEP_M, LESS_DEEP_M = 0.01, 0.005
 MOVED_M = 1e-5  # an object vertex that moves farther to the next frame moves
 TURNED_RAD = 1e-3  # a hinge that turns farther to the next frame turns
 CAP_M = 0.2  # distances of contact maps beyond count as this, corrected
-_FAR_M = 0.02  # no threshold asks what lies beyond
+_FAR_M = 2 * DEEP_M  # no threshold asks what lies beyond
 _NEVER = 1 << 62  # positions from which a grid would pay: these surfaces are asked too seldom
 
 
