@@ -163,9 +163,7 @@ def test_an_annotation_of_other_clips_is_refused(clips, tmp_path):
 
 
 def test_an_unknown_split_is_refused_before_anything_is_written(clips, tmp_path):
-    with pytest.raises(
-        BadInput, match=r"composition, drawn-object, .*official, text2hoi, unseen-object, unseen-subject, got 'text2hio'"
-    ):
+    with pytest.raises(BadInput, match=r"composition, drawn-object, .*official, text2hoi, .*subject, got 'text2hio'"):
         write(tmp_path, clips, wanted="text2hio")
     assert not (tmp_path / "splits").exists()
 
