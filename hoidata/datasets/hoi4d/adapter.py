@@ -20,6 +20,7 @@ from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, 
 from hoidata.datasets.gravity import TrackedObject, estimate_gravity
 from hoidata.datasets.hoi4d.files import (
     PartPose,
+    ShortPose,
     action_events,
     camera_poses,
     frame_numbers,
@@ -49,9 +50,13 @@ CONVENTION = HandConvention(
     left_shape="as released",
     note="MANO: absolute axis-angles, one shape per person, translation added to the rest wrist, camera frame",
 )
-_HANDS = tuple(f"{folder.format(side)}/{CLIP}/*.pickle" for folder in HAND_FOLDERS for side in SIDES)
+# A folder of frame files is one source, so it is named as well as its files.
+_HANDS = tuple(
+    f"{folder.format(side)}/{CLIP}{files}" for folder in HAND_FOLDERS for side in SIDES for files in ("/*.pickle", "")
+)
+_POSES = tuple(f"{ANNOTATIONS}/{CLIP}/objpose{files}" for files in ("/*.json", ""))
 PARTS = (
-    DatasetPart("object poses", (f"{ANNOTATIONS}/{CLIP}/objpose/*.json",), "HOI4D_annotations.zip"),
+    DatasetPart("object poses", _POSES, "HOI4D_annotations.zip"),
     DatasetPart("camera trajectory", (f"{ANNOTATIONS}/{CLIP}/3Dseg/output.log",), "HOI4D_annotations.zip"),
     DatasetPart("hand poses", _HANDS, "HOI4D_Handpose.zip"),
     DatasetPart(
@@ -367,7 +372,7 @@ def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> t
     for frame, data in zip(frames, contents, strict=True):
         try:
             found = hand_frame(data, f"{folder}/{numbers[frame]}")
-        except BadInput as problem:
+        except ShortPose as problem:
             faulty.append(Quarantined.from_error(f"{key}/{side}-{frame:05d}", problem))
             continue
         pose[frame], betas[frame], translation_m[frame], valid[frame] = *found[:2], found.translation_m, True

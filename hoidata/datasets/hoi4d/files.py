@@ -44,6 +44,10 @@ class HandFrame(NamedTuple):
     translation_m: np.ndarray
 
 
+class ShortPose(BadInput):
+    """A hand file of the release whose pose has fewer numbers than 48: a known fault, which costs its frame alone."""
+
+
 class Joint(NamedTuple):
     """The one hinge of an object, in its whole mesh's coordinates. base, moving: names of its meshes (``new-0``)."""
 
@@ -172,6 +176,9 @@ def hand_frame(data: bytes, where: str) -> HandFrame:
     if len(data) > LARGEST_HAND_BYTES:
         raise BadInput(where, f"at most {LARGEST_HAND_BYTES} bytes", f"{len(data)}")
     value = restricted_load(data, ARRAYS, encoding="latin1", where=where)
+    pose = np.asarray(checks.entry(where, value, "poseCoeff"))
+    if pose.dtype.kind in "fiu" and 0 < pose.size < 48:
+        raise ShortPose(f"{where}: poseCoeff", "48 numbers", f"{pose.size}", "nothing to do: a known fault")
     rows = [
         checks.table(f"{where}: {name}", np.atleast_2d(np.asarray(checks.entry(where, value, name))), columns, 1)[0]
         for name, columns in (("poseCoeff", 48), ("beta", 10), ("trans", 3))
