@@ -83,7 +83,7 @@ def run_warm(module: str, arguments: list[str]) -> int | None:
 
 def _ask(connection: socket.socket, asked: dict[str, Any]) -> None:
     environment = {key: value for key, value in os.environ.items() if key != SOCKET}
-    body = json.dumps({**asked, "folder": os.getcwd(), "environment": environment}).encode()
+    body = json.dumps({**asked, "folder": os.getcwd(), "path": sys.path, "environment": environment}).encode()
     socket.send_fds(connection, [struct.pack("!I", len(body))], [0, 1, 2])
     connection.sendall(body)
 
@@ -153,6 +153,10 @@ def _run(request: dict[str, Any]) -> int:
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"])
+    # The stage's own modules are those that the one that asks would import.
+    sys.path[:] = request["path"]
+    for name in [name for name in sys.modules if name.partition(".")[0] == "pipelines"]:
+        del sys.modules[name]
     sys.argv = [request["module"], *request["arguments"]]
     try:
         runpy.run_module(request["module"], run_name="__main__", alter_sys=True)
