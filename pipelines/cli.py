@@ -9,11 +9,13 @@ from pipelines.commands import (
     adapters,
     animate,
     controls,
+    convert,
     corpus,
     evaluate,
     generate,
     graph,
     import_checkpoint,
+    init,
     inspect,
     lineage,
     raw,
@@ -35,6 +37,8 @@ app.add_typer(synth.app, name="synth", help="The corpora made here: write them, 
 app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list them, check that one keeps the rules.")
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
 app.add_typer(lineage.app, name="lineage")
+app.command("init")(init.init)
+app.command("convert")(convert.convert)
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)
 app.command("down")(graph.down)
