@@ -7,7 +7,6 @@ from pathlib import Path
 import typer
 
 from hoidata.errors import HoidataError, told_in_words
-from hoidata.files.written import ask_digests_of
 from pipelines.commands import (
     adapters,
     animate,
@@ -62,13 +61,19 @@ app.command("animate")(animate.animate)
 app.command("show")(show.show)
 
 
+@app.callback()
+def _check_what_is_read() -> None:
+    from hoidata.files.written import ask_digests_of
+
+    ask_digests_of(_written_digest)
+
+
 def main() -> None:
     """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given, or with the
     machine (a full disk, a folder that cannot be written); 130 after Ctrl-C."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
-    ask_digests_of(_written_digest)
     try:
         with told_in_words():
             app()
