@@ -23,6 +23,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.files.tables import write_table
+from hoidata.files.written import read_table
 from hoidata.splits.definitions import Definition, choose, definitions_for
 from hoidata.splits.leaks import Leaks, find_leaks
 from hoidata.splits.published import published
@@ -102,11 +103,11 @@ def motion_digest(clip: Clip) -> str:
 
 def _annotated_clips(store: Store, annotation: Path) -> tuple[pd.DataFrame, list[str]]:
     """The annotation's table of hands, and the clips that have sentences, in the store's order."""
-    hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
+    hand_types = read_table(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
     if list(hand_types["clip_id"]) != store.ids:
         got = f"{len(hand_types)} clips of another conversion"
         raise BadInput(annotation, f"the {len(store)} clips of {store.folder}", got, "run the stage 'annotate' again")
-    named = set(pd.read_parquet(annotation / "text.parquet", columns=["clip_id"])["clip_id"])
+    named = set(read_table(annotation / "text.parquet", ["clip_id"])["clip_id"])
     return hand_types, [clip_id for clip_id in store.ids if clip_id in named]
 
 

@@ -2,11 +2,16 @@
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+
+from hoidata.errors import MissingResource
+from pipelines.commands.hands import hands_of
+from pipelines.commands.project import enter_project
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -51,16 +56,11 @@ def evaluate(
 
 def _hands(reference: Path) -> "HandPair":
     """The hand model the dataset was converted with: the embedded one, or the user's MANO files."""
-    from hoidata.hands import load_embedded_hands
     from hoidata.store.store import read_info
-    from pipelines.commands.project import enter_project
-    from pipelines.stages.base import load_hands
 
-    embedded = load_embedded_hands()
-    if read_info(reference / "clips")["hand_model"]["digest"] == embedded.digest:
-        return embedded
-    enter_project()
-    return load_hands("own")
+    with suppress(MissingResource):
+        enter_project()  # where the user's MANO files are noted
+    return hands_of(read_info(reference / "clips")["hand_model"]["digest"], str(reference))
 
 
 def table(

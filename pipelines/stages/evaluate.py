@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from hoidata.files.written import read_json
 from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_json
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ def run(paths: StagePaths) -> None:
     samples, metrics = paths.samples / "clips", with_lists(load_settings(EvaluateSettings, "evaluate").metrics)
     found = evaluate_store(samples, paths.data, hands, metrics=metrics, encoders=encoders, jobs=jobs(), progress=True)
     found["left_out"] = _with_reasons(found["left_out"], paths.samples / "left_out.json")
-    diagnostics = json.loads((paths.samples / "diagnostics.json").read_text(encoding="utf-8"))
+    diagnostics = read_json(paths.samples / "diagnostics.json")
     write_json(paths.metrics, found | {"diagnostics": diagnostics})
 
 
