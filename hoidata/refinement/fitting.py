@@ -33,7 +33,7 @@ class GeneratedHand:
     @property
     def is_there(self) -> np.ndarray:
         """(frame,) bool: the frame has this hand."""
-        return np.isfinite(self.keypoints_m).all(axis=(1, 2))
+        return np.asarray(np.isfinite(self.keypoints_m).all(axis=(1, 2)))
 
 
 def fit_hands(
@@ -45,8 +45,9 @@ def fit_hands(
 ) -> dict[Side, HandTrack]:
     """Hands whose vertices come nearest to generated keypoints, each frame by itself.
 
-    betas: (2, 10) shapes of left and right. keypoint_ids: (J,) vertices, the same on both sides. template_m: (2, 778, 3)
-    personal rest meshes, or None. A hand is valid in the frames it is there. Raises BadInput for arrays of other shapes.
+    betas: (2, 10) shapes of left and right. keypoint_ids: (J,) vertices, the same on both sides. template_m:
+    (2, 778, 3) personal rest meshes, or None. A hand is valid in the frames it is there. Raises BadInput for arrays of
+    other shapes.
     """
     tracks = {}
     for side, hand in generated.items():

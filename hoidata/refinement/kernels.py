@@ -1,8 +1,8 @@
 """Derivatives of skinned vertices, and distances with their slope: the loops of the refinement, compiled.
 
-The unknowns of one hand in one frame are 51: the wrist's place 3, a small turn of the whole hand about it 3 (world axes,
-applied from the left), and the axis-angles of the 15 finger joints 45. float64, one thread. All that call each other
-stand in this file: numba keeps compiled code by the file it is in, and does not see a change in another.
+The unknowns of one hand in one frame are 51: the wrist's place 3, a small turn of the whole hand about it 3 (world
+axes, applied from the left), and the axis-angles of the 15 finger joints 45. float64, one thread. All that call each
+other stand in this file: numba keeps compiled code by the file it is in, and does not see a change in another.
 """
 
 import numpy as np

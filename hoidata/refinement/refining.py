@@ -28,9 +28,10 @@ class RefinementSettings:
     """Standard deviations, metres; a smaller one counts more.
 
     keypoint_m: of a keypoint from the generated one; one that is outlier_m off counts half. surface_m: of keypoint plus
-    generated vector from the object's surface; off by more than stray_m, the vector is not believed. reach_m: vectors of
-    this length count 0.6 of short ones. depth_m: of a vertex inside the object. acceleration_m: of a keypoint's second
-    difference in time, per frame squared. pose: weight of the prior of finger poses. steps: at most.
+    generated vector from the object's surface; off by more than stray_m, the vector is not believed. reach_m: vectors
+    of this length count 0.6 of short ones. depth_m: of a vertex inside the object. acceleration_m: of a keypoint's
+    second difference in time, per frame squared. pose: weight of the prior of finger poses. steps: at most; fewer where
+    one gains less than ``enough`` of the cost.
     """
 
     keypoint_m: float = 0.004

@@ -1,6 +1,5 @@
 """Some vertices of one hand of known shape: where they are in each pose, and how they follow the 51 unknowns."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
