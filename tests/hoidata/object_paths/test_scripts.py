@@ -108,7 +108,7 @@ def test_shaking_goes_both_ways_as_often_as_asked_and_ends_where_it_began():
 def test_velocity_and_acceleration_never_jump():
     place = made("lift 20 cm in 1 s, move right 30 cm in 2 s, put down in 1 s").track.translation_m.astype(float)
     jerk = np.diff(place, 3, axis=0) * FPS**3
-    assert np.abs(jerk).max() == pytest.approx(60 * 0.2, rel=0.1)  # of least jerk, 60 way / time**3; a stop gives 100
+    assert np.abs(jerk).max() < 60 * 0.2 * 1.05  # of least jerk, 60 way / time**3; at constant speed it were 180
 
 
 @pytest.mark.parametrize(
