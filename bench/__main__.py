@@ -16,6 +16,7 @@ from bench import (
     manipnet_speed,
     physics,
     realism,
+    refinement,
     samplers,
     scale,
     sensors,
@@ -39,6 +40,7 @@ BENCHMARKS = {
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,
+    "refinement": refinement.main,
     "manipnet": manipnet.main,
 }
 

@@ -39,8 +39,8 @@ class RefinementSettings:
     surface_m: float = 0.003
     stray_m: float = 0.01
     reach_m: float = 0.02
-    depth_m: float = 0.001
-    acceleration_m: float = 0.0015
+    depth_m: float = 0.0005
+    acceleration_m: float = 0.003
     pose: float = 1.0
     steps: int = 15
     enough: float = 1e-4
