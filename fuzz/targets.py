@@ -405,7 +405,7 @@ def _object_paths() -> list[Target]:
             "object-keyframes",
             seeds.keyframe_files,
             lambda data: keyframes.keyframed_path(thing, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0)),
-            [code for code in functions_of(keyframes) if code is not keyframes.read_keyframes],
+            functions_of(keyframes, ("read_keyframes",)),
             words,
         ),
         Target(
