@@ -12,6 +12,7 @@ with the distances of our grids.
 import os
 import time
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -291,17 +292,9 @@ def _show_reached(pair: HandPair, ids: np.ndarray, found: list[Window]) -> None:
         fitted = fit_hands(pair, window.betas, ids, window.generated)
         made = {"recorded": window.recorded, "spoilt, fitted": fitted, "ours": ours(pair, ids, window)}
         seconds["ours"].append(np.median([_timed(lambda w=window: ours(pair, ids, w)) for _ in range(RUNS)]))
-        for name, grids in (("released", False), ("Adam on grids", True)):
-            descent = Descent(pair, ids, window)
-            step = _timed(lambda d=descent: d.fit(TIMED_FITS)) / TIMED_FITS
-            descent = Descent(pair, ids, window)
-            steps = descent.fit(MOST_FITS)
-            touch = descent.by_grids if grids else descent.by_vertices(descent.by_parity)
-            once = _timed(lambda t=touch, d=descent: d.refine(1, t))
-            descent.refine(REFINEMENTS - 1, descent.by_grids if grids else descent.by_vertices(descent.by_winding))
-            seconds[name].append(steps * step + REFINEMENTS * once)
-            print(f"{window.name}, {name}: {steps} steps of {1000 * step:.1f} ms, {REFINEMENTS} of {once:.2f} s")
-            made[name] = descent.tracks()
+        for name, own, second in _descended(pair, ids, window):
+            seconds[name].append(second)
+            made[name] = own.tracks()
         for name, tracks in made.items():
             figures[name].append(reached(pair, ids, window, tracks))
     rows = []
@@ -314,6 +307,23 @@ def _show_reached(pair: HandPair, ids: np.ndarray, found: list[Window]) -> None:
     columns = ["", "Pen 10 mm %", "Pen 5 mm %", "Con %", "Accel cm", "far RMS mm", "seconds", "of ours"]
     title = f"{len(found)} windows of {FRAMES} frames, both hands, {TRIANGLES[0]} triangles, processor time"
     show(title, columns, rows)
+
+
+def _descended(pair: HandPair, ids: np.ndarray, window: Window) -> list[tuple[str, Descent, float]]:
+    """Both ways of descent, run to their end, and the seconds all their steps take; they share the fit."""
+    first = Descent(pair, ids, window)
+    step = _timed(lambda: first.fit(TIMED_FITS)) / TIMED_FITS
+    steps = TIMED_FITS + first.fit(MOST_FITS - TIMED_FITS)
+    other, done = deepcopy(first), []
+    for name, own, timed, exact in (
+        ("released", first, first.by_vertices(first.by_parity), first.by_vertices(first.by_winding)),
+        ("Adam on grids", other, other.by_grids, other.by_grids),
+    ):
+        once = _timed(lambda own=own, timed=timed: own.refine(1, timed))
+        own.refine(REFINEMENTS - 1, exact)
+        done.append((name, own, steps * step + REFINEMENTS * once))
+        print(f"{window.name}, {name}: {steps} steps of {1000 * step:.1f} ms, {REFINEMENTS} of {once:.2f} s")
+    return done
 
 
 def _show_growth(pair: HandPair, ids: np.ndarray, few: list[Window], many: list[Window]) -> None:
