@@ -101,11 +101,12 @@ class Objective:
         drop = (drop if self.loss.dropout_of == "window" else drop[:1].expand(len(windows))).to(self.device)
         noise = torch.randn(clean.shape, generator=generator).to(self.device)
         made = self.network(add_noise(clean, noise, steps, self.signal), steps, windows, drop)
-        found = {"simple": masked_mean((made - clean).square(), known)}
+        wrong = (made - clean) / self.network.config.signal_scale
+        found = {"simple": masked_mean(wrong.square(), known)}
         total = found["simple"]
         if self.loss.velocity_weight:
             both = known[:, 1:] & known[:, :-1]
-            found["velocity"] = masked_mean((made - clean).diff(dim=1).square(), both)
+            found["velocity"] = masked_mean(wrong.diff(dim=1).square(), both)
             total = total + self.loss.velocity_weight * found["velocity"]
         return {"total": total, **found}
 
@@ -119,7 +120,7 @@ class Objective:
             noise = torch.randn(clean.shape, generator=generator).to(self.device)
             made = network(add_noise(clean, noise, steps, self.signal), steps, windows)
             total += masked_mean((made - clean).square(), known)
-        return total / len(VALIDATION_STEPS)
+        return total / len(VALIDATION_STEPS) / network.config.signal_scale**2
 
     def _drawn(self, clip_id: str, generator: torch.Generator) -> list[tuple[Recorded, int]]:
         starts = self.starts[clip_id]

@@ -12,30 +12,36 @@ import torch
 from torch import Tensor, nn
 
 from models.bimart.scene import FeatureConfig
-from models.common.sampling import TRAIN_STEPS
+from models.common.sampling import TRAIN_STEPS, alphas_cumprod
+from models.common.spline import projected
 from models.common.transformer import Encoder, TransformerConfig, attention_mask_of, sinusoid, to_frames, to_tokens
 
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """The defaults are the release's sizes. encoder: widths of the hidden layers of the two encoders, object and map.
+    """The defaults are the release's sizes. encoder: widths of the hidden layers of both encoders, of object and map.
 
-    latents: of object and contact are added to a token ("sum", released), or half its width each ("concatenate", paper).
+    latents: of object and contact are added to a token ("sum", released), or half its width each ("concatenate",
+    paper), or one encoder sees both ("joint"), which can tell where on the object a value of the map belongs.
     null: what stands for a contact map that is not told: learnt for every frame of a window (released), or one for all.
     told: which hands take part is told, and the others neither enter nor are made. diffusion_steps: of the 1,000 those
     that are trained; 50 are walked one by one, 1,000 by any sampler. position_dropout: of tokens with their positions.
-    floor: no number counts as varying less than this share of the mean spread of its kind.
+    floor: no number counts as varying less than this share of the mean spread of its kind. knot_frames: what is made
+    is a smooth curve with a knot so often (0: any numbers). signal_scale: spread of clean numbers beside the noise's 1:
+    the smaller, the later a motion is decided on (Chen 2023).
     """
 
     features: FeatureConfig = field(default_factory=FeatureConfig)
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     encoder: tuple[int, ...] = (1024, 1024)
-    latents: Literal["sum", "concatenate"] = "sum"
+    latents: Literal["sum", "concatenate", "joint"] = "sum"
     null: Literal["window", "frame"] = "window"
     told: bool = False
     diffusion_steps: int = 50
     position_dropout: float = 0.1
     floor: float = 0.0
+    knot_frames: int = 0
+    signal_scale: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -66,13 +72,20 @@ class Windows:
 class Prepared:
     """Windows as the Transformer takes them. conditional, unconditional: (B, token, width) with contact map, without.
 
-    attention_mask: (B, token + 1). mask: (B, F, D) which numbers there are.
+    attention_mask: (B, token + 1). mask: (B, F, D) which numbers there are. lengths: frames of each window.
     """
 
     conditional: Tensor
     unconditional: Tensor
     attention_mask: Tensor
     mask: Tensor
+    lengths: list[int]
+
+    def twice(self) -> "Prepared":
+        """All windows two times, with the contact map (as ``conditional``) and without."""
+        both = torch.cat((self.conditional, self.unconditional))
+        masks = [torch.cat((own, own)) for own in (self.attention_mask, self.mask)]
+        return Prepared(both, both, masks[0], masks[1], 2 * self.lengths)
 
 
 class Denoiser(nn.Module):
@@ -86,7 +99,7 @@ class Denoiser(nn.Module):
     contact_scale: Tensor
     basis_points: Tensor
     keypoint_ids: Tensor
-    side: Tensor
+    signal: Tensor
 
     def __init__(self, config: DenoiserConfig, size: int, with_contact: bool) -> None:
         super().__init__()
@@ -95,16 +108,20 @@ class Denoiser(nn.Module):
         self.x_in, self.x_out = nn.Linear(rows * size, width), nn.Linear(width, rows * size)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         latent = width // 2 if config.latents == "concatenate" and with_contact else width
-        self.object_in = _layers(features.scene_size, config.encoder, latent)
+        self.is_joint = config.latents == "joint" and with_contact
+        seen = features.scene_size + self.is_joint * features.contact_size
+        self.object_in = _layers(seen, config.encoder, latent)
         self.hands_in = nn.Linear(2, width, bias=False) if config.told else None
         self.tokens_in = nn.Linear(rows * width, width) if rows > 1 else nn.Identity()
         if with_contact:
-            self.contact_in = _layers(features.contact_size, config.encoder, latent)
-            self.null = nn.Parameter(0.02 * torch.randn(features.window if config.null == "window" else 1, latent))
+            told = features.contact_size if self.is_joint else latent
+            self.contact_in = nn.Identity() if self.is_joint else _layers(features.contact_size, config.encoder, latent)
+            self.null = nn.Parameter(0.02 * torch.randn(features.window if config.null == "window" else 1, told))
         self.encoder, self.drop = Encoder(config.transformer), nn.Dropout(config.position_dropout)
         for name, count in (("input", features.scene_size), ("", size), ("contact", features.contact_size)):
             self.register_buffer(f"{name}_mean".strip("_"), torch.zeros(count))
             self.register_buffer(f"{name}_scale".strip("_"), torch.ones(count))
+        self.register_buffer("signal", alphas_cumprod(), persistent=False)
         self.register_buffer("basis_points", torch.from_numpy(features.basis.points()))
         self.register_buffer("keypoint_ids", torch.zeros(features.keypoints, dtype=torch.long))
 
@@ -124,15 +141,15 @@ class Denoiser(nn.Module):
         """The part of ``forward`` that is the same at every step."""
         rows, seen = self.config.transformer.frames_per_token, self._scene(windows)
         frames = windows.frames[..., None]
-        latent = self.object_in(seen)
         hands = 0.0 if self.hands_in is None else self.hands_in(windows.hands.float())[:, None]
         conditional, unconditional = (
-            self.tokens_in(to_tokens(self._with_contact(latent, windows, known) * frames, rows)) + hands
+            self.tokens_in(to_tokens(self._encoded(seen, windows, known) * frames, rows)) + hands
             for known in (True, False)
         )
         mask = attention_mask_of(windows.frames, rows)
         attention_mask = torch.cat((mask.new_ones(len(mask), 1), mask), 1)
-        return Prepared(conditional, unconditional, attention_mask, self.channel_mask(windows))
+        lengths = windows.frames.sum(1).tolist() if self.config.knot_frames else []
+        return Prepared(conditional, unconditional, attention_mask, self.channel_mask(windows), lengths)
 
     def _scene(self, windows: Windows) -> Tensor:
         """(B, F, 3N + S + 1) normalised O, G and scale; zeros for a part that is not there."""
@@ -142,33 +159,45 @@ class Denoiser(nn.Module):
         known = torch.cat((there, there.new_ones(*there.shape[:2], seen.shape[-1] - there.shape[-1])), -1)
         return seen * known
 
-    def _with_contact(self, latent: Tensor, windows: Windows, known: bool) -> Tensor:
+    def _encoded(self, seen: Tensor, windows: Windows, known: bool) -> Tensor:
+        """(B, F, width) what a frame's token is told of its object, and of its contact map where that is known."""
         if not self.with_contact:
-            return latent
-        contact = self.null[: latent.shape[1]].expand(*latent.shape[:2], -1)
+            return self.object_in(seen)
+        contact = self.null[: seen.shape[1]].expand(*seen.shape[:2], -1)
         if known:
             assert windows.contact_m is not None
-            there = contact_channels(windows)
-            contact = self.contact_in((windows.contact_m - self.contact_mean) / self.contact_scale * there)
+            normalised = (windows.contact_m - self.contact_mean) / self.contact_scale
+            contact = self.contact_in(normalised * contact_channels(windows))
+        if self.is_joint:
+            return self.object_in(torch.cat((seen, contact), -1))
+        latent = self.object_in(seen)
         return latent + contact if self.config.latents == "sum" else torch.cat((latent, contact), -1)
 
     def denoise(self, x: Tensor, steps: Tensor, known: Prepared, tokens: Tensor) -> Tensor:
         """``forward`` with what is prepared; tokens: its conditional or unconditional ones."""
-        rows, width = self.config.transformer.frames_per_token, self.config.transformer.width
-        number = (steps + 1) * self.config.diffusion_steps / TRAIN_STEPS - 1
+        config, rows, width = self.config, self.config.transformer.frames_per_token, self.config.transformer.width
+        number = (steps + 1) * config.diffusion_steps / TRAIN_STEPS - 1
         time = self.step_in(sinusoid(number, width))[:, None]
-        frames = torch.cat((time, self.x_in(to_tokens(x * known.mask, rows)) + tokens), 1)
+        x = x * self._size(steps) * known.mask
+        frames = torch.cat((time, self.x_in(to_tokens(x, rows)) + tokens), 1)
         frames = self.drop(frames + sinusoid(torch.arange(frames.shape[1], device=x.device), width))
-        found = self.encoder(frames, known.attention_mask)[:, 1:]
-        return to_frames(self.x_out(found), x.shape[1], rows) * known.mask
+        found = to_frames(self.x_out(self.encoder(frames, known.attention_mask)[:, 1:]), x.shape[1], rows)
+        if config.knot_frames:
+            found = projected(found, known.lengths, config.knot_frames)
+        return found * known.mask * config.signal_scale
+
+    def _size(self, steps: Tensor) -> Tensor:
+        """(B, 1, 1) factors that make noised numbers of any ``signal_scale`` as wide as 1; 1 where that is 1."""
+        share = self.signal[steps][:, None, None]
+        return (share * self.config.signal_scale**2 + 1 - share).rsqrt()
 
     def encode(self, values: Tensor) -> Tensor:
         """Metres (..., D) to normalised numbers."""
-        return (values - self.mean) / self.scale
+        return (values - self.mean) / self.scale * self.config.signal_scale
 
     def decode(self, x: Tensor) -> Tensor:
         """The inverse of ``encode``."""
-        return x * self.scale + self.mean
+        return x / self.config.signal_scale * self.scale + self.mean
 
 
 class ContactModel(Denoiser):

@@ -147,9 +147,7 @@ class BimArt:
         self, network: Denoiser, known: Prepared, layout: Layout, wanted: Map
     ) -> Callable[[Tensor, Tensor], Tensor]:
         """The motion model told of its map, pulled to it, and away from what it does untold."""
-        config, calls = self.config, 0
-        told = replace(known, attention_mask=_twice(known.attention_mask), mask=_twice(known.mask))
-        tokens = torch.cat((known.conditional, known.unconditional))
+        config, calls, both = self.config, 0, known.twice()
 
         def denoise(x: Tensor, steps: Tensor) -> Tensor:
             nonlocal calls
@@ -158,8 +156,8 @@ class BimArt:
             if config.sampler.guidance == 0:
                 clean, untold = layout.joined(network.denoise(cut, own, known, known.conditional)), None
             else:
-                both = network.denoise(_twice(cut), _twice(own), told, tokens)
-                clean, untold = (layout.joined(part) for part in both.chunk(2))
+                found = network.denoise(torch.cat((cut, cut)), torch.cat((own, own)), both, both.conditional)
+                clean, untold = (layout.joined(part) for part in found.chunk(2))
             if config.guide != "off" and calls > config.sampler.steps * (1 - config.guide_share):
                 clean = self._pulled(clean, wanted)
             return clean if untold is None else combined(clean, untold, config.sampler.guidance, config.rule)
@@ -169,7 +167,7 @@ class BimArt:
     def _pulled(self, clean: Tensor, wanted: Map) -> Tensor:
         """(B, frame, D) with its positions moved by a step of contact-map guidance; the ways to the object stay."""
         network, half = self.motion, clean.shape[-1] // 2
-        scale = network.scale[:half].reshape(2, -1, 3)
+        scale = (network.scale[:half] / network.config.signal_scale).reshape(2, -1, 3)
         keypoints = network.decode(clean)[..., :half].unflatten(-1, (2, -1, 3))
         if self.config.guide == "released":
             step = released_step(keypoints, wanted, scale, network.config.features.window)
@@ -184,10 +182,6 @@ def _plain(network: Denoiser, known: Prepared, layout: Layout) -> Callable[[Tens
         return layout.joined(network.denoise(layout.cut(x), own, known, known.conditional))
 
     return denoise
-
-
-def _twice(values: Tensor) -> Tensor:
-    return torch.cat((values, values))
 
 
 def _made(hands: np.ndarray, contact_m: np.ndarray, motion: np.ndarray) -> Made:
