@@ -13,6 +13,7 @@ from pipelines.commands import (
     evaluate,
     generate,
     graph,
+    hands,
     import_checkpoint,
     inspect,
     lineage,
@@ -52,6 +53,7 @@ app.command("table")(evaluate.table)
 app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
+app.command("hands")(hands.hands)
 app.command("show")(show.show)
 
 
