@@ -177,8 +177,12 @@ def _object(
     known = [paths for name in names if not empty_reason((paths := StagePaths(profile, name)).clips)]
     for paths in known:
         if wish.object in list(open_store(paths.clips, hands).objects["object"]):
-            limits = limits or _recorded_range(wish.object, paths, hands)
-            return stored_object(wish.object, paths, hands), limits, []
+            recorded, notes = _recorded_range(wish.object, paths, hands), []
+            if recorded is not None and limits is None:
+                notes.append("recorded with its hinge at {:.0f} to {:.0f} deg".format(*np.degrees(recorded)))
+                # Recordings say to which side it opens, not how far it could.
+                limits = (-np.pi, recorded[1]) if -recorded[0] > recorded[1] else (recorded[0], np.pi)
+            return stored_object(wish.object, paths, hands), limits, notes
     if not known:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb)", wish.object, "correct the path")
     return stored_object(wish.object, known[0], hands), limits, []  # says which there are
