@@ -9,6 +9,7 @@ import sys
 from bench import (
     adapters,
     batches,
+    bimart,
     evaluate,
     evaluator,
     kernels,
@@ -32,6 +33,7 @@ BENCHMARKS = {
     "kernels": kernels.main,
     "surface": surface.main,
     "sensors": sensors.main,
+    "bimart": bimart.main,
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,

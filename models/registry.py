@@ -57,7 +57,9 @@ NETWORKS = {
     "bimart-motion": "models.bimart.motion_training:MOTION",
 }
 # Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
-IF_LISTED = ("manipnet",)
+IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
+# Networks of such a family under other names.
+LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
 
 
 def family_names() -> list[str]:

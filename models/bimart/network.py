@@ -23,7 +23,7 @@ class DenoiserConfig:
 
     latents: of object and contact are added to a token ("sum", released), or half its width each ("concatenate",
     paper), or one encoder sees both ("joint"), which can tell where on the object a value of the map belongs.
-    null: what stands for a contact map that is not told: learnt for every frame of a window (released), or one for all.
+    untold: what stands for a map that is not told, learnt for every frame of a window (released), or one for all.
     told: which hands take part is told, and the others neither enter nor are made. diffusion_steps: of the 1,000 those
     that are trained; 50 are walked one by one, 1,000 by any sampler. position_dropout: of tokens with their positions.
     floor: no number counts as varying less than this share of the mean spread of its kind. knot_frames: what is made
@@ -35,7 +35,7 @@ class DenoiserConfig:
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     encoder: tuple[int, ...] = (1024, 1024)
     latents: Literal["sum", "concatenate", "joint"] = "sum"
-    null: Literal["window", "frame"] = "window"
+    untold: Literal["window", "frame"] = "window"
     told: bool = False
     diffusion_steps: int = 50
     position_dropout: float = 0.1
@@ -116,7 +116,7 @@ class Denoiser(nn.Module):
         if with_contact:
             told = features.contact_size if self.is_joint else latent
             self.contact_in = nn.Identity() if self.is_joint else _layers(features.contact_size, config.encoder, latent)
-            self.null = nn.Parameter(0.02 * torch.randn(features.window if config.null == "window" else 1, told))
+            self.null = nn.Parameter(0.02 * torch.randn(features.window if config.untold == "window" else 1, told))
         self.encoder, self.drop = Encoder(config.transformer), nn.Dropout(config.position_dropout)
         for name, count in (("input", features.scene_size), ("", size), ("contact", features.contact_size)):
             self.register_buffer(f"{name}_mean".strip("_"), torch.zeros(count))

@@ -18,6 +18,7 @@ STAGES = (
     "split",
     "evaluator",
     "train",
+    "train_listed",
     "sample",
     "evaluate",
     "controls",

@@ -109,7 +109,7 @@ def test_the_map_is_not_seen_where_it_is_dropped_and_the_contact_model_never_see
 
 
 @pytest.mark.parametrize(
-    "change", [{"latents": "concatenate"}, {"latents": "joint"}, {"null": "frame"}, {"knot_frames": 4}]
+    "change", [{"latents": "concatenate"}, {"latents": "joint"}, {"untold": "frame"}, {"knot_frames": 4}]
 )
 def test_every_kind_of_encoding_keeps_these_promises(change: dict) -> None:
     network = MotionModel(replace(TINY, **change)).eval()
