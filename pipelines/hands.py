@@ -182,10 +182,10 @@ def _object(
                 notes.append("recorded with its hinge at {:.0f} to {:.0f} deg".format(*np.degrees(recorded)))
                 # Recordings say to which side it opens, not how far it could.
                 limits = (-np.pi, recorded[1]) if -recorded[0] > recorded[1] else (recorded[0], np.pi)
-            return stored_object(wish.object, paths, hands), limits, notes
+            return stored_object(wish.object, paths.clips, hands), limits, notes
     if not known:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb)", wish.object, "correct the path")
-    return stored_object(wish.object, known[0], hands), limits, []  # says which there are
+    return stored_object(wish.object, known[0].clips, hands), limits, []  # says which there are
 
 
 def _recorded_range(name: str, paths: StagePaths, hands: HandPair) -> tuple[float, float] | None:

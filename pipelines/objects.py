@@ -1,12 +1,12 @@
 """The object a command is told: the user's mesh file, or one of a dataset."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.store.store import open_store
-from pipelines.stages.base import StagePaths
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,9 @@ class MeshWish:
     hinge: str = ""
 
 
-def stored_object(name: str, paths: StagePaths, hands: HandPair) -> ObjectModel:
+def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
     """An object of the dataset by name. Raises BadInput that lists the names there are."""
-    store = open_store(paths.clips, hands)
+    store = open_store(clips, hands)
     names = list(store.objects["object"])
     if name not in names:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"

@@ -1,65 +1,33 @@
-"""``hoidata hands``: both hands for any motion of an object."""
+"""Which hand a command computes with, where no profile says so."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING
 
-import typer
+from hoidata.errors import MissingResource
 
-from pipelines.commands.project import current_profile, enter_project
+if TYPE_CHECKING:
+    from hoidata.hands import HandPair
 
 
-def hands(
-    out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
-    object: Annotated[
-        str,
-        typer.Argument(metavar="[MESH]", help="A mesh file (OBJ, PLY, STL, GLB), or a dataset's object."),
-    ] = "",
-    script: Annotated[
-        str,
-        typer.Option(help="What the object does, or a file: 'lift 15 cm, open to 70 deg in 1.5 s, hold, put down'."),
-    ] = "",
-    keyframes: Annotated[str, typer.Option(help="A .csv or .json file of times, places, turns and angles.")] = "",
-    clip: Annotated[str, typer.Option(help="A stored clip, whose object and motion are taken.")] = "",
-    motion: Annotated[
-        str, typer.Option(help="A motion.npz of `hoidata generate`, whose object's motion is taken.")
-    ] = "",
-    samples: Annotated[int, typer.Option(help="How many motions, side by side.", min=1, max=16)] = 1,
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
-    hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Which hands.")] = "both",
-    length: Annotated[float | None, typer.Option(help="Seconds it is to last, instead of its own time.")] = None,
-    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm or inch; metres when left out.")] = "",
-    up: Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")] = "",
-    hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
-    hinge_range: Annotated[str, typer.Option(help="How far it opens, like 0:110 degrees; 0 is as drawn.")] = "",
-    model: Annotated[str, typer.Option(help="Dataset whose networks to use; else the first that has them.")] = "",
-    profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
-) -> None:
-    """An object's motion -> contact maps, hands, refinement; writes arrays, animated GLBs and a page."""
-    here = Path.cwd()
-    project = enter_project()
-    from pipelines.hands import HandsWish, hands_files
-    from pipelines.objects import MeshWish
-    from pipelines.params import read_params
+def chosen_hands(choice: str) -> "HandPair":
+    """``embedded``, or the folder of MANO's files; for nothing those that are registered, else the embedded one."""
+    from hoidata.hands import load_embedded_hands, load_mano_hands
+    from pipelines.stages.base import HAND, own_root
 
-    def found(name: str) -> str:
-        return str(here / name) if name and len(name) < 250 and "\n" not in name and (here / name).is_file() else name
+    folder = Path(choice) if choice not in ("", "embedded") else (own_root(HAND) if not choice else None)
+    return load_embedded_hands() if folder is None else load_mano_hands(folder)
 
-    wish = HandsWish(
-        found(object),
-        found(script),
-        str(here / keyframes) if keyframes else "",
-        clip,
-        str(here / motion) if motion else "",
-        MeshWish(unit, up, hinge),
-        hinge_range,
-        hand,
-        samples,
-        seed,
-        length,
-        model,
-    )
-    written = hands_files(wish, profile or current_profile(), tuple(read_params(project)["datasets"]), out)
-    for note in written.notes:
-        typer.echo(note, err=True)
-    for path in written.paths:
-        typer.echo(path)
+
+def hands_of(digest: str, what: str) -> "HandPair":
+    """The hand of a digest that ``what`` was made with: the embedded one, or the user's MANO files.
+
+    Raises MissingResource where it is neither.
+    """
+    embedded, own = chosen_hands("embedded"), chosen_hands("")
+    found = next((hands for hands in (embedded, own) if hands.digest == digest), None)
+    if found is None:
+        raise MissingResource(
+            f"{what} was made with a hand ({digest[:12]}) that is not here; name the folder of the MANO files in "
+            "HOIDATA_MANO, or register it in a project: `hoidata raw scan mano --root FOLDER`"
+        )
+    return found
