@@ -10,6 +10,7 @@ from bench import (
     adapters,
     batches,
     bimart,
+    borders,
     evaluate,
     evaluator,
     kernels,
@@ -43,6 +44,7 @@ BENCHMARKS = {
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,
     "refinement": refinement.main,
+    "borders": borders.main,
     "manipnet": manipnet.main,
 }
 
