@@ -44,6 +44,7 @@ from hoidata.files import (
     torch_pickle,
 )
 from hoidata.hands import mano, model
+from hoidata.object_paths import keyframes, script
 from hoidata.objects import mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
@@ -121,6 +122,7 @@ def all_targets() -> dict[str, Target]:
         _texts(),
         _trajectories(),
         _hoi4d(),
+        _object_paths(),
         _json_files(),
         _settings(),
     )
@@ -426,6 +428,27 @@ def _hoi4d() -> list[Target]:
                 *(hoi4d_files.object_poses, hoi4d_files._part_pose, hoi4d_files._numbers, hoi4d_files.action_events),
                 *(hoi4d_files._numbers_of, hoi4d_files._clock_s, hoi4d_files.hinge_joint, hoi4d_files._mesh_of),
             ),
+        ),
+    ]
+
+
+def _object_paths() -> list[Target]:
+    thing = seeds.hinged_object()
+    words = (b",", b"\n", b"nan", b"1e400", b"-", b"time_s", b"hinge_deg", b"z_cm", b"\xff", b'{"', b"[", b"null")
+    return [
+        Target(
+            "object-keyframes",
+            seeds.keyframe_files,
+            lambda data: keyframes.keyframed_path(thing, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0)),
+            functions_of(keyframes, ("read_keyframes",)),
+            words,
+        ),
+        Target(
+            "object-scripts",
+            lambda: [line.encode() for line in seeds.OBJECT_SCRIPTS],
+            lambda data: script.scripted_path(thing, data.decode("utf-8", "replace"), (0.0, 2.0)),
+            functions_of(script),
+            (b" to ", b" by ", b" in ", b" and ", b" cm", b" deg", b"9e9", b"-", "°".encode(), "٣".encode(), b"#"),
         ),
     ]
 

@@ -20,6 +20,7 @@ from pipelines.commands import (
     init,
     inspect,
     lineage,
+    object_hands,
     raw,
     settings,
     share,
@@ -58,6 +59,7 @@ app.command("table")(evaluate.table)
 app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
+app.command("hands")(object_hands.hands)
 app.command("show")(show.show)
 
 
