@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -17,8 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, told_in_words
 from hoidata.files.atomic import exclusive, write_whole
+from pipelines.warm import WarmProcess
 
 CODE = "code"
 RUN = Path(".hoidata/repro")
@@ -27,6 +29,7 @@ DURATIONS = Path(".hoidata/durations.json")
 # What every run of a single stage would import anew, about a second each time.
 PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
 TAIL = 15
+_ROOM = 1 << 20  # bytes that must fit beside the cache before anything is begun
 Upstream = Mapping[str, frozenset[str]]
 RunStage = Callable[[str], int]
 
@@ -57,6 +60,8 @@ def reproduce_side_by_side(
             _tell(CODE, run, 0)
         else:
             upstream = stale_stages(targets, children.forced if force else None)
+            if len(upstream) > jobs:
+                children.warm.start()
             run_all(upstream, pool, jobs, run_stage, run)
             write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
         run.wall = time.monotonic() - start
@@ -93,12 +98,23 @@ def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset
         known = {CODE, *(forced or ())}
         changed = [stage for stage in stages if stage.addressing not in known and stage.changed()]
         changed += [stage for stage in stages if stage.addressing in known - {CODE}]
+        if changed:
+            _try_writing(Path(repo.cache.local.path))
         stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
         return {
             stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
             for stage in stages
             if stage in stale
         }
+
+
+def _try_writing(folder: Path) -> None:
+    """Raise MachineTrouble where DVC could not keep what stages make: they would run for nothing."""
+    with told_in_words():
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder) as stream:
+            stream.write(bytes(_ROOM))
+            stream.flush()
 
 
 def run_all(upstream: Upstream, pool: ThreadPoolExecutor, jobs: int, run_stage: RunStage, run: Run) -> None:
@@ -203,6 +219,7 @@ class _Children:
         self.context = multiprocessing.get_context("forkserver")
         self.processes: set[Any] = set()
         self.forced: set[str] = set()
+        self.warm = WarmProcess()
 
     def __enter__(self) -> "_Children":
         self.context.set_forkserver_preload(PRELOADED)
@@ -215,12 +232,14 @@ class _Children:
         for process in self.processes:
             if process.is_alive():
                 os.killpg(process.pid, signal.SIGINT)
+        self.warm.close()
 
     def run(self, name: str) -> int:
         """DVC's exit code for one stage; what it prints goes to the stage's log."""
         LOGS.mkdir(parents=True, exist_ok=True)
+        environment = {"HOIDATA_JOBS": str(self.cores), **self.warm.environment}
         process = self.context.Process(
-            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, self.cores)
+            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, environment)
         )
         process.start()
         self.processes.add(process)
@@ -232,13 +251,22 @@ def _stop(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _run_single_stage(project: Path, name: str, force: bool, cores: int) -> None:
+def _end_with_parent() -> None:
+    """Interrupt this stage when the run it belongs to is gone, however it ended: nobody would wait for it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.killpg(0, signal.SIGINT)
+
+
+def _run_single_stage(project: Path, name: str, force: bool, environment: dict[str, str]) -> None:
     """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
     from dvc.cli import main
 
     os.setpgrp()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.chdir(project)
-    os.environ["HOIDATA_JOBS"] = str(cores)
+    os.environ.update(environment)
     with log_of(name).open("wb") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)

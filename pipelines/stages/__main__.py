@@ -5,7 +5,10 @@ import importlib
 import os
 import sys
 from dataclasses import replace
+from io import TextIOWrapper
 from pathlib import Path
+
+from pipelines.warm import ENVIRONMENT, run_warm
 
 STAGES = (
     "code",
@@ -27,7 +30,10 @@ STAGES = (
 
 
 def main() -> int:
-    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do."""
+    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do; 130: Ctrl-C."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
     parser.add_argument("--profile", default="", help="the one params.yaml chooses; no other has its settings there")
@@ -35,9 +41,10 @@ def main() -> int:
     parser.add_argument("--model", default="")
     parser.add_argument("--family", default="")
     options = parser.parse_args()
-    # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read as torch loads.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("GOMP_SPINCOUNT", "0")
+    if (code := run_warm("pipelines.stages", sys.argv[1:])) is not None:
+        return code
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     try:
         module = importlib.import_module(f"pipelines.stages.{options.stage}")
     except ModuleNotFoundError as error:
@@ -47,7 +54,7 @@ def main() -> int:
 
 
 def _run(module, options: argparse.Namespace) -> int:
-    from hoidata.errors import BadInput, HoidataError
+    from hoidata.errors import BadInput, HoidataError, told_in_words
     from pipelines.params import read_params
     from pipelines.stages.base import StagePaths
 
@@ -56,7 +63,8 @@ def _run(module, options: argparse.Namespace) -> int:
         chosen = read_params(Path())["profile"]
         if paths.profile not in ("", chosen):
             raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "choose it there")
-        module.run(replace(paths, profile=chosen))
+        with told_in_words():
+            module.run(replace(paths, profile=chosen))
     except HoidataError as error:
         print(f"{options.stage} of {paths}: {error}", file=sys.stderr)
         return 1
@@ -64,4 +72,8 @@ def _run(module, options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        print(f"{' '.join(sys.argv[1:])}: interrupted; run it again, nothing that was there is lost", file=sys.stderr)
+        sys.exit(130)
