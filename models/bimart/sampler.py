@@ -26,9 +26,10 @@ IDLE_M = 0.2  # a hand that is farther than this from the object takes no part
 class SamplingConfig:
     """How both networks are walked. sampler: ``guidance`` is lambda_f of classifier-free guidance; 0: none.
 
-    rule: of that guidance. with_map: motions are told contact maps. guide: contact-map guidance; in ``guide_share``, the
-    last part, of the steps. overlapping: windows of a path share their frames at every step; else they are made apart
-    and put side by side. contact_anchor: of G for the contact model, otherwise than it learnt (released: "before").
+    rule: of that guidance. with_map: motions are told contact maps. guide: contact-map guidance, in the last
+    ``guide_share`` of the steps. overlapping: windows of a path share their frames at every step; else they are made
+    apart and put side by side. contact_anchor: of G for the contact model, otherwise than it learnt (released:
+    "before").
     """
 
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig("ddim", 20, 0.5))
