@@ -89,7 +89,7 @@ def draw_conventions(figure: Figure, data: Path) -> None:
     for number, name in enumerate(("h2o", "grab", "arctic", "manipnet", "taco")):
         adapter, facts = get_adapter(name), dataset_facts(name)
         convention, frame = adapter.hand_convention, adapter.frame
-        axes = figure.add_subplot(1, 5, number + 1, projection="3d")
+        axes = figure.add_subplot(2, 3, number + 1, projection="3d")
         pose = model.mean_pose if convention.fingers == "mean-relative" else np.zeros(45)
         vertices = posed(pose)
         mesh(axes, vertices, model.faces, SAND, 0.9)
@@ -218,7 +218,7 @@ def _label(name: str) -> str:
 
 DRAWINGS: dict[str, tuple[Callable[[Figure, Path], None], tuple[float, float]]] = {
     "clip": (draw_clip, (12, 3.2)),
-    "conventions": (draw_conventions, (14, 4.2)),
+    "conventions": (draw_conventions, (9, 8.5)),
     "contact": (draw_contact, (10, 4.2)),
     "hand-type": (draw_hand_type, (8, 3.2)),
     "splits": (draw_splits, (11, 4.4)),
