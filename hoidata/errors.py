@@ -1,6 +1,12 @@
 """Errors that name the place, what was expected, what came, and what to do."""
 
+import errno
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+_NO_ROOM = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_NOT_ALLOWED = {errno.EROFS, errno.EACCES, errno.EPERM}
 
 
 class HoidataError(Exception):
@@ -22,6 +28,38 @@ class BadInput(HoidataError):
 
     def __reduce__(self) -> tuple:
         return type(self), (self.where, self.expected, self.got, self.remedy)
+
+
+class ChangedMeanwhile(BadInput):
+    """A raw file is not, or no longer, as it was listed: the data moved under a run; no sequence is to blame."""
+
+
+class MachineTrouble(HoidataError):
+    """The machine failed, not what it was given: no room on the disk, nothing may be written, a disk that fails."""
+
+
+@contextmanager
+def told_in_words() -> Iterator[None]:
+    """What the system says of a full or read-only disk, or of too little memory, raised as MachineTrouble."""
+    try:
+        yield
+    except (OSError, MemoryError) as error:
+        if isinstance(error, BrokenPipeError) or not (words := _trouble(error)):
+            raise
+        raise MachineTrouble(words) from error
+
+
+def _trouble(error: OSError | MemoryError) -> str:
+    """The trouble and what to do, in words; empty where the error is more likely a defect."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory ({error}); end other programs or lower --jobs, and run again"
+    kept = "what was there before is as it was. Run again: finished work is taken up"
+    # NumPy and Arrow tell of a write that came short without a number.
+    if error.errno in _NO_ROOM or (error.errno is None and "written" in str(error)) or "No space left" in str(error):
+        return f"{error}: no room; make some, {kept}"
+    if error.errno in _NOT_ALLOWED:
+        return f"{error}: allow writing there; {kept}"
+    return f"{error}: the disk fails; {kept}" if error.errno == errno.EIO else ""
 
 
 class MissingResource(HoidataError):

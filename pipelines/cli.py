@@ -1,10 +1,12 @@
 """The ``hoidata`` command. Every sub-command imports what it needs when it runs, so that ``--help`` is quick."""
 
 import sys
+from io import TextIOWrapper
+from pathlib import Path
 
 import typer
 
-from hoidata.errors import HoidataError
+from hoidata.errors import HoidataError, told_in_words
 from pipelines.commands import (
     adapters,
     animate,
@@ -59,16 +61,34 @@ app.command("animate")(animate.animate)
 app.command("show")(show.show)
 
 
+@app.callback()
+def _check_what_is_read() -> None:
+    from hoidata.files.written import ask_digests_of
+
+    ask_digests_of(_written_digest)
+
+
 def main() -> None:
-    """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given."""
+    """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given, or with the
+    machine (a full disk, a folder that cannot be written); 130 after Ctrl-C."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
     try:
-        app()
+        with told_in_words():
+            app()
     except HoidataError as error:
         from rich.console import Console
         from rich.markup import escape
 
         Console(stderr=True).print(f"[bold red]hoidata:[/] {escape(str(error))}", highlight=False, soft_wrap=True)
         sys.exit(1)
+
+
+def _written_digest(path: Path) -> str | None:
+    from pipelines.lineage.locks import written_digest
+
+    return written_digest(path)
 
 
 if __name__ == "__main__":

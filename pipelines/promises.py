@@ -4,13 +4,13 @@ A control that keeps its promise shows that the figure sees what was taken from 
 figure that can be won without it.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
+from hoidata.files.written import read_json
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
 
 TRUTH = "ground-truth"
@@ -84,7 +84,7 @@ def datasets_below(folder: Path) -> list[Path]:
 def read_rows(folder: Path) -> dict[str, dict[str, Any]]:
     """What was measured of each family of one dataset, controls included."""
     paths = [*folder.glob("*.json"), *folder.glob("controls/*.json")]
-    rows = {path.stem: json.loads(path.read_text(encoding="utf-8")) for path in sorted(paths)}
+    rows = {path.stem: read_json(path) for path in sorted(paths)}
     return {name: row for name, row in rows.items() if "figures" in row}
 
 

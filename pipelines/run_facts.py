@@ -1,8 +1,8 @@
 """What a person reads after a run: clips, what was left out, leading figures of every row, where the pages are."""
 
-import json
 from pathlib import Path
 
+from hoidata.files.written import read_json
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import read_params
 
@@ -27,12 +27,12 @@ def describe_results(project: Path, profile: str) -> str:
 
 
 def _counts(dataset: str, data: Path) -> str:
-    counts = json.loads((data / "clips/meta/info.json").read_text())["counts"]
+    counts = read_json(data / "clips/meta/info.json")["counts"]
     splits = data / "splits/info.json"
-    parts = json.loads(splits.read_text()).get("chosen", {}).get("clips", {}) if splits.is_file() else {}
+    parts = read_json(splits).get("chosen", {}).get("clips", {}) if splits.is_file() else {}
     numbers = [parts.get(name, "") for name in ("train", "validation", "test")]
     return f"| {' | '.join(map(str, (dataset, counts['clips'], counts['quarantined'], *numbers)))} |"
 
 
 def _measured(path: Path) -> bool:
-    return path.is_file() and "figures" in json.loads(path.read_text())
+    return path.is_file() and "figures" in read_json(path)

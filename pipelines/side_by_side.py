@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, told_in_words
 from hoidata.files.atomic import exclusive, write_whole
 from pipelines.warm import WarmProcess
 
@@ -28,6 +29,7 @@ DURATIONS = Path(".hoidata/durations.json")
 # What every run of a single stage would import anew, about a second each time.
 PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
 TAIL = 15
+_ROOM = 1 << 20  # bytes that must fit beside the cache before anything is begun
 Upstream = Mapping[str, frozenset[str]]
 RunStage = Callable[[str], int]
 
@@ -96,12 +98,23 @@ def _ask_dvc(targets: list[str], forced: set[str] | None) -> dict[str, frozenset
         known = {CODE, *(forced or ())}
         changed = [stage for stage in stages if stage.addressing not in known and stage.changed()]
         changed += [stage for stage in stages if stage.addressing in known - {CODE}]
+        if changed:
+            _try_writing(Path(repo.cache.local.path))
         stale = set(changed).union(*(networkx.ancestors(needed, stage) for stage in changed))
         return {
             stage.addressing: frozenset(other.addressing for other in needed.successors(stage) if other in stale)
             for stage in stages
             if stage in stale
         }
+
+
+def _try_writing(folder: Path) -> None:
+    """Raise MachineTrouble where DVC could not keep what stages make: they would run for nothing."""
+    with told_in_words():
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder) as stream:
+            stream.write(bytes(_ROOM))
+            stream.flush()
 
 
 def run_all(upstream: Upstream, pool: ThreadPoolExecutor, jobs: int, run_stage: RunStage, run: Run) -> None:
@@ -238,11 +251,20 @@ def _stop(*_: object) -> None:
     raise KeyboardInterrupt
 
 
+def _end_with_parent() -> None:
+    """Interrupt this stage when the run it belongs to is gone, however it ended: nobody would wait for it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os.killpg(0, signal.SIGINT)
+
+
 def _run_single_stage(project: Path, name: str, force: bool, environment: dict[str, str]) -> None:
     """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
     from dvc.cli import main
 
     os.setpgrp()
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.chdir(project)
     os.environ.update(environment)
     with log_of(name).open("wb") as output:

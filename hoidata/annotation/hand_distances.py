@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from hoidata.clips import SIDES, HandType, Side
 from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
+from hoidata.files.written import read_table
 from hoidata.store.hand_evidence import FIRST_FRAME, HandEvidence, hand_type_of
 
 
@@ -38,7 +38,7 @@ def hand_types_at(annotation: str | Path, threshold_m: float) -> dict[str, HandT
     if not threshold_m > 0:
         raise BadInput("threshold_m", "metres above 0", repr(threshold_m), "give a length such as 0.02")
     minima = {side: f"min_{side}_m" for side in SIDES}
-    table = pd.read_parquet(Path(annotation) / "hand_type.parquet", columns=["clip_id", *minima.values()])
+    table = read_table(Path(annotation) / "hand_type.parquet", ["clip_id", *minima.values()])
     found: dict[str, HandType | None] = {}
     for clip_id, *values in table.itertuples(index=False):
         closest: dict[Side, float] = dict(zip(SIDES, (float(value) for value in values), strict=True))

@@ -3,10 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import orjson
-
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M
 from hoidata.errors import BadInput, MissingResource
+from hoidata.files.written import read_json
 from hoidata.objects.sampling import POINT_COUNT
 from hoidata.settings import build_config
 
@@ -35,5 +34,5 @@ def read_contact_settings(folder: str | Path) -> ContactSettings:
     path = Path(folder) / "info.json"
     if not path.is_file():
         raise MissingResource(f"{folder} is not there: run the stage 'contact' of this dataset first")
-    info = orjson.loads(path.read_bytes())
+    info = read_json(path)
     return build_config(ContactSettings, {name: info.get(name) for name in ("points", "threshold_m")}, str(path))

@@ -19,7 +19,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
 from hoidata.conversion.finished import FinishedWork, Item, job_of
 from hoidata.datasets.base import Adapter, RawTree, Recorded, SequenceKey
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
 from hoidata.store.info import store_info
@@ -66,13 +66,15 @@ def convert_dataset(
     manifest: Mapping[str, SourceFile] | Iterable[SourceFile] | None = None,
     progress: bool = True,
     synthetic: bool = False,
+    stop_on_change: bool = False,
 ) -> ConversionSummary:
     """Convert every sequence below ``root`` and write the store ``out``.
 
     root: None, or a folder without sequences, gives a valid empty store that says why. jobs: worker processes; order
     and bytes of the result do not depend on it. manifest: each file read must be listed with its SHA-256.
-    synthetic: the raw data was generated; every clip and the store say so. progress: a bar on stderr and the summary
-    on stdout.
+    stop_on_change: raise ChangedMeanwhile for a listed file that is gone or another; by default its sequences are
+    left out. synthetic: the raw data was generated; every clip and the store say so. progress: a bar on stderr and the
+    summary on stdout.
 
     A run that ends early, even by ``kill -9``, leaves ``.<name>.work`` beside ``out``; the next one takes up what was
     finished there if neither raw files, code nor settings have changed. A sequence whose worker process dies, and dies
@@ -86,7 +88,7 @@ def convert_dataset(
     listed = None if files is None else {item.path: item for item in files}
     out, root = Path(out), Path(root or ".")
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
-    convert = SequenceConverter(adapter, root, hands, listed, synthetic, work)
+    convert = SequenceConverter(adapter, root, hands, listed, synthetic, work, stop_on_change)
     with exclusive(out) as lock:
         remove_leftovers(out)
         work.open(job_of(adapter, hands, root, keys, listed, synthetic))
@@ -112,6 +114,7 @@ class SequenceConverter:
     manifest: Mapping[str, SourceFile] | None
     synthetic: bool
     work: FinishedWork
+    stop_on_change: bool = False
 
     def __call__(self, key: SequenceKey) -> None:
         raw = RawTree(self.root, self.manifest)
@@ -123,6 +126,8 @@ class SequenceConverter:
             if isinstance(self.adapter, Recorded) and any(isinstance(item, Clip) for item in results):
                 results += self.adapter.recordings(raw, key)
         except BadInput as error:
+            if self.stop_on_change and isinstance(error, ChangedMeanwhile):
+                raise
             self.work.keep(key, [_left_out(key, self.root, error)], None)
         except Exception as error:  # one sequence must not stop the others; the reason says that this is our fault
             problem = BadInput(str(key), "a sequence the adapter can read", repr(error), DEFECT)

@@ -18,7 +18,7 @@ from hoidata.clips.hand_parameters import HandConvention
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording
 from hoidata.dataset_folders import DatasetFacts
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 
@@ -165,12 +165,12 @@ class RawTree:
         self._record(SourceFile(path, place.stat().st_size, sha256_file(place)))
         return place
 
-    def read(self, path: str) -> bytes:
-        """The bytes of one file of at most 256 MiB, recorded and checked."""
+    def read(self, path: str, largest: int = _LARGEST_FILE) -> bytes:
+        """The bytes of one file of at most ``largest`` bytes (256 MiB), recorded and checked."""
         place = self._inside(path)
         size = place.stat().st_size
-        if size > _LARGEST_FILE:
-            raise BadInput(path, f"a file of at most {_LARGEST_FILE} bytes", f"{size} bytes")
+        if size > largest:
+            raise BadInput(path, f"a file of at most {largest} bytes", f"{size} bytes")
         data = place.read_bytes()
         self._record(SourceFile(path, len(data), sha256_bytes(data)))
         return data
@@ -234,7 +234,8 @@ class RawTree:
     def _inside(self, path: str) -> Path:
         place = self.root / path
         if not place.is_file():
-            raise BadInput(path, "a file", "nothing there", "check that the download is complete and unpacked here")
+            kind = ChangedMeanwhile if path in (self.manifest or ()) else BadInput
+            raise kind(path, "a file", "nothing there", "check that the download is complete and unpacked here")
         if not self._is_inside(path):
             raise BadInput(path, "a file inside the raw folder", "a link that leaves it", "replace the link by a copy")
         return place
@@ -251,7 +252,7 @@ class RawTree:
         if listed.sha256 != found.sha256:
             expected = f"SHA-256 {listed.sha256[:12]} ({listed.size} bytes)"
             got = f"{found.sha256[:12]} ({found.size} bytes)"
-            raise BadInput(found.path, expected, got, "restore the file, or scan the raw folder again")
+            raise ChangedMeanwhile(found.path, expected, got, "restore the file, or scan the raw folder again")
 
 
 def _read_small(folder: int, name: str) -> bytes | None:

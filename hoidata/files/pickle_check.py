@@ -14,7 +14,7 @@ from typing import Any
 REFUSED_OPCODES = frozenset(
     {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"} | {"DUP", "LONG4"}
 )
-_MOST_OPCODES = 3_000_000  # some seconds; numbers lie within few opcodes, a tensor takes about 50
+_MOST_OPCODES = 1_000_000  # a second; numbers lie within few opcodes, a tensor takes about 50
 _PUT_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET_OPCODES = {"GET", "BINGET", "LONG_BINGET"}
 _TUPLES = {"TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_TUPLE"}

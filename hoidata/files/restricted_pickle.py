@@ -8,7 +8,7 @@ import io
 import math
 import pickle
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from types import FunctionType
 from typing import Any, BinaryIO
@@ -46,8 +46,10 @@ def restricted_load(
         raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
     try:
         check_opcodes(data)
-        budget = Budget(_GROWTH * len(data) + _FREE_BYTES)
-        return _plain(_Unpickler(io.BytesIO(data), allow, encoding, budget).load(), {})
+        most = _GROWTH * len(data) + _FREE_BYTES
+        value = _Unpickler(io.BytesIO(data), allow, encoding, Budget(most)).load()
+        _written_out(value, {}, most)
+        return _plain(value, {})
     except BadInput:
         raise
     except Exception as error:  # a malformed pickle can raise anything
@@ -119,6 +121,39 @@ class _Callable(StandIn):
         elif isinstance(result, bytes | set | dict):
             self._budget.spend(sys.getsizeof(result))
         return result
+
+
+def _written_out(value: Any, known: dict[int, int | None], most: int) -> int:
+    """Bytes a value takes with all it shares written out, as NumPy makes one array of lists of lists.
+
+    A few hundred bytes of pickle can hold one list 2^60 times. Raises UnpicklingError above ``most`` and for values
+    that hold themselves.
+    """
+    if isinstance(value, str | bytes | bytearray):
+        return len(value)
+    items = _items(value)
+    if not len(items):
+        return value.nbytes if isinstance(value, np.ndarray) else 8
+    if id(value) not in known:
+        known[id(value)] = None
+        known[id(value)] = 8 + sum(_written_out(item, known, most) for item in items)
+    size = known[id(value)]
+    if size is None:
+        raise pickle.UnpicklingError("a value that holds itself")
+    if size > most:
+        raise pickle.UnpicklingError("values that are, written out, far larger than the file")
+    return size
+
+
+def _items(value: Any) -> Collection[Any]:
+    """What a value holds, keys of dictionaries and members of sets apart, which are small."""
+    if isinstance(value, dict):
+        return value.values()
+    if isinstance(value, np.ndarray):
+        return value.ravel().tolist() if value.dtype.hasobject else ()
+    if isinstance(value, Record):
+        return () if value.state is None else (value.state,)
+    return value if isinstance(value, list | tuple) else ()
 
 
 def _plain(value: Any, seen: dict[int, tuple[Any, Any]]) -> Any:

@@ -14,6 +14,7 @@ from hoidata.files.digest import sha256_bytes
 
 METADATA_KEY = "hoidata"
 MAX_HEADER_BYTES = 100_000_000
+MOST_CONTAINERS = 2_000_000  # a list takes sixty bytes, and two in the file
 BLANK = "0" * 64
 # What to write into the metadata before ``sealed``.
 OPEN_SEAL = {"payload_sha256": BLANK, "file_sha256": BLANK}
@@ -62,6 +63,8 @@ def read_metadata(path: str | Path) -> dict[str, Any]:
         if not 2 <= length <= MAX_HEADER_BYTES:
             raise BadInput(path, "a safetensors file", f"a header of {length} bytes", "train it again")
         header = stream.read(length)
+    if header.count(b"[") + header.count(b"{") > MOST_CONTAINERS:
+        raise BadInput(path, f"a header of at most {MOST_CONTAINERS} lists", "more", "train it again")
     try:
         values = json.loads(json.loads(header)["__metadata__"][METADATA_KEY])
     except (ValueError, KeyError, TypeError, RecursionError) as error:

@@ -1,5 +1,6 @@
 """Reading triangle meshes exactly as stored, and their mass properties."""
 
+import io
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -7,9 +8,10 @@ import numpy as np
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.ply import parse_ply
+from hoidata.objects.ply import MOST_CORNERS, MOST_TRIANGLES, MOST_VERTICES, parse_ply
 
 LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen times as much when read
+_MOST = f"at most {MOST_VERTICES} vertices, {MOST_TRIANGLES} triangles and {MOST_CORNERS} corners of one face"
 _FARTHEST = 1e9  # in any unit; areas and volumes of such a mesh still fit into a float
 
 
@@ -63,10 +65,12 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
     # Own reader: trimesh splits and reorders vertices where faces carry texture or normal indices.
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split()
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):
+        words = line.split(maxsplit=MOST_CORNERS + 1)
         if not words or words[0] not in ("v", "f"):
             continue
+        if len(words) > MOST_CORNERS + 1 or len(vertices) > MOST_VERTICES or len(faces) > MOST_TRIANGLES:
+            raise BadInput(f"{path}:{number}", _MOST, "more", "decimate the mesh")
         try:
             if words[0] == "v":
                 vertices.append([float(word) for word in words[1:4]])

@@ -18,6 +18,10 @@ _KINDS = {
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
 _CORNERS = ("vertex_indices", "vertex_index")
+MOST_VERTICES, MOST_TRIANGLES = 1_000_000, 3_000_000
+MOST_CORNERS = 10_000  # of one polygon: the lid of a finely cut cylinder may have thousands
+_MOST_WORDS = 16_000_000
+_BLOCK = 1 << 20  # numbers, or bytes, that are looked at together
 
 
 class _Property(NamedTuple):
@@ -43,13 +47,24 @@ def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     rows = _BinaryRows(data, start, order) if order else _TextRows(data[start:])
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
+    stated = {element.name: element.count for element in elements}
+    triangles = 0
+    _check_counts(stated.get("vertex", 0), stated.get("face", 0))
     for element in elements[: _last_needed(elements) + 1]:
         for columns in _read_rows(rows, element):
             if element.name == "vertex":
                 vertices.append(_positions(element, columns))
             elif element.name == "face":
                 faces.append(_fans(element, columns))
+                triangles += len(faces[-1])
+                _check_counts(0, triangles)
     return np.concatenate([np.zeros((0, 3)), *vertices]), np.concatenate([np.zeros((0, 3), np.int64), *faces])
+
+
+def _check_counts(vertices: int, triangles: int) -> None:
+    """Raise ValueError for more than a mesh may have; each takes some hundred bytes while it is read."""
+    if vertices > MOST_VERTICES or triangles > MOST_TRIANGLES:
+        raise ValueError(f"more than {MOST_VERTICES} vertices or {MOST_TRIANGLES} triangles: decimate the mesh")
 
 
 def _read_header(data: bytes) -> tuple[str, list[_Element], int]:
@@ -141,7 +156,8 @@ class _BinaryRows:
             fields.append((f"values{number}", self.order + item.kind, (length,)))
         kind = np.dtype(fields)
         self.row_bytes = kind.itemsize
-        fitting = min(most, (len(self.data) - self.offset) // max(1, kind.itemsize))
+        here = (len(self.data) - self.offset) // max(1, kind.itemsize)
+        fitting = min(most, here, 1 + _BLOCK // max(1, kind.itemsize))
         table = np.frombuffer(self.data, kind, fitting, self.offset)
         found = []
         for number, item in enumerate(element.properties):
@@ -157,6 +173,9 @@ class _TextRows:
     """As ``_BinaryRows``, of a text file."""
 
     def __init__(self, text: bytes) -> None:
+        # Counted first: a word takes fifty bytes.
+        if sum(map(text.count, (b" ", b"\n", b"\t", b"\r"))) > _MOST_WORDS:
+            raise ValueError(f"more than {_MOST_WORDS} words: decimate the mesh, or write it in binary")
         self.words = text.split()
         self.offset = self.width = 0
         if max(map(len, self.words), default=0) > _LONGEST_WORD:
@@ -179,7 +198,8 @@ class _TextRows:
 
     def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
         self.width = sum(lengths) + sum(item.count_kind is not None for item in element.properties)
-        fitting = min(most, (len(self.words) - self.offset) // self.width)
+        here = (len(self.words) - self.offset) // self.width
+        fitting = min(most, here, 1 + _BLOCK // self.width)
         words = np.array(self.words[self.offset : self.offset + fitting * self.width])
         with np.errstate(all="ignore"):  # what does not fit its type becomes infinite, and is refused as such
             return self._columns(element, lengths, words.astype(np.float64).reshape(fitting, self.width))
@@ -201,8 +221,8 @@ class _TextRows:
 
 
 def _checked_length(value: float) -> int:
-    if not 0 <= value < 2**32 or value != int(value):
-        raise ValueError(f"a list of {value} numbers")
+    if not 0 <= value <= MOST_CORNERS or value != int(value):
+        raise ValueError(f"a list of {value} numbers; at most {MOST_CORNERS}")
     return int(value)
 
 

@@ -1,6 +1,7 @@
 """An object from a mesh somebody has: its unit, which way is up, its hinge; each is told, or found and said."""
 
 import io
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,6 +21,7 @@ HELD_M = (0.02, 1.0)  # sizes a hand is likely to be asked to hold, for guesses 
 UP_AXES = {
     sign + letter: np.eye(3)[axis] * float(f"{sign}1") for axis, letter in enumerate("xyz") for sign in ("", "-")
 }
+LARGEST_GLB_JSON, MOST_SHOWN = 4 << 20, 5_000_000
 METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
 NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
 CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
@@ -95,6 +97,8 @@ def _read(path: Path) -> Mesh:
         raise BadInput(path, "a mesh file", "nothing there", "correct the path")
     if path.stat().st_size > LARGEST_MESH_BYTES:
         raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
+    if _is_gltf(path):
+        _check_glb(path)
     try:
         # From bytes and without a resolver: a GLB cannot make the reader open another file.
         scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower())
@@ -104,6 +108,32 @@ def _read(path: Path) -> Mesh:
         got = f"{type(error).__name__}: {str(error)[:200]}"
         raise BadInput(path, "a readable mesh", got, "export it anew") from error
     return checked_mesh(path, Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)))
+
+
+def _check_glb(path: Path) -> None:
+    """Refuse a GLB that states more numbers than it holds, or shows a mesh again and again: trimesh would make them."""
+    size = path.stat().st_size
+    with open(path, "rb") as stream:
+        length = int.from_bytes(stream.read(20)[12:16], "little")
+        text = stream.read(min(length, LARGEST_GLB_JSON + 1))
+    try:
+        if len(text) > LARGEST_GLB_JSON:
+            raise ValueError(f"more than {LARGEST_GLB_JSON} bytes of JSON")
+        tree = json.loads(text)
+        counts = [int(accessor["count"]) for accessor in tree.get("accessors", ())]
+        sizes = [sum(counts[number] for number in _accessors(mesh)) for mesh in tree.get("meshes", ())]
+        shown = sum(sizes[node["mesh"]] for node in tree.get("nodes", ()) if "mesh" in node)
+        if sum(counts) > size or shown > max(size, MOST_SHOWN):
+            raise ValueError(f"{max(sum(counts), shown)} corners in {size} bytes")
+    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        got = f"{type(error).__name__}: {str(error)[:200]}"
+        raise BadInput(path, "a readable mesh", got, "export the mesh alone, anew") from error
+
+
+def _accessors(mesh: dict) -> list[int]:
+    """Of a glTF mesh the numbers of the arrays of positions and corners."""
+    named = [(part["attributes"].get("POSITION"), part.get("indices")) for part in mesh["primitives"]]
+    return [number for pair in named for number in pair if number is not None]
 
 
 def _is_gltf(path: Path) -> bool:

@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-import pandas as pd
-
 from hoidata.errors import MissingResource
+from hoidata.files.written import read_table
 
 
 def left_out_reasons(folder: str | Path) -> dict[str, str]:
@@ -12,7 +11,7 @@ def left_out_reasons(folder: str | Path) -> dict[str, str]:
     path = Path(folder) / "clips.parquet"
     if not path.is_file():
         raise MissingResource(f"{path} is not there: run the stage 'quality' of this dataset first")
-    rows = pd.read_parquet(path, columns=["clip_id", "verdict", "reasons"])
+    rows = read_table(path, ["clip_id", "verdict", "reasons"])
     failed = rows[rows["verdict"] == "left out"]
     return {
         clip_id: f"left out by quality control: {reasons}"

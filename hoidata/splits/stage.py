@@ -1,7 +1,7 @@
 """Stage split: every named split of a dataset, the chosen one, what they promise, and the training statistics.
 
     splits.parquet    clip_id, one column per named split the dataset has (of any dataset's, those for which it has
-                      clips enough), and `split`, the chosen one: train,
+                      clips enough; none that is written only where it is chosen), and `split`, the chosen one: train,
                       validation, test, or null for a clip without sentences or that no part covers; one row per clip
     info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is
     statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
@@ -23,6 +23,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.files.tables import write_table
+from hoidata.files.written import read_table
 from hoidata.splits.definitions import Definition, choose, definitions_for
 from hoidata.splits.leaks import Leaks, find_leaks
 from hoidata.splits.published import published
@@ -49,7 +50,8 @@ def split_store(
     store = open_store(clips_folder)
     hand_types, used = _annotated_clips(store, Path(annotation_folder))
     dataset = str(store.info["dataset"])
-    chosen, named = choose(dataset, wanted), definitions_for(dataset)
+    chosen = choose(dataset, wanted)
+    named = {name: item for name, item in definitions_for(dataset).items() if not item.if_chosen}
     words = hand_types.loc[used]
     rows = store.sequences.loc[used].assign(verb=words["verb"], hand_type=words["hand_type"])
     digests = {clip_id: motion_digest(store.clip(clip_id, motion_only=True)) for clip_id in used}
@@ -101,11 +103,11 @@ def motion_digest(clip: Clip) -> str:
 
 def _annotated_clips(store: Store, annotation: Path) -> tuple[pd.DataFrame, list[str]]:
     """The annotation's table of hands, and the clips that have sentences, in the store's order."""
-    hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
+    hand_types = read_table(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
     if list(hand_types["clip_id"]) != store.ids:
         got = f"{len(hand_types)} clips of another conversion"
         raise BadInput(annotation, f"the {len(store)} clips of {store.folder}", got, "run the stage 'annotate' again")
-    named = set(pd.read_parquet(annotation / "text.parquet", columns=["clip_id"])["clip_id"])
+    named = set(read_table(annotation / "text.parquet", ["clip_id"])["clip_id"])
     return hand_types, [clip_id for clip_id in store.ids if clip_id in named]
 
 

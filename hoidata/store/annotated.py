@@ -34,6 +34,7 @@ import pandas as pd
 from hoidata.clips.clip import SIDES, Clip, HandType, Side
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz
+from hoidata.files.written import read_json, read_table
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
@@ -67,22 +68,22 @@ class AnnotatedStore:
         self.root = root
         self.store = store
         annotation, contact = root / "annotation", root / "contact"
-        self.text = pd.read_parquet(annotation / "text.parquet")
-        self.hand_types = pd.read_parquet(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
-        chosen = pd.read_parquet(root / "splits" / "splits.parquet", columns=["clip_id", "split"])
+        self.text = read_table(annotation / "text.parquet")
+        self.hand_types = read_table(annotation / "hand_type.parquet").set_index("clip_id", drop=False)
+        chosen = read_table(root / "splits" / "splits.parquet", ["clip_id", "split"])
         self.splits: dict[str, str | None] = {
             clip_id: None if pd.isna(subset) else str(subset) for clip_id, subset in chosen.itertuples(index=False)
         }
-        self.split_info: dict[str, Any] = orjson.loads((root / "splits" / "info.json").read_bytes())
-        self.annotation_info: dict[str, Any] = orjson.loads((annotation / "info.json").read_bytes())
-        self.contact_info: dict[str, Any] = orjson.loads((contact / "info.json").read_bytes())
+        self.split_info: dict[str, Any] = read_json(root / "splits" / "info.json")
+        self.annotation_info: dict[str, Any] = read_json(annotation / "info.json")
+        self.contact_info: dict[str, Any] = read_json(contact / "info.json")
         embeddings = read_npz(annotation / "embeddings.npz")
         self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
         self._features = embeddings["features"]
         self._sentences = _by_clip(self.text.query("form != @VARIATION"))
         self._variations = _by_clip(self.text.query("form == @VARIATION"))
-        self._objects = pd.read_parquet(contact / "objects.parquet").set_index("object")
-        self._clips = pd.read_parquet(contact / "clips.parquet").set_index("clip_id")
+        self._objects = read_table(contact / "objects.parquet").set_index("object")
+        self._clips = read_table(contact / "clips.parquet").set_index("clip_id")
         self._points = read_npz(contact / "points.npz")
         self._contact = read_npz(contact / "contact.npz")
         self._distances: dict[int, dict[str, np.ndarray]] = {}

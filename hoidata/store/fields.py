@@ -402,7 +402,7 @@ def empty_array(field: Field) -> np.ndarray:
 def value_at(info: Any, name: str) -> Any:
     """The value of a dotted key of info.json. Raises KeyError when it is not there."""
     for key in name.split("."):
-        if not isinstance(info, dict):
+        if not isinstance(info, dict) or key not in info:
             raise KeyError(name)
         info = info[key]
     return info

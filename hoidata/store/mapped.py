@@ -1,15 +1,17 @@
-"""Arrays of a stored (uncompressed) NPZ file mapped into memory: only the pages that are read are loaded."""
+"""Arrays of a stored (uncompressed) NPZ file mapped into memory, each held against the checksum it was written with."""
 
 import io
 import math
 import mmap
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.files.npy_header import check_text, read_npy_header
+from hoidata.files.written import REMEDY
 
 _LOCAL_HEADER = 30  # bytes of a zip local header before name and extra field
 _NPY_HEADER = 1 << 16  # at most so many bytes describe the dtype and shape of a member
@@ -18,10 +20,11 @@ _NPY_HEADER = 1 << 16  # at most so many bytes describe the dtype and shape of a
 def map_npz(path: str | Path) -> dict[str, np.ndarray]:
     """Every array of a stored NPZ as a read-only view of one memory map, by name.
 
-    Nothing is unpickled. Raises BadInput when the file is missing, truncated, compressed or holds Python objects.
+    Nothing is unpickled. The whole file is read once, at some gigabytes a second. Raises BadInput when the file is
+    missing, truncated, compressed, holds Python objects, or a byte of an array is another than was written.
     """
     if not Path(path).is_file():
-        raise BadInput(path, "an array file of the store", "nothing there", "run the conversion again")
+        raise BadInput(path, "an array file of the store", "nothing there", REMEDY)
     try:
         with zipfile.ZipFile(path) as archive, open(path, "rb") as stream:
             # Filled at once: a fault per clip costs as much as copying it. These pages are the file's own cache.
@@ -31,7 +34,7 @@ def map_npz(path: str | Path) -> dict[str, np.ndarray]:
     except BadInput:
         raise
     except Exception as error:  # what zipfile raises on damaged archives has no common base
-        raise BadInput(path, "a stored NPZ file of plain arrays", str(error), "run the conversion again") from error
+        raise BadInput(path, "a stored NPZ file of plain arrays", str(error), REMEDY) from error
 
 
 def _view(path: str | Path, mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndarray:
@@ -41,6 +44,10 @@ def _view(path: str | Path, mapped: mmap.mmap, item: zipfile.ZipInfo) -> np.ndar
     # The local header's own lengths count: its extra field may differ from the one in the directory.
     skipped = int.from_bytes(header[26:28], "little") + int.from_bytes(header[28:30], "little")
     start = item.header_offset + _LOCAL_HEADER + skipped
+    whole = memoryview(mapped)[start : start + item.file_size]
+    if len(whole) < item.file_size or zlib.crc32(whole) != item.CRC:
+        where = f"{path}: {item.filename.removesuffix('.npy')}"
+        raise BadInput(where, "the bytes that were written", "another checksum (CRC-32)", REMEDY)
     stream = io.BytesIO(mapped[start : start + min(item.file_size, _NPY_HEADER)])
     shape, fortran, dtype = read_npy_header(stream, f"{path}: {item.filename}")
     if dtype.hasobject:

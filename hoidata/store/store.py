@@ -15,9 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import orjson
 import pandas as pd
-import pyarrow.parquet as pq
 
 from hoidata.clips.clip import (
     SIDES,
@@ -33,14 +31,16 @@ from hoidata.clips.clip import (
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording
 from hoidata.errors import BadInput, MissingResource
+from hoidata.files.written import REMEDY, read_json, read_table
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.store.fields import SCHEMA_VERSION, TABLES
+from hoidata.store.info import info_problems
 from hoidata.store.mapped import map_npz
 from hoidata.store.reading import FrameShard, clip_rows
 from hoidata.store.recordings import read_hand, read_recording
-from hoidata.store.versions import checked_version, filled_info, filled_sequences
+from hoidata.store.versions import CURRENT, checked_version, filled_info, filled_sequences
 from hoidata.store.writing import write_store
 
 __all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"]
@@ -64,9 +64,12 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     if hands is not None and written and hands.digest != written:
         remedy = "open it with the hands it was converted with"
         raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
-    sequences, objects, files, quarantine = (_read_table(folder / file.path) for file in TABLES.values())
+    sequences, objects, files, quarantine = (read_table(folder / file.path) for file in TABLES.values())
     sequences = filled_sequences(sequences, version).set_index("clip_id", drop=False).rename_axis(None)
-    return Store(folder, filled_info(info, version), sequences, objects, files, quarantine, hands)
+    info = filled_info(info, version)
+    if problems := info_problems(info, CURRENT):
+        raise BadInput(folder / problems[0].where, problems[0].expected, problems[0].got, REMEDY)
+    return Store(folder, info, sequences, objects, files, quarantine, hands)
 
 
 def read_info(folder: str | Path) -> dict[str, Any]:
@@ -77,19 +80,9 @@ def read_info(folder: str | Path) -> dict[str, Any]:
     path = Path(folder) / "meta" / "info.json"
     if not path.is_file():
         raise MissingResource(f"{folder} is no store: {path} is missing; run the conversion of this dataset first")
-    try:
-        info = orjson.loads(path.read_bytes())
-        _ = info["schema_version"]
-    except (ValueError, KeyError, TypeError, OSError) as error:
-        raise BadInput(path, "JSON with a schema_version", str(error), "run the conversion again") from error
+    info = read_json(path)
+    _ = info["schema_version"]
     return info
-
-
-def _read_table(path: Path) -> pd.DataFrame:
-    try:
-        return pq.read_table(path, memory_map=True, use_threads=False).to_pandas()
-    except (OSError, ValueError) as error:  # pyarrow's errors are both
-        raise BadInput(path, "a Parquet table of the store", str(error), "run the conversion again") from error
 
 
 @dataclass

@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import orjson
 import pandas as pd
 import pyarrow as pa
 
@@ -36,6 +35,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files import canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
+from hoidata.files.written import read_json, read_table
 from hoidata.hands.model import N_VERTICES
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.mapped import map_npz
@@ -187,12 +187,9 @@ def open_surface(folder: str | Path) -> "SurfaceStore":
     folder = Path(folder)
     if not (folder / "info.json").is_file():
         raise MissingResource(f"{folder} is not there: run the stage 'surface' of this dataset first")
-    try:
-        info = orjson.loads((folder / "info.json").read_bytes())
-        version = info["surface_version"]
-        tables = {name: pd.read_parquet(folder / f"{name}.parquet") for name in ("clips", "objects")}
-    except (ValueError, KeyError, TypeError, OSError) as error:  # pyarrow's errors are among these
-        raise BadInput(folder, "info.json and two tables of the stage surface", str(error)[:300], REMEDY) from error
+    info = read_json(folder / "info.json")
+    version = info["surface_version"]
+    tables = {name: read_table(folder / f"{name}.parquet") for name in ("clips", "objects")}
     if version != VERSION:
         raise BadInput(folder / "info.json", f"surface_version {VERSION}", repr(version)[:80], REMEDY)
     for name, schema in (("clips", CLIPS), ("objects", OBJECTS)):

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, write_whole
 from hoidata.files.sealed import METADATA_KEY, OPEN_SEAL, check_seal, sealed
+from hoidata.files.written import read_json
 from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
 from models.common.features import Normaliser
@@ -107,7 +108,7 @@ def write_empty(folder: str | Path, reason: str) -> Path:
 def empty_reason(folder: str | Path) -> str | None:
     """Why a folder holds no checkpoint, or None when it says nothing."""
     path = Path(folder) / EMPTY_NAME
-    return json.loads(path.read_text())["reason"] if path.is_file() else None
+    return read_json(path)["reason"] if path.is_file() else None
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -13,8 +13,9 @@ decimetres with y up; the object's position is the middle of its bounding box.
 
 import csv
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -31,7 +32,7 @@ BODIES = ("object", *SIDES)
 PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 FASTEST_HZ, SLOWEST_HZ = 1000.0, 5.0
 LARGEST = 1e30  # of any number: squares of it are numbers still
-MOST_BYTES, MOST_FRAMES = 64 * 2**20, 200_000
+MOST_BYTES, MOST_FRAMES, LONGEST_LINE = 64 * 2**20, 200_000, 1 << 16
 UNITS = UNITS_M | {"dm": 0.1}
 _MIRROR_POSITION, _MIRROR_QUATERNION = np.array([-1.0, 1, 1]), np.array([1.0, 1, -1, -1])
 
@@ -81,10 +82,10 @@ def read_trajectories(path: Path, unit: str = "m", axes: Axes = "model") -> Traj
 def parse_csv(data: bytes, where: str, unit_m: float = 1.0) -> TrajectoryFile:
     """The CSV form, of any bytes."""
     try:
-        rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"))))
+        # One more than there may be, so that too many are noticed and not kept.
+        rows = list(islice(filter(None, csv.reader(_lines(data))), MOST_FRAMES + 2))
     except (UnicodeDecodeError, csv.Error) as error:
         raise BadInput(where, "CSV text", f"{type(error).__name__}: {error}", "export it anew") from error
-    rows = [row for row in rows if row]
     names = [name.strip() for name in rows[0]] if rows else []
     if len(set(names)) < len(names):
         raise BadInput(where, "a header with each column once", ", ".join(names)[:200], "correct the header")
@@ -104,6 +105,13 @@ def parse_csv(data: bytes, where: str, unit_m: float = 1.0) -> TrajectoryFile:
     return from_arrays(arrays, where, unit_m)
 
 
+def _lines(data: bytes) -> Iterator[str]:
+    for line in io.StringIO(data.decode("utf-8-sig"), newline=""):
+        if len(line) > LONGEST_LINE:
+            raise csv.Error(f"a line of more than {LONGEST_LINE} characters")
+        yield line
+
+
 def from_arrays(arrays: Mapping[str, np.ndarray], where: str, unit_m: float = 1.0) -> TrajectoryFile:
     """The NPZ form; also what the CSV form becomes."""
     if "time_s" not in arrays:
@@ -121,7 +129,8 @@ def from_arrays(arrays: Mapping[str, np.ndarray], where: str, unit_m: float = 1.
 
 def parse_manipnet(data: bytes, where: str) -> TrajectoryFile:
     """ManipNet's text files (packed ones are to be unpacked first), of any bytes."""
-    lines = [line for line in data.decode("utf-8", "replace").splitlines() if line.strip()]
+    told = (line for line in io.StringIO(data.decode("utf-8", "replace"), newline=None) if line.strip())
+    lines = list(islice(told, MOST_FRAMES + 2))
     rate = _numbers([[lines[0]]], 1, where)[0, 0] if lines else 0.0
     if not SLOWEST_HZ <= rate <= FASTEST_HZ:
         remedy = "the first line of ManipNet's files is 120; other trajectories belong into a .csv or .npz"

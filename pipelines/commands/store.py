@@ -1,4 +1,4 @@
-"""``hoidata validate`` and ``hoidata migrate``: whether a store is sound, and bringing an older one up to date."""
+"""``hoidata validate`` and ``hoidata migrate``: whether files are whole and sound, and bringing a store up to date."""
 
 from pathlib import Path
 from typing import Annotated
@@ -6,25 +6,25 @@ from typing import Annotated
 import typer
 
 Store = Annotated[Path, typer.Argument(help="A store of clips.", exists=True, file_okay=False, resolve_path=True)]
+Output = Annotated[
+    Path, typer.Argument(help="A store, a checkpoint, or whatever a stage wrote.", exists=True, resolve_path=True)
+]
 
 
-def validate(store: Store) -> None:
-    """Check every file, table and array of a store against the schema; exit code 1 when something is wrong."""
-    from hoidata.store.store import open_store
-    from hoidata.store_check.check import check_store
-    from pipelines.stages.base import empty_reason
+def validate(output: Output) -> None:
+    """Check that files are those that were written (dvc.lock, seals, checksums), and a store against the schema.
 
-    if reason := empty_reason(store):
-        typer.echo(f"{store}: empty, {reason}")
-        return
-    problems = check_store(store)
+    Exit code 1 when something is wrong.
+    """
+    from pipelines.validation import problems_of
+
+    problems, sound = problems_of(output)
     for problem in problems:
         typer.echo(str(problem))
     if problems:
-        typer.echo(f"{store}: {len(problems)} problem{'s' if len(problems) > 1 else ''}")
+        typer.echo(f"{output}: {len(problems)} problem{'s' if len(problems) > 1 else ''}")
         raise typer.Exit(1)
-    opened = open_store(store)
-    typer.echo(f"{store}: sound, {len(opened)} clips, schema {opened.info['schema_version']}")
+    typer.echo(f"{output}: {sound}")
 
 
 def migrate(store: Store) -> None:

@@ -5,32 +5,39 @@ from pathlib import Path
 
 from hoidata.errors import BadInput
 from hoidata.files.sealed import seal_fault
-from pipelines.lineage.locks import dvc_digest, read_locks
+from pipelines.lineage.locks import Locked, other_files, read_locks
 from pipelines.lineage.raw import raw_list
 from pipelines.lineage.targets import Target
 from pipelines.lineage.tree import Node, raw_folder
+
+SHOWN = 5
 
 
 def check(root: Path, target: Target | None = None) -> list[Node]:
     """One node per output, checkpoint and raw folder behind ``target``, or of all that was ever run here."""
     locks = read_locks(root)
     behind = target.record["stages"] if target and target.kind != "motion" else locks
-    outs = {path: md5 for name in locks.keys() & behind.keys() for path, md5 in locks[name].outs.items()}
+    outs = {path: locks[name] for name in locks.keys() & behind.keys() for path in locks[name].outs}
     outs.pop("code", None)  # written anew by every run
     return [node for path in sorted(outs) for node in _checked(root, path, outs[path])]
 
 
-def _checked(root: Path, path: str, md5: str) -> Iterator[Node]:
-    found = dvc_digest(root / path)
-    if found is None:
+def _checked(root: Path, path: str, lock: Locked) -> Iterator[Node]:
+    if not (root / path).exists():
         yield Node("data", path, "missing", "noted in dvc.lock")
         return
-    yield Node("data", path, "same") if found == md5 else Node("data", path, "tampered", "not what dvc.lock says")
+    others = other_files(root, lock, path)
+    detail = f"not what dvc.lock says: {_some(others)}" if others else ""
+    yield Node("data", path, "tampered" if others else "same", detail)
     for file in sorted((root / path).rglob("*.safetensors")):
         yield _sealed(file, file.relative_to(root).as_posix())
     listed = raw_list(root, path)
     if listed is not None and listed.files:
         yield _raw(root, path)
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
 
 
 def _sealed(file: Path, name: str) -> Node:

@@ -2,14 +2,17 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from hoidata.errors import BadInput
+from hoidata.files.written import md5_file
 
 CACHE = Path(".dvc/cache/files/md5")
 # Neither DVC (.dvcignore) nor we count these.
@@ -61,11 +64,11 @@ def _locked(name: str, body: dict[str, Any]) -> Locked:
 def dvc_digest(path: Path) -> str | None:
     """The MD5 by which DVC knows a file or folder; None when there is nothing."""
     if path.is_file():
-        return _md5(path)
+        return md5_file(path)
     if not path.is_dir():
         return None
     files = (item for item in path.rglob("*") if item.is_file() and not _IGNORED & set(item.parts))
-    entries = {item.relative_to(path).as_posix(): _md5(item) for item in files if item.suffix != ".pyc"}
+    entries = {item.relative_to(path).as_posix(): md5_file(item) for item in files if item.suffix != ".pyc"}
     return listing_digest(entries)
 
 
@@ -84,6 +87,41 @@ def cached_listing(root: Path, digest: str) -> dict[str, str]:
         return {}
 
 
-def _md5(path: Path) -> str:
-    with open(path, "rb") as stream:
-        return hashlib.file_digest(stream, "md5").hexdigest()
+def written_digest(path: Path) -> str | None:
+    """The MD5 a file had when its stage wrote it, by dvc.lock of the project it lies in; None where nobody knows."""
+    path = Path(os.path.abspath(path))
+    root = next((folder for folder in path.parents if (folder / "dvc.lock").is_file()), None)
+    if root is None:
+        return None
+    stamps = tuple((root / name).stat().st_mtime_ns for name in lock_files(root))
+    return _written_digests(root, stamps).get(path.relative_to(root).as_posix())
+
+
+@cache
+def _written_digests(root: Path, _stamps: tuple[int, ...]) -> dict[str, str]:
+    return {path: md5 for lock in read_locks(root).values() for path, md5 in written_files(root, lock).items()}
+
+
+def written_files(root: Path, lock: Locked) -> dict[str, str]:
+    """MD5 by path of every file a stage wrote, as far as DVC's cache still lists its folders."""
+    found = {}
+    for out, md5 in lock.outs.items():
+        if not md5.endswith(".dir"):
+            found[out] = md5
+        found |= {f"{out}/{name}": digest for name, digest in cached_listing(root, md5).items()}
+    return found
+
+
+def other_files(root: Path, lock: Locked, out: str) -> list[str]:
+    """The files of one output that are not those its stage wrote, missing and further ones too.
+
+    The output itself where only that much is known.
+    """
+    if dvc_digest(root / out) == lock.outs[out]:
+        return []
+    before = {path: md5 for path, md5 in written_files(root, lock).items() if Path(path).is_relative_to(out)}
+    if not before:
+        return [out]
+    there = [path for path in (root / out).rglob("*") if path.is_file()] if (root / out).is_dir() else []
+    names = {*before, *(path.relative_to(root).as_posix() for path in there)}
+    return sorted(name for name in names if dvc_digest(root / name) != before.get(name))

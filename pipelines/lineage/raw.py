@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hoidata.errors import BadInput
+from hoidata.files.written import REMEDY, check_written, read_json
+
 TABLE = "meta/sequences.parquet"
 
 
@@ -59,13 +62,11 @@ def raw_from_json(store: str, values: dict[str, Any]) -> RawSource:
 
 def read_raw(root: Path, store: str, wanted: set[str] | None = None) -> RawSource | None:
     """What lies behind some clips (all when None) of a store; None where the folder holds no clips."""
-    import pyarrow.parquet as parquet
-
     folder = root / store
     if not (folder / TABLE).is_file():
         return None
-    info = json.loads((folder / "meta/info.json").read_bytes())
-    files = parquet.read_table(folder / "meta/files.parquet", columns=["path", "sha256"]).to_pylist()
+    info = read_json(folder / "meta/info.json")
+    files = _rows(folder / "meta/files.parquet", ["path", "sha256"])
     columns = [
         "clip_id",
         "subject",
@@ -75,12 +76,23 @@ def read_raw(root: Path, store: str, wanted: set[str] | None = None) -> RawSourc
         "last_source_frame",
         "source_files",
     ]
-    rows = parquet.read_table(folder / TABLE, columns=columns).to_pylist()
+    rows = _rows(folder / TABLE, columns)
     clips = [_clip(row, files) for row in rows if wanted is None or row["clip_id"] in wanted]
     used = {path for clip in clips for path in clip.files}
     digests = {file["path"]: file["sha256"] for file in files if file["path"] in used}
     facts = (info.get(name, default) for name, default in zip(_FACTS, ("", False, "", False), strict=True))
     return RawSource(store, *facts, digests=digests, clips=tuple(clips)) if clips else None
+
+
+def _rows(path: Path, columns: list[str]) -> list[dict[str, Any]]:
+    """Rows of a table, without pandas, whose import takes longer than all the rest."""
+    import pyarrow.parquet as parquet
+
+    try:
+        check_written(path)
+        return parquet.read_table(path, columns=columns).to_pylist()
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInput(path, "a table of the store", str(error)[:300], REMEDY) from error
 
 
 def _clip(row: dict[str, Any], files: list[dict[str, Any]]) -> RawClip:

@@ -1,6 +1,5 @@
 """The tables of one clip's page: words, what the hand type rests on, quality, splits, where the clip comes from."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ import pandas as pd
 
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.errors import MissingResource
+from hoidata.files.written import read_json, read_table
 from hoidata.hands import JOINT_NAMES, HandPair
 from hoidata.quality.thresholds import CLIP_MEASURES
 from hoidata.store.annotated import AnnotatedStore
@@ -132,8 +132,8 @@ def clip_quality(folder: Path, clip_id: str) -> ClipQuality:
     """What quality control found. Raises MissingResource where its stage has not run."""
     if not (folder / "clips.parquet").is_file():
         raise MissingResource(f"{folder} is not there: run the stage 'quality' of this dataset first")
-    row = pd.read_parquet(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
-    limits = json.loads((folder / "info.json").read_text(encoding="utf-8"))["thresholds"]["limits"]
+    row = read_table(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
+    limits = read_json(folder / "info.json")["thresholds"]["limits"]
     measures = [
         (
             f"{measure.words}{', ' + measure.unit if measure.unit else ''}",
@@ -151,7 +151,7 @@ def _number(value: Any, missing: str = "not measured") -> str:
 
 def split_rows(annotated: AnnotatedStore, clip_id: str) -> Rows:
     """(split, part) of every named split of the dataset; the chosen one first."""
-    table = pd.read_parquet(annotated.root / "splits" / "splits.parquet").set_index("clip_id")
+    table = read_table(annotated.root / "splits" / "splits.parquet").set_index("clip_id")
     row = table.loc[clip_id]
     chosen = str(annotated.split_info["chosen"]["name"])
     parts = [(str(name), NOTHING if pd.isna(part) else str(part)) for name, part in row.items()]

@@ -1,6 +1,5 @@
 """The facts of one dataset as the report shows them, read from the folders its stages wrote."""
 
-import json
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from hoidata.clips.clip import FPS
+from hoidata.files.written import read_json
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import Store, open_store
@@ -56,7 +56,7 @@ def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
 def reason_for_nothing(folder: Path) -> str:
     """The reason a stage noted in ``folder/empty.json``; "" where it noted none."""
     note = folder / "empty.json"
-    return str(json.loads(note.read_text(encoding="utf-8"))["reason"]) if note.is_file() else ""
+    return str(read_json(note)["reason"]) if note.is_file() else ""
 
 
 def has_tables(root: Path, *tables: str) -> bool:

@@ -1,6 +1,5 @@
 """What evaluation found, as tables and charts: rows are families and controls, columns the registered metrics."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,12 +9,18 @@ from rich import box
 from rich.table import Table
 
 from hoidata.errors import BadInput
+from hoidata.files.written import read_json
+from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
 from pipelines.promises import TRUTH
 
 AnyMetric = Metric | FeatureMetric
-ALL_METRICS: tuple[AnyMetric, ...] = (*METRICS, *FEATURE_METRICS)
+ALL_METRICS: tuple[AnyMetric, ...] = (
+    *METRICS,
+    *FEATURE_METRICS,
+    *(row for rows in ASKED_LISTS.values() for row in rows),
+)
 LOOKUPS = ("nearest-clip", "prompt-lookup")
 CONTROLS = "controls"
 NO_FIGURE = "-"
@@ -171,7 +176,7 @@ def _found(folder: Path, families: Sequence[str]) -> _Found:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {"empty": "not evaluated"}
+    return read_json(path) if path.is_file() else {"empty": "not evaluated"}
 
 
 def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:

@@ -1,6 +1,5 @@
 """Quality control of one dataset as the report shows it: a table, a chart of every measure, and what was left out."""
 
-import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from hoidata.files.written import read_json, read_table
 from hoidata.quality.thresholds import CLIP_MEASURES, MESH_MEASURES, Measure
 from pipelines.pages.curves import COLOURS, figure_svg
 from pipelines.pages.metrics_table import number
@@ -57,8 +57,8 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
     """What the stage left in ``folder``; None where it has not run, or found no clip."""
     if not (folder / "clips.parquet").is_file():
         return None
-    info = json.loads((folder / "info.json").read_text(encoding="utf-8"))
-    clips, meshes = (pd.read_parquet(folder / f"{name}.parquet") for name in ("clips", "meshes"))
+    info = read_json(folder / "info.json")
+    clips, meshes = (read_table(folder / f"{name}.parquet") for name in ("clips", "meshes"))
     if not len(clips):
         return None
     limits = info["thresholds"]["limits"]

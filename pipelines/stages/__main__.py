@@ -5,6 +5,7 @@ import importlib
 import os
 import sys
 from dataclasses import replace
+from io import TextIOWrapper
 from pathlib import Path
 
 from pipelines.warm import ENVIRONMENT, run_warm
@@ -28,7 +29,10 @@ STAGES = (
 
 
 def main() -> int:
-    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do."""
+    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do; 130: Ctrl-C."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
     parser = argparse.ArgumentParser(prog="python -m pipelines.stages")
     parser.add_argument("stage", choices=STAGES)
     parser.add_argument("--profile", default="", help="the one params.yaml chooses; no other has its settings there")
@@ -49,7 +53,7 @@ def main() -> int:
 
 
 def _run(module, options: argparse.Namespace) -> int:
-    from hoidata.errors import BadInput, HoidataError
+    from hoidata.errors import BadInput, HoidataError, told_in_words
     from pipelines.params import read_params
     from pipelines.stages.base import StagePaths
 
@@ -58,7 +62,8 @@ def _run(module, options: argparse.Namespace) -> int:
         chosen = read_params(Path())["profile"]
         if paths.profile not in ("", chosen):
             raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "choose it there")
-        module.run(replace(paths, profile=chosen))
+        with told_in_words():
+            module.run(replace(paths, profile=chosen))
     except HoidataError as error:
         print(f"{options.stage} of {paths}: {error}", file=sys.stderr)
         return 1
@@ -66,4 +71,8 @@ def _run(module, options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        print(f"{' '.join(sys.argv[1:])}: interrupted; run it again, nothing that was there is lost", file=sys.stderr)
+        sys.exit(130)

@@ -15,7 +15,7 @@ from hoidata.datasets import checks
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 
-LARGEST_TEXT_BYTES = 16 << 20
+LARGEST_TEXT_BYTES = 4 << 20
 EGO_IMAGE_SIZE = (2800, 2000)  # width, height of the head camera's images
 _RANGE = re.compile(r"([0-9]{1,9})-([0-9]{1,9})")
 _ROTATION_ERROR = 1e-3

@@ -24,6 +24,7 @@ _FRAME_FILE = re.compile(r"\d{6}\.txt")
 _LIST_FILE = re.compile(r"action_\w+\.txt")
 _SEQUENCE = re.compile(r"subject\d+/\w+/\d+")
 _LIST_COLUMNS = ("id", "path", "action_label", "start_act", "end_act", "start_frame", "end_frame")
+_LARGEST_LIST = 4 << 20  # bytes; the released ones have some 50,000
 _LONGEST_NUMBER = 9  # digits of a frame number that is one
 
 
@@ -130,7 +131,8 @@ def listed_segments(raw: RawTree, sequence: str) -> tuple[list[Segment], str]:
     for name in raw.names(LISTS, ".txt"):
         if _LIST_FILE.fullmatch(name):
             path = f"{LISTS}/{name}"
-            own = [segment for segment in parse_segments(raw.read(path), path) if segment.sequence == sequence]
+            listed = parse_segments(raw.read(path, _LARGEST_LIST), path)
+            own = [segment for segment in listed if segment.sequence == sequence]
             if own:
                 return sorted(own, key=lambda segment: segment.start), path
     return [], ""

@@ -18,7 +18,14 @@ from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.bvh import BvhMotion, angles_yxz_to_rotmat, parse_bvh, unpack_text
-from hoidata.datasets.manipnet.hand import HAND_REFERENCE, HAND_SKIN, METRES_PER_UNIT, MIRROR_X, read_hand
+from hoidata.datasets.manipnet.hand import (
+    HAND_REFERENCE,
+    HAND_SKIN,
+    LARGEST_REFERENCE,
+    METRES_PER_UNIT,
+    MIRROR_X,
+    read_hand,
+)
 from hoidata.datasets.manipnet.segments import (
     LIFTED_M,
     SHORTEST_FRAMES,
@@ -317,7 +324,7 @@ def _read_motion(raw: RawTree, path: str) -> BvhMotion:
 def _read_tips(raw: RawTree) -> dict[str, np.ndarray]:
     """Finger tips of the right hand in the frames of the last joints, right-handed axes, source units."""
     try:
-        capsules = json.loads(raw.read(HAND_REFERENCE))["capsules"]
+        capsules = json.loads(raw.read(HAND_REFERENCE, LARGEST_REFERENCE))["capsules"]
         ends = {capsule["joint"]: np.array(capsule["end_local"], dtype=np.float64) for capsule in capsules}
         tips = {joint: ends[joint] * MIRROR_X for joint in TIP_JOINTS}
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:

@@ -16,7 +16,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 
 ROOT_CHANNELS = "6 Xposition Yposition Zposition Yrotation Xrotation Zrotation"
 JOINT_CHANNELS = "3 Yrotation Xrotation Zrotation"
-MAX_TEXT_BYTES = 256 * 2**20
+MAX_TEXT_BYTES = 32 * 2**20  # the largest released file has 4.3 MB
 MAX_JOINTS = 256
 MAX_FRAMES = 1_000_000
 

@@ -16,6 +16,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import JointCapsules, Skin, TrackedHand
 
 HAND_REFERENCE = "hand/hand_reference.json"
+LARGEST_REFERENCE = 1 << 20  # bytes
 HAND_SKIN = "hand/right_hand_skin.npz"
 METRES_PER_UNIT = 0.1
 MIRROR_X = np.array([-1.0, 1.0, 1.0])
@@ -70,7 +71,7 @@ def read_hand(raw: RawTree, skeleton: BvhMotion) -> TrackedHand:
 def _read_reference(raw: RawTree, names: tuple[str, ...]) -> tuple[JointCapsules, np.ndarray]:
     """The 19 capsules and the 104 vertices of the proximity sensors."""
     try:
-        reference = json.loads(raw.read(HAND_REFERENCE))
+        reference = json.loads(raw.read(HAND_REFERENCE, LARGEST_REFERENCE))
         rows = reference["capsules"]
         joint = np.array([names.index(row["joint"]) for row in rows])
         start, end = (np.array([row[key] for row in rows], dtype=np.float64) for key in ("start_local", "end_local"))

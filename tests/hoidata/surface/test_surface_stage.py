@@ -310,7 +310,7 @@ def test_missing_other_or_damaged_folder_is_refused(written):
     (surface / "info.json").write_text(good)
     table = (surface / "clips.parquet").read_bytes()
     (surface / "clips.parquet").write_bytes(table[:100])
-    with pytest.raises(BadInput, match="two tables"):
+    with pytest.raises(BadInput, match="a Parquet table"):
         open_surface(surface)
     pd.read_parquet(surface / "objects.parquet").to_parquet(surface / "clips.parquet")
     with pytest.raises(BadInput, match="none named"):

@@ -109,7 +109,7 @@ class TestGrab(AdapterContract):
         yield Row("symlink out of the root", FILE, linked_outside(FILE), "link that leaves")
         yield Row("path out of the root inside the file", "passwd", edited(outside), "link that leaves")
         yield Row("zero-face mesh", MESH, holding(MESH, NO_FACE_PLY), "with faces")
-        yield Row("absurd size (10^9 vertices)", MESH, holding(MESH, HUGE_PLY), "ends within")
+        yield Row("absurd size (10^9 vertices)", MESH, holding(MESH, HUGE_PLY), "more than")
         yield Row("absurd size (header)", FILE, at(FILE, with_member("n_frames.npy", huge_npy(b""))), "bytes of data")
         yield Row("zip bomb", FILE, at(FILE, with_member("n_frames.npy", bomb + bytes(1_200_000_000))), "when unpacked")
 

@@ -1,0 +1,69 @@
+"""What ``hoidata validate`` finds: files that are not those their stage wrote, broken seals, a store's own faults."""
+
+from pathlib import Path
+
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files.sealed import seal_fault
+from hoidata.files.written import REMEDY
+from pipelines.lineage.locks import Locked, other_files, read_locks
+from pipelines.stages.base import empty_reason
+
+
+def problems_of(path: Path) -> tuple[list[BadInput], str]:
+    """Everything that is wrong with an output, and what to say of it when nothing is."""
+    made = _made(path)
+    problems = [item for root, lock, out in made for item in _others(root, lock, out, path)]
+    files = [path] if path.is_file() else sorted(path.rglob("*.safetensors"))
+    problems += [problem for file in files if file.suffix == ".safetensors" and (problem := _broken_seal(file))]
+    known = f"as written by {', '.join(lock.name for _, lock, _ in made[:3])}{' and others' * (len(made) > 3)}"
+    if not (path / "meta").is_dir():
+        if not made and not files:
+            raise MissingResource(f"{path} is no store, checkpoint or output of a stage; name one of these")
+        return problems, known if made else "sound"
+    if reason := empty_reason(path):
+        return problems, f"empty, {reason}"
+    return problems + _of_store(path, bool(problems)), _store_in_words(path)
+
+
+def _made(path: Path) -> list[tuple[Path, Locked, str]]:
+    """Project, stage and output of what lies at the path, below it or around it."""
+    root = next((folder for folder in path.parents if (folder / "dvc.lock").is_file()), None)
+    if root is None:
+        return []
+    name = path.relative_to(root)
+    outs = [(root, lock, out) for lock in read_locks(root).values() for out in lock.outs if lock.name != "code"]
+    return [item for item in outs if name.is_relative_to(item[2]) or Path(item[2]).is_relative_to(name)]
+
+
+def _others(root: Path, lock: Locked, out: str, path: Path) -> list[BadInput]:
+    """Those of an output's files at the path that its stage did not write so."""
+    found = (root / name for name in other_files(root, lock, out))
+    concerned = [file for file in found if file.is_relative_to(path) or path.is_relative_to(file)]
+    return [BadInput(file, f"the bytes {lock.name} wrote, by dvc.lock", "others", REMEDY) for file in concerned]
+
+
+def _broken_seal(file: Path) -> BadInput | None:
+    try:
+        fault = seal_fault(file)
+    except BadInput as error:
+        return error
+    return BadInput(file, f"the {fault} it was written with, by its own digest", "others", REMEDY) if fault else None
+
+
+def _of_store(path: Path, is_known_broken: bool) -> list[BadInput]:
+    from hoidata.store_check.check import check_store
+
+    try:
+        return check_store(path)
+    except BadInput as error:
+        return [] if is_known_broken else [error]
+
+
+def _store_in_words(path: Path) -> str:
+    from hoidata.store.store import open_store
+
+    try:
+        opened = open_store(path)
+    except BadInput:
+        return ""
+    return f"sound, {len(opened)} clips, schema {opened.info['schema_version']}"

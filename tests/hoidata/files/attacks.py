@@ -1,0 +1,162 @@
+"""Small files that unpack, nest or repeat to gigabytes or minutes, each as its bytes and what reads such a file."""
+
+import json
+import pickle
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from hoidata.datasets.arctic.files import parse_parts
+from hoidata.datasets.base import RawTree
+from hoidata.datasets.checks import table
+from hoidata.datasets.h2o.files import listed_segments
+from hoidata.datasets.manipnet.adapter import _read_tips
+from hoidata.datasets.manipnet.bvh import ROOT_CHANNELS, parse_bvh, unpack_text
+from hoidata.files.restricted_pickle import ARRAYS, restricted_load
+from hoidata.files.sealed import read_metadata
+from hoidata.objects.mesh import LARGEST_MESH_BYTES, load_mesh, parse_obj
+from hoidata.objects.user_mesh import read_user_object
+from models.manipnet.trajectory_files import read_trajectories
+
+MB = 1 << 20
+Attack = tuple[str, Callable[[], bytes], Callable[[Path], Any]]
+
+
+def gzipped(text: bytes, repeats: int) -> bytes:
+    """A gzip file that unpacks to a megabyte of ``text`` over and over; a thousandth of that in size."""
+    packer = zlib.compressobj(9, zlib.DEFLATED, 31)
+    member = packer.compress(text * (MB // len(text))) + packer.flush()
+    return member * repeats
+
+
+def nested_lists(width: int, depth: int) -> bytes:
+    """Lists that hold the one before ``width`` times: ``width ** depth`` numbers in some hundred bytes."""
+    value: Any = [0.0] * width
+    for _ in range(depth - 1):
+        value = [value] * width
+    return pickle.dumps(value)
+
+
+def repeated(value: Any, times: int) -> bytes:
+    return pickle.dumps([value] * times)
+
+
+def cyclic() -> bytes:
+    value: list = []
+    value += [value, value]
+    return pickle.dumps(value)
+
+
+def many_lists() -> bytes:
+    return b"\x80\x04](" + b"]" * 2_900_000 + b"e."
+
+
+def ply(faces: bytes, count: int, index: str = "uchar", order: str = "binary_little_endian") -> bytes:
+    head = f"ply\nformat {order} 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += f"element face {count}\nproperty list uint {index} vertex_indices\nend_header\n"
+    return head.encode() + struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + faces
+
+
+def one_polygon() -> bytes:
+    corners = LARGEST_MESH_BYTES - 1000
+    return ply(struct.pack("<I", corners) + bytes([0, 1, 2]) * (corners // 3) + b"\0" * (corners % 3), 1)
+
+
+def text_ply() -> bytes:
+    head = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list int char x\nelement face 9\n"
+    return head + b"property char y\nend_header\n" + b"11 " * (LARGEST_MESH_BYTES // 3 - 100)
+
+
+def wide_obj() -> bytes:
+    return b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf " + b"1 2 3 " * (LARGEST_MESH_BYTES // 6 - 10)
+
+
+def glb(tree: dict, body: bytes = b"") -> bytes:
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<II", len(body), 0x004E4942) + body if body else b""
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def empty_accessors() -> bytes:
+    accessors = [{"componentType": 5126, "type": "VEC3", "count": 400_000_000}]
+    mesh = {"primitives": [{"attributes": {"POSITION": 0}}]}
+    return glb({"asset": {"version": "2.0"}, "accessors": accessors, "meshes": [mesh], "nodes": [{"mesh": 0}],
+                "scenes": [{"nodes": [0]}], "scene": 0})  # fmt: skip
+
+
+def many_nodes() -> bytes:
+    """One mesh of 30,000 triangles, shown by 20,000 nodes."""
+    body = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) * 30_000
+    views = [{"buffer": 0, "byteLength": len(body), "byteOffset": 0}]
+    accessors = [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 90_000}]
+    mesh, count = {"primitives": [{"attributes": {"POSITION": 0}}]}, 20_000
+    nodes = [{"mesh": 0} for _ in range(count)]
+    return glb({"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(body)}], "bufferViews": views,
+                "accessors": accessors, "meshes": [mesh], "nodes": nodes, "scenes": [{"nodes": [*range(count)]}],
+                "scene": 0}, body)  # fmt: skip
+
+
+def header_of_lists() -> bytes:
+    text = b'{"a":[' + b"[]," * 10_000_000 + b"[]]}"
+    return len(text).to_bytes(8, "little") + text
+
+
+def as_table(path: Path) -> Any:
+    return table("a.npy", restricted_load(path.read_bytes(), ARRAYS, where=path), 3)
+
+
+def as_obj(path: Path) -> Any:
+    return parse_obj(unpack_text(path.read_bytes(), str(path)), path)
+
+
+def as_bvh(path: Path) -> Any:
+    return parse_bvh(unpack_text(path.read_bytes(), str(path)), str(path))
+
+
+def zipped_rows() -> bytes:
+    head = zlib.compressobj(9, zlib.DEFLATED, 31)
+    text = f"HIERARCHY ROOT a {{ OFFSET 0 0 0 CHANNELS {ROOT_CHANNELS} }}\nMOTION\n".encode()
+    text += b"Frames: 1000000\nFrame Time: 0.01\n"
+    return head.compress(text) + head.flush() + gzipped(b"1 2 3 4 5 6 7\n\n\n", 200)
+
+
+def listed(path: Path) -> Any:
+    (path.parent / "label_split").mkdir()
+    path.rename(path.parent / "label_split" / path.name)
+    return listed_segments(RawTree(path.parent), "subject1/h1/0")
+
+
+def as_hand_reference(path: Path) -> Any:
+    (path.parent / "hand").mkdir()
+    path.rename(path.parent / "hand" / path.name)
+    return _read_tips(RawTree(path.parent))
+
+
+ATTACKS: list[Attack] = [
+    ("gzip-vertices.obj.gz", lambda: gzipped(b"v 0 0 0\n", 255), as_obj),
+    ("gzip-lines.obj.gz", lambda: gzipped(b"\n", 255), as_obj),
+    ("gzip-words.bvh.gz", lambda: gzipped(b"a ", 255), as_bvh),
+    ("gzip-gigabytes.bvh.gz", lambda: gzipped(b"\0", 4096), as_bvh),
+    ("gzip-rows.bvh.gz", zipped_rows, as_bvh),
+    ("lists-of-lists.pkl", lambda: nested_lists(100, 5), as_table),
+    ("lists-without-end.pkl", lambda: nested_lists(2, 60), as_table),
+    ("list-of-itself.pkl", cyclic, as_table),
+    ("one-text-often.pkl", lambda: repeated("x" * MB, 20_000), as_table),
+    ("many-lists.pkl", many_lists, as_table),
+    ("one-polygon.ply", one_polygon, load_mesh),
+    ("words.ply", text_ply, load_mesh),
+    ("one-polygon.obj", wide_obj, load_mesh),
+    ("empty-accessors.glb", empty_accessors, read_user_object),
+    ("many-nodes.glb", many_nodes, read_user_object),
+    ("parts.json", lambda: b"[" + b"[]," * 1_800_000 + b"[]]", lambda path: parse_parts(path.read_bytes(), "p", 9)),
+    ("action_train.txt", lambda: b"\n" * (5 * MB), listed),
+    ("rows.csv", lambda: b"time_s\n" + b"0\n" * (8 * MB), read_trajectories),
+    ("cells.csv", lambda: b"," * (30 * MB), read_trajectories),
+    ("lines.txt", lambda: b"120\n" + b"0\n" * (8 * MB), read_trajectories),
+    ("hand_reference.json", lambda: b"[" + b"{}," * (4 * MB) + b"{}]", as_hand_reference),
+    ("header.safetensors", header_of_lists, read_metadata),
+]  # fmt: skip
