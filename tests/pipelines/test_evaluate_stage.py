@@ -65,10 +65,10 @@ def test_the_reason_passes_through_where_there_are_no_motions(clips):
     assert json.loads(PATHS.metrics.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
 
 
-def test_a_store_written_by_the_script_of_the_readme_is_measured_by_the_command(clips):
-    script = re.search(r"```python\n(# Your system.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)[1]
+def test_a_store_written_by_the_ten_line_script_of_the_docs_is_measured_by_the_command(clips):
+    script = re.search(r"```python\n(# Your system.*?)```", (PROJECT / "docs/measure.md").read_text(), re.DOTALL)[1]
     assert sum(1 for line in script.splitlines() if line and not line.startswith("#")) <= 10
-    exec(compile(script, "README.md", "exec"), {})
+    exec(compile(script, "measure.md", "exec"), {})
     done = CliRunner().invoke(app, ["evaluate", "mine", "--reference", str(PATHS.data), "--out", "mine.json", *BIMART])
     assert done.exit_code == 0, done.output
     assert "joint error of the best sample" in done.output
