@@ -28,9 +28,10 @@ def thing() -> ObjectModel:
         mesh.vertices = mesh.vertices * (1 + 0.05 * draws.normal(size=(len(mesh.vertices), 1))) * size + middle
         parts.append(mesh)
     part = np.repeat(np.array([0, 1], np.uint8), [len(own.vertices) for own in parts])
-    whole = trimesh.util.concatenate(parts)
+    vertices = np.concatenate([own.vertices for own in parts])
+    faces = np.concatenate((body.faces, lid.faces + len(body.vertices)))
     hinge = Hinge(np.array([0.0, 0.0, -1.0]), np.zeros(3))
-    return ObjectModel("two bodies", np.array(whole.vertices), np.array(whole.faces), part, hinge)
+    return ObjectModel("two bodies", vertices, faces, part, hinge)
 
 
 def reference_bps(model: ObjectModel, settings: BasisSettings, scale: float, placed: np.ndarray) -> np.ndarray:

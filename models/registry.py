@@ -44,6 +44,7 @@ FAMILIES = {
     "noise": "models.baselines.controls:NOISE",
     "bimart-other-path": "models.bimart.family:OTHER_PATH",
     "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
+    "bimart-no-map": "models.bimart.family:NO_MAP",
     "bimart-zero-map": "models.bimart.family:ZERO_MAP",
 }
 # Each in a module of its own, so that a change of one trains no other again.

@@ -17,16 +17,17 @@ from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, ref
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.contact_training import CONTACT
+from models.bimart.diagnostics import diagnose
 from models.bimart.lookups import training_clips
 from models.bimart.motion_training import MOTION
 from models.bimart.sampler import BimArt, Made, Path, SamplingConfig
 from models.bimart.scene import Scene
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, LeftOut, Sources, motion_clip
+from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
 
 NO_OBJECT_MOTION = "it makes hands for the motion of an object, and none was given"
 AT_ONCE = 16  # motions of one length that share a batch
-Change = Literal["none", "other path", "other object", "zero map"]
+Change = Literal["none", "other path", "other object", "zero map", "no map"]
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,8 @@ class HandsForPaths:
     def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "HandsForPaths":
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
         trained = [load_checkpoint(sources.checkpoints / one.name, one, sources.device) for one in (CONTACT, MOTION)]
-        model = BimArt.of(trained[0], trained[1], config.sampling, sources.device)
+        sampling = replace(config.sampling, with_map=config.sampling.with_map and change != "no map")
+        model = BimArt.of(trained[0], trained[1], sampling, sources.device)
         synthetic = bool(trained[1].facts["synthetic"])
         config = replace(config, refined=config.refined and refined)
         return cls(model, sources.hands, config, synthetic, change, sources.annotated)
@@ -84,7 +86,7 @@ class HandsForPaths:
         """The motion of a request, or what a control takes for it."""
         assert request.trajectories is not None
         basis, thing = self.model.motion.config.features.basis, request.trajectories.object[: request.n_frames]
-        if self.change in ("none", "zero map"):
+        if self.change in ("none", "zero map", "no map"):
             return Scene.of(request.object, thing, basis)
         assert self.annotated is not None
         others = [clip for clip in training_clips(self.annotated) if clip.length >= request.n_frames]
@@ -125,6 +127,10 @@ class HandsForPaths:
         return replace(clip, hands={**clip.hands, **tracks})
 
 
+def _figures(sources: Sources) -> Figures:
+    return diagnose(HandsForPaths.load(sources).model, sources)
+
+
 def _family(name: str, title: str, refined: bool = True, change: Change = "none") -> Family:
     return Family(
         name,
@@ -132,6 +138,7 @@ def _family(name: str, title: str, refined: bool = True, change: Change = "none"
         lambda sources: HandsForPaths.load(sources, refined, change),
         networks=(CONTACT, MOTION) if name == "bimart" else (),
         uses=(CONTACT.name, MOTION.name),
+        diagnose=_figures if name == "bimart" else lambda sources: {},
     )
 
 
@@ -139,4 +146,5 @@ BIMART = _family("bimart", "BimArt: hands for the object's motion")
 UNREFINED = _family("bimart-unrefined", "BimArt before refinement", refined=False)
 OTHER_PATH = _family("bimart-other-path", "BimArt told another motion of the object", change="other path")
 OTHER_OBJECT = _family("bimart-other-object", "BimArt told another object", change="other object")
+NO_MAP = _family("bimart-no-map", "BimArt told no contact map", change="no map")
 ZERO_MAP = _family("bimart-zero-map", "BimArt told a contact map of zeros", change="zero map")

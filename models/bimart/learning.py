@@ -1,7 +1,7 @@
 """How both networks are trained: windows of clips, noised, against what is clean (Sec. 3.5)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ from models.bimart.scene import Recorded, recorded_clip
 from models.bimart.windows import Asked, windows_of
 from models.common.family import Losses, Setup
 from models.common.losses import masked_mean
-from models.common.sampling import TRAIN_STEPS, add_noise, alphas_cumprod
+from models.common.sampling import TRAIN_STEPS, add_noise
 
 VALIDATION_STEPS = (99, 299, 499, 699, 899)
 TINY = 1e-10
@@ -50,6 +50,9 @@ class Targets:
     known: Tensor
     mapped: Tensor
 
+    def to(self, device: torch.device | str) -> "Targets":
+        return Targets(*(getattr(self, item.name).to(device) for item in fields(self)))
+
 
 def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:
     """First frames of a clip's windows, none across a jump of the object; a clip that is too short has one, or none."""
@@ -73,7 +76,6 @@ class Objective:
         pair: HandPair = setup.corpus.annotated.store.hand_pair()
         self.loss: LossConfig = setup.loss
         self.device, self.length = setup.device, network.config.features.window
-        self.signal = alphas_cumprod(setup.device)
         train = setup.corpus.train
         features = network.config.features
         self.clips = {own: recorded_clip(train.whole(own), pair, features) for own in train.ids}
@@ -83,43 +85,24 @@ class Objective:
         self.network = network.to(setup.device)
         held = [recorded_clip(sample, pair, features) for sample in setup.corpus.held_out]
         middles = [(clip, max(len(clip.scene) - self.length, 0) // 2) for clip in held]
-        self.held_out = (
-            targets_of(network, middles).windows.to(self.device),
-            *self._placed(targets_of(network, middles)),
-        )
+        self.held_out = targets_of(network, middles).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         drawn = [one for sample in batch.samples for one in self._drawn(sample.clip_id, generator)]
         if not drawn:
             return {"total": self.network.x_out.bias.sum() * 0}
-        target = targets_of(self.network, drawn)
-        windows, (clean, known) = target.windows.to(self.device), self._placed(target)
-        count = self.network.config.diffusion_steps
-        number = torch.randint(count, (len(windows),), generator=generator)
-        steps = ((number + 1) * (TRAIN_STEPS // count) - 1).to(self.device)
-        drop = torch.rand(len(windows), generator=generator) < self.loss.contact_dropout
-        drop = (drop if self.loss.dropout_of == "window" else drop[:1].expand(len(windows))).to(self.device)
-        noise = torch.randn(clean.shape, generator=generator).to(self.device)
-        made = self.network(add_noise(clean, noise, steps, self.signal), steps, windows, drop)
-        wrong = (made - clean) / self.network.config.signal_scale
-        found = {"simple": masked_mean(wrong.square(), known)}
-        total = found["simple"]
-        if self.loss.velocity_weight:
-            both = known[:, 1:] & known[:, :-1]
-            found["velocity"] = masked_mean(wrong.diff(dim=1).square(), both)
-            total = total + self.loss.velocity_weight * found["velocity"]
-        return {"total": total, **found}
+        return window_losses(self.network, targets_of(self.network, drawn).to(self.device), self.loss, generator)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, Denoiser)
-        generator, (windows, clean, known) = torch.Generator().manual_seed(0), self.held_out
-        total = torch.zeros((), device=self.device)
+        generator, held = torch.Generator().manual_seed(0), self.held_out
+        clean, total = normalised(network, held), torch.zeros((), device=self.device)
         for step in VALIDATION_STEPS:
-            steps = torch.full((len(windows),), step, device=self.device)
+            steps = torch.full((len(clean),), step, device=self.device)
             noise = torch.randn(clean.shape, generator=generator).to(self.device)
-            made = network(add_noise(clean, noise, steps, self.signal), steps, windows)
-            total += masked_mean((made - clean).square(), known)
+            made = network(add_noise(clean, noise, steps, network.signal), steps, held.windows)
+            total += masked_mean((made - clean).square(), held.known)
         return total / len(VALIDATION_STEPS) / network.config.signal_scale**2
 
     def _drawn(self, clip_id: str, generator: torch.Generator) -> list[tuple[Recorded, int]]:
@@ -134,10 +117,29 @@ class Objective:
         apart = max(self.length // 8, 1)
         return [(clip, int(start)) for own, clip in self.clips.items() for start in self.starts[own][::apart]]
 
-    def _placed(self, target: Targets) -> tuple[Tensor, Tensor]:
-        """Normalised clean numbers, zero where there are none, and which there are; on the device."""
-        clean, known = target.clean.to(self.device), target.known.to(self.device)
-        return torch.where(known, self.network.encode(clean), 0.0), known
+
+def window_losses(network: Denoiser, target: Targets, loss: LossConfig, generator: torch.Generator) -> Losses:
+    """Noise windows to steps drawn evenly, and compare what is made of them with what is clean (Sec. 3.5)."""
+    clean, device = normalised(network, target), target.clean.device
+    batch, count = len(clean), network.config.diffusion_steps
+    number = torch.randint(count, (batch,), generator=generator)
+    steps = ((number + 1) * (TRAIN_STEPS // count) - 1).to(device)
+    drop = torch.rand(batch, generator=generator) < loss.contact_dropout
+    drop = (drop if loss.dropout_of == "window" else drop[:1].expand(batch)).to(device)
+    noise = torch.randn(clean.shape, generator=generator).to(device)
+    made = network(add_noise(clean, noise, steps, network.signal), steps, target.windows, drop)
+    wrong = (made - clean) / network.config.signal_scale
+    found = {"simple": masked_mean(wrong.square(), target.known)}
+    total = found["simple"]
+    if loss.velocity_weight:
+        found["velocity"] = masked_mean(wrong.diff(dim=1).square(), target.known[:, 1:] & target.known[:, :-1])
+        total = total + loss.velocity_weight * found["velocity"]
+    return {"total": total, **found}
+
+
+def normalised(network: Denoiser, target: Targets) -> Tensor:
+    """(B, F, D) clean numbers, zero where there are none."""
+    return torch.where(target.known, network.encode(target.clean), 0.0)
 
 
 def targets_of(network: Denoiser, drawn: Sequence[tuple[Recorded, int]]) -> Targets:

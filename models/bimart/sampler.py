@@ -26,13 +26,15 @@ IDLE_M = 0.2  # a hand that is farther than this from the object takes no part
 class SamplingConfig:
     """How both networks are walked. sampler: ``guidance`` is lambda_f of classifier-free guidance; 0: none.
 
-    rule: of that guidance. guide: contact-map guidance; in ``guide_share``, the last part, of the steps. overlapping:
-    windows of a path share their frames at every step; else they are made apart and put side by side. contact_anchor:
-    of G for the contact model, otherwise than it learnt (released: "before").
+    rule: of that guidance. with_map: motions are told contact maps. guide: contact-map guidance, in the last
+    ``guide_share`` of the steps. overlapping: windows of a path share their frames at every step; else they are made
+    apart and put side by side. contact_anchor: of G for the contact model, otherwise than it learnt (released:
+    "before").
     """
 
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig("ddim", 20, 0.5))
     rule: Literal["usual", "paper"] = "usual"
+    with_map: bool = True
     guide: Guide = "metres"
     guide_share: float = 1 / 3
     overlapping: bool = True
@@ -94,12 +96,21 @@ class BimArt:
     def make(self, paths: Sequence[Path], contact_m: Tensor | None = None) -> list[Made]:
         """Hands for paths of one length. contact_m: (B, frame, 2N) maps in the place of those that would be drawn."""
         generators = [torch.Generator().manual_seed(path.seed) for path in paths]
-        drawn = self._walk(self.contact, paths, generators, None)
-        drawn = self.contact.decode(drawn).clamp_min(0) * self._known(paths)
+        drawn = self._maps(paths, generators)  # even where maps are given: a motion's noise comes after a map's
         contact = drawn if contact_m is None else contact_m.to(drawn)
         motion = self.motion.decode(self._walk(self.motion, paths, generators, contact))
         rows = zip(map(self._hands, paths), contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
         return [_made(*own) for own in rows]
+
+    @torch.no_grad()
+    def maps(self, paths: Sequence[Path]) -> np.ndarray:
+        """(B, frame, 2N) metres: the maps that hands would be made for."""
+        return self._maps(paths, [torch.Generator().manual_seed(path.seed) for path in paths]).cpu().numpy()
+
+    def _maps(self, paths: Sequence[Path], generators: list[torch.Generator]) -> Tensor:
+        drawn = self.contact.decode(self._walk(self.contact, paths, generators, None))
+        most = self.contact.config.features.most_m or None
+        return drawn.clamp(0, most) * self._known(paths)
 
     def _known(self, paths: Sequence[Path]) -> Tensor:
         """(B, frame, 2N) bool: values of maps that are there."""
@@ -153,6 +164,8 @@ class BimArt:
             nonlocal calls
             calls += 1
             cut, own = layout.cut(x), steps.repeat_interleave(len(layout.starts))
+            if not config.with_map:
+                return layout.joined(network.denoise(cut, own, known, known.unconditional))
             if config.sampler.guidance == 0:
                 clean, untold = layout.joined(network.denoise(cut, own, known, known.conditional)), None
             else:

@@ -11,7 +11,15 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.sensors.keypoints import hand_keypoints
-from hoidata.sensors.part_bps import BasisSettings, PartBps, Variant, canonical_object, distance_map, object_scale
+from hoidata.sensors.part_bps import (
+    BasisSettings,
+    Nearest,
+    PartBps,
+    Variant,
+    canonical_object,
+    distance_map,
+    object_scale,
+)
 from tests.builders.objects import box_model, model_of, two_parts
 
 COUNT = 40
@@ -103,7 +111,8 @@ def test_the_canonical_frame_has_the_hinge_along_minus_z_and_leads_back() -> Non
 def test_the_surface_looks_the_same_in_a_finer_mesh_and_vertices_do_not() -> None:
     coarse = trimesh.creation.box((0.1, 0.2, 0.05))
     fine = coarse.subdivide().subdivide()
-    for nearest, same in (("surface", True), ("vertex", False)):
+    kinds: tuple[tuple[Nearest, bool], ...] = (("surface", True), ("vertex", False))
+    for nearest, same in kinds:
         seen = [
             PartBps(model_of(mesh), BasisSettings(COUNT, nearest=nearest)).look(np.zeros(1)).offset
             for mesh in (coarse, fine)

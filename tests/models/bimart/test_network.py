@@ -87,6 +87,7 @@ def test_a_hand_and_a_part_that_are_not_there_neither_enter_nor_are_made(network
     mask, whole = network.channel_mask(windows), made(network, windows, x)
     assert not whole[~mask].any()
     spoilt = torch.where(mask, x, 1e3)
+    assert windows.contact_m is not None
     contact = torch.where(contact_channels(windows), windows.contact_m, 1e3)
     offset = torch.where(windows.there.repeat_interleave(3, 1)[:, None], windows.offset, 1e3)
     torch.testing.assert_close(made(network, replace(windows, contact_m=contact, offset=offset), spoilt), whole)
@@ -102,6 +103,7 @@ def test_a_batch_of_windows_is_each_by_itself(network: Denoiser) -> None:
 
 def test_the_map_is_not_seen_where_it_is_dropped_and_the_contact_model_never_sees_one(network: Denoiser) -> None:
     windows, x, steps = drawn([8, 8], 8), torch.randn(2, 8, len(network.mean)), torch.full((2,), 399)
+    assert windows.contact_m is not None
     other = replace(windows, contact_m=windows.contact_m * 2)
     both = [network(x, steps, own, torch.tensor([True, False])) for own in (windows, other)]
     torch.testing.assert_close(both[0][0], both[1][0])
