@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter1d
+from scipy.ndimage import binary_dilation, gaussian_filter1d
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -35,7 +35,7 @@ from hoidata.store.store import open_store
 FRAMES, WINDOWS, KEYPOINTS, RUNS = 64, 2, 100, 5
 TRIANGLES = (8_000, 20_000)
 MOST_FITS, ENOUGH, TIMED_FITS, REFINEMENTS = 4_001, 1e-6, 40, 100
-FAR_M = 0.03  # a hand none of whose keypoints is nearer is not corrected by the object
+FAR_M, AROUND = 0.03, 5  # a hand that is nowhere nearer in so many frames around is not corrected by the object
 
 
 @dataclass(frozen=True)
@@ -277,7 +277,8 @@ def reached(pair: HandPair, ids: np.ndarray, window: Window, tracks: Mapping[Sid
     second = np.mean([np.linalg.norm(np.diff(skin, 2, axis=0), axis=-1) for skin in skins.values()])
     squares = []
     for side, hand in window.generated.items():
-        far = nearest(window.thing, hand.keypoints_m)[0].min(axis=1) > FAR_M
+        near = nearest(window.thing, hand.keypoints_m)[0].min(axis=1) < FAR_M
+        far = ~binary_dilation(near, iterations=AROUND)
         squares.append(((skins[side][:, ids] - hand.keypoints_m) ** 2).sum(-1)[far])
     rms = 1000 * np.sqrt(np.concatenate(squares).mean())
     shares = [100 * (deepest < -limit).mean() for limit in (0.01, 0.005, -0.005)]
