@@ -1,6 +1,6 @@
 """Pictures of the pages of `make demo`, taken in headless Chromium: python docs/make/screens.py PROJECT.
 
-A generated motion as an animated WebP, the report on a wide and a narrow screen.
+A generated motion as an animated WebP, the page of one, the report on a wide and a narrow screen, and its intervals.
 """
 
 import asyncio
@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import urllib.request
+from os import chdir
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from PIL import Image
 from websockets.asyncio.client import ClientConnection, connect
 
 from hoidata.hands import load_embedded_hands
+from models.text2hoi.generation import Wish
+from pipelines.generation import Asked, generate_files
 from pipelines.showing import write_shown_of
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -29,6 +32,10 @@ READY = "document.documentElement.dataset.players >= {}"
 CANVAS = "JSON.stringify(document.querySelector('canvas').getBoundingClientRect())"
 SHOW = """(async () => {{ const bar = document.querySelector('input[type=range]'); bar.value = {};
 bar.dispatchEvent(new Event('input')); await new Promise((done) => setTimeout(done, 120)); }})()"""
+
+
+INTERVALS = "const all = document.querySelector('details .charts').parentElement; all.open = true; all.scrollIntoView()"
+SENTENCE = "Drink from a mug with the right hand."
 
 
 class Page:
@@ -83,6 +90,20 @@ async def take(project: Path, folder: Path) -> None:
             await page.open(project / "report/embedded/index.html", width, height, 3)
             await asyncio.sleep(3)
             (await page.picture()).save(IMAGES / f"{name}.png", optimize=True)
+        await page.open(project / "report/embedded/index.html", 1200, 900, 3)
+        await page.run(INTERVALS)
+        await asyncio.sleep(1)
+        (await page.picture()).save(IMAGES / "charts.png", optimize=True)
+        await page.open(generated(project, folder), 1200, 1150, 3)
+        await asyncio.sleep(3)
+        (await page.picture()).save(IMAGES / "generate.png", optimize=True)
+
+
+def generated(project: Path, folder: Path) -> Path:
+    """The page of two motions for a sentence, made in the project."""
+    chdir(project)
+    asked = Asked(SENTENCE, "mug", "embedded", ("grab",), wish=Wish(seed=1, samples=2))
+    return generate_files(asked, folder / "generated").paths[-1]
 
 
 def _tabs() -> list[dict[str, Any]]:
@@ -91,6 +112,7 @@ def _tabs() -> list[dict[str, Any]]:
 
 
 def main(project: Path) -> None:
+    """Take all pictures."""
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     if chromium is None:
         sys.exit("no chromium on PATH")
@@ -108,4 +130,4 @@ def main(project: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]).resolve())
