@@ -52,6 +52,7 @@ def main() -> int:
 def _run(module, options: argparse.Namespace) -> int:
     from hoidata.errors import BadInput, HoidataError, told_in_words
     from pipelines.params import read_params
+    from pipelines.sidecar import noted_run
     from pipelines.stages.base import StagePaths
 
     paths = StagePaths(options.profile, options.dataset, options.model, options.family)
@@ -59,7 +60,7 @@ def _run(module, options: argparse.Namespace) -> int:
         chosen = read_params(Path())["profile"]
         if paths.profile not in ("", chosen):
             raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "choose it there")
-        with told_in_words():
+        with told_in_words(), noted_run(f"{options.stage}@{paths}"):
             module.run(replace(paths, profile=chosen))
     except HoidataError as error:
         print(f"{options.stage} of {paths}: {error}", file=sys.stderr)
