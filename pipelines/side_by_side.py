@@ -20,6 +20,7 @@ from typing import Any
 
 from hoidata.errors import BadInput, told_in_words
 from hoidata.files.atomic import exclusive, write_whole
+from pipelines.warm import WarmProcess
 
 CODE = "code"
 RUN = Path(".hoidata/repro")
@@ -59,6 +60,8 @@ def reproduce_side_by_side(
             _tell(CODE, run, 0)
         else:
             upstream = stale_stages(targets, children.forced if force else None)
+            if len(upstream) > jobs:
+                children.warm.start()
             run_all(upstream, pool, jobs, run_stage, run)
             write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
         run.wall = time.monotonic() - start
@@ -216,6 +219,7 @@ class _Children:
         self.context = multiprocessing.get_context("forkserver")
         self.processes: set[Any] = set()
         self.forced: set[str] = set()
+        self.warm = WarmProcess()
 
     def __enter__(self) -> "_Children":
         self.context.set_forkserver_preload(PRELOADED)
@@ -228,12 +232,14 @@ class _Children:
         for process in self.processes:
             if process.is_alive():
                 os.killpg(process.pid, signal.SIGINT)
+        self.warm.close()
 
     def run(self, name: str) -> int:
         """DVC's exit code for one stage; what it prints goes to the stage's log."""
         LOGS.mkdir(parents=True, exist_ok=True)
+        environment = {"HOIDATA_JOBS": str(self.cores), **self.warm.environment}
         process = self.context.Process(
-            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, self.cores)
+            target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, environment)
         )
         process.start()
         self.processes.add(process)
@@ -253,14 +259,14 @@ def _end_with_parent() -> None:
     os.killpg(0, signal.SIGINT)
 
 
-def _run_single_stage(project: Path, name: str, force: bool, cores: int) -> None:
+def _run_single_stage(project: Path, name: str, force: bool, environment: dict[str, str]) -> None:
     """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
     from dvc.cli import main
 
     os.setpgrp()
     threading.Thread(target=_end_with_parent, daemon=True).start()
     os.chdir(project)
-    os.environ["HOIDATA_JOBS"] = str(cores)
+    os.environ.update(environment)
     with log_of(name).open("wb") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)

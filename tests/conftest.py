@@ -3,7 +3,8 @@
 import os
 import pickle
 import shutil
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,10 +18,22 @@ from tests.builders.clips import build_clip
 def pytest_configure(config: pytest.Config) -> None:
     """xdist would begin with the modules of many tests, and end with the few that take minutes."""
     config.option.loadscopereorder = False
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("first") is None)
+
+
+@pytest.fixture(autouse=True)
+def _usual_arithmetic() -> Iterator[None]:
+    """Commands set threads, precision and algorithms of the process; no test, and no fixture that tests share, is to
+    notice which ran before it."""
+    yield
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(1)
+        torch.use_deterministic_algorithms(False)
+        torch.set_float32_matmul_precision("highest")
 
 
 @pytest.fixture

@@ -90,6 +90,9 @@ def convert_dataset(
     files = manifest.values() if isinstance(manifest, Mapping) else manifest
     listed = None if files is None else {item.path: item for item in files}
     out, root = Path(out), Path(root or ".")
+    if stop_on_change and (gone := [path for path in listed or () if not (root / path).exists()]):
+        got, remedy = f"{len(gone)} gone, first {gone[0]}", "restore the files, or scan the raw folder again"
+        raise ChangedMeanwhile(root, "all files that are listed", got, remedy)
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
     convert = SequenceConverter(adapter, root, hands, listed, synthetic, work, stop_on_change)
     with exclusive(out) as lock:

@@ -8,6 +8,8 @@ from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
 
+from pipelines.warm import ENVIRONMENT, run_warm
+
 STAGES = (
     "code",
     "raw",
@@ -38,9 +40,10 @@ def main() -> int:
     parser.add_argument("--model", default="")
     parser.add_argument("--family", default="")
     options = parser.parse_args()
-    # Threads that wait must sleep: spinning ones cost a busy two-core machine ten times the work. Read as torch loads.
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("GOMP_SPINCOUNT", "0")
+    if (code := run_warm("pipelines.stages", sys.argv[1:])) is not None:
+        return code
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     try:
         module = importlib.import_module(f"pipelines.stages.{options.stage}")
     except ModuleNotFoundError as error:

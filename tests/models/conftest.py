@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
 from hoidata.clips.clip import Clip, ObjectTrack
@@ -17,14 +16,6 @@ from tests.builders.stores import write_annotated
 from tests.models.toy import PARAMS, train
 
 GRASP_HEIGHT_M = 0.01
-
-
-@pytest.fixture(autouse=True)
-def _usual_arithmetic():
-    """Training sets threads, precision and algorithms of the process; no test is to notice which ran before it."""
-    torch.set_num_threads(1)
-    torch.use_deterministic_algorithms(False)
-    torch.set_float32_matmul_precision("highest")
 
 
 BOX, FOLDER = box_model((0.06, 0.06, 0.1)), notebook(0.02)

@@ -1,12 +1,12 @@
 """The preset ``paper`` is Text2HOI as published: numbers typed from its tables, equations worked out apart in NumPy."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
 from hoidata.batches.sight import Sight
@@ -21,10 +21,11 @@ from models.common.transformer import TransformerConfig
 from models.registry import load_network
 from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.contact_config import ContactLossConfig
-from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
+from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective, feature_shares
 from models.text2hoi.length import LengthModel, length_error
-from models.text2hoi.refiner import RefinerConfig, RefinerModel, attention_map
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, attention_map
+from models.text2hoi.refiner_training import RefinerObjective
 from models.text2hoi.surface import Surface
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
@@ -247,6 +248,49 @@ def test_penetration_contact_and_attention_follow_section_3_3() -> None:
     assert float(losses.surface_loss(given[1], given[2], 0.02)) == pytest.approx((joints[near] ** 2).mean(), rel=1e-5)
     np.testing.assert_allclose(attention_map(given[1]).numpy(), np.exp(-50 * np.abs(joints)), atol=1e-5)
     np.testing.assert_allclose(attention_map(given[1], "square").numpy(), np.exp(-50 * joints**2), atol=1e-5)
+
+
+def test_the_denoisers_total_is_equation_4(annotated: AnnotatedStore, seen: ClipBatch) -> None:
+    made = objective(annotated, **asdict(plan("diffusion").loss))
+    found = made.losses(seen, torch.Generator().manual_seed(0))
+    found = {name: float(value.detach()) for name, value in found.items()}
+    parts = found["simple"] + found["distance_map"] + found["relative_orientation"]
+    assert set(found) == {"total", "simple", "distance_map", "relative_orientation"}
+    assert found["total"] == pytest.approx(parts, rel=1e-6)
+
+
+class Exact(MotionGenerator):
+    """A generator that gives recorded motions back."""
+
+    def denoise_once(
+        self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, generator: torch.Generator
+    ) -> tuple[Tensor, Tensor]:
+        del timesteps, generator
+        return self._features((hands, objects), condition)
+
+
+class Off(RefinerModel):
+    """A refiner that adds 0.001 to every number."""
+
+    def forward(self, coarse: CoarseMotion) -> Tensor:
+        return coarse.hands + 0.001
+
+
+def test_the_refiners_losses_follow_equations_8_and_9(annotated: AnnotatedStore) -> None:
+    """Eq. 9 in the hands' 99 numbers, summed; eq. 8 with lambda_1 = 5."""
+    corpus, hands = Corpus.of(annotated, 0), Hands(load_embedded_hands())
+    generator = Exact(
+        DiffusionModel(DiffusionConfig(transformer=TransformerConfig(16, 1, 2, 16))), Normaliser.nothing()
+    )
+    surface = Surface.of(hands, [clip.object_model for clip in (*corpus.train, *corpus.held_out)], 24, CPU)
+    network = Off(replace(plan("refiner").network, transformer=TransformerConfig(16, 1, 2, 16)))
+    weights = replace(plan("refiner").loss, samples=1)
+    made = RefinerObjective(network, weights, corpus, generator, surface, CPU, 0)
+    found = made._losses(network, made.held_out)
+    assert float(found["simple"]) == pytest.approx(99 * 0.001**2, rel=1e-3)
+    assert float(found["contact"]) > 0
+    parts = found["simple"] + found["penetration"] + 5 * found["contact"]
+    assert float(found["total"]) == pytest.approx(float(parts), rel=1e-6)
 
 
 def test_the_refiner_reads_the_2273_numbers_of_section_12(seen: ClipBatch) -> None:

@@ -1,15 +1,19 @@
 """A copy of the project in a temporary folder, with the small corpora and budgets of a few steps."""
 
+import atexit
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import yaml
+
+from pipelines.warm import WarmProcess
 
 PROJECT = Path(__file__).parents[2]
 PARTS = (
@@ -102,9 +106,19 @@ def environment(**more: str) -> dict[str, str]:
     return {**kept, "PATH": path, "OMP_NUM_THREADS": "1", "DVC_NO_ANALYTICS": "1", "DO_NOT_TRACK": "1", **more}
 
 
+@cache
+def warm_process() -> WarmProcess:
+    """One for all tests of a worker: the stages DVC runs need not load torch anew."""
+    process = WarmProcess()
+    process.start()
+    atexit.register(process.close)
+    return process
+
+
 def run(folder: Path, *command: str, **more: str) -> subprocess.CompletedProcess:
     """Run a command as a user would type it, in the project folder."""
-    return subprocess.run(command, cwd=folder, env=environment(**more), capture_output=True, text=True)
+    warm = warm_process().environment if command[:2] == ("dvc", "repro") else {}
+    return subprocess.run(command, cwd=folder, env=environment(**warm, **more), capture_output=True, text=True)
 
 
 @pytest.fixture

@@ -140,7 +140,7 @@ def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, 
     remedy = {
         "absent": "hoidata synth write grab",
         "changed": "restore the file",
-        "one gone": "check that the download",
+        "one gone": "1 gone, first",
     }
     assert remedy[what] in done.stderr
     assert outputs(built) == before

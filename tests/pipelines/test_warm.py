@@ -1,0 +1,109 @@
+"""A stage run by the warm process is the one it would be by itself: output, folder, environment, exit code, signals."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from pipelines.warm import KILLED, SOCKET, run_warm
+
+ACT = """
+import os, signal, sys, time
+from pathlib import Path
+what = sys.argv[1]
+print(what, os.getcwd(), os.environ["WORD"], "HOIDATA_WARM" in os.environ, __name__, flush=True)
+print("said", file=sys.stderr)
+if what == "wait":
+    Path("began").touch()
+    try:
+        time.sleep(60)
+    except KeyboardInterrupt:
+        Path("interrupted").touch()
+        sys.exit(7)
+if what == "die":
+    os.kill(os.getpid(), signal.SIGKILL)
+if what == "raise":
+    raise ValueError("words")
+sys.exit(3)
+"""
+SERVE = "from pipelines.warm import serve; serve({!r}, ())"
+ASK = "import sys; from pipelines.warm import run_warm; sys.exit(run_warm('act', sys.argv[1:]))"
+
+
+@pytest.fixture
+def warm(tmp_path: Path):
+    """A folder with the module ``act``, and the environment of a process that asks there."""
+    (tmp_path / "act.py").write_text(ACT)
+    path = tmp_path / "socket"
+    paths = os.pathsep.join((str(tmp_path), os.getcwd()))
+    server = subprocess.Popen(
+        [sys.executable, "-c", SERVE.format(str(path))],
+        stdin=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": paths},
+        start_new_session=True,
+    )
+    until(path.exists)
+    yield {**os.environ, "PYTHONPATH": paths, "WORD": "given", SOCKET: str(path)}
+    server.communicate(timeout=10)
+    assert server.returncode == 0
+
+
+def until(true) -> None:
+    end = time.monotonic() + 20
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def ask(warm: dict[str, str], folder: Path, what: str) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-c", ASK, what], cwd=folder, env=warm, start_new_session=True)
+
+
+@pytest.mark.parametrize(("what", "code"), [("do", 3), ("raise", 1), ("die", KILLED)])
+def test_a_stage_says_and_answers_what_it_would_by_itself(warm, tmp_path: Path, what: str, code: int) -> None:
+    both = [
+        subprocess.run([sys.executable, *call, what], cwd=tmp_path, env=warm, capture_output=True, text=True)
+        for call in (("-c", ASK), ("-m", "act"))
+    ]
+    asked, own = both
+    assert asked.stdout == own.stdout.replace("True", "False") == f"{what} {tmp_path} given False __main__\n"
+    assert asked.stderr.splitlines()[0] == "said"
+    assert asked.stderr.splitlines()[-1] == own.stderr.splitlines()[-1]
+    assert (asked.returncode, own.returncode) == (code, -signal.SIGKILL if what == "die" else code)
+
+
+def test_a_signal_for_the_one_that_asks_is_for_the_stage(warm, tmp_path: Path) -> None:
+    asking = ask(warm, tmp_path, "wait")
+    until((tmp_path / "began").exists)
+    asking.send_signal(signal.SIGINT)
+    assert asking.wait(20) == 7
+    assert (tmp_path / "interrupted").exists()
+
+
+def test_a_stage_ends_with_the_one_that_asked(warm, tmp_path: Path) -> None:
+    asking = ask(warm, tmp_path, "wait")
+    until((tmp_path / "began").exists)
+    fork = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and socket_of(entry, warm)]
+    assert len(fork) == 1
+    asking.kill()
+    asking.wait()
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in fork))
+
+
+def socket_of(process: Path, warm: dict[str, str]) -> bool:
+    """Whether a process is a fork of the server: its command names the socket, and its folder is where it was asked."""
+    try:
+        command = (process / "cmdline").read_text()
+        return "serve" in command and warm[SOCKET] in command and (process / "cwd").readlink() != Path.cwd()
+    except OSError:
+        return False
+
+
+def test_without_a_warm_process_a_stage_runs_by_itself(monkeypatch, tmp_path: Path) -> None:
+    assert run_warm("act", []) is None
+    monkeypatch.setenv(SOCKET, str(tmp_path / "none"))
+    assert run_warm("act", []) is None
