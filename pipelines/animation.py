@@ -134,7 +134,7 @@ def _object(
         return user.model, list(user.notes)
     if not wish.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")
-    return stored_object(wish.object, StagePaths(profile, wish.model or datasets[0]), hands), []
+    return stored_object(wish.object, StagePaths(profile, wish.model or datasets[0]).clips, hands), []
 
 
 def chosen_network(

@@ -7,16 +7,17 @@ from pathlib import Path
 import typer
 
 from hoidata.errors import HoidataError, told_in_words
-from hoidata.files.written import ask_digests_of
 from pipelines.commands import (
     adapters,
     animate,
     controls,
+    convert,
     corpus,
     evaluate,
     generate,
     graph,
     import_checkpoint,
+    init,
     inspect,
     lineage,
     raw,
@@ -38,6 +39,8 @@ app.add_typer(synth.app, name="synth", help="The corpora made here: write them, 
 app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list them, check that one keeps the rules.")
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
 app.add_typer(lineage.app, name="lineage")
+app.command("init")(init.init)
+app.command("convert")(convert.convert)
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)
 app.command("down")(graph.down)
@@ -60,13 +63,19 @@ app.command("animate")(animate.animate)
 app.command("show")(show.show)
 
 
+@app.callback()
+def _check_what_is_read() -> None:
+    from hoidata.files.written import ask_digests_of
+
+    ask_digests_of(_written_digest)
+
+
 def main() -> None:
     """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given, or with the
     machine (a full disk, a folder that cannot be written); 130 after Ctrl-C."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
-    ask_digests_of(_written_digest)
     try:
         with told_in_words():
             app()

@@ -5,13 +5,14 @@ from typing import Any
 
 import yaml
 
+from hoidata.beside import FOLDER, IS_INSTALLED
 from hoidata.files.atomic import write_whole
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import read_params
 
 FILE = Path(".hoidata/deployments.yaml")
 WHOLE_GRAPH = "full-graph"
-ENTRYPOINT = "pipelines/flows.py:bring_up_to_date"
+ENTRYPOINT = f"{FOLDER / 'pipelines/flows.py' if IS_INSTALLED else 'pipelines/flows.py'}:bring_up_to_date"
 # Data stages a person asks for by themselves; what comes before each of them is brought up to date with it.
 WORK = ("convert", "annotate", "contact")
 SCHEDULE = {"cron": "0 3 * * 1", "timezone": "UTC", "active": False}

@@ -11,7 +11,7 @@ from typing import Literal
 from hoidata.errors import HoidataError
 from pipelines.lineage.manifests import Manifest
 from pipelines.params import PROFILES, read_params
-from pipelines.stages.adapters import manifest_of
+from pipelines.stages.adapters import manifest_of, source_of
 from pipelines.stages.base import HAND, StagePaths, load_hands, load_settings, own_root, root_variable
 
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
@@ -71,7 +71,7 @@ def _raw(profile: str, dataset: str) -> Finding:
         manifest = manifest_of(paths)
     except HoidataError as error:
         return Finding(part, "broken", str(error))
-    root = own_root(dataset) if profile == "own" else paths.generated_raw
+    root = own_root(dataset) or own_root(source_of(dataset)) if profile == "own" else paths.generated_raw
     if not manifest.present:
         return Finding(part, "absent", _why_absent(profile, manifest, root))
     if root is None or not root.is_dir():

@@ -31,17 +31,29 @@ class MeshWish:
 
 
 @dataclass(frozen=True)
+class Models:
+    """Trained networks and what they were trained with. clips: the store whose objects may be asked for by name."""
+
+    checkpoints: Path
+    hands: HandPair
+    encoder: TextEncoder
+    clips: Path | None = None
+
+
+@dataclass(frozen=True)
 class Asked:
     """Everything ``hoidata generate`` is told. object: a mesh file, or the name of an object of the dataset.
 
-    model: the dataset whose models to use, or "" for the one that knows the sentence's words best.
+    model: the dataset whose models to use, or "" for the one that knows the sentence's words best. models: these, in
+    place of a project's.
     """
 
     text: str
     object: str | Path
-    profile: str
-    datasets: tuple[str, ...]
+    profile: str = ""
+    datasets: tuple[str, ...] = ()
     model: str = ""
+    models: Models | None = None
     wish: Wish = field(default_factory=Wish)
     mesh: MeshWish = field(default_factory=MeshWish)
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -66,15 +78,29 @@ def generate_files(asked: Asked, out: Path) -> Written:
     if isinstance(asked.object, Path):
         user = read_user_object(asked.object, asked.mesh.unit, asked.mesh.up, asked.mesh.hinge)
         notes += user.notes
-    paths, why = chosen_model(asked, verb, thing)
-    notes.append(why)
+    models, why = (asked.models, "") if asked.models else _of_project(asked, verb, thing)
+    notes += [why] if why else []
     make_repeatable(threads=1)  # one motion is too small for two threads to agree on
-    hands, encoder = load_hands(paths.profile), _encoder()
-    model = user.model if user else stored_object(str(asked.object), paths, hands)
-    generator = Generator.load(paths.checkpoints, hands, encoder, sampler=asked.sampler)
+    hands = models.hands
+    model = user.model if user else _stored_object(str(asked.object), models)
+    generator = Generator.load(models.checkpoints, hands, models.encoder, sampler=asked.sampler)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
-    return Written(write_generation(out, motions, hands, str(paths.checkpoints), notes), notes)
+    return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+
+
+def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Models, str]:
+    """The models of the project that know the words best, and why these, in words."""
+    paths, why = chosen_model(asked, verb, thing)
+    encoder = load_settings(AnnotationSettings, "annotate").encoder
+    return Models(paths.checkpoints, load_hands(paths.profile), load_encoder(encoder), paths.clips), why
+
+
+def _stored_object(name: str, models: Models) -> ObjectModel:
+    if models.clips is not None:
+        return stored_object(name, models.clips, models.hands)
+    expected = "a mesh file (.obj, .ply, .stl, .glb)"
+    raise BadInput("--object", expected, name, "correct the path; objects by name are known in a project alone")
 
 
 def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[StagePaths, str]:
@@ -103,10 +129,6 @@ def _has_object(paths: StagePaths, name: str | Path) -> bool:
     return isinstance(name, str) and name in list(open_store(paths.clips, load_hands(paths.profile)).objects["object"])
 
 
-def _encoder() -> TextEncoder:
-    return load_encoder(load_settings(AnnotationSettings, "annotate").encoder)
-
-
 def why_not_trained(paths: StagePaths) -> str | None:
     """What is missing of the four models of a dataset, or None when all are there."""
     for name in NAMES:
@@ -118,9 +140,9 @@ def why_not_trained(paths: StagePaths) -> str | None:
     return None
 
 
-def stored_object(name: str, paths: StagePaths, hands: HandPair) -> ObjectModel:
+def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
     """An object of the dataset by name. Raises BadInput that lists the names there are."""
-    store = open_store(paths.clips, hands)
+    store = open_store(clips, hands)
     names = list(store.objects["object"])
     if name not in names:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"

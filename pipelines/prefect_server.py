@@ -20,6 +20,7 @@ from urllib.parse import urlsplit
 
 import psutil
 
+from hoidata.beside import python_path
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import exclusive
 from pipelines.deployments import write_deployments
@@ -109,7 +110,7 @@ def server_environment(url: str, key: str) -> dict[str, str]:
     }
     home = os.environ.get("PREFECT_HOME", str(Path(".prefect").resolve()))
     quiet = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
-    return {**os.environ, **quiet, **guards, "PREFECT_HOME": home, "PREFECT_API_URL": url}
+    return {**os.environ, **python_path(), **quiet, **guards, "PREFECT_HOME": home, "PREFECT_API_URL": url}
 
 
 def deploy(environment: dict[str, str]) -> None:

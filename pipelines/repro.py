@@ -10,8 +10,8 @@ from pipelines.lineage.graph import read_graph
 from pipelines.lineage.manifests import read_manifest
 from pipelines.params import read_params
 from pipelines.side_by_side import Run, RunStage, reproduce_side_by_side
-from pipelines.stages.adapters import ensure_manifests
-from pipelines.stages.base import StagePaths, raw_root
+from pipelines.stages.adapters import ensure_manifests, raw_files
+from pipelines.stages.base import StagePaths
 from pipelines.stages.code import write_code
 from pipelines.stages.raw import require_hand, write_generated
 
@@ -52,14 +52,14 @@ def preflight() -> None:
     for paths in unreadable:
         if not paths.is_generated:
             if {f"raw@{paths}", f"convert@{paths}"} & stale:
-                raw_root(paths)
+                raw_files(paths)
         elif f"raw@{paths}" not in stale and f"convert@{paths}" in stale:
             write_generated(paths, read_manifest(paths.manifest), paths.generated_raw)
 
 
 def _is_readable(paths: StagePaths) -> bool:
     try:
-        return raw_root(paths).is_dir()
+        return raw_files(paths).is_dir()
     except MissingResource:
         return False
 

@@ -3,12 +3,15 @@
 import difflib
 from pathlib import Path
 
+from hoidata.clips.clip import FPS
 from hoidata.dataset_folders import dataset_title
 from hoidata.errors import BadInput, MissingResource
+from hoidata.hands import HandPair
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.dataset_page import write_dataset_page
+from pipelines.pages.player import motion_player, write_page
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
@@ -29,6 +32,43 @@ def write_shown(what: str, profile: str, out: Path) -> Path:
     return write_clip_page(out / page_name(what), load_annotated(paths.data, hands), what, hands)
 
 
+def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Path:
+    """Write the page of a clip of ``folder``, an annotated dataset or a bare store, below ``out``; without an id that
+    of the whole dataset. Raises BadInput as ``write_shown`` does.
+    """
+    is_store = (folder / "meta").is_dir()
+    store = open_store(folder if is_store else folder / "clips", hands)
+    if clip_id and clip_id not in store.sequences.index:
+        raise _unknown(clip_id, str(folder), {str(store.info["dataset"]): store})
+    if is_store:
+        return write_stored_clip(out, store, clip_id, hands)
+    if clip_id:
+        return write_clip_page(out / page_name(clip_id), load_annotated(folder, hands), clip_id, hands)
+    name = str(store.info["dataset"])
+    return write_dataset_page(out, folder, name, hands, dataset_title(name))
+
+
+def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) -> Path:
+    """The page of a clip of a store that is not annotated: its motion and what is known of it."""
+    if not clip_id:
+        near = ", ".join(store.ids[:CLOSEST])
+        raise BadInput("CLIP", f"the id of one of {len(store)} clips", "none", f"name one, such as {near}")
+    clip = store.clip(clip_id)
+    title = f"{clip.verb or 'move'}: {clip.object_words}"
+    facts = [
+        ("clip", clip_id),
+        ("dataset", f"{clip.dataset}, subject {clip.subject}, sequence {clip.sequence}"),
+        ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s"),
+        ("source frames", f"{clip.source_frames[0]:g} to {clip.source_frames[-1]:g} at {clip.source_fps:g} per second"),
+        ("files", ", ".join(source.path for source in clip.sources) or "none are recorded"),
+        ("hand model", hands.name),
+        ("licence", str(store.info["licence"])),
+    ]
+    player = motion_player(clip, hands, title)
+    values = {"title": title, "synthetic": clip.synthetic, "player": player, "facts": facts, "has_players": True}
+    return write_page(out / page_name(clip_id), "store_clip.html", **values)
+
+
 def find_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
     """The dataset that holds a clip."""
     stores = {name: store for name in datasets if (store := _store(StagePaths(profile, name))) is not None}
@@ -37,7 +77,7 @@ def find_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
             return StagePaths(profile, name)
     if not stores:
         raise MissingResource(f"no dataset of the profile {profile} is converted; run `dvc repro` first")
-    raise _unknown(clip_id, profile, stores)
+    raise _unknown(clip_id, f"the profile {profile}", stores)
 
 
 def _store(paths: StagePaths) -> Store | None:
@@ -47,7 +87,7 @@ def _store(paths: StagePaths) -> Store | None:
     return open_store(paths.clips)
 
 
-def _unknown(clip_id: str, profile: str, stores: dict[str, Store]) -> BadInput:
+def _unknown(clip_id: str, where: str, stores: dict[str, Store]) -> BadInput:
     left_out = [
         row for store in stores.values() for row in store.quarantine.to_dict("records") if row["source_key"] == clip_id
     ]
@@ -57,7 +97,7 @@ def _unknown(clip_id: str, profile: str, stores: dict[str, Store]) -> BadInput:
         return BadInput(clip_id, "a clip", got, str(row["remedy"]))
     counts = ", ".join(f"{name} {len(store)}" for name, store in stores.items())
     near = closest_ids(clip_id, [known for store in stores.values() for known in store.ids])
-    expected = f"the id of one of the clips of the profile {profile} ({counts}) or a dataset"
+    expected = f"the id of one of the clips of {where} ({counts}) or a dataset"
     return BadInput("CLIP", expected, clip_id, f"closest: {', '.join(near)}")
 
 

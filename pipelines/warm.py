@@ -23,6 +23,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from hoidata.beside import python_path
+
 SOCKET = "HOIDATA_WARM"
 PRELOADED = (
     "numpy", "scipy.spatial.transform", "scipy.optimize", "scipy.stats", "pandas", "pyarrow.parquet", "numba", "orjson",
@@ -50,7 +52,7 @@ class WarmProcess:
             [sys.executable, "-m", "pipelines.warm", self.path],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            env={**os.environ, **ENVIRONMENT},
+            env={**os.environ, **ENVIRONMENT, **python_path()},
             start_new_session=True,
         )
 

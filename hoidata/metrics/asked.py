@@ -1,13 +1,18 @@
 """The contact maps motions were asked for, kept beside a predicted store's folder of clips.
 
     <folder>/clips/      the store     <folder>/asked.npz    motion_id (motion,) text; asked (motion, point) bool
+    <folder>/asked-distances.npz    maps of distances, as BimArt's: motion_id (motion,) text; first (motion + 1,) row at
+        which each begins; vertex (row, point) int32; distance_m (row, 2, point) float16; hand_vertices (n,) int32
 
-A point is one of the contact stage's sampled points of the motion's object; true where some acting hand is to touch it.
-Families that ask for no contact write no file; a motion without a row has no adherence.
+In asked.npz a point is one of the contact stage's sampled points of the motion's object; true where some acting hand is
+to touch it. In asked-distances.npz a row is a frame, a point a vertex of the object's mesh, other ones in every frame.
+Families that ask for no contact write no file; a motion without a row has no adherence, and no error of its map.
 """
 
 from collections.abc import Mapping
+from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +20,21 @@ from hoidata.errors import BadInput
 from hoidata.files.arrays import read_npz, write_npz
 
 FILE_NAME = "asked.npz"
+DISTANCES_NAME = "asked-distances.npz"
+REMEDY = "sample the family again"
+
+
+class AskedDistances(NamedTuple):
+    """The map of distances one motion was made for, frame by frame.
+
+    vertex: (frame, point) int32 vertices of the object's mesh. distance_m: (frame, 2, point) from each of them to the
+    nearest vertex of the left and the right hand, metres, not finite where nothing was asked. hand_vertices: (n,) int32
+    of the 778 those the distances are to.
+    """
+
+    vertex: np.ndarray
+    distance_m: np.ndarray
+    hand_vertices: np.ndarray
 
 
 def write_asked(folder: str | Path, asked: Mapping[str, np.ndarray]) -> None:
@@ -31,5 +51,46 @@ def read_asked(clips: str | Path) -> dict[str, np.ndarray]:
     names, asked = arrays.get("motion_id"), arrays.get("asked")
     if names is None or asked is None or asked.dtype != bool or asked.shape != (len(names), asked.shape[-1]):
         got = ", ".join(f"{name} {array.dtype} {array.shape}" for name, array in arrays.items())
-        raise BadInput(path, "motion_id (motion,) and asked (motion, point) bool", got, "sample the family again")
+        raise BadInput(path, "motion_id (motion,) and asked (motion, point) bool", got, REMEDY)
     return dict(zip(names.tolist(), asked, strict=True))
+
+
+def write_asked_distances(folder: str | Path, asked: Mapping[str, AskedDistances]) -> None:
+    """Write ``folder/asked-distances.npz``. asked: by motion id, all of as many points and of the same hand vertices.
+
+    Distances are kept as float16: off by less than 0.1 mm below 20 cm.
+    """
+    maps = list(asked.values())
+    arrays = {
+        "motion_id": np.array(list(asked)),
+        "first": np.cumsum([0, *(len(own.vertex) for own in maps)]),
+        "vertex": np.concatenate([own.vertex for own in maps]).astype(np.int32),
+        "distance_m": np.concatenate([own.distance_m for own in maps]).astype(np.float16),
+        "hand_vertices": maps[0].hand_vertices.astype(np.int32),
+    }
+    write_npz(Path(folder) / DISTANCES_NAME, arrays)
+
+
+def read_asked_distances(clips: str | Path) -> dict[str, AskedDistances]:
+    """By motion id, of the file beside the folder ``clips``; nothing without it. Raises BadInput."""
+    path = Path(clips).parent / DISTANCES_NAME
+    if not path.is_file():
+        return {}
+    arrays = read_npz(path)
+    try:
+        names, first, vertex, distance_m, hand = (arrays[name] for name in _DISTANCE_ARRAYS)
+        rows, points = vertex.shape
+        in_order = first[0] == 0 and first[-1] == rows and (np.diff(first) >= 0).all()
+        if distance_m.shape != (rows, 2, points) or len(first) != len(names) + 1 or not in_order:
+            raise ValueError(f"{len(names)} motions, vertex {vertex.shape}, distance_m {distance_m.shape}")
+        spans = [slice(*ends) for ends in pairwise(first.tolist())]
+        return {
+            str(name): AskedDistances(vertex[span], distance_m[span], hand)
+            for name, span in zip(names, spans, strict=True)
+        }
+    except (KeyError, ValueError, IndexError) as error:
+        expected = "motion_id (n,), first (n + 1,), vertex (row, point), distance_m (row, 2, point), hand_vertices"
+        raise BadInput(path, expected, str(error), REMEDY) from error
+
+
+_DISTANCE_ARRAYS = ("motion_id", "first", "vertex", "distance_m", "hand_vertices")

@@ -1,5 +1,6 @@
 """The list of metrics as README.md beside this file: ``python -m hoidata.metrics.describe > .../README.md``."""
 
+from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric
 
@@ -25,10 +26,17 @@ To add a metric: a function of (pair, every) that gives the values of one motion
 - A store whose info says `"length": "own"` holds motions of lengths the family chose. Its hands are seen where it has
   them, and what is compared frame by frame has no figure. Rows of given and of own length are never one row.
 
+"""
+_COLUMNS = """\
 | name | figure | unit | better | reduction | frames | every n-th | samples | frame by frame | thresholds | source |
 |---|---|---|---|---|---|---|---|---|---|---|
 """
+_ASKED = """
+## Figures of the list `{}`
 
+Computed where it is asked for: `evaluate: {metrics: [{}]}` in `params.yaml`, `hoidata evaluate ... --metrics {}`.
+
+"""
 
 _FEATURES = """
 ## Figures of features
@@ -47,7 +55,8 @@ there is one over clips: whole source sequences drawn again 2,000 times, the net
 
 def readme() -> str:
     """The text of README.md."""
-    tables = (_HEAD, map(_cells, METRICS)), (_FEATURES, map(_feature_cells, FEATURE_METRICS))
+    asked = ((_ASKED.replace("{}", name) + _COLUMNS, map(_cells, rows)) for name, rows in ASKED_LISTS.items())
+    tables = (_HEAD + _COLUMNS, map(_cells, METRICS)), *asked, (_FEATURES, map(_feature_cells, FEATURE_METRICS))
     return "".join(head + "".join(f"| {' | '.join(cells)} |\n" for cells in rows) for head, rows in tables)
 
 

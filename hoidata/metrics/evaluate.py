@@ -23,7 +23,7 @@ from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.metrics.action import Actions, training_actions, verb_of
-from hoidata.metrics.asked import read_asked
+from hoidata.metrics.asked import AskedDistances, read_asked, read_asked_distances
 from hoidata.metrics.encoded import Encoder
 from hoidata.metrics.encoded_store import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
@@ -93,7 +93,8 @@ def evaluate_store(
     annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
     asked = annotated.ids(split)
     samples, left_out = matched(store.ids, asked)
-    bench = _Bench(annotated, store, metrics, samples, read_asked(predicted), training_actions(annotated))
+    maps = read_asked(predicted), read_asked_distances(predicted)
+    bench = _Bench(annotated, store, metrics, samples, *maps, training_actions(annotated))
     jobs = jobs if sum(map(len, samples.values())) >= WORKERS_PAY_FROM else 1
     found = dict[str, Measured]()
     with Progress(console=Console(stderr=True), disable=not progress) as bar:
@@ -201,13 +202,17 @@ class _Reference:
 
 @dataclass
 class _Bench:
-    """Both stores, and what is built once per object. samples: predicted ids by reference; asked: maps by motion id."""
+    """Both stores, and what is built once per object. samples: predicted ids by reference.
+
+    asked, asked_distances: maps by motion id.
+    """
 
     annotated: AnnotatedStore
     store: Store
     metrics: tuple[Metric, ...]
     samples: dict[str, list[str]]
     asked: dict[str, np.ndarray]
+    asked_distances: dict[str, AskedDistances]
     actions: Actions
     indices: dict[str, ProximityIndex] = field(default_factory=dict)
 
@@ -220,7 +225,8 @@ class _Bench:
         group = str(self.annotated.store.sequences.at[clip_id, "sequence"])
         if clip_id not in self.samples:
             return Measured(group, [], [Unlike(clip_id, "no prediction of this clip")])
-        reference, found, left_out = self._reference(clip_id), list[Sample](), list[Unlike]()
+        reference, found, left_out, pairs = self._reference(clip_id), list[Sample](), list[Unlike](), list[Pair]()
+        together = [metric for metric in self.metrics if metric.together]
         for sample in self.samples[clip_id]:
             pair = self._pair(reference, sample)
             if isinstance(pair, str):
@@ -229,26 +235,33 @@ class _Bench:
             looking = [
                 metric
                 for metric in self.metrics
-                if (metric.samples is None or len(found) < metric.samples) and (pair.aligned or not metric.aligned)
+                if (metric.samples is None or len(found) < metric.samples)
+                and (pair.aligned or not metric.aligned)
+                and not metric.together
             ]
             values = {metric.name: metric.measure(pair, metric.every) for metric in looking}
             found.append(Sample(_number(sample, clip_id), values))
+            pairs += [pair] if together else []  # a motion and its meshes are kept no longer than they are asked for
+        for metric in together if pairs and not self.own_length else ():
+            found[0].values[metric.name] = metric.measure(pairs, metric.every)
         return Measured(group, found, left_out)
 
     def _pair(self, reference: _Reference, sample: str) -> Pair | str:
         """A prediction beside its reference, or why it cannot be compared."""
-        predicted, asked = _motion(self.store, sample), self.asked.get(sample)
+        predicted = _motion(self.store, sample)
+        asked, distances = self.asked.get(sample), self.asked_distances.get(sample)
         check = own_window_of if self.own_length else window_of
         window = check(predicted.clip, reference.motion.clip, reference.sides)
         if isinstance(window, str):
             return window
         if asked is not None and asked.shape != reference.part.shape:
             return f"the contact map asked for has {len(asked)} points, {len(reference.part)} expected"
+        if distances is not None and len(distances.vertex) != predicted.clip.n_frames:
+            return f"the map of distances asked for has {len(distances.vertex)} frames, not {predicted.clip.n_frames}"
         own, contact = reference.cut(*window)
         aligned = not self.own_length
-        return Pair(
-            predicted, own, reference.sides, contact, reference.table_m, aligned, asked, reference.verb, self.actions
-        )
+        given = aligned, asked, reference.verb, self.actions, distances
+        return Pair(predicted, own, reference.sides, contact, reference.table_m, *given)
 
     def _reference(self, clip_id: str) -> _Reference:
         annotated, motion = self.annotated, _motion(self.annotated.store, clip_id)

@@ -10,6 +10,7 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
 from hoidata.metrics.action import Actions
+from hoidata.metrics.asked import AskedDistances
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene
 
@@ -55,7 +56,8 @@ class Pair:
     sides: the hands that act in the reference clip. table_m: height of the table the object of the whole reference clip
     rests on; None where gravity is not known. aligned: frame ``i`` of both is the same moment, and the prediction has
     its hands wherever the reference has; else the family chose its own length. asked: (point,) bool, the contact map
-    the prediction was made for, or None. verb: of the reference clip; actions: what verbs ask of a motion.
+    the prediction was made for, or None; asked_distances: the map of distances, or None. verb: of the reference clip;
+    actions: what verbs ask of a motion.
     """
 
     predicted: Motion
@@ -67,6 +69,7 @@ class Pair:
     asked: np.ndarray | None = None
     verb: str | None = None
     actions: Actions | None = None
+    asked_distances: AskedDistances | None = None
 
     def valid(self, side: Side) -> np.ndarray:
         """(frame,) bool: the frames of the prediction in which this hand is looked at."""

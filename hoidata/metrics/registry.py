@@ -1,6 +1,7 @@
 """The one list of metrics: evaluation, the tables on pages and README.md beside this file are made from it.
 
-To add one: a function of (pair, every) that gives the values of one motion as an array, and a row here.
+To add one: a function of (pair, every) that gives the values of one motion as an array, and a row here. A list of
+``asked_metrics.py`` is computed only where it is asked for.
 """
 
 from collections.abc import Callable
@@ -10,12 +11,11 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from hoidata.metrics import forces, motion, touch, two_hands
-from hoidata.metrics.pair import Pair
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
 
 Direction = Literal["higher", "lower", "nearer the truth"]
-Topic = Literal["Action", "Contact", "Physics", "Motion"]
+Topic = Literal["Action", "Contact", "Physics", "Motion", "BimArt", "CAMS"]
 Reduction = Literal["best of a clip's samples", "mean over motions", "mean over frames"]
 
 
@@ -34,6 +34,7 @@ class Metric:
     at; None: all. thresholds: in words. source: where the definition comes from.
     floor_of: the metric of which this is what it gives for nothing; no figure of a floor is better than another.
     aligned: compares frame by frame, so there is no figure for motions of a length their family chose.
+    together: ``measure`` gets the pairs of all motions of a clip in a list, instead of one pair.
     """
 
     topic: Topic
@@ -41,7 +42,7 @@ class Metric:
     title: str
     unit: str
     direction: Direction
-    measure: Callable[[Pair, int], np.ndarray]
+    measure: Callable[..., np.ndarray]
     reduction: Reduction
     frames: str
     source: str
@@ -50,6 +51,7 @@ class Metric:
     thresholds: str = ""
     floor_of: str = ""
     aligned: bool = False
+    together: bool = False
 
 
 class Figure(NamedTuple):

@@ -19,7 +19,7 @@ from hoidata.splits.published import published
 from hoidata.splits.rules import KINDS, SplitRule
 
 FOLDER = Path(__file__).with_name("definitions")
-OF_ANY_DATASET = ("composition", "drawn-object")
+OF_ANY_DATASET = ("composition", "drawn-object", "drawn-per-object")
 OWN = "params.yaml"
 OWN_SOURCE = "a rule of this project's params.yaml"
 RULE_KEYS = tuple(field.name for field in fields(SplitRule))
@@ -32,6 +32,7 @@ USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
     "time": (),
     "rounds": (),
     "drawn": ("sequence", "file"),
+    "drawn-per-object": ("sequence", "file"),
     "drawn-object": ("object",),
     "composition": ("composition",),
 }
@@ -39,13 +40,17 @@ USUAL_PROMISES: dict[str, tuple[Promise, ...]] = {
 
 @dataclass(frozen=True)
 class Definition:
-    """One dataset's part of a named split. version counts changes of the definition; source says whose split it is."""
+    """One dataset's part of a named split. version counts changes of the definition; source says whose split it is.
+
+    if_chosen: the stage writes it only where it is chosen, so that it changes nothing for whoever does not want it.
+    """
 
     name: str
     version: int
     source: str
     rule: SplitRule
     promises: tuple[Promise, ...]
+    if_chosen: bool = False
 
     def as_json(self) -> dict[str, Any]:
         facts = {"name": self.name, "version": self.version, "source": self.source}
@@ -113,7 +118,8 @@ def _read(path: Path) -> Definition:
         values = (orjson.loads(general.read_bytes()) if general.is_file() else {}) | orjson.loads(path.read_bytes())
     except (orjson.JSONDecodeError, TypeError) as error:
         raise BadInput(path, "a JSON object", str(error), "correct it") from error
-    origin = {key: values.pop(key, None) for key in ("version", "source")}
+    origin, if_chosen = {key: values.pop(key, None) for key in ("version", "source")}, values.pop("if_chosen", False)
     if not all(origin.values()):
         raise BadInput(path, "the split's version and source", f"{origin}", "state them there")
-    return Definition(path.stem, origin["version"], origin["source"], *_rule_and_promises(str(path), values))
+    rule, promises = _rule_and_promises(str(path), values)
+    return Definition(path.stem, origin["version"], origin["source"], rule, promises, bool(if_chosen))

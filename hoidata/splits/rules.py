@@ -12,12 +12,24 @@ from hoidata.files import sha256_bytes
 from hoidata.splits.held_out import hold_out, without_shared_frames
 
 Part = Literal["train", "validation", "test"]
-Kind = Literal["subject", "object", "sequence", "prefix", "time", "rounds", "drawn", "drawn-object", "composition"]
+Kind = Literal[
+    "subject",
+    "object",
+    "sequence",
+    "prefix",
+    "time",
+    "rounds",
+    "drawn",
+    "drawn-per-object",
+    "drawn-object",
+    "composition",
+]
 PARTS: tuple[Part, ...] = get_args(Part)
 KINDS: tuple[Kind, ...] = get_args(Kind)
 IN_TIME = ("time", "rounds")
 HELD_OUT = ("drawn-object", "composition")
-BY_SHARE = (*IN_TIME, "drawn", *HELD_OUT)  # rules that list no names
+DRAWN = ("drawn", "drawn-per-object")
+BY_SHARE = (*IN_TIME, *DRAWN, *HELD_OUT)  # rules that list no names
 REST = "rest"
 ROUND: tuple[Part, ...] = ("train", "train", "train", "validation", "test")
 REMEDY = "mend params.yaml"
@@ -38,6 +50,8 @@ class SplitRule:
     (the shares are not used). For recordings whose end shows other actions than their beginning.
     by "drawn": whole source sequences in the order of the SHA-256 of their names; shares as by "time". For a dataset of
     which no list of sequences is known.
+    by "drawn-per-object": the same among the sequences of every object (that of a sequence's first clip in time): each
+    object tests, with its only sequence if it has no other, and validates where it has three or more.
     by "drawn-object": whole objects, of which every verb and hand type is also seen in training; shares of all clips.
     by "composition": whole compositions, each a verb, an object and a hand type that training has all three of, never
     together. A clip that shares frames with one of test (or of validation) but is of another part is left out.
@@ -112,8 +126,8 @@ def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:
     rows = sequences.reset_index(drop=True)
     if rule.by in IN_TIME:
         parts = _in_time(rows, rule)
-    elif rule.by == "drawn":
-        drawn = _drawn(rows["sequence"], rule)
+    elif rule.by in DRAWN:
+        drawn = _drawn(rows["sequence"], rule) if rule.by == "drawn" else _drawn_per_object(rows, rule)
         parts = [drawn[name] for name in rows["sequence"]]
     elif rule.by == "prefix":
         parts = [_by_prefix(name, rule) for name in rows["sequence"]]
@@ -233,6 +247,17 @@ def _drawn(sequences: Iterable[str], rule: SplitRule) -> dict[str, Part]:
     """Part of each sequence: with every sequence that is added few others change theirs."""
     names = sorted(set(sequences), key=lambda name: sha256_bytes(name.encode()))
     return dict(zip(names, _by_share(len(names), rule), strict=True))
+
+
+def _drawn_per_object(rows: pd.DataFrame, rule: SplitRule) -> dict[str, Part]:
+    first = rows.sort_values(["first_source_frame", "clip_id"], kind="stable").groupby("sequence")["object"].first()
+    parts: dict[str, Part] = {}
+    for _, own in first.groupby(first.map(object_name)):
+        drawn = _drawn(own.index, rule)
+        parts |= drawn
+        if rule.test_share and "test" not in drawn.values():
+            parts[list(drawn)[-1]] = "test"
+    return parts
 
 
 def _by_rounds(n_clips: int) -> Sequence[Part]:

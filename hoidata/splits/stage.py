@@ -1,7 +1,7 @@
 """Stage split: every named split of a dataset, the chosen one, what they promise, and the training statistics.
 
     splits.parquet    clip_id, one column per named split the dataset has (of any dataset's, those for which it has
-                      clips enough), and `split`, the chosen one: train,
+                      clips enough; none that is written only where it is chosen), and `split`, the chosen one: train,
                       validation, test, or null for a clip without sentences or that no part covers; one row per clip
     info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is
     statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
@@ -50,7 +50,8 @@ def split_store(
     store = open_store(clips_folder)
     hand_types, used = _annotated_clips(store, Path(annotation_folder))
     dataset = str(store.info["dataset"])
-    chosen, named = choose(dataset, wanted), definitions_for(dataset)
+    chosen = choose(dataset, wanted)
+    named = {name: item for name, item in definitions_for(dataset).items() if not item.if_chosen}
     words = hand_types.loc[used]
     rows = store.sequences.loc[used].assign(verb=words["verb"], hand_type=words["hand_type"])
     digests = {clip_id: motion_digest(store.clip(clip_id, motion_only=True)) for clip_id in used}

@@ -45,6 +45,7 @@ from hoidata.store.store import Store, open_store
 
 # The form of a sentence beyond the four.
 VARIATION = "variation"
+SUBSETS = ("train", "validation", "test")
 STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
 
 
@@ -93,7 +94,12 @@ class AnnotatedStore:
         return len(self.ids())
 
     def ids(self, split: str | None = None) -> list[str]:
-        """Clips with sentences, of one subset of the chosen split or all, in the store's order."""
+        """Clips with sentences, of one subset of the chosen split or all, in the store's order.
+
+        Raises BadInput for what is the name of no subset.
+        """
+        if split not in (None, *SUBSETS):
+            raise BadInput("split", f"one of {', '.join(SUBSETS)}, or None for all clips", repr(split), "correct it")
         return [key for key in self._sentences if split is None or self.splits[key] == split]
 
     def split_ids(self, split: str) -> list[str]:

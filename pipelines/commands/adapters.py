@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hoidata.errors import BadInput
+from pipelines.commands.hands import chosen_hands
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -60,7 +61,7 @@ def check(
     from hoidata.conformance.check import check_adapter
     from hoidata.datasets.registry import get_adapter
 
-    adapter = get_adapter(name, **_settings(setting or []))
+    adapter = get_adapter(name, **read_settings(setting or []))
     hands, note = _hands(hand, adapter.needs_mano)
     with Console(stderr=True).status(f"loading up to {sequences} sequences of {name}, each several times"):
         findings = check_adapter(adapter, root, hands, sequences)
@@ -70,7 +71,7 @@ def check(
     raise typer.Exit(1 if failed else 0)
 
 
-def _settings(pairs: list[str]) -> dict[str, Any]:
+def read_settings(pairs: list[str]) -> dict[str, Any]:
     """``margin_frames=5`` as a number, other values as YAML reads them."""
     settings = {}
     for pair in pairs:
@@ -83,17 +84,11 @@ def _settings(pairs: list[str]) -> dict[str, Any]:
 
 def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
     """The hand to check with, and what to say about it."""
-    from hoidata.hands import load_embedded_hands, load_mano_hands
-    from pipelines.stages.base import HAND, own_root
-
-    registered = own_root(HAND)
-    folder = Path(choice) if choice not in ("", "embedded") else (registered if not choice else None)
-    if folder is not None:
-        return load_mano_hands(folder), f"hand: MANO files of {folder}"
-    note = "hand: embedded"
-    if needs_mano:
+    hands = chosen_hands(choice)
+    note = f"hand: {hands.name}"
+    if needs_mano and hands.name == "embedded":
         note += "; on files made with MANO, warnings about touch mean nothing without --hand FOLDER"
-    return load_embedded_hands(), note
+    return hands, note
 
 
 def _print(name: str, findings, note: str) -> None:

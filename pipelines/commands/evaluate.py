@@ -2,11 +2,16 @@
 
 import json
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+
+from hoidata.errors import MissingResource
+from pipelines.commands.hands import hands_of
+from pipelines.commands.project import enter_project
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -24,9 +29,11 @@ def evaluate(
         Path | None, typer.Option(help="Its trained evaluator, such as evaluators/study/study.", exists=True)
     ] = None,
     split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
+    metrics: Annotated[str, typer.Option(help="Further lists of metrics, comma between: bimart.")] = "",
 ) -> None:
     """Measure every clip of a store against the clip it was made for, and print the table of metrics."""
     from hoidata.files import write_whole
+    from hoidata.metrics.asked_metrics import with_lists
     from hoidata.metrics.evaluate import evaluate_store
     from pipelines.pages.metrics_table import printed_table
     from pipelines.stages.base import jobs
@@ -36,8 +43,10 @@ def evaluate(
         from models.evaluator.encoders import load_evaluators
 
         encoders = load_evaluators(evaluators)
-    hands = _hands(reference)
-    found = evaluate_store(store, reference, hands, split=split, encoders=encoders, jobs=jobs(), progress=True)
+    hands, asked = _hands(reference), with_lists(filter(None, metrics.split(",")))
+    found = evaluate_store(
+        store, reference, hands, split=split, metrics=asked, encoders=encoders, jobs=jobs(), progress=True
+    )
     Console(width=None if sys.stdout.isatty() else 120).print(printed_table(found))
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")
@@ -47,16 +56,11 @@ def evaluate(
 
 def _hands(reference: Path) -> "HandPair":
     """The hand model the dataset was converted with: the embedded one, or the user's MANO files."""
-    from hoidata.hands import load_embedded_hands
     from hoidata.store.store import read_info
-    from pipelines.commands.project import enter_project
-    from pipelines.stages.base import load_hands
 
-    embedded = load_embedded_hands()
-    if read_info(reference / "clips")["hand_model"]["digest"] == embedded.digest:
-        return embedded
-    enter_project()
-    return load_hands("own")
+    with suppress(MissingResource):
+        enter_project()  # where the user's MANO files are noted
+    return hands_of(read_info(reference / "clips")["hand_model"]["digest"], str(reference))
 
 
 def table(

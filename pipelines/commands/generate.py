@@ -1,11 +1,15 @@
 """``hoidata generate``: a sentence and an object become motions."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from pipelines.commands.hands import hands_of
 from pipelines.commands.project import current_profile, enter_project
+
+if TYPE_CHECKING:
+    from pipelines.generation import Models
 
 
 def generate(
@@ -16,6 +20,14 @@ def generate(
     samples: Annotated[int, typer.Option(help="How many motions, side by side.", min=1, max=32)] = 1,
     hand: Annotated[Literal["left", "right", "both"] | None, typer.Option(help="Whatever the words say.")] = None,
     length: Annotated[float | None, typer.Option(help="Seconds, instead of the length network's answer.")] = None,
+    models: Annotated[
+        Path | None,
+        typer.Option(
+            help="Checkpoints of one dataset, such as checkpoints/embedded/grab: no project is needed.",
+            exists=True,
+            file_okay=False,
+        ),
+    ] = None,
     model: Annotated[str, typer.Option(help="Dataset whose models to use; else what knows the words.")] = "",
     sampler: Annotated[Literal["ddim", "ddpm", "dpm++"], typer.Option(help="How noise becomes motion.")] = "ddim",
     steps: Annotated[int, typer.Option(help="Denoiser calls.", min=1, max=1000)] = 20,
@@ -34,24 +46,26 @@ def generate(
 ) -> None:
     """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
     mesh = Path(object).resolve() if Path(object).is_file() else None
-    root = enter_project()
+    root = enter_project() if models is None else None
     from hoidata.clips.clip import FPS
     from models.common.sampling import SamplerConfig
     from models.text2hoi.generation import Wish
     from pipelines.generation import Asked, MeshWish, generate_files
     from pipelines.params import read_params
 
+    where: dict[str, Any] = {"models": _given_models(models)} if models else {}
+    if root is not None:
+        where = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
     wish = Wish(seed, samples, hand, None if length is None else round(length * FPS), hand_by)
     written = generate_files(
         Asked(
             text,
             mesh or object,
-            profile or current_profile(),
-            tuple(read_params(root)["datasets"]),
-            model,
-            wish,
-            MeshWish(unit, up, hinge),
-            SamplerConfig(sampler, steps, scale),
+            model=model,
+            wish=wish,
+            mesh=MeshWish(unit, up, hinge),
+            sampler=SamplerConfig(sampler, steps, scale),
+            **where,
         ),
         out,
     )
@@ -59,3 +73,14 @@ def generate(
         typer.echo(note, err=True)
     for path in written.paths:
         typer.echo(path)
+
+
+def _given_models(folder: Path) -> "Models":
+    """Networks of a folder, with the hand and the text encoder their headers name."""
+    from hoidata.annotation.encoders import load_encoder
+    from models.common.checkpoints import FILE_NAME, read_info
+    from pipelines.generation import Models
+
+    facts = read_info(folder / "contact" / FILE_NAME)["facts"]
+    encoder = str(facts["encoder"]["name"])
+    return Models(folder, hands_of(facts["hand_digest"], str(folder)), load_encoder(encoder))

@@ -25,7 +25,9 @@ def enter_project() -> Path:
         if (folder / "dvc.yaml").is_file() and (folder / "params.yaml").is_file():
             os.chdir(folder)
             return folder
-    raise MissingResource(f"no hoidata project (a folder with dvc.yaml) at or above {here}; change into one")
+    raise MissingResource(
+        f"no hoidata project (a folder with dvc.yaml) at or above {here}; change into one, or `hoidata init DIR`"
+    )
 
 
 def current_profile() -> str:
@@ -39,11 +41,11 @@ def set_profile(profile: str) -> bool:
     text, before = path.read_text(), current_profile()
     _keep_profile_from_git(profile)
     if before != profile:
-        path.write_text(PROFILE.sub(_profile_line(profile), text, count=1))
+        path.write_text(PROFILE.sub(profile_line(profile), text, count=1))
     return before != profile
 
 
-def _profile_line(profile: str) -> str:
+def profile_line(profile: str) -> str:
     """Equally long for all profiles: git looks closer at a file of the same size before it calls it changed."""
     return f"profile: {profile}  # or {', '.join(name for name in PROFILES if name != profile)}"
 
@@ -58,8 +60,8 @@ def _keep_profile_from_git(profile: str) -> None:
         chosen = Path(git("rev-parse", "--git-path", CHOSEN))
     except (OSError, subprocess.CalledProcessError):
         return  # no git here, no work tree to keep clean
-    chosen.write_text(f"s/{PROFILE.pattern}/{_profile_line(profile)}/\n")
-    git("config", f"filter.{FILTER}.clean", f"sed -e 's/{PROFILE.pattern}/{_profile_line('embedded')}/'")
+    chosen.write_text(f"s/{PROFILE.pattern}/{profile_line(profile)}/\n")
+    git("config", f"filter.{FILTER}.clean", f"sed -e 's/{PROFILE.pattern}/{profile_line('embedded')}/'")
     git("config", f"filter.{FILTER}.smudge", f'sed -e "$(cat "$(git rev-parse --git-path {CHOSEN})" 2>/dev/null)"')
 
 

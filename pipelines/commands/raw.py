@@ -23,14 +23,16 @@ def scan(
     """Write the manifest of your copy of a dataset, remember where it lies, and switch to the profile `own`."""
     enter_project()
     from pipelines.lineage.manifests import write_manifest
-    from pipelines.stages.adapters import ensure_manifests
+    from pipelines.stages.adapters import ensure_manifests, source_of
     from pipelines.stages.base import HAND, StagePaths
 
     name = HAND if dataset == "mano" else dataset
     paths = StagePaths("own", name)
     manifest = _scan_hand(paths, root) if name == HAND else _scan_dataset(paths, root)
-    ensure_manifests("own", read_params(Path())["datasets"])
-    write_manifest(paths.manifest, manifest)
+    known = read_params(Path())["datasets"]
+    ensure_manifests("own", known)
+    for variant in (name, *(other for other in known if other != name and source_of(other) == name)):
+        write_manifest(StagePaths("own", variant).manifest, manifest)
     remember_root(name, root)
     size = sum(entry.size for entry in manifest.files)
     typer.echo(f"{paths.manifest}: {len(manifest.files)} entries, {size / 1e6:.1f} MB; {root} noted in hoidata.toml")
@@ -121,8 +123,8 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
     asked_for: by name, so that its absence is a complaint.
     """
     from pipelines.lineage.manifests import read_manifest, verify_files
-    from pipelines.stages.adapters import configured_adapter, manifest_of
-    from pipelines.stages.base import StagePaths, raw_root
+    from pipelines.stages.adapters import configured_adapter, manifest_of, raw_files
+    from pipelines.stages.base import StagePaths
 
     paths, adapter = StagePaths(current_profile(), dataset), configured_adapter(dataset)
     manifest = manifest_of(paths)
@@ -131,7 +133,7 @@ def _verify_one(dataset: str, asked_for: bool) -> bool:
         _say_where_to_get(adapter)
         return not asked_for
     try:
-        root = raw_root(paths)
+        root = raw_files(paths)
     except MissingResource as error:
         typer.echo(f"{dataset}: {error}")
         _say_where_to_get(adapter)

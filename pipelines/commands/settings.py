@@ -16,6 +16,7 @@ SECTIONS = {
     "annotate": "hoidata.annotation.settings:AnnotationSettings",
     "surface": "hoidata.surface.stage:SurfaceSettings",
     "evaluator": "models.evaluator.settings:EvaluatorSettings",
+    "evaluate": "pipelines.stages.evaluate:EvaluateSettings",
     "controls": "pipelines.stages.controls:ControlSettings",
 }
 

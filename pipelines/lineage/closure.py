@@ -14,6 +14,7 @@ from importlib.util import find_spec
 from itertools import accumulate
 from pathlib import Path
 
+from hoidata.beside import INSTALLED, home_of
 from hoidata.files.atomic import write_whole
 from hoidata.files.digest import sha256_file
 
@@ -141,7 +142,7 @@ class SourceTree:
     @cached_property
     def _homes(self) -> dict[str, Path]:
         """The folder each package lies in: the project, or where a package of others is installed."""
-        homes: dict[str, Path] = {name: self._root for name in OWN_PACKAGES}
+        homes: dict[str, Path] = {name: home_of(name, self._root) for name in OWN_PACKAGES}
         for point in self._entry_points:
             top = point.module.partition(".")[0]
             spec = None if top in homes else find_spec(top)
@@ -193,7 +194,7 @@ def _below(package: str, folder: Path, path: Path) -> str:
 def _data_files(folder: Path) -> Iterator[Path]:
     for item in folder.iterdir():
         if item.is_dir():
-            if item.name != "__pycache__" and not any(item.glob("*.py")):
+            if item.name not in ("__pycache__", INSTALLED) and not any(item.glob("*.py")):
                 yield from _data_files(item)
         elif not any(item.match(pattern) for pattern in NOT_DATA):
             yield item

@@ -30,10 +30,15 @@ def rerun(root: Path, target: Target, commit: str = "HEAD") -> tuple[str, str]:
         _run(root, "git", "clone", "--quiet", "--no-hardlinks", str(root.resolve()), str(clone))
         _run(clone, "git", "checkout", "--quiet", _resolved(root, commit))
         _link_inputs(root, clone, out)
-        python = (sys.executable, "-m", "pipelines.stages")
-        _run(clone, *python, "code")
-        _run(clone, *python, *words)
+        _run(clone, *stage_command(clone), "code")
+        _run(clone, *stage_command(clone), *words)
         return payload_digest(root / target.name), payload_digest(clone / out / WEIGHTS)
+
+
+def stage_command(project: Path) -> tuple[str, ...]:
+    """What runs a stage in a project: its own code in a clone, else that of the installed hoidata."""
+    words = ["pipelines.stages"] if (project / "pipelines").is_dir() else ["hoidata", "stage"]
+    return (sys.executable, "-m", *words)
 
 
 def _arguments(root: Path, out: str, stage: str) -> list[str]:

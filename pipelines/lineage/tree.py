@@ -303,7 +303,8 @@ def raw_folder(root: Path, path: str, listed: RawList) -> Path | None:
     from pipelines.stages.base import StagePaths, own_root
 
     profile, dataset = Path(path).parts[-3:-1]
-    return root / StagePaths(profile, dataset).generated_raw if listed.synthetic else own_root(dataset)
+    own = own_root(dataset) or own_root(dataset.partition("-")[0])  # a variant reads the files of its source
+    return root / StagePaths(profile, dataset).generated_raw if listed.synthetic else own
 
 
 def raw_status(folder: Path | None, listed: RawList) -> tuple[Status, str]:

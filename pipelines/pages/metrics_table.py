@@ -10,12 +10,17 @@ from rich.table import Table
 
 from hoidata.errors import BadInput
 from hoidata.files.written import read_json
+from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
 from pipelines.promises import TRUTH
 
 AnyMetric = Metric | FeatureMetric
-ALL_METRICS: tuple[AnyMetric, ...] = (*METRICS, *FEATURE_METRICS)
+ALL_METRICS: tuple[AnyMetric, ...] = (
+    *METRICS,
+    *FEATURE_METRICS,
+    *(row for rows in ASKED_LISTS.values() for row in rows),
+)
 LOOKUPS = ("nearest-clip", "prompt-lookup")
 CONTROLS = "controls"
 NO_FIGURE = "-"

@@ -20,7 +20,12 @@
     const text = atob(element.textContent.trim());
     const bytes = new Uint8Array(text.length);
     for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
-    return bytes.buffer;
+    return bytes;
+  }
+
+  function unpacked(element) {
+    const packed = new Blob([bytesOf(element)]).stream();
+    return new Response(packed.pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
   }
 
   class Player {
@@ -67,7 +72,7 @@
     }
 
     async load() {
-      const buffer = bytesOf(this.figure.querySelector(".glb"));
+      const buffer = await unpacked(this.figure.querySelector(".glb"));
       const gltf = await new Promise((done, fail) => new THREE.GLTFLoader().parse(buffer, "", done, fail));
       gltf.scene.traverse((node) => this.prepare(node));
       this.scene.add(gltf.scene);

@@ -1,14 +1,19 @@
-"""The adapter of a dataset with the settings of params.yaml: what scanning, checking and converting share."""
+"""The adapter of a dataset with the settings of params.yaml: what scanning, checking and converting share.
+
+One raw dataset may be converted several times side by side: a word in `datasets` with a hyphen, such as `arctic-whole`,
+is a variant of what stands before it. It has the same adapter and raw files; settings, split and folders are its own.
+"""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from hoidata.datasets.base import Adapter
-from hoidata.datasets.registry import get_adapter
+from hoidata.datasets.registry import adapter_names, get_adapter
 from hoidata.errors import BadInput
 from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
-from pipelines.stages.base import StagePaths, load_settings
+from pipelines.stages.base import StagePaths, load_settings, own_root, raw_root
 
 
 @dataclass(frozen=True)
@@ -29,13 +34,35 @@ class ConvertSettings:
         """The adapter of that dataset with its settings; its own ``margin_frames`` wins over the common one."""
         # Without a margin nothing is said of it, so that an adapter without that setting works too.
         common = {"margin_frames": self.margin_frames} if self.margin_frames else {}
-        return get_adapter(name, **{**common, **(self.adapters.get(name) or {})})
+        return get_adapter(source_of(name), **{**common, **(self.adapters.get(name) or {})})
 
 
 def manifest_of(paths: StagePaths) -> Manifest:
-    """What is known of a dataset's raw files; that it is absent where nothing has been scanned."""
-    path = paths.manifest
-    return read_manifest(path) if path.is_file() else absent_manifest(configured_adapter(paths.dataset))
+    """What is known of a dataset's raw files; that it is absent where nothing has been scanned.
+
+    Of a variant that has no manifest of its own: what is known of its source.
+    """
+    known = [path for path in (paths.manifest, source_paths(paths).manifest) if path.is_file()]
+    return read_manifest(known[0]) if known else absent_manifest(configured_adapter(paths.dataset))
+
+
+def source_of(name: str) -> str:
+    """The dataset that one of params.yaml is a variant of; itself where it has an adapter."""
+    return name if "-" not in name or name in adapter_names() else name.partition("-")[0]
+
+
+def source_paths(paths: StagePaths) -> StagePaths:
+    """Where the files of a variant's source lie."""
+    return replace(paths, dataset=source_of(paths.dataset))
+
+
+def raw_files(paths: StagePaths) -> Path:
+    """The raw folder of a dataset that is present; of a variant of the user's own data that of its source.
+
+    A generated corpus is written for each variant, as its manifest may hold another recipe. Raises MissingResource.
+    """
+    shared = not paths.is_generated and own_root(paths.dataset) is None
+    return raw_root(source_paths(paths) if shared else paths)
 
 
 def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:

@@ -144,12 +144,14 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
         return section.get("seed"), *[(section.get(section.get(kind)) or {}).get(of) for kind in ("preset", "size")]
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
-    return (section, params.get("sample")) if stage == "controls" else section
+    return (section, params.get("sample"), params.get("evaluate")) if stage == "controls" else section
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
     """The dataset's adapter, in its folder or registered by another package, and what is read of its folder."""
+    added = tree.modules_below(f"{DATASETS}.{name}") or tree.added("hoidata.adapters", name)
+    name = name if added else name.partition("-")[0]  # a variant, such as arctic-whole
     package = f"{DATASETS}.{name}"
-    modules = tree.modules_below(package) or tree.added("hoidata.adapters", name)
+    modules = added or tree.modules_below(package) or tree.added("hoidata.adapters", name)
     read = {reader: [Choice(package=package, files=files)] for reader, files in READERS.items()}
     return {f"{DATASETS}.registry": [Choice(tuple(modules))], **read}

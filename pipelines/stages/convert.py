@@ -2,8 +2,8 @@
 
 from hoidata.conversion.convert import convert_dataset
 from pipelines.lineage.manifests import read_manifest
-from pipelines.stages.adapters import configured_adapter
-from pipelines.stages.base import StagePaths, jobs, load_hands, note_empty, raw_root
+from pipelines.stages.adapters import configured_adapter, raw_files
+from pipelines.stages.base import StagePaths, jobs, load_hands, note_empty
 
 
 def run(paths: StagePaths) -> None:
@@ -12,7 +12,7 @@ def run(paths: StagePaths) -> None:
     manifest = read_manifest(paths.raw_manifest)
     summary = convert_dataset(
         adapter,
-        raw_root(paths) if manifest.present else None,
+        raw_files(paths) if manifest.present else None,
         load_hands(paths.profile),
         paths.clips,
         jobs=jobs(),

@@ -1,14 +1,22 @@
 """Stage evaluate: every metric of one family's motions of one dataset. It knows no family."""
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hoidata.files.written import read_json
-from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, write_json
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_json
 
 if TYPE_CHECKING:
     from models.evaluator.encoders import MotionEvaluator
+
+
+@dataclass(frozen=True)
+class EvaluateSettings:
+    """metrics: lists of ``hoidata/metrics/asked_metrics.py`` that are computed beside the one that always is."""
+
+    metrics: tuple[str, ...] = ()
 
 
 def run(paths: StagePaths) -> None:
@@ -17,11 +25,12 @@ def run(paths: StagePaths) -> None:
     if reason := next(filter(None, map(empty_reason, folders)), None):
         write_json(paths.metrics, {"empty": reason, "held_out_clips": 0})
         return
+    from hoidata.metrics.asked_metrics import with_lists
     from hoidata.metrics.evaluate import evaluate_store
 
     hands, encoders = load_hands(paths.profile), _encoders(paths)
-    samples = paths.samples / "clips"
-    found = evaluate_store(samples, paths.data, hands, encoders=encoders, jobs=jobs(), progress=True)
+    samples, metrics = paths.samples / "clips", with_lists(load_settings(EvaluateSettings, "evaluate").metrics)
+    found = evaluate_store(samples, paths.data, hands, metrics=metrics, encoders=encoders, jobs=jobs(), progress=True)
     found["left_out"] = _with_reasons(found["left_out"], paths.samples / "left_out.json")
     diagnostics = read_json(paths.samples / "diagnostics.json")
     write_json(paths.metrics, found | {"diagnostics": diagnostics})

@@ -8,8 +8,8 @@ from hoidata.files.atomic import write_whole
 from pipelines.lineage.closure import SourceTree
 from pipelines.lineage.digests import value_digest
 from pipelines.lineage.manifests import Manifest, scan_files, verify_files, write_manifest
-from pipelines.stages.adapters import configured_adapter, manifest_of
-from pipelines.stages.base import StagePaths, hand_is_present, jobs, raw_root, root_variable
+from pipelines.stages.adapters import configured_adapter, manifest_of, raw_files, source_of
+from pipelines.stages.base import StagePaths, hand_is_present, jobs, root_variable
 
 SHOWN_DIFFERENCES = 5
 WRITER = "hoidata.synthetic.corpus"
@@ -49,7 +49,7 @@ def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
     recipe = manifest.recipe or {}
     if recipe.keys() != {"seed", "size"}:
         raise BadInput(paths.manifest, "a recipe of seed and size", ", ".join(recipe), "restore it with git checkout")
-    write_corpus(paths.dataset, root, recipe["seed"], recipe["size"], jobs())
+    write_corpus(source_of(paths.dataset), root, recipe["seed"], recipe["size"], jobs())
 
 
 def require_hand(paths: StagePaths) -> None:
@@ -65,7 +65,7 @@ def require_hand(paths: StagePaths) -> None:
 
 def check_own_files(paths: StagePaths, manifest: Manifest) -> None:
     """Compare the user's files with the scanned manifest. Raises BadInput that lists the first differences."""
-    root = raw_root(paths)
+    root = raw_files(paths)
     differences = verify_files(root, manifest, configured_adapter(paths.dataset).parts)
     if differences:
         shown = ", ".join(f"{item.path} ({item.problem})" for item in differences[:SHOWN_DIFFERENCES])

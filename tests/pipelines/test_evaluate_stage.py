@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from hoidata.errors import BadInput
+from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.cli import app
@@ -38,6 +40,11 @@ def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
     assert found["figures"]["contact_f1"] == 1
     assert found["held_out_clips"] == found["motions"] == 2
     assert found["diagnostics"] == {"length": {"mae_frames": 3.5}}
+
+
+def test_a_subset_no_split_has_is_refused_and_not_empty(clips):
+    with pytest.raises(BadInput, match="train, validation, test"):
+        load_annotated(PATHS.data).ids("dev")
 
 
 def test_the_reason_passes_through_where_there_are_no_motions(clips):

@@ -160,6 +160,10 @@ def every_frame_of_the_source(clip: Clip) -> Clip:
     return replace(clip, source_frames=np.arange(clip.n_frames, dtype=np.int32))
 
 
+def betas(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Clip], Clip]:
+    return lambda c: replace(c, hands={s: replace(t, betas=change(t.betas)) for s, t in c.hands.items()})
+
+
 COUNTER = count()
 WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "transposed": (transposed, "transposed by 0.0"),
@@ -187,6 +191,8 @@ WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "id": (lambda c: replace(c, clip_id=f"kitchen/{next(COUNTER):04d}"), "does not begin with kitchen/"),
     "dataset": (lambda c: replace(c, dataset="cellar"), "its dataset is 'cellar'"),
     "fitted": (lambda c: replace(c, hands_from="keypoints"), "fit_error_m is to be stated"),
+    "nine betas": (betas(lambda found: found[:, :9]), "betas: expected shape (1, 10), got (1, 9)"),
+    "betas without frames": (betas(lambda found: found[0]), "betas: expected shape (24, 10), got (10,)"),
     "NaN": (lambda c: replace(c, object=replace(c.object, rotvec=c.object.rotvec * np.nan)), "finite floats"),
 }
 NO_MISTAKE = {"shift of frames"}  # one source frame early or late, as where clocks differ

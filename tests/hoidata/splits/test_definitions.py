@@ -120,6 +120,18 @@ def test_bimarts_committed_list_follows_its_rule():
     assert set(definitions_for("arctic")["bimart"].rule.test) == chosen
 
 
+def test_bimart_as_released_tests_on_the_first_and_the_last_three_names_of_every_object():
+    names = sorted(published("arctic").usable)
+    found = parts("arctic", "bimart-released", names)
+    assert Counter(found.values()) == {"train": 257, "test": 44}
+    held = {name for name, part in found.items() if part == "test"}
+    objects = {name.split("/")[1].split("_")[0] for name in names}
+    own = [[name for name in names if f"/{thing}_" in name] for thing in objects]
+    assert held == {name for row in own for name in (row[0], *row[-3:])}
+    assert Counter(name[:3] for name in held) == {"s10": 21, "s01": 11, "s09": 11, "s08": 1}
+    assert len(held & set(definitions_for("arctic")["bimart"].rule.test)) == 5
+
+
 def test_bimart_with_a_validation_part_tests_on_the_same_and_validates_on_two_of_each_object():
     plain, validated = (definitions_for("arctic")[name].rule for name in ("bimart", "bimart-validated"))
     assert set(validated.test) == set(plain.test)
@@ -159,7 +171,7 @@ def test_every_definition_says_its_source_its_version_and_its_promises(dataset):
             assert definition.rule.by in definition.promises
             assert definition.rule.validation
             assert definition.rule.test
-        if definition.rule.by in ("sequence", "prefix", "drawn"):
+        if definition.rule.by in ("sequence", "prefix", "drawn", "drawn-per-object"):
             assert "sequence" in definition.promises
 
 
@@ -196,11 +208,11 @@ def test_manipnet_has_the_splits_in_time_and_no_split_by_its_only_subject():
 def test_an_unknown_name_lists_the_splits_of_that_dataset():
     with pytest.raises(
         BadInput,
-        match=r"one of: bimart, bimart-validated, composition, drawn-object, p1, p2, text2hoi, .*unseen-subject, got",
+        match=r"one of: bimart, bimart-released, bimart-validated, composition, .*drawn-per-object, p1, .*subject, got",
     ):
         choose("arctic", "rounds")
     for wanted, got in (("text2hoi", "'text2hoi'"), (None, "nothing")):
-        with pytest.raises(BadInput, match=f"one of: composition, drawn-object, got {got}"):
+        with pytest.raises(BadInput, match=f"one of: composition, drawn-object, drawn-per-object, got {got}"):
             choose("mydata", wanted)
 
 

@@ -1,5 +1,6 @@
 """Rules put clips into parts, by names or in time; what no part names is left out, never trained on."""
 
+import hashlib
 from collections import Counter
 
 import numpy as np
@@ -157,3 +158,23 @@ def test_drawn_sequences_keep_together_and_few_change_parts_when_others_come():
     more = drawn([*names, "day4/new"])
     assert sum(more[name] != found[name] for name in names) <= 2
     assert set(drawn(names[:3]).values()) == {"train", "validation", "test"}
+
+
+def test_of_every_object_a_share_of_its_sequences_tests_and_at_least_one():
+    counts = {"box": 20, "mug": 7, "pen": 2, "cup": 1}
+    names = {f"s{number % 3}/{thing}_{number:02d}": thing for thing, count in counts.items() for number in range(count)}
+    rows = [(f"{name}/{cut}", "s1", name, cut, cut, thing, []) for name, thing in names.items() for cut in (0, 9)]
+    split = assign_split(table(rows), SplitRule("drawn-per-object", validation_share=0.1, test_share=44 / 301))
+    assert all(split[f"{name}/0"] == split[f"{name}/9"] for name in names)
+    found = Counter((thing, split[f"{name}/0"]) for name, thing in names.items())
+    assert found == {
+        **{("box", "train"): 15, ("box", "validation"): 2, ("box", "test"): 3},
+        **{("mug", "train"): 5, ("mug", "validation"): 1, ("mug", "test"): 1},
+        **{("pen", "train"): 1, ("pen", "test"): 1, ("cup", "test"): 1},
+    }
+    in_order = sorted((name for name, thing in names.items() if thing == "box"), key=digest)
+    assert [split[f"{name}/0"] for name in in_order] == ["train"] * 15 + ["validation"] * 2 + ["test"] * 3
+
+
+def digest(name: str) -> str:
+    return hashlib.sha256(name.encode()).hexdigest()

@@ -1,3 +1,5 @@
+import base64
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -5,7 +7,7 @@ import pytest
 
 from hoidata.clips.clip import ObjectTrack
 from hoidata.objects.model import ObjectModel
-from pipelines.pages.player import three_javascript
+from pipelines.pages.player import motion_player, three_javascript
 from pipelines.pages.view import view_of
 
 
@@ -15,6 +17,12 @@ def test_three_comes_with_its_licence_notice_and_the_loader():
     assert "THREE.GLTFLoader=" in script
     assert len(script) < 700_000
     assert "</script" not in script
+
+
+def test_a_page_holds_a_motion_deflated(hands, page_clip):
+    player = motion_player(page_clip(), hands, "a box")
+    assert zlib.decompress(base64.b64decode(player.glb_packed)) == player.glb
+    assert len(player.glb_packed) < len(player.glb)
 
 
 def test_camera_sees_every_joint_and_stands_on_the_lowest_point(hands, page_clip):

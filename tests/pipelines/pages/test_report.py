@@ -55,6 +55,7 @@ def write(folders, hands, out, *datasets):
 def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, hands, tmp_path):
     text = write(folders, hands, tmp_path / "report", "grab", "arctic")
     assert "<td>arctic is not present</td>" in text
+    assert text.index("Held-out figures") < text.index("arctic is not present")
     assert "NaN in &lt;frame 3&gt;" in text
     assert "<b>3</b><span>clips</span>" in text
     assert "SYNTHETIC" in text

@@ -1,0 +1,23 @@
+"""``hoidata`` and ``python -m hoidata``; with the word ``stage`` a stage, as dvc.yaml of a project of `init` does."""
+
+import sys
+from importlib import import_module
+
+from hoidata.beside import add_to_path
+from hoidata.errors import HoidataError
+
+
+def main() -> None:
+    """Run the command, with ``models`` and ``pipelines`` of this very hoidata."""
+    try:
+        add_to_path()
+    except HoidataError as error:
+        sys.exit(f"hoidata: {error}")
+    if sys.argv[1:2] == ["stage"]:
+        sys.argv.pop(1)
+        sys.exit(import_module("pipelines.stages.__main__").main())
+    import_module("pipelines.cli").main()
+
+
+if __name__ == "__main__":
+    main()

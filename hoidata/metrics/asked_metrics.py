@@ -1,0 +1,127 @@
+"""Lists of metrics that are computed only where they are asked for: ``evaluate: {metrics: [bimart]}``, by their name.
+
+To add one: rows of ``registry.Metric``, whose names no other list has, and its name in ``ASKED_LISTS``.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+
+import numpy as np
+
+from hoidata.errors import BadInput
+from hoidata.metrics import bimart, cams
+from hoidata.metrics.pair import Pair
+from hoidata.metrics.registry import HANDS, METRICS, Direction, Metric
+
+BIMART, CAMS = "BimArt (Zhang et al. 2025)", "CAMS (Zheng et al. 2023)"
+_PAPER, _CORRECTED = "as released", "this project: corrected"
+_MOVES = f"{HANDS} and an object vertex moves by more than 0.01 mm to the next"
+_TURNS = f"{HANDS} and the hinge turns by more than 0.001 rad to the next"
+_PARITY = "inside where a line crosses the whole mesh an odd number of times"
+_SOLID = "inside the solid of a closed part"
+_CONTACT = "5 mm or nearer, none deeper than 1 cm"
+_FORCES = "residual below 0.01, friction 0.35, contact 2 mm"
+Measure = Callable[[Pair, int], np.ndarray]
+_INNER = "all but the first and last; known gravity"
+
+
+def _shares(
+    name: str, title: str, direction: Direction, measures: tuple[Measure, Measure], frames: str, limits: tuple[str, str]
+) -> tuple[Metric, Metric]:
+    """A share of frames in percent, paper and corrected; ``paper`` pools the frames of each clip's first motion."""
+    return (
+        Metric(
+            "BimArt", f"bimart_{name}_paper", f"{title}, paper", "%", direction, measures[0],
+            "mean over frames", frames, f"{BIMART}, {_PAPER}", samples=1, thresholds=limits[0],
+        ),
+        Metric(
+            "BimArt", f"bimart_{name}_corrected", f"{title}, corrected", "%", direction, measures[1],
+            "mean over motions", frames, f"{BIMART}, {_CORRECTED}", thresholds=limits[1],
+        ),
+    )  # fmt: skip
+
+
+BIMART_METRICS: tuple[Metric, ...] = (
+    Metric(
+        "BimArt", "bimart_mul_cm", "Mul: spread of the motions of one clip", "cm", "higher", bimart.mul_cm,
+        "mean over motions", HANDS, f"{BIMART}: mean over pairs of motions; none of a single motion", aligned=True,
+        together=True,
+    ),
+    Metric(
+        "BimArt", "bimart_accel_paper", "Accel, paper", "cm/frame2", "lower", bimart.accel_paper, "mean over motions",
+        f"{HANDS}, three in a row", f"{BIMART}, {_PAPER}", samples=1,
+    ),
+    Metric(
+        "BimArt", "bimart_accel_corrected", "Accel, corrected", "m/s2", "nearer the truth", bimart.accel_corrected,
+        "mean over motions", f"{HANDS}, three in a row", f"{BIMART}, {_CORRECTED}",
+    ),
+    *_shares(
+        "pen_1cm", "Pen 1 cm", "lower", (bimart.pen_1cm_paper, bimart.pen_1cm_corrected), HANDS,
+        (f"1 cm, {_PARITY}", f"1 cm, {_SOLID}"),
+    ),
+    *_shares(
+        "pen_5mm", "Pen 5 mm", "lower", (bimart.pen_5mm_paper, bimart.pen_5mm_corrected), HANDS,
+        (f"5 mm, {_PARITY}", f"5 mm, {_SOLID}"),
+    ),
+    *_shares(
+        "con", "Con", "higher", (bimart.con_paper, bimart.con_corrected), _MOVES,
+        ("nearer than 5 mm, or at any depth inside", _CONTACT),
+    ),
+    Metric(
+        "BimArt", "bimart_con_everywhere_corrected", "Con in all frames, corrected", "%", "nearer the truth",
+        bimart.con_everywhere_corrected, "mean over motions", HANDS, f"{BIMART}, {_CORRECTED}", thresholds=_CONTACT,
+    ),
+    *_shares(
+        "art", "Art", "higher", (bimart.art_paper, bimart.art_corrected), _TURNS,
+        (
+            "nearer than 5 mm to the faces wholly in the moving part, or at any depth inside",
+            f"{_CONTACT}, of the moving part with its seam",
+        ),
+    ),
+    Metric(
+        "BimArt", "bimart_cm_paper", "CM, paper", "cm", "lower", bimart.cm_paper, "mean over motions", HANDS,
+        f"{BIMART}, to 778 vertices: `asked-distances.npz` beside the clips", samples=1,
+    ),
+    Metric(
+        "BimArt", "bimart_cm_corrected", "CM, corrected", "cm", "lower", bimart.cm_corrected, "mean over motions",
+        HANDS, f"{BIMART}, {_CORRECTED}: to the hand vertices the map was made of",
+        thresholds="distances capped at 20 cm",
+    ),
+    Metric(
+        "CAMS", "cams_pen_paper", "CAMS Pen, paper", "", "lower", cams.pen_paper, "mean over motions", HANDS,
+        f"{CAMS}, {_PAPER}: share of hand vertices, added up over parts", samples=1, thresholds=f"5 mm, {_PARITY}",
+    ),
+    Metric(
+        "CAMS", "cams_pen_corrected", "CAMS Pen, corrected", "", "lower", cams.pen_corrected, "mean over motions",
+        HANDS, f"{CAMS}, {_CORRECTED}", thresholds=f"5 mm, {_SOLID}",
+    ),
+    Metric(
+        "CAMS", "cams_con_paper", "CAMS Con, paper", "", "higher", cams.con_paper, "mean over frames", _INNER,
+        f"{CAMS}, {_PAPER}: 1 kg on every vertex, gravity 1 m per frame2", samples=1, thresholds=_FORCES,
+    ),
+    Metric(
+        "CAMS", "cams_con_corrected", "CAMS Con, corrected", "", "higher", cams.con_corrected, "mean over motions",
+        _INNER, f"{CAMS}, {_CORRECTED}: SI, 1 kg of even density", samples=1,
+        thresholds=f"{_FORCES}, no deeper than 1 cm",
+    ),
+    Metric(
+        "CAMS", "cams_art_paper", "CAMS Art, paper", "", "higher", cams.art_paper, "mean over frames",
+        "frames in which the hinge turns by more than 1e-6 rad to the next", f"{CAMS}, {_PAPER}", samples=1,
+        thresholds="arm above 0.3 of the mean, contact 2 mm",
+    ),
+    Metric(
+        "CAMS", "cams_art_corrected", "CAMS Art, corrected", "", "higher", cams.art_corrected, "mean over motions",
+        "frames in which the hinge turns by more than 0.001 rad to the next", f"{CAMS}, {_CORRECTED}",
+        thresholds="arm above 0.3 of the mean, contact 2 mm, no deeper than 1 cm",
+    ),
+)  # fmt: skip
+
+ASKED_LISTS: Mapping[str, tuple[Metric, ...]] = MappingProxyType({"bimart": BIMART_METRICS})
+
+
+def with_lists(names: Iterable[str]) -> tuple[Metric, ...]:
+    """The metrics that are always computed, then those of the lists named. Raises BadInput for an unknown name."""
+    names = list(names)
+    if unknown := [name for name in names if name not in ASKED_LISTS]:
+        raise BadInput("evaluate.metrics", f"names of {', '.join(ASKED_LISTS)}", ", ".join(unknown), "correct the name")
+    return METRICS + tuple(metric for name in names for metric in ASKED_LISTS[name])

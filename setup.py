@@ -1,0 +1,22 @@
+"""What a wheel holds: hoidata and, inside it as hoidata/installed, all that stands beside it here.
+
+So an installation takes one name of Python's, not three: a user's own ``models`` and ``pipelines`` stay theirs.
+``hoidata/beside.py`` finds these packages in a clone and in an installation.
+"""
+
+from setuptools import find_packages, setup
+
+INSTALLED = "hoidata.installed"
+DATA = ["npz", "csv", "html", "json", "toml", "js", "css", "md"]
+PROJECT = ["dvc.yaml", "params.yaml", "prefect.toml", ".dvcignore", ".gitattributes", ".gitignore"]
+FOLDERS = [".dvc/config", ".dvc/.gitignore", "manifests/embedded/*.json", "manifests/study/*.json", "models/*/dvc.yaml"]
+
+own = find_packages(include=["hoidata*"])
+beside = [f"{INSTALLED}.{name}" for name in find_packages(include=["models*", "pipelines*"])]
+data = [*(f"**/*.{suffix}" for suffix in DATA), "vendor/LICENSE-three"]
+setup(
+    packages=[*own, INSTALLED, *beside],
+    package_dir={INSTALLED: "."},
+    package_data={**dict.fromkeys([*own, *beside], data), INSTALLED: [*PROJECT, *FOLDERS]},
+    exclude_package_data={INSTALLED: ["setup.py", "pyproject.toml"]},
+)

@@ -1,0 +1,310 @@
+"""BimArt's figures on shapes and motions whose figure is known, and ``paper`` beside the released ones written anew."""
+
+import itertools
+from dataclasses import replace
+
+import igl
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips.clip import FPS, ObjectTrack
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.metrics import bimart
+from hoidata.metrics.asked import DISTANCES_NAME, AskedDistances, read_asked_distances, write_asked_distances
+from hoidata.metrics.asked_metrics import ASKED_LISTS, BIMART_METRICS, with_lists
+from hoidata.metrics.evaluate import evaluate_store
+from hoidata.metrics.registry import METRICS
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from tests.builders.clips import clip_of, flat_hand
+from tests.builders.objects import model_of, notebook
+
+RADIUS_M = 0.05
+FACE_UP = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
+
+
+def under_the_hand(model, depths_m, reach_m, **facts):
+    """A still right hand whose lowest vertex is so deep in an object that reaches ``reach_m`` above its origin."""
+    n_frames = len(depths_m)
+    hand = replace(flat_hand(np.zeros((n_frames, 3))), global_orient=np.tile(np.float32(FACE_UP), (n_frames, 1)))
+    away = replace(hand, wrist_m=hand.wrist_m + np.float32([0, 0, 9]))
+    vertices = track_vertices(hand, load_embedded_hands().right)[0]
+    lowest = vertices[vertices[:, 2].argmin()]
+    place = lowest - np.array([0, 0, 1]) * (reach_m - np.asarray(depths_m)[:, None])
+    track = ObjectTrack(model, np.zeros((n_frames, 3), np.float32), place.astype(np.float32), **facts)
+    return clip_of("toy/s1/a", track, {"left": away, "right": hand})
+
+
+def ball():
+    return model_of(trimesh.creation.icosphere(4, RADIUS_M), "ball")
+
+
+# --- known figures
+
+
+def test_a_constant_acceleration_is_given_per_frame_and_per_second(make_clip, moved, pair_of):
+    clip, time = make_clip(9), np.arange(9) / FPS
+    still = moved(clip, 0)
+    hand = replace(still.hands["right"], global_orient=np.tile(still.hands["right"].global_orient[:1], (9, 1)))
+    path = np.zeros((9, 3))
+    path[:, 0] = 0.5 * 3.0 * time**2
+    pair = pair_of(replace(clip, hands=clip.hands | {"right": replace(hand, wrist_m=path.astype(np.float32))}), clip)
+    assert bimart.accel_paper(pair, 1) == pytest.approx(np.full(7, 100 * 3.0 / 900), abs=1e-4)
+    assert bimart.accel_corrected(pair, 1) == pytest.approx(np.full(7, 3.0), abs=1e-3)
+
+
+def test_mul_is_the_mean_distance_of_all_pairs_of_motions(make_clip, moved, pair_of):
+    clip = make_clip(5, "both")
+    shifted = [pair_of(moved(clip, (shift, 0, 0)), clip, "both") for shift in (0, 0.03, 0.07)]
+    assert np.mean(bimart.mul_cm(shifted, 1)) == pytest.approx((3 + 4 + 7) / 3, abs=1e-4)
+    one_hand = [shifted[0], pair_of(moved(clip, (0, 0.03, 0), ["left"]), clip, "both")]
+    assert bimart.mul_cm(one_hand, 1) == pytest.approx([1.5], abs=1e-4)
+    assert len(bimart.mul_cm(shifted[:1], 1)) == 0
+
+
+def test_a_sphere_at_known_depths_is_penetrated_and_touched_at_the_thresholds(pair_of):
+    depths_mm = np.array([12, 9, 6, 4, -4, -6, -6, 13])
+    clip = under_the_hand(ball(), depths_mm / 1000, RADIUS_M)
+    pair = pair_of(clip, clip)
+    for pen_1cm, pen_5mm in (
+        (bimart.pen_1cm_paper, bimart.pen_5mm_paper),
+        (bimart.pen_1cm_corrected, bimart.pen_5mm_corrected),
+    ):
+        assert pen_1cm(pair, 1).tolist() == [100, 0, 0, 0, 0, 0, 0, 100]
+        assert pen_5mm(pair, 1).tolist() == [100, 100, 100, 0, 0, 0, 0, 100]
+    # The ball does not move from the sixth frame to the seventh, and the last frame has no next.
+    assert bimart.moves(clip.object).tolist() == [True] * 5 + [False, True, False]
+    assert bimart.con_paper(pair, 1).tolist() == [100, 100, 100, 100, 100, 0]
+    assert bimart.con_corrected(pair, 1).tolist() == [0, 100, 100, 100, 100, 0]
+    assert bimart.con_everywhere_corrected(pair, 1).tolist() == [0, 100, 100, 100, 100, 0, 0, 0]
+
+
+def test_a_hinge_that_moves_asks_for_contact_with_the_part_that_moves(pair_of):
+    angle = np.float32([0, 0.01, 0.02, 0.0205, 0.04, 0.06])
+    wide = notebook()
+    wide = replace(wide, vertices_m=wide.vertices_m * [1, 5, 1])  # the hand lies over one plate alone
+
+    def art(middle_x_m):
+        clip = under_the_hand(wide, np.full(6, 0.003), 0.005, hinge_rad=angle)
+        vertices = track_vertices(clip.hands["right"], load_embedded_hands().right)[0]
+        lowest = vertices[vertices[:, 2].argmin()]
+        place = clip.object.translation_m.copy()
+        place[:, 0] = lowest[0] - middle_x_m
+        own = replace(clip, object=replace(clip.object, translation_m=place))
+        pair = pair_of(own, own)
+        return bimart.art_paper(pair, 1).tolist(), bimart.art_corrected(pair, 1).tolist()
+
+    still = np.zeros((6, 3), np.float32)
+    assert bimart.turns(ObjectTrack(wide, still, still, angle)).tolist() == [True, True, False, True, True, False]
+    assert art(0.05) == ([100] * 4, [100] * 4)
+    assert art(-0.95) == ([0] * 4, [0] * 4)
+
+
+def test_open_parts_have_an_unreliable_inside_as_released_and_none_in_the_corrected(pair_of):
+    """A plate whose top has corners in both parts: all that lies wholly in the moving part is its far side."""
+    mesh = trimesh.creation.box((0.1, 0.5, 0.02))
+    model = notebook()
+    model = replace(model, vertices_m=np.array(mesh.vertices), faces=np.array(mesh.faces))
+    model = replace(model, part=(model.vertices_m[:, 0] > 0).astype(np.uint8))
+    index = bimart.surface_index(model)
+    released = bimart.shells(index, moving_part=True)[1].surface.tree
+    assert len(released.face) == 2
+    assert len(released.face) < len(model.faces_of(1))
+    clip = under_the_hand(model, np.full(4, 0.003), 0.01, hinge_rad=np.float32([0, 0.002, 0.004, 0.006]))
+    pair = pair_of(clip, clip)
+    # Centimetres away from those two triangles, but before them on a line along x.
+    assert bimart.art_paper(pair, 1).tolist() == [100, 100, 100]
+    assert len(bimart.art_corrected(pair, 1)) == len(bimart.pen_1cm_corrected(pair, 1)) == 0
+
+
+def test_an_object_without_hinge_has_no_art_and_one_at_rest_no_con(pair_of):
+    clip = under_the_hand(ball(), np.zeros(4), RADIUS_M)
+    pair = pair_of(clip, clip)
+    for measure in (bimart.art_paper, bimart.art_corrected, bimart.con_paper, bimart.con_corrected):
+        assert len(measure(pair, 1)) == 0
+
+
+def test_shifted_hands_lose_contact_and_pressed_hands_keep_the_papers_alone(make_clip, moved, pair_of):
+    clip = make_clip(12, "both", articulated=True)
+    normal = Rotation.from_rotvec(clip.object.rotvec).apply([0, 0, 1.0])
+
+    def con(shift_m):
+        pair = pair_of(moved(clip, shift_m * normal), clip, "both")
+        return [measure(pair, 1).mean() for measure in (bimart.con_paper, bimart.con_corrected)]
+
+    assert con(0.0) == [100, 100]
+    assert con(0.03) == [0, 0]
+    assert con(-0.03) == [100, 0]
+
+
+# --- the released definitions, written anew: other distances, other rays, loops
+
+
+def released(vertices_m, track):
+    """Pen 1 cm, Pen 5 mm, Con, Art in percent, Accel in cm per frame^2, of (frame, vertex, 3) hand vertices."""
+    model, n_frames = track.model, len(vertices_m)
+    whole, top, places = np.empty(n_frames), np.empty(n_frames), []
+    wholly = model.faces[(model.part[model.faces] == 1).all(axis=1)]
+    for frame in range(n_frames):
+        local = model.vertices_m.copy()
+        moving = model.part == 1
+        turn = Rotation.from_rotvec(model.hinge.axis * float(track.hinge_rad[frame]))
+        local[moving] = turn.apply(local[moving] - model.hinge.origin_m) + model.hinge.origin_m
+        world = Rotation.from_rotvec(track.rotvec[frame]).apply(local) + track.translation_m[frame]
+        places.append(world)
+        whole[frame] = depth(vertices_m[frame], world, model.faces).max()
+        top[frame] = depth(vertices_m[frame], world, wholly).max()
+    moves = [np.linalg.norm(b - a, axis=1).max() > 1e-5 for a, b in itertools.pairwise(places)]
+    turns = [abs(float(b) - float(a)) > 0.001 for a, b in itertools.pairwise(track.hinge_rad)]
+    accel = [
+        np.mean([np.linalg.norm(vertices_m[f + 1, v] - 2 * vertices_m[f, v] + vertices_m[f - 1, v]) for v in (0, 9)])
+        for f in range(1, n_frames - 1)
+    ]
+    return {
+        "bimart_pen_1cm_paper": 100 * np.mean(whole > 0.01),
+        "bimart_pen_5mm_paper": 100 * np.mean(whole > 0.005),
+        "bimart_con_paper": 100 * np.mean([whole[f] > -0.005 for f in range(n_frames - 1) if moves[f]]),
+        "bimart_art_paper": 100 * np.mean([top[f] > -0.005 for f in range(n_frames - 1) if turns[f]]),
+        "accel of two": 100 * np.mean(accel),
+    }
+
+
+def depth(points, vertices, faces):
+    """Positive inside: parity of a slanted ray by Moeller and Trumbore, distance by libigl."""
+    apart = np.sqrt(igl.point_mesh_squared_distance(points, vertices, np.asarray(faces, np.int64))[0])
+    ray = np.array([0.31, -0.52, 0.79])
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    ab, ac = b - a, c - a
+    side = np.cross(ray, ac)
+    area = (ab * side).sum(axis=1)
+    from_a = points[:, None] - a
+    u = (from_a * side).sum(axis=2) / area
+    across = np.cross(from_a, ab)
+    v = across @ ray / area
+    ahead = (across * ac).sum(axis=2) / area > 0
+    hits = ((u >= 0) & (v >= 0) & (u + v <= 1) & ahead).sum(axis=1)
+    return np.where(hits % 2 == 1, apart, -apart)
+
+
+def test_paper_is_what_the_release_gives_on_random_motions(pair_of, make_clip):
+    random, hands = np.random.default_rng(5), load_embedded_hands()
+    names = {metric.name: metric.measure for metric in BIMART_METRICS}
+    seen = []
+    for seed in range(3):
+        clip = make_clip(14, "both", articulated=True, seed=seed)
+        overlapping = replace(clip.object.model, vertices_m=clip.object.model.vertices_m * [1, 1.1, 1])
+        hinge = np.cumsum(np.where(random.random(14) < 0.4, 0.0, random.normal(0, 0.05, 14))).astype(np.float32)
+        still = random.random(14) < 0.3
+        still[0] = False
+        frames = np.maximum.accumulate(np.where(still, 0, np.arange(14)))  # some frames repeat the one before
+        track = replace(clip.object.take(frames), model=overlapping, hinge_rad=hinge)
+        shift = random.normal(0, 0.02, (14, 3)).astype(np.float32)
+        moved = {s: replace(hand, wrist_m=hand.wrist_m[frames] + shift) for s, hand in clip.hands.items()}
+        own = replace(clip, object=track, hands=moved)
+        pair = pair_of(own, own, "both")
+        vertices = np.concatenate([track_vertices(own.hands[s], hands[s]) for s in ("left", "right")], axis=1)
+        expected = released(vertices.astype(np.float64), track)
+        two = np.stack([vertices[:, 0], vertices[:, 9]], axis=1)
+        every = np.linalg.norm(np.diff(vertices.astype(np.float64), n=2, axis=0), axis=2)
+        assert 100 * np.linalg.norm(np.diff(two, n=2, axis=0), axis=2).mean() == pytest.approx(
+            expected.pop("accel of two")
+        )
+        assert names["bimart_accel_paper"](pair, 1).mean() == pytest.approx(100 * every.mean())
+        assert {name: names[name](pair, 1).mean() for name in expected} == pytest.approx(expected)
+        seen.append(list(expected.values()))
+    assert (np.ptp(seen, axis=0) > 0).any()
+    assert 0 < np.mean(seen) < 100
+
+
+# --- contact maps
+
+
+def asked_of(clip, off_m=0.0, hand_vertices=None):
+    """The map that the clip's hands make at ten vertices of its box, off by so much."""
+    used = np.arange(778) if hand_vertices is None else hand_vertices
+    hands, model = load_embedded_hands(), clip.object.model
+    vertex = np.tile(np.arange(10) % len(model.vertices_m), (clip.n_frames, 1)).astype(np.int32)
+    points = clip.object.points_in_world(model.vertices_m, model.part)[:, vertex[0]]
+    distance = np.stack(
+        [
+            np.linalg.norm(points[:, :, None] - track_vertices(clip.hands[s], hands[s])[:, None, used], axis=3).min(
+                axis=2
+            )
+            for s in ("left", "right")
+        ],
+        axis=1,
+    )
+    return AskedDistances(vertex, distance + off_m, used.astype(np.int32))
+
+
+def test_cm_is_the_distance_of_the_map_made_from_the_one_asked_for(make_clip, pair_of):
+    clip = make_clip(6, "both", articulated=True)
+    pair = replace(pair_of(clip, clip, "both"), asked_distances=asked_of(clip, 0.01))
+    assert bimart.cm_paper(pair, 1) == pytest.approx(np.ones(12), abs=1e-4)
+    few = asked_of(clip, hand_vertices=np.arange(0, 778, 10))
+    pair = replace(pair, asked_distances=few)
+    assert bimart.cm_corrected(pair, 1) == pytest.approx(np.zeros(12), abs=1e-4)
+    assert (bimart.cm_paper(pair, 1) > 0.01).all()  # a map of few vertices is farther than one of all
+    nothing = few._replace(distance_m=np.full_like(few.distance_m, np.nan))
+    assert len(bimart.cm_paper(replace(pair, asked_distances=nothing), 1)) == 0
+    assert len(bimart.cm_paper(pair_of(clip, clip, "both"), 1)) == 0
+    far = few._replace(distance_m=np.full_like(few.distance_m, 5.0))
+    assert bimart.cm_corrected(replace(pair, asked_distances=far), 1).max() < 20
+
+
+def test_maps_of_distances_come_back_from_the_file_to_a_tenth_of_a_millimetre(make_clip, tmp_path):
+    asked = {"a~0": asked_of(make_clip(4)), "a~1": asked_of(make_clip(7))}
+    assert read_asked_distances(tmp_path / "clips") == {}
+    write_asked_distances(tmp_path, asked)
+    back = read_asked_distances(tmp_path / "clips")
+    assert list(back) == list(asked)
+    for name, own in asked.items():
+        assert np.array_equal(back[name].vertex, own.vertex)
+        near = own.distance_m < 0.2
+        assert np.abs(back[name].distance_m - own.distance_m)[near].max() < 1e-4
+    wrong = np.load(tmp_path / DISTANCES_NAME)
+    arrays = {name: wrong[name] for name in wrong.files}
+    np.savez(tmp_path / DISTANCES_NAME, **(arrays | {"first": arrays["first"][::-1]}))
+    with pytest.raises(BadInput, match="motion_id"):
+        read_asked_distances(tmp_path / "clips")
+
+
+# --- asked for
+
+
+def test_the_list_costs_nothing_until_it_is_asked_for(write_annotated, moved, tmp_path):
+    root, clips = write_annotated()
+    predicted = [
+        replace(moved(c, (0, 0.01 * k, 0)), clip_id=f"{c.clip_id}~{k}") for c in clips.values() for k in (0, 1)
+    ]
+    write_store(tmp_path / "two" / "clips", predicted, generated_info("predicted"))
+    write_asked_distances(tmp_path / "two", {clip.clip_id: asked_of(clip) for clip in predicted})
+    own = {metric.name for metric in BIMART_METRICS}
+    plain = evaluate_store(tmp_path / "two" / "clips", root)
+    assert not own & set(plain["figures"])
+    found = evaluate_store(tmp_path / "two" / "clips", root, metrics=with_lists(["bimart"]))
+    assert {name: value for name, value in found["figures"].items() if name not in own} == plain["figures"]
+    assert found["figures"]["bimart_mul_cm"] == pytest.approx(1, abs=1e-4)
+    assert found["counts"]["bimart_mul_cm"] == {"clips": 2, "motions": 2, "values": 2}
+    assert found["counts"]["bimart_con_paper"] == {"clips": 2, "motions": 2, "values": 22}
+    assert found["figures"]["bimart_cm_paper"] == pytest.approx(0, abs=0.01)
+    rigid = {name for name in own if "_art_" in name}
+    assert own - set(found["figures"]) == rigid
+    with pytest.raises(BadInput, match="bimart"):
+        with_lists(["bimart", "omomo"])
+
+
+def test_names_and_titles_of_all_lists_are_different():
+    rows = [*METRICS, *(row for rows in ASKED_LISTS.values() for row in rows)]
+    assert len({row.name for row in rows}) == len({row.title for row in rows}) == len(rows)
+
+
+def test_figures_at_borders_stand_over_those_elsewhere():
+    values = np.ones((20, 5))
+    assert bimart.border_ratios(values, [10]) == 1
+    values[9:12] = 4
+    assert bimart.border_ratios(values, [10]) == 4
+    assert np.isnan(bimart.border_ratios(values, []))
