@@ -72,7 +72,7 @@ def _machine() -> dict[str, Any]:
     from pipelines.lineage.made import processor
 
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    git = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True)
+    git = subprocess.run(["git", "rev-parse", "--verify", "--quiet", "HEAD"], capture_output=True, text=True)
     return {
         "host": platform.node(),
         "processor": processor(),
