@@ -11,6 +11,7 @@ from openlineage.client import event_v2 as openlineage
 from prov.model import ProvActivity, ProvDocument, ProvEntity
 from typer.testing import CliRunner
 
+from hoidata.errors import BadInput
 from pipelines.cli import app
 
 CONTACT = "checkpoints/embedded/grab/contact"
@@ -190,3 +191,39 @@ def test_the_sub_commands_say_by_their_exit_codes_what_they_found(typed, ran):
     code, output = typed("check")
     assert code == 1
     assert f"data {CLIPS} tampered" in output
+
+
+def test_a_table_of_a_whole_run_tells_whether_another_made_the_same(typed, ran):
+    table = ran.root / "made.json"
+    assert typed("check", "--write", str(table))[0] == 0
+    assert typed("check", "--against", str(table))[0] == 0
+    values = json.loads(table.read_text())
+    assert {CLIPS, "data/embedded/grab/raw.json"} <= values["outputs"].keys()
+    assert WEIGHTS in values["networks"]
+    assert not [name for name in values["outputs"] if not name.startswith("data/")]
+    values["networks"][WEIGHTS] = "0" * 64
+    table.write_text(json.dumps(values))
+    assert typed("check", "--against", str(table))[0] == 1  # other weights, the same processor and libraries
+    table.write_text(json.dumps({**values, "processor": "another one"}))
+    code, output = typed("check", "--against", str(table))
+    assert (code, "1 of another machine" in output, "processor another one there" in output) == (0, True, True)
+    (ran.root / "data/embedded/grab/raw.json").write_text("{}")
+    assert typed("check", "--against", str(table))[0] == 1
+
+
+def test_facts_of_a_run_are_kept_beside_its_outputs_also_when_it_fails(tmp_path, monkeypatch):
+    from pipelines.sidecar import noted_run, read_run
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DVC_STAGE", "models/text2hoi/dvc.yaml:train@embedded-grab-contact")
+    with noted_run("train@embedded-grab-contact"):
+        pass
+    facts = read_run(tmp_path, "models/text2hoi/dvc.yaml:train@embedded-grab-contact")
+    assert facts["ended"] == "complete"
+    assert {"began_at", "seconds", "processor_seconds", "peak_mib", "host", "device", "cores", "commit"} <= facts.keys()
+    monkeypatch.delenv("DVC_STAGE")
+    with pytest.raises(BadInput), noted_run("convert@embedded-grab"):
+        raise BadInput("a", "b", "c")
+    assert read_run(tmp_path, "convert@embedded-grab")["ended"] == "failed"
+    (tmp_path / ".hoidata/runs/convert@embedded-grab.json").write_text("{")
+    assert read_run(tmp_path, "convert@embedded-grab") == {}
