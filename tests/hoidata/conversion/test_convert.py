@@ -219,7 +219,7 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     assert adapter.hand_convention.note
     assert adapter.parts
     assert not any(part.is_in(tmp_path) for part in adapter.parts)
-    assert adapter.source_fps >= 30
+    assert adapter.source_fps >= 15
     assert pickle.loads(pickle.dumps(adapter)) == adapter
     assert adapter.sequences(tmp_path) == []
 
