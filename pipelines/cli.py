@@ -14,6 +14,7 @@ from pipelines.commands import (
     convert,
     corpus,
     evaluate,
+    export,
     generate,
     graph,
     import_checkpoint,
@@ -59,6 +60,7 @@ app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
 app.command("show")(show.show)
+app.command("export")(export.export)
 
 
 @app.callback()
