@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
 
 from hoidata.clips import SIDES
 from hoidata.errors import BadInput
@@ -18,6 +19,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.store.fields import STORE_FILES, TABLES
 from hoidata.store.info import generated_info
 from hoidata.store.store import Store, open_store, write_store
+from pipelines.cli import app
 from pipelines.exports.export import FORMATS, export_store
 from pipelines.exports.licences import KINDS, MANO, licences_of, spdx_of
 from tests.builders.clips import build_clip, with_hand
@@ -205,6 +207,17 @@ def test_the_mesh_of_mano_is_not_passed_on_even_where_the_data_may_be(store, tmp
     assert (by_kind["hand surface"].licence, by_kind["hand surface"].may_be_shared) == (MANO, False)
     with pytest.raises(BadInput, match="hand surface under: MANO"):
         export_store(dataclasses.replace(store, info=info), "usd", tmp_path / "out", progress=False)
+
+
+def test_the_command_writes_a_dataset_with_its_words_and_its_page_names_every_form(store, tmp_path):
+    asked = ["export", str(store.folder.parent), "--to", "webdataset", "--out", str(tmp_path / "a")]
+    found = CliRunner().invoke(app, asked)
+    assert found.exit_code == 0, found.output
+    assert {path.name for path in (tmp_path / "a").glob("*.tar")} == {"train-000000.tar", "validation-000000.tar"}
+    page = (Path(__file__).parents[3] / "docs" / "export.md").read_text()
+    assert all(f"| `{name}` |" in page for name in FORMATS)
+    said = " ".join(CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "300"}).output.split())
+    assert f"{', '.join(list(FORMATS)[:-1])} or {list(FORMATS)[-1]}" in said
 
 
 def test_what_cannot_be_exported_is_answered(store, tmp_path):
