@@ -14,6 +14,7 @@ from pipelines.commands import (
     convert,
     corpus,
     evaluate,
+    export,
     generate,
     graph,
     import_checkpoint,
@@ -49,6 +50,8 @@ app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
 app.command("validate")(store.validate)
 app.command("migrate")(store.migrate)
+app.command("push")(store.push)
+app.command("pull")(store.pull)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
@@ -61,6 +64,7 @@ app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
 app.command("hands")(object_hands.hands)
 app.command("show")(show.show)
+app.command("export")(export.export)
 
 
 @app.callback()

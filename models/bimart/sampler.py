@@ -32,7 +32,7 @@ class SamplingConfig:
     "before").
     """
 
-    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig("ddim", 20, 0.5))
+    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig("ddim", 10, 0.0))
     rule: Literal["usual", "paper"] = "usual"
     with_map: bool = True
     guide: Guide = "metres"

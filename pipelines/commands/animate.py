@@ -12,7 +12,8 @@ def animate(
     what: Annotated[
         str,
         typer.Argument(
-            metavar="TRAJECTORIES|CLIP", help="A .csv, .npz or ManipNet .txt file (README), or a stored clip's id."
+            metavar="TRAJECTORIES|CLIP",
+            help="A .csv, .npz or ManipNet .txt file (docs/fingers.md), or a clip's id.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
