@@ -9,7 +9,7 @@ export PREFECT_SERVER_ANALYTICS_ENABLED := false
 export HF_HUB_OFFLINE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo install install-dev docs test test-fast fuzz lint types imports check bench clean
+.PHONY: demo install install-dev docs test test-fast chaos fuzz lint types imports check bench clean
 
 demo: $(VENV)/.installed
 	hoidata repro
@@ -35,6 +35,10 @@ test: install-dev
 
 test-fast: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow"
+
+# Every situation that may stop a run, three times each; `make test` has a share of it.
+chaos: install-dev
+	OMP_NUM_THREADS=1 HOIDATA_CHAOS=3 pytest tests/pipelines/test_chaos.py
 
 # 50,000 damaged files for each parser, over a million in all; inputs that fail are kept in .fuzz/.
 fuzz: install-dev

@@ -37,7 +37,7 @@ def animate(
     project = enter_project()
     from hoidata.clips.clip import SIDES
     from pipelines.animation import AnimateWish, animate_files
-    from pipelines.generation import MeshWish
+    from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
     paths = [str(here / name) if name and (here / name).is_file() else name for name in (what, object)]
