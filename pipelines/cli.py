@@ -14,6 +14,7 @@ from pipelines.commands import (
     convert,
     corpus,
     evaluate,
+    export,
     generate,
     graph,
     import_checkpoint,
@@ -63,6 +64,7 @@ app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
 app.command("hands")(object_hands.hands)
 app.command("show")(show.show)
+app.command("export")(export.export)
 
 
 @app.callback()

@@ -201,7 +201,7 @@ class Hoi4dAdapter(Described):
             raise BadInput(folder, f"object poses of frames 0 to {len(camera) - 1}, as output.log has", got)
         frames = np.array(sorted(numbers))
         names = [numbers[frame] for frame in frames]
-        contents = raw.read_folder(folder, names)
+        contents = _read_frames(raw, folder, names)
         poses = [object_poses(data, f"{folder}/{name}") for name, data in zip(names, contents, strict=True)]
         labels = [pose.label for pose in poses[0]]
         for name, own in zip(names, poses, strict=True):
@@ -359,6 +359,13 @@ def _hands(
     return tracks, faulty
 
 
+def _read_frames(raw: RawTree, folder: str, names: list[str]) -> list[bytes]:
+    """The files of a folder in the order given, read in that of their names: the folder has one digest."""
+    in_order = sorted(names)
+    contents = dict(zip(in_order, raw.read_folder(folder, in_order) if names else [], strict=True))
+    return [contents[name] for name in names]
+
+
 def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> tuple[SourceHand, list[Quarantined]]:
     folders = [f"{folder.format(side)}/{key.name}" for folder in HAND_FOLDERS]
     folder = next((own for own in folders if raw.names(own, ".pickle")), folders[0])
@@ -368,7 +375,7 @@ def _source_hand(raw: RawTree, key: SequenceKey, side: Side, n_frames: int) -> t
     frames = sorted(numbers)
     if frames and frames[-1] >= n_frames:
         raise BadInput(folder, f"frames 0 to {n_frames - 1}, as output.log has", f"{frames[-1]}")
-    contents = raw.read_folder(folder, [numbers[frame] for frame in frames]) if frames else []
+    contents = _read_frames(raw, folder, [numbers[frame] for frame in frames])
     for frame, data in zip(frames, contents, strict=True):
         try:
             found = hand_frame(data, f"{folder}/{numbers[frame]}")
