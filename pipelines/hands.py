@@ -10,16 +10,18 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
 from hoidata.clips.clip import FPS, SIDES, HandType, ObjectTrack
+from hoidata.clips.features import upright
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import sha256_file
 from hoidata.files.numpy_files import load_npz_arrays
+from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.object_paths import keyframed_path, read_keyframes, scripted_path
 from hoidata.object_paths.path import PathStep
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
-from hoidata.store.store import open_store
+from hoidata.store.store import Store, open_store
 from models.bimart.family import BIMART, HandsForPaths
 from models.bimart.hands import MadeHands, MotionWish, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
@@ -160,10 +162,17 @@ def _notes(motions: list[MadeHands]) -> list[str]:
     return notes
 
 
-def _object(
-    wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair
-) -> tuple[ObjectModel, tuple[float, float] | None, list[str]]:
-    """The object, the stops of its hinge (radians), and what was assumed."""
+class _Thing(NamedTuple):
+    """An object to be moved. limits_rad: the stops of its hinge. standing: see ``checked_path``. notes: what was
+    assumed."""
+
+    model: ObjectModel
+    limits_rad: tuple[float, float] | None
+    standing: np.ndarray | None
+    notes: list[str]
+
+
+def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> _Thing:
     if not wish.object:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb) or a dataset's object", "none", "name it first")
     limits = hinge_range(wish.hinge_range) if wish.hinge_range else None
@@ -172,31 +181,32 @@ def _object(
         notes = list(user.notes)
         if user.model.is_articulated and limits is None:
             notes.append("how far the hinge opens is not known; --hinge-range 0:110 has it checked")
-        return user.model, limits, notes
+        return _Thing(user.model, limits, None, notes)
     names = (wish.model,) if wish.model else datasets
     known = [paths for name in names if not empty_reason((paths := StagePaths(profile, name)).clips)]
     for paths in known:
-        if wish.object in list(open_store(paths.clips, hands).objects["object"]):
-            recorded, notes = _recorded_range(wish.object, paths, hands), []
-            if recorded is not None and limits is None:
-                notes.append("recorded with its hinge at {:.0f} to {:.0f} deg".format(*np.degrees(recorded)))
-                # Recordings say to which side it opens, not how far it could.
-                limits = (-np.pi, recorded[1]) if -recorded[0] > recorded[1] else (recorded[0], np.pi)
-            return stored_object(wish.object, paths.clips, hands), limits, notes
+        store = open_store(paths.clips, hands)
+        if wish.object in list(store.objects["object"]):
+            return _recorded(store, wish.object, limits)
     if not known:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb)", wish.object, "correct the path")
-    return stored_object(wish.object, known[0].clips, hands), limits, []  # says which there are
+    stored_object(wish.object, known[0].clips, hands)  # says which there are
+    raise AssertionError
 
 
-def _recorded_range(name: str, paths: StagePaths, hands: HandPair) -> tuple[float, float] | None:
-    """Least and largest hinge angle in clips of the object, rest included."""
-    store = open_store(paths.clips, hands)
+def _recorded(store: Store, name: str, limits: tuple[float, float] | None) -> _Thing:
+    """An object of a dataset: it stands as in the first frame of its first clip, and opens to the side it did there."""
     rows = [clip_id for clip_id, own in zip(store.ids, store.sequences["object"], strict=True) if own == name]
-    angles = [store.clip(clip_id).object.hinge_rad for clip_id in rows[:CLIPS_FOR_RANGE]]
-    found = [angle for angle in angles if angle is not None]
-    if not found:
-        return None
-    return min(0.0, *(float(angle.min()) for angle in found)), max(0.0, *(float(angle.max()) for angle in found))
+    clips, notes = [store.clip(clip_id) for clip_id in rows[:CLIPS_FOR_RANGE]], list[str]()
+    first = clips[0]
+    standing = upright(first.gravity) @ rotvec_to_rotmat(first.object.rotvec[0].astype(np.float64))
+    angles = [clip.object.hinge_rad for clip in clips if clip.object.hinge_rad is not None]
+    if angles and limits is None:
+        low, high = min(0.0, *(float(a.min()) for a in angles)), max(0.0, *(float(a.max()) for a in angles))
+        notes.append(f"recorded with its hinge at {np.degrees(low):.0f} to {np.degrees(high):.0f} deg")
+        # Recordings say to which side it opens, not how far it could.
+        limits = (-np.pi, high) if -low > high else (low, np.pi)
+    return _Thing(store.object_model(name), limits, standing, notes)
 
 
 def hinge_range(text: str) -> tuple[float, float]:
@@ -212,15 +222,16 @@ def hinge_range(text: str) -> tuple[float, float]:
 
 
 def _of_path(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
-    model, limits, notes = _object(wish, profile, datasets, hands)
+    thing = _object(wish, profile, datasets, hands)
     if wish.keyframes:
-        path = keyframed_path(model, read_keyframes(wish.keyframes), limits, wish.keyframes)
-        return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", notes)
+        keys = read_keyframes(wish.keyframes)
+        path = keyframed_path(thing.model, keys, thing.limits_rad, wish.keyframes, thing.standing)
+        return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", thing.notes)
     text = wish.script
     if "\n" not in text and len(text) < 250 and Path(text).is_file():
         text = Path(text).read_text(encoding="utf-8", errors="replace")
-    path = scripted_path(model, text, limits)
-    return Asked(path.track, own, path.steps, f"script: {' '.join(text.split())}", notes)
+    path = scripted_path(thing.model, text, thing.limits_rad, standing=thing.standing)
+    return Asked(path.track, own, path.steps, f"script: {' '.join(text.split())}", thing.notes)
 
 
 def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
@@ -253,7 +264,7 @@ def _of_generated(wish: HandsWish, profile: str, datasets: tuple[str, ...], hand
     if missing:
         raise BadInput(path, "a motion.npz of `hoidata generate`", f"no {missing[0]}", "give one, or --keyframes")
     if wish.object:
-        model, _, notes = _object(wish, profile, datasets, hands)
+        model, _, _, notes = _object(wish, profile, datasets, hands)
     else:
         model, notes = _mesh_of(arrays, path), []
     angle = arrays.get("object_hinge_rad")

@@ -86,7 +86,7 @@ def draw_conventions(figure: Figure, data: Path) -> None:
     """What zero angles, the translation and up mean in each source, drawn on the same right hand."""
     model = HANDS["right"]
     wrist = model.wrist_offset_m(np.zeros((1, 10)))[0]
-    for number, name in enumerate(("h2o", "grab", "arctic", "manipnet", "taco")):
+    for number, name in enumerate(("h2o", "grab", "arctic", "manipnet", "taco", "hoi4d")):
         adapter, facts = get_adapter(name), dataset_facts(name)
         convention, frame = adapter.hand_convention, adapter.frame
         axes = figure.add_subplot(2, 3, number + 1, projection="3d")

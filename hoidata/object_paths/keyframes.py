@@ -64,11 +64,16 @@ def parse_keyframes(data: bytes, where: str) -> Keyframes:
 
 
 def keyframed_path(
-    model: ObjectModel, keys: Keyframes, limits_rad: tuple[float, float] | None = None, where: str = "keyframes"
+    model: ObjectModel,
+    keys: Keyframes,
+    limits_rad: tuple[float, float] | None = None,
+    where: str = "keyframes",
+    standing: np.ndarray | None = None,
 ) -> ObjectPath:
     """The motion through keyframes; each is reached at its time. limits_rad: stops of the hinge, where they are known.
 
-    Raises BadInput for a hinge angle of a rigid object, and for what ``checked_path`` refuses.
+    standing: as in ``checked_path``. Raises BadInput for a hinge angle of a rigid object, and for what ``checked_path``
+    refuses.
     """
     if keys.hinge_rad is not None and keys.hinge_rad.any() and not model.is_articulated:
         remedy = 'tell the hinge (--hinge "px,py,pz dx,dy,dz"), or leave the column out'
@@ -85,7 +90,7 @@ def keyframed_path(
         PathStep(f"keyframes {number + 1} to {number + 2}", float(start), float(end))
         for number, (start, end) in enumerate(zip(keys.time_s[:-1], keys.time_s[1:], strict=True))
     ]
-    return checked_path(model, shift, turned, angle, steps, limits_rad)
+    return checked_path(model, shift, turned, angle, steps, limits_rad, standing)
 
 
 def _csv_rows(text: str, where: str) -> list[dict[str, object]]:

@@ -71,15 +71,19 @@ def checked_path(
     hinge_rad: np.ndarray,
     steps: Sequence[PathStep],
     limits_rad: tuple[float, float] | None = None,
+    standing: np.ndarray | None = None,
 ) -> ObjectPath:
     """The path of an object, once it is found possible.
 
     shift_m: (frame, 3) way from the start; rotmats: (frame, 3, 3) of the object against its start; hinge_rad: (frame,).
+    standing: (3, 3) world from object at the start, where the object's own z is not up.
     Raises BadInput for an angle beyond the stop, a speed or acceleration no hand has, or an object under the table.
     """
-    low, high = model.vertices_m.min(axis=0), model.vertices_m.max(axis=0)
-    middle = (low + high) / 2
-    place = shift_m + np.array([0.0, 0.0, middle[2] - low[2]])
+    standing = np.eye(3) if standing is None else standing
+    stood = model.vertices_m @ standing.T
+    low, high = stood.min(axis=0), stood.max(axis=0)
+    middle, rotmats = standing.T @ (low + high) / 2, rotmats @ standing
+    place = shift_m + np.array([0.0, 0.0, (high[2] - low[2]) / 2])
     translation = (place - rotmats @ middle).astype(np.float32)
     hinge = hinge_rad.astype(np.float32) if model.is_articulated else None
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats).astype(np.float32), translation, hinge)

@@ -79,12 +79,17 @@ class _Plan:
 
 
 def scripted_path(
-    model: ObjectModel, script: str, limits_rad: tuple[float, float] | None = None, rest_s: float = REST_S
+    model: ObjectModel,
+    script: str,
+    limits_rad: tuple[float, float] | None = None,
+    rest_s: float = REST_S,
+    standing: np.ndarray | None = None,
 ) -> ObjectPath:
     """The motion of an object that does what a script says.
 
     limits_rad: stops of the hinge, where they are known; by the larger of the two it opens. rest_s: how long it stands
-    before and after. Raises BadInput for what ``parse_script`` or ``checked_path`` refuse, and for a hinge it has not.
+    before and after. standing: as in ``checked_path``. Raises BadInput for what ``parse_script`` or ``checked_path``
+    refuse, and for a hinge it has not.
     """
     plan, state = _Plan(), _State(dict.fromkeys(_CHANNELS, 0.0), limits_rad)
     now, steps = rest_s, [PathStep("at rest", 0.0, rest_s)]
@@ -101,7 +106,7 @@ def scripted_path(
     zero = np.zeros(len(at_s))
     tilt = rotvec_to_rotmat(np.stack((curve["tilt_x"], curve["tilt_y"], zero), axis=1))
     rotmats = tilt @ rotvec_to_rotmat(np.stack((zero, zero, curve["yaw"]), axis=1))
-    return checked_path(model, shift, rotmats, curve["hinge"], steps, limits_rad)
+    return checked_path(model, shift, rotmats, curve["hinge"], steps, limits_rad, standing)
 
 
 def parse_script(script: str) -> list[list[Step]]:

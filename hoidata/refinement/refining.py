@@ -34,7 +34,7 @@ class RefinementSettings:
     prior of finger poses. steps: at most; fewer where one gains less than ``enough`` of the cost.
     """
 
-    keypoint_m: float = 0.003
+    keypoint_m: float = 0.004
     touching_m: float = 0.006
     outlier_m: float = 0.02
     surface_m: float = 0.0015

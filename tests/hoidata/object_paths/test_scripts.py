@@ -149,6 +149,16 @@ def test_a_rigid_object_is_not_opened_but_may_be_lifted():
         scripted_path(mug, "open to 40 deg")
 
 
+def test_an_object_whose_own_z_is_not_up_begins_as_it_stands_and_is_lifted_from_there():
+    standing = rotvec_to_rotmat(np.array([np.pi / 2, 0, 0]))  # its y is up
+    path = made("lift 10 cm, turn 90 deg left", standing=standing)
+    assert heights(path)[0] == pytest.approx(0, abs=1e-3)  # of the base; the lid is part of what stands
+    assert heights(path)[-1] == pytest.approx(0.10, abs=1e-3)
+    first, last = rotvec_to_rotmat(path.track.rotvec[[0, -1]].astype(float))
+    assert first == pytest.approx(standing, abs=1e-6)
+    assert last @ [0, 1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
+
+
 def test_the_same_script_gives_the_same_bytes():
     first, second = made(EXAMPLE).track, made(EXAMPLE).track
     assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in first.PER_FRAME)
