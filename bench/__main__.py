@@ -9,6 +9,8 @@ import sys
 from bench import (
     adapters,
     batches,
+    bimart,
+    borders,
     evaluate,
     evaluator,
     kernels,
@@ -16,6 +18,7 @@ from bench import (
     manipnet_speed,
     physics,
     realism,
+    refinement,
     samplers,
     scale,
     sensors,
@@ -31,6 +34,7 @@ BENCHMARKS = {
     "kernels": kernels.main,
     "surface": surface.main,
     "sensors": sensors.main,
+    "bimart": bimart.main,
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
@@ -39,6 +43,8 @@ BENCHMARKS = {
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,
+    "refinement": refinement.main,
+    "borders": borders.main,
     "manipnet": manipnet.main,
 }
 

@@ -23,6 +23,10 @@ FAMILIES = {
     "mean-pose": "models.baselines.families:MEAN_POSE",
     "ground-truth": "models.baselines.families:GROUND_TRUTH",
     "manipnet": "models.manipnet.family:FINGERS",
+    "bimart": "models.bimart.family:BIMART",
+    "bimart-unrefined": "models.bimart.family:UNREFINED",
+    "nearest-window": "models.bimart.lookups:NEAREST_WINDOW",
+    "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
@@ -38,6 +42,10 @@ FAMILIES = {
     "hands-away": "models.baselines.controls:HANDS_AWAY",
     "pressed": "models.baselines.controls:PRESSED",
     "noise": "models.baselines.controls:NOISE",
+    "bimart-other-path": "models.bimart.family:OTHER_PATH",
+    "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
+    "bimart-no-map": "models.bimart.family:NO_MAP",
+    "bimart-zero-map": "models.bimart.family:ZERO_MAP",
 }
 # Each in a module of its own, so that a change of one trains no other again.
 NETWORKS = {
@@ -46,9 +54,13 @@ NETWORKS = {
     "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
     "refiner": "models.text2hoi.refiner_training:REFINER",
     "manipnet": "models.manipnet.training:MANIPNET",
+    "bimart-contact": "models.bimart.contact_training:CONTACT",
+    "bimart-motion": "models.bimart.motion_training:MOTION",
 }
 # Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
-IF_LISTED = ("manipnet",)
+IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
+# Networks of such a family under other names.
+LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
 
 
 def family_names() -> list[str]:

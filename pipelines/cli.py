@@ -14,12 +14,14 @@ from pipelines.commands import (
     convert,
     corpus,
     evaluate,
+    export,
     generate,
     graph,
     import_checkpoint,
     init,
     inspect,
     lineage,
+    object_hands,
     raw,
     settings,
     share,
@@ -60,7 +62,9 @@ app.command("table")(evaluate.table)
 app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
+app.command("hands")(object_hands.hands)
 app.command("show")(show.show)
+app.command("export")(export.export)
 
 
 @app.callback()

@@ -138,12 +138,12 @@ def _problem(side: Side, points: np.ndarray, model: HandModel, settings: FitSett
         weights=torch.from_numpy(known * np.asarray(settings.weights)),
         rest=torch.from_numpy(rest),
         prior_mean=torch.from_numpy(model.mean_pose.reshape(5, 9)),
-        prior=torch.from_numpy(_pose_prior(rest, settings)),
+        prior=torch.from_numpy(pose_precision(rest, settings)),
         smooth=(settings.noise_m / settings.shake_rad) ** 2,
     )
 
 
-def _pose_prior(rest: np.ndarray, settings: FitSettings) -> np.ndarray:
+def pose_precision(rest: np.ndarray, settings: FitSettings) -> np.ndarray:
     """Precision (5, 9, 9) of each finger's axis-angles, in units of squared metres.
 
     The hinge axis lies across the bone in the plane of the palm; a thumb bends about any axis across its bone.

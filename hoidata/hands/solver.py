@@ -187,7 +187,7 @@ def _finger_derivative(pose: Pose, predicted: Tensor) -> Tensor:
     first = pose.orient[:, None].expand(-1, 5, -1, -1)
     second = first @ local[:, :, 0]
     parents = torch.stack((first, second, second @ local[:, :, 1]), 2)
-    axes = parents @ _left_jacobian(pose.fingers)
+    axes = parents @ left_jacobian(pose.fingers)
     points = predicted[:, FINGER_POINTS]
     lever = points[:, :, :, None] - points[:, :, None, :3]
     beyond = torch.ones(4, 3, dtype=predicted.dtype).tril(-1)[..., None, None]
@@ -195,7 +195,7 @@ def _finger_derivative(pose: Pose, predicted: Tensor) -> Tensor:
     return turned.transpose(3, 4).reshape(len(predicted), 5, 12, 9)
 
 
-def _left_jacobian(rotvec: Tensor) -> Tensor:
+def left_jacobian(rotvec: Tensor) -> Tensor:
     """(..., 3, 3): ``R(v + dv) = R(J dv) R(v)`` to first order (Barfoot 2017, eq. 7.77)."""
     angle = rotvec.norm(dim=-1)[..., None, None].clamp_min(1e-4)
     cross = skew(rotvec)

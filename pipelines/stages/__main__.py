@@ -21,6 +21,7 @@ STAGES = (
     "split",
     "evaluator",
     "train",
+    "train_listed",
     "sample",
     "evaluate",
     "controls",

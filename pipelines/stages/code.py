@@ -13,7 +13,7 @@ from typing import Any
 from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from models.registry import IF_LISTED, NETWORKS, family_module, family_names, network_modules
+from models.registry import IF_LISTED, LISTED_AS, NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.params import chosen_params, read_file, read_params
 from pipelines.stages.base import StagePaths, write_json
@@ -91,7 +91,8 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
     sizes = [section for section in params["train"].values() if isinstance(section, dict)]
     for network in dict.fromkeys([*NETWORKS, *(name for section in sizes for name in section)]):
-        found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
+        stage = "train_listed" if network in LISTED_AS else "train"
+        found[f"train/{network}"] = _start(stage, every | _families(network_modules(network)))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
     rows = (params.get("controls") or {}).get("families") or []
@@ -115,8 +116,9 @@ def own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
     Of a family or network that is made only where it is listed: whether it is.
     """
     stage, _, dataset = name.partition("/")
-    if stage in ("train", "sample") and dataset in IF_LISTED:
-        return {"params.yaml families": canonical_json(dataset in params["families"])}
+    family = LISTED_AS.get(dataset, dataset)
+    if stage in ("train", "sample") and family in IF_LISTED:
+        return {"params.yaml families": canonical_json(family in params["families"])}
     if stage not in SECTIONS_OF_DATASETS:
         return {}
     keys, value = (*SECTIONS_OF_DATASETS[stage], dataset), params

@@ -1,0 +1,42 @@
+"""Distances to an object from grids of its parts at rest: made once, asked at every frame and hinge angle."""
+
+import numpy as np
+
+from hoidata.clips.clip import ObjectTrack
+from hoidata.geometry.transform import RigidTransform
+from hoidata.objects.surface_index import surface_index
+from hoidata.refinement.kernels import lower_signed
+
+
+class ObjectField:
+    """The surface of one moving object. A part that bounds no solid has no inside: its distances are not negative.
+
+    solid_note: what was repaired of the mesh, or left without an inside, in words; None where there is nothing to say.
+    """
+
+    def __init__(self, thing: ObjectTrack) -> None:
+        index, self.n_frames = surface_index(thing.model), thing.n_frames
+        self.solid_note = index.solid_note
+        self._parts = [
+            (surface.grid, _part_from_world(thing, part))
+            for part, surface in index.filled.items()  # one grid per part, whatever the frames and angles
+        ]
+
+    def distances(self, places_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Signed distances (frame, place), metres, and their slope (frame, place, 3), world frame.
+
+        places_m: (frame, place, 3) world. frames: (frame,) which of the object's, all by default. Of two parts the one
+        whose distance is less.
+        """
+        rows = slice(None) if frames is None else frames
+        distance, slope = np.full(places_m.shape[:2], np.inf), np.zeros(places_m.shape)
+        for grid, (rotation, offset) in self._parts:
+            lower_signed(*grid, rotation[rows], offset[rows], np.ascontiguousarray(places_m), distance, slope)
+        return distance, slope
+
+
+def _part_from_world(thing: ObjectTrack, part: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (frame, 3, 3) and translation (frame, 3)."""
+    world_from_object = thing.world_from_object
+    found: RigidTransform = (world_from_object @ thing.model.object_from_part(part, thing.hinge_rad)).inverse()
+    return np.ascontiguousarray(found.rotation), np.ascontiguousarray(found.translation)

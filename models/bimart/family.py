@@ -1,0 +1,150 @@
+"""BimArt as a family: hands for the object's motion of a request; recorded wrists are not looked at."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import groupby
+from typing import Literal
+
+import numpy as np
+import torch
+
+from hoidata.batches.requests import Request
+from hoidata.clips.clip import SIDES, Clip, Side
+from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands import HandPair
+from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
+from hoidata.settings import build_config
+from hoidata.store.annotated import AnnotatedStore
+from models.bimart.contact_training import CONTACT
+from models.bimart.diagnostics import diagnose
+from models.bimart.lookups import training_clips
+from models.bimart.motion_training import MOTION
+from models.bimart.sampler import BimArt, Made, Path, SamplingConfig
+from models.bimart.scene import Scene
+from models.common.checkpoints import load_checkpoint
+from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
+
+NO_OBJECT_MOTION = "it makes hands for the motion of an object, and none was given"
+AT_ONCE = 16  # motions of one length that share a batch
+Change = Literal["none", "other path", "other object", "zero map", "no map"]
+
+
+@dataclass(frozen=True)
+class FamilyConfig:
+    """sampling: how the networks are walked. refined: hands are refined against the object after they are fitted."""
+
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    refined: bool = True
+    refinement: RefinementSettings = field(default_factory=RefinementSettings)
+
+
+@dataclass(frozen=True)
+class HandsForPaths:
+    """The trained networks of one dataset with their hands. change: what a control is told instead of the truth."""
+
+    model: BimArt
+    pair: HandPair
+    config: FamilyConfig
+    synthetic: bool
+    change: Change = "none"
+    annotated: AnnotatedStore | None = None
+
+    @classmethod
+    def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "HandsForPaths":
+        config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
+        trained = [load_checkpoint(sources.checkpoints / one.name, one, sources.device) for one in (CONTACT, MOTION)]
+        sampling = replace(config.sampling, with_map=config.sampling.with_map and change != "no map")
+        model = BimArt.of(trained[0], trained[1], sampling, sources.device)
+        synthetic = bool(trained[1].facts["synthetic"])
+        config = replace(config, refined=config.refined and refined)
+        return cls(model, sources.hands, config, synthetic, change, sources.annotated)
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+        found: dict[int, Made] = {}
+        for rows in self._alike(requests):
+            found |= zip(rows, self.made([requests[row] for row in rows]), strict=True)
+        return [
+            self.clip(request, found[row]) if row in found else LeftOut(request.motion_id, NO_OBJECT_MOTION)
+            for row, request in enumerate(requests)
+        ]
+
+    def _alike(self, requests: Sequence[Request]) -> list[list[int]]:
+        """Rows of requests of one length, at most so many together."""
+        rows = [row for row, request in enumerate(requests) if request.trajectories is not None]
+        rows.sort(key=lambda row: requests[row].n_frames)
+        groups = [list(own) for _, own in groupby(rows, key=lambda row: requests[row].n_frames)]
+        return [own[first : first + AT_ONCE] for own in groups for first in range(0, len(own), AT_ONCE)]
+
+    def made(self, requests: Sequence[Request]) -> list[Made]:
+        """Maps, keypoints and ways to the object for requests of one length, canonical frame."""
+        paths = [Path(self._scene(request), request.active_hands, request.seed) for request in requests]
+        maps = torch.zeros(len(paths), len(paths[0].scene), len(self.model.contact.mean))
+        return self.model.make(paths, maps if self.change == "zero map" else None)
+
+    def _scene(self, request: Request) -> Scene:
+        """The motion of a request, or what a control takes for it."""
+        assert request.trajectories is not None
+        basis, thing = self.model.motion.config.features.basis, request.trajectories.object[: request.n_frames]
+        if self.change in ("none", "zero map", "no map"):
+            return Scene.of(request.object, thing, basis)
+        assert self.annotated is not None
+        others = [clip for clip in training_clips(self.annotated) if clip.length >= request.n_frames]
+        alike = self.change == "other path"
+        others = [clip for clip in others if (clip.object_model.name == request.object.name) == alike]
+        other = others[request.seed % len(others)]
+        if alike:
+            return Scene.of(request.object, other.object[: request.n_frames], basis)
+        return Scene.of(other.object_model, thing, basis)
+
+    def generated(self, request: Request, made: Made) -> dict[Side, GeneratedHand]:
+        """Keypoints and ways to the object in the world, of the hands that take part."""
+        assert request.trajectories is not None
+        thing = request.trajectories.object[: request.n_frames]
+        body = Scene.of(request.object, thing, self.model.motion.config.features.basis).model_from_canonical
+        rotation, offset = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
+        world_from_canonical = RigidTransform(rotation @ body.rotation, body.translation @ rotation.T + offset)
+        return {
+            side: GeneratedHand(
+                world_from_canonical @ made.keypoints_m[row].astype(np.float64),
+                world_from_canonical.turn(made.to_object_m[row].astype(np.float64)),
+                made.active[row],
+            )
+            for row, side in enumerate(SIDES)
+            if request.active_hands[row]
+        }
+
+    def clip(self, request: Request, made: Made) -> Clip:
+        """The hands fitted to what was made, and refined against the object."""
+        assert request.trajectories is not None
+        hands, generated = self.generated(request, made), torch.zeros(2, request.n_frames, HAND_FEATURES)
+        generated[..., GLOBAL_ORIENT_6D.start :: 6] = generated[..., GLOBAL_ORIENT_6D.start + 3 :: 6] = 1
+        clip = motion_clip(request, generated, torch.from_numpy(request.trajectories.object), self.synthetic)
+        ids = self.model.motion.keypoint_ids.cpu().numpy()
+        tracks = fit_hands(self.pair, request.betas, ids, hands, request.template_m)
+        if self.config.refined:
+            tracks = refine_hands(self.pair, ids, hands, tracks, clip.object, self.config.refinement)
+        return replace(clip, hands={**clip.hands, **tracks})
+
+
+def _figures(sources: Sources) -> Figures:
+    return diagnose(HandsForPaths.load(sources).model, sources)
+
+
+def _family(name: str, title: str, refined: bool = True, change: Change = "none") -> Family:
+    return Family(
+        name,
+        title,
+        lambda sources: HandsForPaths.load(sources, refined, change),
+        networks=(CONTACT, MOTION) if name == "bimart" else (),
+        uses=(CONTACT.name, MOTION.name),
+        diagnose=_figures if name == "bimart" else lambda sources: {},
+    )
+
+
+BIMART = _family("bimart", "BimArt: hands for the object's motion")
+UNREFINED = _family("bimart-unrefined", "BimArt before refinement", refined=False)
+OTHER_PATH = _family("bimart-other-path", "BimArt told another motion of the object", change="other path")
+OTHER_OBJECT = _family("bimart-other-object", "BimArt told another object", change="other object")
+NO_MAP = _family("bimart-no-map", "BimArt told no contact map", change="no map")
+ZERO_MAP = _family("bimart-zero-map", "BimArt told a contact map of zeros", change="zero map")

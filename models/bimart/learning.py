@@ -1,0 +1,230 @@
+"""How both networks are trained: windows of clips, noised, against what is clean (Sec. 3.5)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from hoidata.batches.dataset import ClipBatch
+from hoidata.hands import HandPair
+from hoidata.sensors.keypoints import hand_keypoints
+from models.bimart.network import ContactModel, Denoiser, MotionModel, Windows, contact_channels
+from models.bimart.scene import Recorded, recorded_clip
+from models.bimart.windows import Asked, windows_of
+from models.common.family import Losses, Setup
+from models.common.losses import masked_mean
+from models.common.sampling import TRAIN_STEPS, add_noise
+
+VALIDATION_STEPS = (99, 299, 499, 699, 899)
+TINY = 1e-10
+JUMP_M, JUMP_RAD = 0.1, 0.8  # an object that moves farther than this in a frame was cut there
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """windows: drawn of every clip of a batch. skip_first, skip_last: frames at the ends of a clip in which no window
+    starts (the release: 100, and 100 after the end of the last window). contact_dropout: how often a contact map is not
+    told; per "window", or the whole "batch" alike (released). velocity_weight: of the same error of differences between
+    frames.
+    """
+
+    windows: int = 1
+    skip_first: int = 0
+    skip_last: int = 0
+    contact_dropout: float = 0.5
+    dropout_of: Literal["window", "batch"] = "window"
+    velocity_weight: float = 0.0
+
+
+@dataclass(frozen=True)
+class Targets:
+    """windows: what is told. clean (B, F, D): what is to be made, metres. known (B, F, D), mapped (B, F, 2N): where it
+    and the contact map are known.
+    """
+
+    windows: Windows
+    clean: Tensor
+    known: Tensor
+    mapped: Tensor
+
+    def to(self, device: torch.device | str) -> "Targets":
+        return Targets(*(getattr(self, item.name).to(device) for item in fields(self)))
+
+
+def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:
+    """First frames of a clip's windows, none across a jump of the object; a clip that is too short has one, or none."""
+    last = max(len(clip.scene) - length, 0)
+    starts = np.arange(min(loss.skip_first, last), max(last - loss.skip_last, min(loss.skip_first, last)) + 1)
+    body = clip.scene.model_from_canonical
+    step = np.linalg.norm(np.diff(body.translation, axis=0), axis=1)
+    turns = body.rotation[:-1].swapaxes(1, 2) @ body.rotation[1:]
+    cosine = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
+    jumps = np.append(0, np.cumsum((step > JUMP_M) | (cosine < np.cos(JUMP_RAD))))
+    stops = np.minimum(starts + length, len(clip.scene)) - 1
+    return starts[jumps[stops] == jumps[starts]]
+
+
+class Objective:
+    """Mean squared error of the clean, normalised numbers of hands and parts that are there."""
+
+    frames = entries = 0
+
+    def __init__(self, setup: Setup, network: Denoiser) -> None:
+        pair: HandPair = setup.corpus.annotated.store.hand_pair()
+        self.loss: LossConfig = setup.loss
+        self.device, self.length = setup.device, network.config.features.window
+        train = setup.corpus.train
+        features = network.config.features
+        self.clips = {own: recorded_clip(train.whole(own), pair, features) for own in train.ids}
+        self.starts = {own: window_starts(clip, self.length, self.loss) for own, clip in self.clips.items()}
+        network.keypoint_ids.copy_(torch.from_numpy(hand_keypoints(pair.right, features.keypoints)))
+        learn_statistics(network, self._every_window())
+        self.network = network.to(setup.device)
+        held = [recorded_clip(sample, pair, features) for sample in setup.corpus.held_out]
+        middles = [(clip, max(len(clip.scene) - self.length, 0) // 2) for clip in held]
+        self.held_out = targets_of(network, middles).to(self.device)
+
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
+        drawn = [one for sample in batch.samples for one in self._drawn(sample.clip_id, generator)]
+        if not drawn:
+            return {"total": self.network.x_out.bias.sum() * 0}
+        return window_losses(self.network, targets_of(self.network, drawn).to(self.device), self.loss, generator)
+
+    @torch.no_grad()
+    def validation(self, network: nn.Module) -> Tensor:
+        assert isinstance(network, Denoiser)
+        generator, held = torch.Generator().manual_seed(0), self.held_out
+        clean, total = normalised(network, held), torch.zeros((), device=self.device)
+        for step in VALIDATION_STEPS:
+            steps = torch.full((len(clean),), step, device=self.device)
+            noise = torch.randn(clean.shape, generator=generator).to(self.device)
+            made = network(add_noise(clean, noise, steps, network.signal), steps, held.windows)
+            total += masked_mean((made - clean).square(), held.known)
+        return total / len(VALIDATION_STEPS) / network.config.signal_scale**2
+
+    def _drawn(self, clip_id: str, generator: torch.Generator) -> list[tuple[Recorded, int]]:
+        starts = self.starts[clip_id]
+        if not len(starts):
+            return []
+        rows = torch.randint(len(starts), (self.loss.windows,), generator=generator).tolist()
+        return [(self.clips[clip_id], int(starts[row])) for row in rows]
+
+    def _every_window(self) -> Sequence[tuple[Recorded, int]]:
+        """All windows, but for neighbours that share seven eighths of their frames."""
+        apart = max(self.length // 8, 1)
+        return [(clip, int(start)) for own, clip in self.clips.items() for start in self.starts[own][::apart]]
+
+
+def window_losses(network: Denoiser, target: Targets, loss: LossConfig, generator: torch.Generator) -> Losses:
+    """Noise windows to steps drawn evenly, and compare what is made of them with what is clean (Sec. 3.5)."""
+    clean, device = normalised(network, target), target.clean.device
+    batch, count = len(clean), network.config.diffusion_steps
+    number = torch.randint(count, (batch,), generator=generator)
+    steps = ((number + 1) * (TRAIN_STEPS // count) - 1).to(device)
+    drop = torch.rand(batch, generator=generator) < loss.contact_dropout
+    drop = (drop if loss.dropout_of == "window" else drop[:1].expand(batch)).to(device)
+    noise = torch.randn(clean.shape, generator=generator).to(device)
+    made = network(add_noise(clean, noise, steps, network.signal), steps, target.windows, drop)
+    wrong = (made - clean) / network.config.signal_scale
+    found = {"simple": masked_mean(wrong.square(), target.known)}
+    total = found["simple"]
+    if loss.velocity_weight:
+        found["velocity"] = masked_mean(wrong.diff(dim=1).square(), target.known[:, 1:] & target.known[:, :-1])
+        total = total + loss.velocity_weight * found["velocity"]
+    return {"total": total, **found}
+
+
+def normalised(network: Denoiser, target: Targets) -> Tensor:
+    """(B, F, D) clean numbers, zero where there are none."""
+    return torch.where(target.known, network.encode(target.clean), 0.0)
+
+
+def targets_of(network: Denoiser, drawn: Sequence[tuple[Recorded, int]]) -> Targets:
+    """What a network is to make of windows of clips, by their first frames; on the CPU."""
+    config = network.config
+    length = max(min(config.features.window, len(clip.scene) - start) for clip, start in drawn)
+    asked = [Asked(clip.scene, start, start + length, clip.active_hands) for clip, start in drawn]
+    windows = windows_of(asked, length, config)
+    rows = [slice(start, start + length) for _, start in drawn]
+    contact = [clip.contact_m[:, own].transpose(1, 0, 2) for (clip, _), own in zip(drawn, rows, strict=True)]
+    contact_m = _padded([own.reshape(len(own), -1) for own in contact], length)
+    windows = replace(windows, contact_m=contact_m)
+    motion = [clip.motion[own] for (clip, _), own in zip(drawn, rows, strict=True)]
+    clean = contact_m if isinstance(network, ContactModel) else _padded(motion, length)
+    present = _padded([clip.present[:, own].T for (clip, _), own in zip(drawn, rows, strict=True)], length).bool()
+    mapped = present.repeat_interleave(config.features.places, 2) & contact_channels(windows)
+    known = mapped
+    if isinstance(network, MotionModel):
+        seen = present.repeat_interleave(3 * config.features.keypoints, 2).repeat(1, 1, 2)
+        known = seen & network.channel_mask(windows)
+    return Targets(windows, clean, known, mapped)
+
+
+def _padded(rows: Sequence[np.ndarray], length: int) -> Tensor:
+    shaped = [np.concatenate((own, np.zeros((length - len(own), own.shape[1]), own.dtype))) for own in rows]
+    return torch.from_numpy(np.stack(shaped).astype(np.float32))
+
+
+@torch.no_grad()
+def learn_statistics(network: Denoiser, every: Sequence[tuple[Recorded, int]], at_once: int = 64) -> None:
+    """Mean and spread of all that is normalised, over the windows that are trained on."""
+    features = network.config.features
+    sums = {
+        "input": Moments(features.scene_size),
+        "": Moments(len(network.mean)),
+        "contact": Moments(features.contact_size),
+    }
+    for first in range(0, len(every), at_once):
+        target = targets_of(network, every[first : first + at_once])
+        own = target.windows
+        assert own.contact_m is not None
+        count = own.offset.shape[1]
+        scale = own.scale[:, None, None].expand(-1, count, 1)
+        frames = own.frames[..., None]
+        there = own.there.repeat_interleave(3, 1)[:, None] & frames
+        whole = frames.expand(-1, -1, own.state.shape[-1] + 1)
+        sums["input"].add(torch.cat((own.offset, own.state, scale), -1), torch.cat((there, whole), -1))
+        sums[""].add(target.clean, target.known)
+        sums["contact"].add(own.contact_m, target.mapped)
+    groups = {
+        "input": _scene_groups(features.places * 3, features.scene_size),
+        "": [slice(None)],
+        "contact": [slice(None)],
+    }
+    if isinstance(network, MotionModel):
+        groups[""] = [slice(0, len(network.mean) // 2), slice(len(network.mean) // 2, None)]
+    for name, moments in sums.items():
+        mean, spread = moments.found()
+        for own in groups[name]:
+            kind = spread[own].square().mean().sqrt()
+            spread[own] = spread[own].clamp_min(float(network.config.floor * kind) + TINY)
+        getattr(network, f"{name}_mean".strip("_")).copy_(mean)
+        getattr(network, f"{name}_scale".strip("_")).copy_(spread)
+
+
+def _scene_groups(offsets: int, size: int) -> list[slice]:
+    """O, and every number of G and the scale by itself."""
+    return [slice(0, offsets), *(slice(one, one + 1) for one in range(offsets, size))]
+
+
+class Moments:
+    """Means and spreads of columns, gathered a batch at a time; a column never seen has mean 0 and spread 1."""
+
+    def __init__(self, size: int) -> None:
+        self.count, self.total, self.squares = (torch.zeros(size, dtype=torch.float64) for _ in range(3))
+
+    def add(self, values: Tensor, known: Tensor) -> None:
+        """values, known: (..., size)."""
+        values, known = values.double().flatten(0, -2), known.flatten(0, -2)
+        values = torch.where(known, values, 0.0)
+        self.count += known.sum(0)
+        self.total += values.sum(0)
+        self.squares += values.square().sum(0)
+
+    def found(self) -> tuple[Tensor, Tensor]:
+        mean = self.total / self.count.clamp_min(1)
+        spread = (self.squares / self.count.clamp_min(1) - mean.square()).clamp_min(0).sqrt()
+        return mean, torch.where(self.count > 0, spread, 1.0)

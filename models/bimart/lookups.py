@@ -1,0 +1,146 @@
+"""Rivals that learn nothing: the training window whose object and motion are nearest, the mean pose at the object."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+
+from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.requests import Request
+from hoidata.clips.clip import Clip
+from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES, WRIST
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
+from hoidata.geometry.transform import RigidTransform
+from hoidata.sensors.part_bps import BasisSettings
+from hoidata.store.annotated import AnnotatedStore
+from models.bimart.scene import Scene
+from models.common.family import Family, LeftOut, Sources, motion_clip
+from models.common.features import proper_hands
+
+BASIS = BasisSettings(64, nearest="vertex", frame="base")
+WINDOW = 64
+STRIDE = 8
+KINDS = (slice(0, 6 * BASIS.count), slice(6 * BASIS.count, None))  # O, and G with the scale: they count alike
+
+
+@lru_cache(maxsize=2)
+def training_clips(annotated: AnnotatedStore) -> tuple[ClipSample, ...]:
+    """All training clips of a dataset, whole."""
+    split = HoiDataset(annotated, "train")
+    return tuple(split.whole(own) for own in split.ids)
+
+
+def canonical_hands(hands: np.ndarray, model_from_canonical: RigidTransform) -> np.ndarray:
+    """Features (side, frame, 99) of the model frame in the canonical one."""
+    return _moved(hands, model_from_canonical.inverse())
+
+
+def _moved(hands: np.ndarray, frame: RigidTransform) -> np.ndarray:
+    made = hands.astype(np.float64)
+    made[..., WRIST] = (frame @ made[..., WRIST].swapaxes(0, 1)).swapaxes(0, 1)
+    made[..., GLOBAL_ORIENT_6D] = rotmat_to_rot6d(frame.rotation @ rot6d_to_rotmat(made[..., GLOBAL_ORIENT_6D]))
+    return made
+
+
+def told(scene: Scene) -> np.ndarray:
+    """(frame, number) what a network is told of each frame: O, local G, scale."""
+    scale = np.full((len(scene), 1), scene.scale)
+    own = scene.offset.reshape(len(scene), -1), scene.state("local", "first", 0, len(scene)), scale
+    return np.concatenate(own, axis=1)
+
+
+@dataclass(frozen=True)
+class NearestWindow:
+    """For every window of a request the hands of the training window most like it, of the same hands.
+
+    clips: by hands that take part, what is told (frame, number), normalised, and hands (2, frame, 99) canonical.
+    """
+
+    clips: dict[tuple[bool, bool], list[tuple[np.ndarray, np.ndarray]]]
+    mean: np.ndarray
+    spread: np.ndarray
+    synthetic: bool
+
+    @classmethod
+    def load(cls, sources: Sources) -> "NearestWindow":
+        samples = training_clips(sources.annotated)
+        scenes = [Scene.of(sample.object_model, sample.object, BASIS) for sample in samples]
+        rows = [told(scene) for scene in scenes]
+        every = np.concatenate(rows)
+        spread = every.std(axis=0)
+        for kind in KINDS:
+            spread[kind] = np.maximum(spread[kind], 0.05 * spread[kind].mean()) * np.sqrt(spread[kind].size)
+        clips: dict[tuple[bool, bool], list[tuple[np.ndarray, np.ndarray]]] = {}
+        for sample, scene, row in zip(samples, scenes, rows, strict=True):
+            own = (row - every.mean(axis=0)) / spread, canonical_hands(sample.hands, scene.model_from_canonical)
+            clips.setdefault(_hands(sample.active_hands), []).append(own)
+        return cls(clips, every.mean(axis=0), spread, any(sample.synthetic for sample in samples))
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+        return [self._answer(request) for request in requests]
+
+    def _answer(self, request: Request) -> Clip | LeftOut:
+        if request.trajectories is None or _hands(request.active_hands) not in self.clips:
+            return LeftOut(request.motion_id, "no training window of these hands, or no motion of an object")
+        thing = request.trajectories.object[: request.n_frames]
+        scene = Scene.of(request.object, thing, BASIS)
+        asked = (told(scene) - self.mean) / self.spread
+        parts = [
+            self._nearest(asked[start : start + WINDOW], request, rank=request.number)
+            for start in range(0, len(asked), WINDOW)
+        ]
+        hands = _moved(np.concatenate(parts, axis=1), scene.model_from_canonical)
+        return motion_clip(request, torch.from_numpy(hands), torch.from_numpy(thing), self.synthetic)
+
+    def _nearest(self, asked: np.ndarray, request: Request, rank: int) -> np.ndarray:
+        """(2, frame, 99) of the nearest window; of the next nearest clip for each further motion of a request."""
+        found = []
+        for row, hands in self.clips[_hands(request.active_hands)]:
+            starts = np.arange(0, max(len(row) - len(asked), 0) + 1, STRIDE)
+            frames = np.minimum(starts[:, None] + np.arange(len(asked)), len(row) - 1)
+            apart = ((row[frames] - asked) ** 2).sum(axis=-1).mean(axis=-1)
+            found.append((apart.min(), frames[apart.argmin()], hands))
+        _, frames, hands = sorted(found, key=lambda one: one[0])[rank % len(found)]
+        return hands[:, frames]
+
+
+@dataclass(frozen=True)
+class MeanPose:
+    """The mean hand at the object, canonical frame. hands: (2, 99)."""
+
+    hands: np.ndarray
+    synthetic: bool
+
+    @classmethod
+    def load(cls, sources: Sources) -> "MeanPose":
+        total, count = np.zeros((2, HAND_FEATURES)), np.zeros((2, 1))
+        samples = training_clips(sources.annotated)
+        for sample in samples:
+            scene = Scene.of(sample.object_model, sample.object, BASIS)
+            own = canonical_hands(sample.hands, scene.model_from_canonical)
+            known = (sample.valid & sample.active_hands[:, None])[..., None]
+            total, count = total + (own * known).sum(axis=1), count + known.sum(axis=1)
+        hands = proper_hands(torch.from_numpy(total / count.clip(1))).numpy()
+        return cls(hands, any(sample.synthetic for sample in samples))
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+        return [self._answer(request) for request in requests]
+
+    def _answer(self, request: Request) -> Clip | LeftOut:
+        if request.trajectories is None:
+            return LeftOut(request.motion_id, "no motion of an object")
+        thing = request.trajectories.object[: request.n_frames]
+        scene = Scene.of(request.object, thing, BASIS)
+        hands = np.repeat(self.hands[:, None], len(thing), axis=1)
+        moved = torch.from_numpy(_moved(hands, scene.model_from_canonical))
+        return motion_clip(request, moved, torch.from_numpy(thing), self.synthetic)
+
+
+def _hands(active_hands: np.ndarray) -> tuple[bool, bool]:
+    return bool(active_hands[0]), bool(active_hands[1])
+
+
+NEAREST_WINDOW = Family("nearest-window", "nearest training window by object and its motion", NearestWindow.load)
+OBJECT_MEAN_POSE = Family("mean-pose-at-object", "mean pose in the object's frame", MeanPose.load)

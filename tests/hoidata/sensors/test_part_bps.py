@@ -1,0 +1,143 @@
+"""Promises of BimArt's object features and maps: the vertices a k-d tree finds, part by part, in any world and mesh."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import Hinge, ObjectModel, articulate
+from hoidata.sensors.keypoints import hand_keypoints
+from hoidata.sensors.part_bps import (
+    BasisSettings,
+    Nearest,
+    PartBps,
+    Variant,
+    canonical_object,
+    distance_map,
+    object_scale,
+)
+from tests.builders.objects import box_model, model_of, two_parts
+
+COUNT = 40
+
+
+def lump(size: tuple[float, float, float], middle: tuple[float, float, float], seed: int) -> ObjectModel:
+    """A bumpy ellipsoid, so that no two vertices are equally near to anything."""
+    mesh = trimesh.creation.icosphere(2, 1.0)
+    bumps = 1 + 0.1 * np.random.default_rng(seed).normal(size=(len(mesh.vertices), 1))
+    mesh.vertices = mesh.vertices * bumps * size + middle
+    return model_of(mesh)
+
+
+BOTTLE = two_parts(lump((0.05, 0.04, 0.1), (0.03, 0, 0), 0), lump((0.05, 0.04, 0.02), (0.02, 0, 0.12), 1), (0, 0, -1))
+ANGLES = np.concatenate((np.linspace(-0.4, 2.0, 9), [0.0]))
+
+
+def test_vertices_are_those_of_a_tree_of_every_frame_and_part_the_moving_part_first() -> None:
+    settings = BasisSettings(COUNT, seed=3)
+    seen, scale = PartBps(BOTTLE, settings).look(ANGLES), object_scale(BOTTLE)
+    placed, points = articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES), settings.points()
+    for frame, vertices in enumerate(placed):
+        for row, part in enumerate((1, 0)):
+            own, columns = np.flatnonzero(BOTTLE.part == part), slice(row * COUNT, (row + 1) * COUNT)
+            nearest = own[KDTree(scale * vertices[own]).query(points)[1]]
+            np.testing.assert_array_equal(seen.vertex[frame, columns], nearest)
+            np.testing.assert_allclose(seen.place_m[frame, columns], vertices[nearest], atol=1e-6)
+            np.testing.assert_allclose(seen.offset[frame, columns], scale * vertices[nearest] - points, atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["whole", "unscaled"])
+def test_variants_without_parts_find_the_nearest_vertex_of_the_whole_object(variant: Variant) -> None:
+    settings = BasisSettings(COUNT, variant=variant)
+    seen, points = PartBps(BOTTLE, settings).look(ANGLES), settings.points()
+    assert len(points) == 2 * COUNT
+    scale = 1.0 if variant == "unscaled" else object_scale(BOTTLE)
+    for vertices, found in zip(
+        articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES), seen.vertex, strict=True
+    ):
+        np.testing.assert_array_equal(found, KDTree(scale * vertices).query(points)[1])
+
+
+def test_basis_points_fill_their_ball_evenly_and_come_from_the_seed() -> None:
+    points = BasisSettings(4000).points()
+    radius = np.linalg.norm(points, axis=1)
+    assert radius.max() <= 1
+    assert abs((radius < 0.5).mean() - 0.125) < 0.02
+    assert np.abs(points.mean(axis=0)).max() < 0.03
+    assert np.linalg.norm(BasisSettings(4000, variant="unscaled").points(), axis=1).max() <= 0.5
+    assert not np.array_equal(points, BasisSettings(4000, seed=1).points())
+
+
+def test_the_scale_brings_the_farthest_vertex_to_0_85_at_any_angle() -> None:
+    for vertices in articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES):
+        np.testing.assert_allclose(object_scale(BOTTLE) * np.linalg.norm(vertices, axis=1).max(), 0.85, rtol=1e-9)
+
+
+def test_a_rigid_object_has_no_moving_part() -> None:
+    seen = PartBps(canonical_object(box_model(middle_m=(1, 2, 3)))[0], BasisSettings(COUNT)).look(np.zeros(2))
+    np.testing.assert_array_equal(seen.there, np.arange(2 * COUNT) >= COUNT)
+    assert not seen.offset[:, :COUNT].any()
+    assert seen.offset[:, COUNT:].any()
+
+
+def moved(model: ObjectModel, turn: np.ndarray, shift: np.ndarray) -> ObjectModel:
+    assert model.hinge is not None
+    hinge = Hinge(turn @ model.hinge.axis, turn @ model.hinge.origin_m + shift + 0.3 * (turn @ model.hinge.axis))
+    return replace(model, vertices_m=model.vertices_m @ turn.T + shift, hinge=hinge)
+
+
+def test_the_canonical_object_is_the_same_however_its_mesh_lies() -> None:
+    turn, shift = rotvec_to_rotmat(np.array([0.4, -1.2, 0.7])), np.array([0.3, 0.2, -0.1])
+    for model in (BOTTLE, two_parts(box_model(), lump((0.1, 0.05, 0.02), (0.1, 0, 0), 2), (0, 0.6, 0.8), (0.02, 0, 0))):
+        first, second = (canonical_object(own, "base")[0] for own in (model, moved(model, turn, shift)))
+        np.testing.assert_allclose(first.vertices_m, second.vertices_m, atol=1e-12)
+    assert canonical_object(BOTTLE, "axis")[0] is BOTTLE
+
+
+def test_the_canonical_frame_has_the_hinge_along_minus_z_and_leads_back() -> None:
+    model = moved(BOTTLE, rotvec_to_rotmat(np.array([2.0, 1.0, 0.3])), np.array([0.1, 0, 0]))
+    for frame in ("axis", "base"):
+        made, object_from_canonical = canonical_object(model, frame)
+        assert made.hinge is not None
+        np.testing.assert_allclose(object_from_canonical @ made.vertices_m, model.vertices_m, atol=1e-12)
+        at_rest, turned = (articulate(own.vertices_m, own.part, own.hinge, np.array([0.8]))[0] for own in (model, made))
+        np.testing.assert_allclose(object_from_canonical @ turned, at_rest, atol=1e-12)
+
+
+def test_the_surface_looks_the_same_in_a_finer_mesh_and_vertices_do_not() -> None:
+    coarse = trimesh.creation.box((0.1, 0.2, 0.05))
+    fine = coarse.subdivide().subdivide()
+    kinds: tuple[tuple[Nearest, bool], ...] = (("surface", True), ("vertex", False))
+    for nearest, same in kinds:
+        seen = [
+            PartBps(model_of(mesh), BasisSettings(COUNT, nearest=nearest)).look(np.zeros(1)).offset
+            for mesh in (coarse, fine)
+        ]
+        assert np.allclose(seen[0], seen[1], atol=1e-6) == same
+
+
+def test_the_nearest_place_of_positions_is_that_of_the_nearer_part() -> None:
+    positions = np.random.default_rng(0).normal(0, 0.1, (len(ANGLES), 7, 3))
+    found = PartBps(BOTTLE, BasisSettings(4)).nearest_m(positions, ANGLES)
+    for frame, vertices in enumerate(articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES)):
+        np.testing.assert_allclose(found[frame], vertices[KDTree(vertices).query(positions[frame])[1]], atol=1e-12)
+
+
+def test_a_map_has_the_distance_to_the_nearest_point_of_the_hand() -> None:
+    draws = np.random.default_rng(1)
+    places, hand = draws.normal(size=(3, 11, 3)), draws.normal(size=(3, 5, 3))
+    wanted = np.linalg.norm(places[:, :, None] - hand[:, None], axis=-1).min(axis=2)
+    np.testing.assert_allclose(distance_map(places, hand), wanted, rtol=1e-5)
+
+
+@pytest.mark.parametrize("count", [20, 64, 100])
+def test_keypoints_are_vertices_of_every_segment_none_twice(count: int) -> None:
+    model = load_embedded_hands().right
+    ids = hand_keypoints(model, count)
+    assert len(set(ids.tolist())) == count
+    segments = model.skin_weights.argmax(axis=1)
+    assert set(segments[ids]) == set(segments)

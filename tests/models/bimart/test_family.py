@@ -1,0 +1,230 @@
+"""Promises of BimArt from training to clips: it goes on where it was, knows what it needs, sees no recorded hand."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.clips.clip import SIDES, Clip
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.sensors.keypoints import hand_keypoints
+from hoidata.sensors.part_bps import BasisSettings, distance_map
+from hoidata.store.annotated import AnnotatedStore
+from models.bimart.contact_training import CONTACT
+from models.bimart.family import BIMART, OTHER_OBJECT, UNREFINED, ZERO_MAP, HandsForPaths
+from models.bimart.learning import LossConfig, learn_statistics, targets_of, window_losses
+from models.bimart.lookups import NEAREST_WINDOW, OBJECT_MEAN_POSE
+from models.bimart.motion_training import MOTION
+from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
+from models.bimart.sampler import BimArt
+from models.bimart.sampler import Path as ObjectPath
+from models.bimart.scene import FeatureConfig, Scene, recorded_clip
+from models.common.checkpoints import load_checkpoint
+from models.common.family import LeftOut, Network, Setup, Sources
+from models.common.predicting import PredictionConfig, requests_for
+from models.common.training import train_network
+from models.common.transformer import TransformerConfig
+from tests.models.bimart.test_sampling import FAST
+
+HANDS = load_embedded_hands()
+PARAMS: dict[str, Any] = {
+    "network": {
+        "features": {"basis": {"count": 8}, "keypoints": 20, "window": 16, "state": "local", "most_m": 0.2},
+        "transformer": {"width": 16, "layers": 1, "heads": 2, "feed_forward": 16, "norm_first": True},
+        "encoder": [16],
+        "untold": "frame",
+        "told": True,
+        "diffusion_steps": 1000,
+    },
+    "training": {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "save_every": 1},
+}
+STEPS = 500
+SETTINGS = {"bimart": {"sampling": {"sampler": {"steps": 2, "guidance": 0.5}}}}
+
+
+@pytest.fixture(scope="module")
+def checkpoints(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("bimart")
+    for network in (CONTACT, MOTION):
+        train_network(network, annotated_root, out / network.name, PARAMS)
+    return out
+
+
+@pytest.fixture(scope="module")
+def sources(annotated: AnnotatedStore, checkpoints: Path) -> Sources:
+    return Sources(annotated, checkpoints, HANDS, torch.device("cpu"), SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def samples(annotated: AnnotatedStore) -> list[ClipSample]:
+    """A folder opened by both hands, a box lifted by the left one."""
+    every = [sample for split in ("train", "test") for sample in HoiDataset(annotated, split, crop="start")]
+    return [next(one for one in every if one.hand_type == hand) for hand in ("both", "left")]
+
+
+def interrupted(network: Network, at: int) -> Network:
+    """The network with an objective that stops everything at its ``at``-th step."""
+
+    def objective(setup: Setup):
+        made, normaliser = network.objective(setup)
+        count, losses = iter(range(1, at + 1)), made.losses
+
+        def counted(batch, generator):
+            if next(count) == at:
+                raise KeyboardInterrupt
+            return losses(batch, generator)
+
+        setattr(made, "losses", counted)  # noqa: B010 (pyright knows losses as a method)
+        return made, normaliser
+
+    return replace(network, objective=objective)
+
+
+def test_an_interrupted_training_goes_on_to_the_same_bytes(
+    annotated_root: Path, checkpoints: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        train_network(interrupted(MOTION, 3), annotated_root, tmp_path / "m", PARAMS, progress=tmp_path / "state")
+    made = train_network(MOTION, annotated_root, tmp_path / "m", PARAMS, progress=tmp_path / "state")
+    assert made.read_bytes() == (checkpoints / "bimart-motion" / "model.safetensors").read_bytes()
+
+
+def test_a_checkpoint_knows_its_keypoints_basis_points_and_statistics(
+    annotated: AnnotatedStore, checkpoints: Path
+) -> None:
+    network = load_checkpoint(checkpoints / "bimart-motion", MOTION).network
+    assert isinstance(network, MotionModel)
+    features = network.config.features
+    np.testing.assert_array_equal(network.keypoint_ids, hand_keypoints(HANDS.right, 20))
+    np.testing.assert_array_equal(network.basis_points, features.basis.points())
+    rows = []
+    for sample in HoiDataset(annotated, "train"):
+        clip = recorded_clip(sample, HANDS, features)
+        for start in range(0, max(sample.length - 16, 0) + 1, 2):
+            own = clip.motion[start : start + 16].reshape(-1, 2, 2, 60)[:, :, 0]
+            rows.append(own[clip.present[0, start : start + 16]] if clip.active_hands[0] else own[:0])
+    left = np.concatenate(rows).astype(np.float64)
+    own = network.mean.numpy().reshape(2, 2, 60)[:, 0], network.scale.numpy().reshape(2, 2, 60)[:, 0]
+    np.testing.assert_allclose(own[0], left.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(own[1], left.std(axis=0), atol=1e-6)
+
+
+def test_targets_are_the_clips_hands_in_the_objects_frame(samples: list[ClipSample], checkpoints: Path) -> None:
+    network = load_checkpoint(checkpoints / "bimart-contact", CONTACT).network
+    assert isinstance(network, Denoiser)
+    for sample in samples:
+        clip = recorded_clip(sample, HANDS, network.config.features)
+        target = targets_of(network, [(clip, 3)])
+        scene = clip.scene
+        np.testing.assert_allclose(clip.motion[:, :60], clip.keypoints_m[0].reshape(-1, 60))
+        near = scene.bps.nearest_m(clip.keypoints_m[1].astype(np.float64), scene.hinge_rad)
+        np.testing.assert_allclose(clip.to_object_m[1], near - clip.keypoints_m[1], atol=1e-6)
+        places = target.clean[0].reshape(16, 2, -1).numpy()
+        skin = distance_map(scene.place_m[3:19], clip.keypoints_m[0, 3:19])
+        assert (places[:, 0] <= np.minimum(skin, 0.2) + 1e-3).all()  # the skin has more points than the keypoints
+        assert target.known.reshape(16, 2, -1).any(dim=(0, 2)).tolist() == sample.active_hands.tolist()
+
+
+def same(one: Clip, other: Clip) -> bool:
+    names = ("wrist_m", "global_orient", "hand_pose", "valid")
+    return all(np.array_equal(getattr(one.hands[s], n), getattr(other.hands[s], n)) for s in SIDES for n in names)
+
+
+def test_it_answers_with_hands_for_the_objects_motion_and_looks_at_no_recorded_hand(
+    sources: Sources, samples: list[ClipSample]
+) -> None:
+    family, draws = UNREFINED.load(sources), np.random.default_rng(0)
+    for sample in samples:
+        spoilt = replace(sample, hands=draws.normal(size=sample.hands.shape).astype(np.float32))
+        asked = [requests_for(one, PredictionConfig(samples=2)) for one in (sample, spoilt)]
+        (first, second), (again, _) = (family.sample(own) for own in asked)
+        assert isinstance(first, Clip)
+        assert isinstance(second, Clip)
+        assert isinstance(again, Clip)
+        assert same(first, again)
+        assert not same(first, second)
+        np.testing.assert_allclose(
+            first.object.translation_m, sources.annotated.clip(sample.clip_id).object.translation_m, atol=1e-5
+        )
+        assert [bool(first.hands[side].valid.all()) for side in SIDES] == sample.active_hands.tolist()
+
+
+def test_a_request_without_the_objects_motion_is_left_out_with_the_reason(
+    sources: Sources, samples: list[ClipSample]
+) -> None:
+    asked = requests_for(samples[1], PredictionConfig(samples=2))
+    answers = UNREFINED.load(sources).sample([replace(asked[0], trajectories=None), asked[1]])
+    assert isinstance(answers[0], LeftOut)
+    assert "motion of an object" in answers[0].reason
+    assert isinstance(answers[1], Clip)
+
+
+def test_refinement_and_controls_change_the_hands_and_never_the_object(
+    sources: Sources, samples: list[ClipSample]
+) -> None:
+    asked = requests_for(samples[1], PredictionConfig(samples=1))
+    plain = UNREFINED.load(sources).sample(asked)[0]
+    assert isinstance(plain, Clip)
+    for family in (BIMART, ZERO_MAP, OTHER_OBJECT):
+        made = family.load(sources).sample(asked)[0]
+        assert isinstance(made, Clip)
+        assert not same(plain, made)
+        np.testing.assert_array_equal(made.object.translation_m, plain.object.translation_m)
+
+
+def test_networks_that_do_not_see_alike_are_refused(sources: Sources, annotated_root: Path, tmp_path: Path) -> None:
+    features = {**PARAMS["network"]["features"], "keypoints": 21}
+    params = {**PARAMS, "network": {**PARAMS["network"], "features": features}}
+    train_network(
+        MOTION, annotated_root, tmp_path / MOTION.name, {**params, "training": {**PARAMS["training"], "steps": 1}}
+    )
+    (tmp_path / CONTACT.name).symlink_to(sources.checkpoints / CONTACT.name)
+    with pytest.raises(BadInput, match="features of its contact model"):
+        HandsForPaths.load(replace(sources, checkpoints=tmp_path))
+
+
+def test_lookups_place_training_hands_at_the_object(sources: Sources, annotated: AnnotatedStore) -> None:
+    train = HoiDataset(annotated, "train")
+    sample = next(one for one in train if one.hand_type == "both")
+    asked = requests_for(sample, PredictionConfig(samples=1))
+    found = NEAREST_WINDOW.load(sources).sample(asked)[0]
+    mean = OBJECT_MEAN_POSE.load(sources).sample(asked)[0]
+    assert isinstance(found, Clip)
+    assert isinstance(mean, Clip)
+    recorded = annotated.clip(sample.clip_id)
+    for side in SIDES:  # a training clip is nearest to itself
+        np.testing.assert_allclose(found.hands[side].wrist_m, recorded.hands[side].wrist_m, atol=1e-4)
+        assert np.abs(mean.hands[side].wrist_m - recorded.hands[side].wrist_m).max() > 1e-3
+
+
+@pytest.mark.slow
+def test_two_windows_are_learnt_by_heart_to_5_mm(samples: list[ClipSample]) -> None:
+    torch.manual_seed(0)
+    features = FeatureConfig(BasisSettings(32, nearest="surface"), 20, 24, "local", most_m=0.2, map_of="keypoints")
+    transformer = TransformerConfig(96, 2, 4, 192, 0.0, norm_first=True)
+    config = DenoiserConfig(features, transformer, (128,), "joint", "frame", True, 1000, 0.0, 0.05, 4, 0.2)
+    clips, network, loss = [recorded_clip(own, HANDS, features) for own in samples], MotionModel(config), LossConfig()
+    learn_statistics(network, [(clip, 0) for clip in clips])
+    target = targets_of(network, [(clip, 0) for clip in clips] * 8)
+    optimiser, generator = torch.optim.AdamW(network.parameters(), lr=2e-3), torch.Generator().manual_seed(0)
+    losses = []
+    for step in range(STEPS):
+        optimiser.param_groups[0]["lr"] = 2e-3 * (1 - step / STEPS)
+        found = window_losses(network, target, loss, generator)["total"]
+        optimiser.zero_grad()
+        found.backward()
+        optimiser.step()
+        losses.append(float(found.detach()))
+    model = BimArt(ContactModel(config).eval(), network.eval(), FAST, torch.device("cpu"))
+    for clip, sample in zip(clips, samples, strict=True):
+        scene = Scene.of(sample.object_model, sample.object[:24], features.basis)
+        maps = clip.contact_m[:, :24].transpose(1, 0, 2).reshape(1, 24, -1).astype(np.float32)
+        made = model.make([ObjectPath(scene, clip.active_hands, 0)], torch.from_numpy(maps))[0]
+        wrong = np.linalg.norm(made.keypoints_m - clip.keypoints_m[:, :24], axis=-1)[clip.active_hands]
+        print(f"{1000 * wrong.mean():.2f} mm, loss {losses[0]:.3f} to {np.mean(losses[-20:]):.4f}")
+        assert wrong.mean() < 0.005

@@ -1,0 +1,215 @@
+"""Promises of BimArt's sampling: guidance by its formulas, windows put together, every motion from its own seed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.sensors.part_bps import BasisSettings
+from models.bimart.guidance import Map, combined, discrepancy, metre_step, released_step
+from models.bimart.learning import LossConfig, window_starts
+from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
+from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig
+from models.bimart.scene import FeatureConfig, Recorded, Scene
+from models.bimart.windows import Asked, Layout, layout_of, windows_of
+from models.common.sampling import SamplerConfig
+from models.common.transformer import TransformerConfig
+from tests.builders.objects import hinged_box
+
+FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window=8, state="local", most_m=0.2)
+TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)
+FAST = replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5))
+
+
+def path_features(frames: int, seed: int = 0, shift_m: float = 0.0) -> np.ndarray:
+    """(frame, 10) a smooth motion of a hinged object in the model frame."""
+    draws = np.random.default_rng(seed)
+    time = np.linspace(0, 1, frames)[:, None]
+    turn = rotvec_to_rotmat(time * draws.normal(size=3))
+    rows = (time * draws.normal(size=3) * 0.1 + shift_m, rotmat_to_rot6d(turn), time)
+    return np.concatenate(rows, axis=1).astype(np.float32)
+
+
+def scene(frames: int, seed: int = 0, basis: BasisSettings = FEATURES.basis, shift_m: float = 0.0) -> Scene:
+    return Scene.of(BOX, path_features(frames, seed, shift_m), basis)
+
+
+BOX = hinged_box()
+
+
+def wanted_map(seed: int = 0) -> tuple[torch.Tensor, Map]:
+    draws = torch.Generator().manual_seed(seed)
+    keypoints = torch.randn(2, 3, 2, 5, 3, generator=draws)
+    known = torch.rand(2, 3, 14, generator=draws) < 0.8
+    return keypoints, Map(torch.randn(2, 3, 7, 3, generator=draws), torch.rand(2, 3, 14, generator=draws), known)
+
+
+def test_the_map_of_keypoints_is_the_distance_to_the_nearest_of_them() -> None:
+    keypoints, wanted = wanted_map()
+    found = discrepancy(keypoints, wanted)
+    apart = np.linalg.norm(keypoints.numpy()[:, :, :, None] - wanted.places_m.numpy()[:, :, None, :, None], axis=-1)
+    error = apart.min(axis=-1) - wanted.contact_m.numpy().reshape(2, 3, 2, 7)
+    np.testing.assert_allclose(found.error_m, error * wanted.known.numpy().reshape(2, 3, 2, 7), atol=1e-6)
+    np.testing.assert_array_equal(found.nearest, apart.argmin(axis=-1))
+
+
+def test_the_released_step_is_down_the_gradient_of_the_mean_square_and_of_length_1() -> None:
+    keypoints, wanted = wanted_map()
+    scale = torch.rand(2, 5, 3) + 0.5
+    step = released_step(keypoints, wanted, scale, window=64)
+    normalised = (keypoints / scale).double().requires_grad_()
+    apart = (normalised * scale)[:, :, :, None] - wanted.places_m[:, :, None, :, None]
+    error = (apart.norm(dim=-1).amin(-1) - wanted.contact_m.unflatten(-1, (2, 7))) * wanted.known.unflatten(-1, (2, 7))
+    share = wanted.known.unflatten(-1, (2, 7)).sum((1, 3), keepdim=True)
+    (error.square() / share).sum().backward()
+    assert normalised.grad is not None
+    for row in range(2):
+        down = -normalised.grad[row] / normalised.grad[row].norm()
+        torch.testing.assert_close(step[row], down.float(), rtol=1e-4, atol=1e-6)
+
+
+def test_a_step_in_metres_brings_keypoints_to_what_the_map_asks_and_leaves_what_agrees() -> None:
+    places = torch.tensor([[0.0, 0, 0]]).expand(1, 1, 1, 3)
+    keypoints = torch.tensor([[[0.05, 0, 0], [0.0, 0.3, 0]]]).expand(1, 1, 2, 2, 3)
+    wanted = Map(places, torch.tensor([[[0.0, 0.05]]]), torch.ones(1, 1, 2, dtype=torch.bool))
+    step = metre_step(keypoints, wanted)
+    assert -0.05 <= float(step[0, 0, 0, 0, 0]) < -0.03
+    assert not step[0, 0, 0, 1].any()
+    torch.testing.assert_close(step[0, 0, 1], torch.zeros(2, 3), atol=1e-7, rtol=0)
+
+
+def test_classifier_free_guidance_is_the_usual_one_or_equation_7() -> None:
+    told, untold = torch.tensor([2.0]), torch.tensor([3.0])
+    assert float(combined(told, untold, 0.5, "usual")) == 1.5 * 2 - 0.5 * 3
+    assert float(combined(told, untold, 0.5, "paper")) == 1.5 * 2 - 3
+
+
+@pytest.mark.parametrize("frames", [5, 8, 9, 12, 30])
+@pytest.mark.parametrize("overlapping", [True, False])
+def test_windows_cover_a_path_and_put_together_are_the_path(frames: int, overlapping: bool) -> None:
+    layout, path = layout_of(frames, 8, overlapping), torch.randn(3, frames, 2)
+    torch.testing.assert_close(layout.joined(layout.cut(path)), path)
+    covered = {start + step for start in layout.starts for step in range(layout.length)}
+    assert covered >= set(range(frames))
+    if overlapping:
+        assert max(covered) < frames
+        assert all(b - a <= 4 for a, b in zip(layout.starts, layout.starts[1:], strict=False))
+
+
+def test_overlapping_windows_are_averaged_with_less_weight_towards_their_ends() -> None:
+    layout = Layout(6, 4)
+    assert layout.starts == [0, 2]
+    joined = layout.joined(torch.stack((torch.zeros(4, 1), torch.ones(4, 1))))
+    np.testing.assert_allclose(joined[0, :, 0], [0, 0, 1 / 3, 2 / 3, 1, 1], rtol=1e-6)
+
+
+def test_the_state_is_the_objects_pose_from_the_anchor_or_what_it_feels_itself() -> None:
+    own, far = scene(12), scene(12, shift_m=3.0)
+    rotation, place = own.model_from_canonical.rotation, own.model_from_canonical.translation
+    pose = own.state("pose", "first", 4, 9)
+    np.testing.assert_allclose(pose[:, :3], rotmat_to_rotvec(rotation[4:9]), atol=1e-12)
+    np.testing.assert_allclose(pose[:, 3:], place[4:9] - place[4], atol=1e-12)
+    np.testing.assert_allclose(own.state("pose", "before", 4, 9)[:, 3:], place[4:9] - place[3], atol=1e-12)
+    felt = own.state("local", "first", 4, 9)
+    np.testing.assert_allclose(felt, own.state("local", "first", 0, 12)[4:9])
+    np.testing.assert_allclose(felt, far.state("local", "before", 4, 9), atol=1e-5)
+    np.testing.assert_allclose(felt[1, :3], rotation[5].T @ [0, 0, -1], atol=1e-12)
+    np.testing.assert_allclose(felt[1, 3:6], rotation[5].T @ (place[6] - place[4]) * 15, atol=1e-9)
+    np.testing.assert_allclose(felt[1, 6:], rotmat_to_rotvec(rotation[4].T @ rotation[6]) * 15, atol=1e-9)
+
+
+def test_a_window_is_anchored_alike_in_training_and_in_use() -> None:
+    own, config = scene(20), replace(TINY, features=replace(FEATURES, state="pose"))
+    asked = [Asked(own, start, start + 8, np.ones(2, bool)) for start in layout_of(20, 8, True).starts]
+    together = windows_of(asked, 8, config)
+    for row, one in enumerate(asked):
+        torch.testing.assert_close(together.state[row], windows_of([one], 8, config).state[0])
+        assert not together.state[row, 0, 3:].any()
+    assert windows_of(asked[1:2], 8, config, "before").state[0, 0, 3:].any()
+
+
+@pytest.mark.parametrize(
+    ("change", "differs"),
+    [
+        ({"state": "pose"}, {"state"}),
+        ({"basis": replace(FEATURES.basis, nearest="surface")}, {"offset"}),
+        ({"basis": replace(FEATURES.basis, seed=1)}, {"offset"}),
+        ({"basis": replace(FEATURES.basis, variant="unscaled")}, {"offset", "scale"}),
+        ({"keypoints": 5}, set()),
+        ({"most_m": 0.0}, set()),
+        ({"map_of": "keypoints"}, set()),
+    ],
+)  # fmt: skip
+def test_a_switch_of_what_is_seen_changes_its_own_part_alone(change: dict, differs: set[str]) -> None:
+    features = replace(FEATURES, **change)
+    kinds = [
+        windows_of([Asked(scene(8, basis=own.basis), 0, 8, np.array([True, False]))], 8, replace(TINY, features=own))
+        for own in (FEATURES, features)
+    ]
+    names = ("offset", "state", "scale", "there", "hands", "frames")
+    assert {name for name in names if not torch.equal(*(getattr(own, name) for own in kinds))} == differs
+
+
+def test_no_window_crosses_a_jump_of_the_object_and_ends_may_be_left_out() -> None:
+    features = path_features(30)
+    features[17:, :3] += 1.0
+    nothing = np.zeros((2, 30, 6), np.float16)
+    clip = Recorded(
+        Scene.of(BOX, features, FEATURES.basis), nothing, nothing, nothing, nothing[..., 0] == 0, np.ones(2)
+    )
+    assert window_starts(clip, 8, LossConfig()).tolist() == [*range(10), *range(17, 23)]
+    assert window_starts(clip, 8, LossConfig(skip_first=3, skip_last=4)).tolist() == [*range(3, 10), 17, 18]
+
+
+@pytest.fixture(scope="module")
+def model() -> BimArt:
+    torch.manual_seed(0)
+    contact, motion = ContactModel(TINY).eval(), MotionModel(TINY).eval()
+    return BimArt(contact, motion, FAST, torch.device("cpu"))
+
+
+def asked_path(frames: int, seed: int, number: int = 0) -> Path:
+    return Path(scene(frames, number), np.array([True, number == 0]), seed)
+
+
+def test_a_motion_is_drawn_from_its_own_seed_in_any_company(model: BimArt) -> None:
+    first, second = asked_path(12, 1), asked_path(12, 2, 1)
+    for config in (FAST, replace(FAST, sampler=SamplerConfig("ddpm", 3, 0.5))):
+        ready = replace(model, config=config)
+        alone, again, other = (ready.make([path])[0] for path in (first, first, replace(first, seed=5)))
+        together = ready.make([second, first])[1]
+        np.testing.assert_array_equal(alone.keypoints_m, again.keypoints_m)
+        np.testing.assert_allclose(alone.keypoints_m, together.keypoints_m, atol=1e-4)
+        assert np.abs(alone.keypoints_m - other.keypoints_m).max() > 1e-2
+
+
+def test_windows_apart_do_not_know_their_neighbours_and_overlapping_ones_do(model: BimArt) -> None:
+    features = path_features(20)
+    changed = features.copy()
+    changed[9:, :3] *= -5
+    changed[9:, 9] += 0.5
+    paths = [Path(Scene.of(BOX, own, FEATURES.basis), np.ones(2, bool), 1) for own in (features, changed)]
+    for overlapping in (True, False):
+        ready = replace(model, config=replace(FAST, overlapping=overlapping))
+        one, other = (ready.make([path])[0].keypoints_m for path in paths)
+        assert np.array_equal(one[:, :8], other[:, :8]) != overlapping
+        assert not np.allclose(one[:, 8:], other[:, 8:], atol=1e-3)
+
+
+def test_guidance_brings_the_made_map_nearer_to_the_wanted_one(model: BimArt) -> None:
+    paths, wanted = [asked_path(8, 3)], torch.full((1, 8, 12), 0.05)
+    errors = []
+    for guide in ("off", "metres", "released"):
+        made = replace(model, config=replace(FAST, guide=guide, guide_share=1.0)).make(paths, wanted)[0]
+        apart = np.linalg.norm(made.keypoints_m[:, :, None] - paths[0].scene.place_m[None, :, :, None], axis=-1)
+        errors.append(np.abs(apart.min(axis=-1) - 0.05).mean())
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[2] < errors[0]
+
+
+def test_presets_differ_as_the_paper_and_its_code_do() -> None:
+    assert PRESETS == {"ours": OURS, "paper": PAPER, "released": RELEASED}
+    assert replace(RELEASED, rule="paper", contact_anchor=None) == PAPER
+    assert SamplingConfig() == OURS
