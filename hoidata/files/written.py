@@ -37,7 +37,9 @@ def check_written(path: str | Path) -> None:
     for known in _known_by:
         digest = known(Path(path))
         if digest and digest != md5_file(path):
-            raise BadInput(path, "the bytes its stage wrote, by dvc.lock", "others", REMEDY)
+            raise BadInput(
+                path, "the bytes its stage wrote, by dvc.lock", "others", f"{REMEDY}; `dvc commit` accepts it"
+            )
 
 
 def md5_file(path: str | Path) -> str:
