@@ -9,7 +9,7 @@ export PREFECT_SERVER_ANALYTICS_ENABLED := false
 export HF_HUB_OFFLINE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo install install-dev test test-fast fuzz lint types imports check bench clean
+.PHONY: demo install install-dev docs test test-fast chaos fuzz lint types imports check bench clean
 
 demo: $(VENV)/.installed
 	hoidata repro
@@ -23,14 +23,22 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	touch $@
 
 $(VENV)/.installed-dev: $(VENV)/.installed
-	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[test,dev]'
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[test,dev,docs]'
 	touch $@
+
+# The documentation as a site in build/site; strict: no dead link, nothing left out.
+docs: install-dev
+	NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
 test: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope
 
 test-fast: install-dev
 	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow"
+
+# Every situation that may stop a run, three times each; `make test` has a share of it.
+chaos: install-dev
+	OMP_NUM_THREADS=1 HOIDATA_CHAOS=3 pytest tests/pipelines/test_chaos.py
 
 # 50,000 damaged files for each parser, over a million in all; inputs that fail are kept in .fuzz/.
 fuzz: install-dev
@@ -46,7 +54,7 @@ types: install-dev
 imports: install-dev
 	lint-imports
 
-check: lint types imports test
+check: lint types imports docs test
 
 # Figures beside baselines of the same run; about half an hour. One part: python -m bench adapters
 bench: install-dev

@@ -10,6 +10,7 @@ from bench import (
     adapters,
     batches,
     bimart,
+    borders,
     evaluate,
     evaluator,
     kernels,
@@ -17,6 +18,7 @@ from bench import (
     manipnet_speed,
     physics,
     realism,
+    refinement,
     samplers,
     scale,
     sensors,
@@ -41,6 +43,8 @@ BENCHMARKS = {
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,
+    "refinement": refinement.main,
+    "borders": borders.main,
     "manipnet": manipnet.main,
 }
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from fuzz.structure import npy_bytes
 from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import Hinge, ObjectModel
 
 TRAJECTORY_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 HEADER = {"descr": "|O", "fortran_order": False, "shape": ()}
@@ -522,3 +523,46 @@ def _archive(arrays: dict[str, np.ndarray]) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, **arrays)
     return stream.getvalue()
+
+
+OBJECT_SCRIPTS = (
+    "lift 15 cm, open to 70 deg in 1.5 s, tilt 30° left, hold, put down",
+    "raise by 2 inches and turn 90 degrees clockwise; move right 0.2 m\n# a remark\nshake left 3 cm 4 times then level",
+    "open, close 10 deg, close to 5 deg, lift to 20 cm, lower, rotate 1 rad, pause 500 ms. put it down",
+    "lift 5",
+    "tilt up",
+    "lift 1 m in 0.1 s",
+    "open to 170 deg",
+    "",
+)
+
+
+def hinged_object() -> ObjectModel:
+    """A tetrahedron with a second one on a hinge, metres."""
+    points = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]])
+    vertices = np.concatenate((points, points + np.array([0, 0, 0.11])))
+    hinge = Hinge(np.array([0.0, 1, 0]), np.array([0.0, 0, 0.11]))
+    return ObjectModel(
+        "two", vertices, np.concatenate((faces, faces + 4)), np.repeat([0, 1], 4).astype(np.uint8), hinge
+    )
+
+
+def keyframe_files() -> list[bytes]:
+    """Keyframes as CSV and JSON that are good, then some that are refused."""
+    table = "time_s,x_cm,z_mm,rx_deg,hinge_rad\n0,0,0,0,0\n1,5,150,20,0.5\n2,5,0,0,0\n"
+    turned = "time_ms,qw,qx,qy,qz,z_m\n0,1,0,0,0,0\n900,0.8,0.6,0,0,0.2\n"
+    rows = [{"time_s": 0, "z_cm": 0, "hinge_deg": 0}, {"time_s": 1.5, "z_cm": 20, "hinge_deg": 45}]
+    texts = [table, turned, json.dumps(rows), json.dumps({"keyframes": rows}), "", "[1]", '[{"time_s": "a"}]']
+    changes = (
+        ("z_mm", "z"),
+        ("z_mm", "x_m"),
+        ("1,5,", "0,5,"),
+        ("2,5,", "9999,5,"),
+        (",150,", ",nan,"),
+        ("150", "9e5"),
+    )
+    changes += ((",20,", ",175,"), ("x_cm", "zcm"), ("1,5,", "1,5,5,"), ("time_s", "x_m"), ("0.5", "3"))
+    texts += [table.replace(old, new) for old, new in changes]
+    texts += [turned.replace("0.8", "2"), turned.replace("qw", "rx_deg"), turned.replace("0.2", "-0.2")]
+    return [*map(str.encode, texts), b"\xff"]

@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import pickle
 import random
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -11,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from fuzz import seeds
@@ -28,8 +30,10 @@ from hoidata.clips.clip import SourceFile
 from hoidata.datasets.arctic import files as arctic_files
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.h2o import files as h2o_files
+from hoidata.datasets.hoi4d import files as hoi4d_files
 from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.datasets.manipnet import bvh
+from hoidata.errors import BadInput
 from hoidata.files import (
     array_pieces,
     arrays,
@@ -40,6 +44,7 @@ from hoidata.files import (
     torch_pickle,
 )
 from hoidata.hands import mano, model
+from hoidata.object_paths import keyframes, script
 from hoidata.objects import mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
@@ -116,6 +121,8 @@ def all_targets() -> dict[str, Target]:
         _meshes(),
         _texts(),
         _trajectories(),
+        _hoi4d(),
+        _object_paths(),
         _json_files(),
         _settings(),
     )
@@ -393,6 +400,86 @@ def _trajectories() -> list[Target]:
             zip_mutation(npy_mutation(mutate)),
         ),
     ]
+
+
+def _hoi4d() -> list[Target]:
+    values = {"poseCoeff": np.zeros(48, "f4"), "beta": np.zeros(10, "f4"), "trans": np.zeros(3, "f4")}
+    return [
+        Target(
+            "hoi4d-camera",
+            lambda: [b"0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n" * 2],
+            lambda data: hoi4d_files.camera_poses(data, "output.log"),
+            (hoi4d_files.camera_poses,),
+            (b"\n", b" ", b"0 0 1\n", b"nan", b"1e400", b"-", b"\xff", b"inf"),
+        ),
+        Target(
+            "hoi4d-hand",
+            lambda: [pickle.dumps(rows, 2) for rows in (values, {**values, "poseCoeff": np.zeros(1)}, {"beta": [1]})],
+            lambda data: hoi4d_files.hand_frame(data, "0.pickle"),
+            (hoi4d_files.hand_frame,),
+            (*OPCODES, *GLOBALS),
+            PICKLE,
+        ),
+        _json_target(
+            "hoi4d-json",
+            _hoi4d_values(),
+            _hoi4d_json,
+            (
+                *(hoi4d_files.object_poses, hoi4d_files._part_pose, hoi4d_files._numbers, hoi4d_files.action_events),
+                *(hoi4d_files._numbers_of, hoi4d_files._clock_s, hoi4d_files.hinge_joint, hoi4d_files._mesh_of),
+            ),
+        ),
+    ]
+
+
+def _object_paths() -> list[Target]:
+    thing = seeds.hinged_object()
+    words = (b",", b"\n", b"nan", b"1e400", b"-", b"time_s", b"hinge_deg", b"z_cm", b"\xff", b'{"', b"[", b"null")
+    return [
+        Target(
+            "object-keyframes",
+            seeds.keyframe_files,
+            lambda data: keyframes.keyframed_path(thing, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0)),
+            functions_of(keyframes, ("read_keyframes",)),
+            words,
+        ),
+        Target(
+            "object-scripts",
+            lambda: [line.encode() for line in seeds.OBJECT_SCRIPTS],
+            lambda data: script.scripted_path(thing, data.decode("utf-8", "replace"), (0.0, 2.0)),
+            functions_of(script),
+            (b" to ", b" by ", b" in ", b" and ", b" cm", b" deg", b"9e9", b"-", "°".encode(), "٣".encode(), b"#"),
+        ),
+    ]
+
+
+def _hoi4d_values() -> list[Any]:
+    three = {"x": 1, "y": 2.5, "z": -3}
+    part = {"label": "a", "center": three, "rotation": three, "dimensions": {"length": 1, "width": 2, "height": 3}}
+    events = [{"event": "cut", "startTime": 1.5, "endTime": 3}]
+    marks = {"marks": [{"event": "cut", "hdTimeStart": 1, "hdTimeEnd": 9}]}
+    axis = {"axis": {"origin": [0, 0, 1], "direction": [0, 1, 0]}}
+    joints = zip((1, 2), (hoi4d_files.FIXED[0], hoi4d_files.REVOLUTE), strict=True)
+    return [
+        {"dataList": [part, {**part, "label": "b"}]},
+        {"objects": [part]},
+        {"info": {"duration": 20.0}, "events": events},
+        {"info": {"Duration": 10}, "markResult": marks},
+        {"events": events},
+        [{"id": id_, "parent": -1, "joint": joint, "parts": [{"id": id_}], "jointData": axis} for id_, joint in joints],
+    ]
+
+
+def _hoi4d_json(data: bytes) -> object:
+    """Whichever of the three kinds of file it looks like; and as a tree of parts."""
+    if b"dataList" in data or b"objects" in data:
+        return hoi4d_files.object_poses(data, "0.json")
+    if b"event" in data or not data.strip():
+        return hoi4d_files.action_events(data, "color.json")
+    tree = b'[{"id": 0, "children": [{"id": 1, "objs": ["new-0"]}, {"id": 2, "objs": ["new-1"]}]}]'
+    with contextlib.suppress(BadInput):
+        hoi4d_files._meshes_by_id(hoi4d_files.read_json(data, "result.json"), "result.json")
+    return hoi4d_files.hinge_joint(data, tree, "mobility_v2.json", "result.json")
 
 
 def _segment_lists() -> tuple[str, str]:

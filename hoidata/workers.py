@@ -13,11 +13,13 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing import reduction
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
+from hoidata.cluster import is_used_for, on_cluster
 from hoidata.errors import BadInput, HoidataError
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
@@ -60,8 +62,13 @@ def in_workers(
 
     jobs: fresh processes, each with one thread; 1 does the work here, where a death ends all. lock: a file descriptor
     each worker keeps open as long as it lives. on_lost: gives the result of an item whose worker died twice, from a
-    WorkerLost; without it that is raised, after all others are done. Raises what the function raised.
+    WorkerLost; without it that is raised, after all others are done. Raises what the function raised. On a cluster,
+    where one is chosen (``hoidata.cluster``), chunks of items are given out instead.
     """
+    if is_used_for(jobs) and len(items) > 1:
+        given_up = partial(_given_up, on_lost)
+        yield from on_cluster(function, items, jobs, _answer_alone, lambda *lost: given_up(WorkerLost(*lost)))
+        return
     if jobs <= 1:
         with one_thread():
             yield from ((item, function(item)) for item in items)
@@ -74,12 +81,24 @@ def in_workers(
             yield item, result
     for item in lost:  # alone: it may need all the memory there is
         for _, result in _shared_out(function, [item], 1, lock):
-            if isinstance(result, _Died):
-                error = WorkerLost(item, result.cause)
-                if on_lost is None:
-                    raise error
-                result = on_lost(error)
-            yield item, result
+            died = isinstance(result, _Died)
+            yield item, _given_up(on_lost, WorkerLost(item, result.cause)) if died else result
+
+
+def _given_up(on_lost: Function | None, error: WorkerLost) -> Any:
+    if on_lost is None:
+        raise error
+    return on_lost(error)
+
+
+def in_order(pairs: Iterator[tuple[Any, Any]], items: Sequence[Any]) -> Iterator[tuple[Any, Any]]:
+    """The pairs of ``in_workers`` in the order of the items; those that come early are held until their turn."""
+    early: dict[Any, Any] = {}
+    for item in items:
+        while item not in early:
+            done, result = next(pairs)
+            early[done] = result
+        yield item, early.pop(item)
 
 
 def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) -> Iterator[tuple[Any, Any]]:
@@ -191,6 +210,11 @@ def _serve(function: Function, connection: Connection, lock: _Descriptor) -> Non
         except EOFError:  # the parent is gone
             return
         connection.send(_answer(function, item))
+
+
+def _answer_alone(function: Function, item: Any) -> tuple[Any, Exception | None]:
+    with one_thread():
+        return _answer(function, item)
 
 
 def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:

@@ -29,7 +29,7 @@ from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.tracks import hands_of
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import Axes, read_trajectories
-from pipelines.generation import MeshWish, stored_object
+from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.animation_page import write_animation
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, load_hands

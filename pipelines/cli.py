@@ -14,12 +14,14 @@ from pipelines.commands import (
     convert,
     corpus,
     evaluate,
+    export,
     generate,
     graph,
     import_checkpoint,
     init,
     inspect,
     lineage,
+    object_hands,
     raw,
     settings,
     share,
@@ -48,6 +50,8 @@ app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
 app.command("validate")(store.validate)
 app.command("migrate")(store.migrate)
+app.command("push")(store.push)
+app.command("pull")(store.pull)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
@@ -58,7 +62,9 @@ app.command("table")(evaluate.table)
 app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
+app.command("hands")(object_hands.hands)
 app.command("show")(show.show)
+app.command("export")(export.export)
 
 
 @app.callback()

@@ -17,17 +17,9 @@ from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
 from models.text2hoi.generation import Generator, Wish
 from models.text2hoi.sentences import read_sentence
+from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.generation_page import write_generation
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings
-
-
-@dataclass(frozen=True)
-class MeshWish:
-    """How to read the user's mesh file; "" for what is to be assumed or found, as in ``read_user_object``."""
-
-    unit: str = ""
-    up: str = ""
-    hinge: str = ""
 
 
 @dataclass(frozen=True)
@@ -138,13 +130,3 @@ def why_not_trained(paths: StagePaths) -> str | None:
         if not (folder / FILE_NAME).is_file():
             return f"{folder} is not there; run `dvc repro`"
     return None
-
-
-def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
-    """An object of the dataset by name. Raises BadInput that lists the names there are."""
-    store = open_store(clips, hands)
-    names = list(store.objects["object"])
-    if name not in names:
-        expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
-        raise BadInput("--object", expected, name, "correct the name or path")
-    return store.object_model(name)

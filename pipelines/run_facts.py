@@ -3,10 +3,9 @@
 from pathlib import Path
 
 from hoidata.files.written import read_json
+from pipelines.figures import LEADING
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import read_params
-
-LEADING = ("action_named", "contact_f1", "joint_error_mm", "deep_share", "jitter_m_s3")
 
 
 def describe_results(project: Path, profile: str) -> str:

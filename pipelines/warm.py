@@ -141,6 +141,8 @@ def _receive(connection: socket.socket) -> dict[str, Any]:
     for own, given in enumerate(descriptors):
         os.dup2(given, own)
         os.close(given)
+    # Those of this process were opened on /dev/null, and believe that it is what they write to.
+    sys.stdout, sys.stderr = (os.fdopen(number, "w", 1, closefd=False) for number in (1, 2))
     return json.loads(body)
 
 

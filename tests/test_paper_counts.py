@@ -116,6 +116,12 @@ class TestBimArt:
         assert Counter(name.split("/")[1].split("_")[0] for name in rule.test) == dict.fromkeys(ARCTIC_OBJECTS, 4)
         assert sum("_grab_" in name for name in rule.test) == 11
 
+    def test_as_released_44_of_301_test_of_which_13_are_grasps(self):
+        rule = definitions_for("arctic")["bimart-released"].rule
+        assert (rule.train, len(set(published("arctic").usable) - set(rule.test))) == ("rest", 257)
+        assert Counter(name.split("/")[1].split("_")[0] for name in rule.test) == dict.fromkeys(ARCTIC_OBJECTS, 4)
+        assert sum("_grab_" in name for name in rule.test) == 13
+
 
 class TestText2Hoi:
     def test_a_hand_has_778_vertices_and_21_joints(self):

@@ -188,7 +188,8 @@ class Clip:
     dataset, subject: names as in the source. sequence: the source sequence the clip was cut from.
     hands: both sides always present; ``valid`` says which frames mean something.
     object: the manipulated object; other_objects: further tracked objects of the scene.
-    source_frames: (frame,) int32 index of each frame in the source file, counted from 0.
+    source_frames: (frame,) int32 index of each frame in the source file, counted from 0; of a source below 30 fps a
+    frame that was made between two has the number of the one before it (``recorded``).
     gravity: (3,) unit vector, the direction things fall in the world frame, or None when it is not known.
     gravity_note: empty where the source states gravity; else how it was estimated, or why it is not known.
     verb: the action in words ("take out", "hand over"), or None when the source has no label.
@@ -227,6 +228,11 @@ class Clip:
     @property
     def n_frames(self) -> int:
         return len(self.source_frames)
+
+    @property
+    def recorded(self) -> np.ndarray:
+        """(frame,) bool: a frame of the source, not one that was made between two of them."""
+        return np.diff(self.source_frames, prepend=self.source_frames[:1] - 1) != 0
 
     def take(self, frames: Frames) -> "Clip":
         """Some frames as a clip of its own, under the same id.

@@ -3,7 +3,7 @@
 The folder it writes is described in ``hoidata.store.annotated``.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,11 @@ from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints, sample_points
 from hoidata.store.store import Store, open_store
+from hoidata.workers import in_order, in_workers
 
 ENTRIES_PER_SHARD = 1 << 23
+# Below this a second process costs more to start than it saves.
+FRAMES_PER_JOB = 50_000
 POINT_SHAPES = {
     "points_m": ((3,), np.float32),
     "normals": ((3,), np.float32),
@@ -46,11 +49,13 @@ def contact_store(
     settings: ContactSettings | None = None,
     *,
     hands: HandPair | None = None,
+    jobs: int = 1,
     **changes: Any,
 ) -> dict[str, int]:
     """Write contact and distance maps of every clip of the store; the folder appears whole or not at all.
 
-    settings, changes: fields of ``changes`` replace those of ``settings``. hands: as in ``open_store``.
+    settings, changes: fields of ``changes`` replace those of ``settings``. hands: as in ``open_store``. jobs: workers
+    at most; order and bytes of the result do not depend on it.
     Returns counts: clips, objects, entries, clips_without_contact.
     """
     settings = replace(settings or ContactSettings(), **changes)
@@ -59,16 +64,37 @@ def contact_store(
     with atomic_folder(out_folder) as partial:
         _write_points(partial, sampled, points)
         writer = _Writer(partial, points)
-        indices = {name: ProximityIndex(cloud) for name, cloud in sampled.items()}
-        for clip_id in store.ids:
-            clip = store.clip(clip_id)
-            joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
-            index = indices[clip.object.model.name]
-            writer.add(clip_id, distance_entries(clip, joints, index, settings.threshold_m))
+        store.hand_pair()
+        jobs = min(jobs, 1 + sum(store.sequences["n_frames"].tolist()) // FRAMES_PER_JOB)
+        measured = in_workers(_Measurer(store, sampled, settings.threshold_m), store.ids, jobs)
+        for clip_id, entries in in_order(measured, store.ids):
+            writer.add(clip_id, entries)
         counts = writer.finish() | {"objects": len(sampled)}
         info = {"threshold_m": settings.threshold_m, "points": points, "counts": counts}
         (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
+
+
+@dataclass
+class _Measurer:
+    """What a worker needs: called with a clip's id, it gives the entries of both hands."""
+
+    store: Store
+    sampled: dict[str, SampledPoints]
+    threshold_m: float
+    _indices: dict[str, ProximityIndex] = field(default_factory=dict, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Workers build the indices anew, which is quicker than sending them."""
+        return {**self.__dict__, "_indices": {}}
+
+    def __call__(self, clip_id: str) -> dict[Side, np.ndarray]:
+        clip = self.store.clip(clip_id)
+        name = clip.object.model.name
+        if name not in self._indices:
+            self._indices[name] = ProximityIndex(self.sampled[name])
+        joints: dict[Side, np.ndarray] = {side: self.store.joints(clip_id, side) for side in SIDES}
+        return distance_entries(clip, joints, self._indices[name], self.threshold_m)
 
 
 def sample_objects(store: Store, points: int) -> dict[str, SampledPoints]:

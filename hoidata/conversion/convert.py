@@ -8,6 +8,7 @@ the bytes depend neither on the number of workers nor on how often the run was k
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 from rich.console import Console
@@ -82,23 +83,28 @@ def convert_dataset(
     it anew. Raises BadInput when ``out`` is being written by another run, or when there is no room.
     """
     hands = hands_for(adapter.hand_convention, hands)
-    keys = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
+    found = adapter.sequences(Path(root)) if root is not None and Path(root).is_dir() else []
+    keys = [key for key in found if _is_utf_8(str(key))]
+    unnamed = [_without_a_name(key) for key in found if key not in keys]
     reason = None if keys else _why_empty(adapter, root)
     files = manifest.values() if isinstance(manifest, Mapping) else manifest
     listed = None if files is None else {item.path: item for item in files}
     out, root = Path(out), Path(root or ".")
+    if stop_on_change and (gone := [path for path in listed or () if not (root / path).exists()]):
+        got, remedy = f"{len(gone)} gone, first {gone[0]}", "restore the files, or scan the raw folder again"
+        raise ChangedMeanwhile(root, "all files that are listed", got, remedy)
     work = FinishedWork(out.with_name(f".{out.name}.work"), root)
     convert = SequenceConverter(adapter, root, hands, listed, synthetic, work, stop_on_change)
     with exclusive(out) as lock:
         remove_leftovers(out)
         work.open(job_of(adapter, hands, root, keys, listed, synthetic))
         taken_up = _convert_all(convert, keys, jobs, lock, progress)
-        items = (item for key in keys for item in work.read(key))
+        items = chain(unnamed, (item for key in keys for item in work.read(key)))
         counts = write_store(out, items, _store_info(adapter, hands, synthetic, reason))
         work.remove()
         # Read back: the store leaves out clips of its own accord, too (an id that is given twice).
         left_out = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
-    summary = ConversionSummary(adapter.name, len(keys), counts["clips"], counts["frames"], left_out, reason, taken_up)
+    summary = ConversionSummary(adapter.name, len(found), counts["clips"], counts["frames"], left_out, reason, taken_up)
     if progress:
         print(summary, file=sys.stdout)
     return summary
@@ -157,6 +163,16 @@ def _left_out(key: SequenceKey, root: Path, error: BadInput) -> Quarantined:
     prefix = f"{root}/"
     where, got = error.where.replace(prefix, ""), error.got.replace(prefix, "")
     return Quarantined(str(key), where, error.expected.replace(prefix, ""), got, error.remedy)
+
+
+def _is_utf_8(text: str) -> bool:
+    return text == text.encode(errors="replace").decode()
+
+
+def _without_a_name(key: SequenceKey) -> Quarantined:
+    """A sequence whose file has a name that no id, table or manifest can hold."""
+    shown = str(key).encode(errors="backslashreplace").decode()
+    return Quarantined(shown, shown, "a file name in UTF-8", "other bytes", "rename it")
 
 
 def _why_empty(adapter: Adapter, root: str | Path | None) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.files.arrays import read_npz, write_npz
+from hoidata.hands.model import N_VERTICES
 
 FILE_NAME = "asked.npz"
 DISTANCES_NAME = "asked-distances.npz"
@@ -83,6 +84,8 @@ def read_asked_distances(clips: str | Path) -> dict[str, AskedDistances]:
         in_order = first[0] == 0 and first[-1] == rows and (np.diff(first) >= 0).all()
         if distance_m.shape != (rows, 2, points) or len(first) != len(names) + 1 or not in_order:
             raise ValueError(f"{len(names)} motions, vertex {vertex.shape}, distance_m {distance_m.shape}")
+        if vertex.min(initial=0) < 0 or not (hand.min(initial=0) >= 0 and hand.max(initial=0) < N_VERTICES):
+            raise ValueError("numbers of vertices that are not there")
         spans = [slice(*ends) for ends in pairwise(first.tolist())]
         return {
             str(name): AskedDistances(vertex[span], distance_m[span], hand)

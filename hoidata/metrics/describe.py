@@ -8,7 +8,7 @@ _HEAD = """# Metrics
 
 Figures of predicted clips beside the clips they were made for. This file is generated from `registry.py` by
 `python -m hoidata.metrics.describe`; a test keeps it equal. `hoidata evaluate STORE --reference DATASET` prints them
-for any store of clips, whatever made it; ten lines that write one stand in the project's README, and a test runs them.
+for any store of clips, whatever made it; ten lines that write one stand in docs/measure.md, and a test runs them.
 `hoidata.metrics.evaluate.evaluate_store` gives the figures to code.
 
 To add a metric: a function of (pair, every) that gives the values of one motion as an array, and a row in `METRICS`.

@@ -256,8 +256,8 @@ class _Bench:
             return window
         if asked is not None and asked.shape != reference.part.shape:
             return f"the contact map asked for has {len(asked)} points, {len(reference.part)} expected"
-        if distances is not None and len(distances.vertex) != predicted.clip.n_frames:
-            return f"the map of distances asked for has {len(distances.vertex)} frames, not {predicted.clip.n_frames}"
+        if distances is not None and (why := _no_map_of(distances, predicted.clip)):
+            return why
         own, contact = reference.cut(*window)
         aligned = not self.own_length
         given = aligned, asked, reference.verb, self.actions, distances
@@ -279,6 +279,14 @@ class _Bench:
             None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
             verb_of(annotated, clip_id),
         )
+
+
+def _no_map_of(distances: AskedDistances, clip: Clip) -> str:
+    """Why a map of distances is not one of this clip; nothing where it is."""
+    if len(distances.vertex) != clip.n_frames:
+        return f"the map of distances asked for has {len(distances.vertex)} frames, not {clip.n_frames}"
+    count = len(clip.object.model.vertices_m)
+    return "" if distances.vertex.max(initial=0) < count else f"its map names vertices beyond the object's {count}"
 
 
 def _number(sample: str, clip_id: str) -> int:

@@ -72,8 +72,9 @@ class Pair:
     asked_distances: AskedDistances | None = None
 
     def valid(self, side: Side) -> np.ndarray:
-        """(frame,) bool: the frames of the prediction in which this hand is looked at."""
-        return (self.reference if self.aligned else self.predicted).clip.hands[side].valid
+        """(frame,) bool: the frames of the prediction in which this hand is looked at: none that was made."""
+        clip = (self.reference if self.aligned else self.predicted).clip
+        return clip.hands[side].valid & clip.recorded
 
     def frames(self, side: Side, every: int = 1) -> np.ndarray:
         """Every n-th of the frames in which this hand is looked at."""

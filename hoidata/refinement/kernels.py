@@ -130,12 +130,10 @@ def lower_signed(low_m, cell_m, value, rotation, offset, places_m, distance_m, s
             if not found < distance_m[f, p]:
                 continue
             distance_m[f, p] = found
-            if way > 0.0:
-                su, sv, sw = way_u / way, way_v / way, way_w / way
-            else:
-                first, second = (b - a) + v * ((d - c) - (b - a)), (g - e) + v * ((m - h) - (g - e))
-                su = (first + w * (second - first)) / cell_m
-                sv = ((above - below) + w * ((above_up - below_up) - (above - below))) / cell_m
-                sw = (near_up - near) / cell_m
+            first, second = (b - a) + v * ((d - c) - (b - a)), (g - e) + v * ((m - h) - (g - e))
+            su = (first + w * (second - first)) / cell_m if way_u == 0.0 else way_u / way
+            sv = ((above - below) + w * ((above_up - below_up) - (above - below))) / cell_m
+            sv = sv if way_v == 0.0 else way_v / way
+            sw = (near_up - near) / cell_m if way_w == 0.0 else way_w / way
             for axis in range(3):
                 slope[f, p, axis] = turn[0, axis] * su + turn[1, axis] * sv + turn[2, axis] * sw

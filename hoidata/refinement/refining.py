@@ -27,20 +27,21 @@ _TINY = 1e-6  # keeps a frame without any data where it is
 class RefinementSettings:
     """Standard deviations, metres; a smaller one counts more.
 
-    keypoint_m: of a keypoint from the generated one; one that is outlier_m off counts half. surface_m: of keypoint plus
-    generated vector from the object's surface; off by more than stray_m, the vector is not believed. reach_m: vectors
-    of this length count 0.6 of short ones. depth_m: of a vertex inside the object. acceleration_m: of a keypoint's
-    second difference in time, per frame squared. pose: weight of the prior of finger poses. steps: at most; fewer where
-    one gains less than ``enough`` of the cost.
+    keypoint_m: of a keypoint from the generated one, touching_m where the hand is to touch the object; one that is
+    outlier_m off counts half. surface_m: of keypoint plus generated vector from the object's surface; off by more than
+    stray_m, the vector is not believed. reach_m: vectors of this length count 0.6 of short ones. depth_m: of a vertex
+    inside the object. acceleration_m: of a keypoint's second difference in time, per frame squared. pose: weight of the
+    prior of finger poses. steps: at most; fewer where one gains less than ``enough`` of the cost.
     """
 
     keypoint_m: float = 0.004
+    touching_m: float = 0.006
     outlier_m: float = 0.02
-    surface_m: float = 0.003
+    surface_m: float = 0.0015
     stray_m: float = 0.01
     reach_m: float = 0.02
-    depth_m: float = 0.001
-    acceleration_m: float = 0.0015
+    depth_m: float = 0.0003
+    acceleration_m: float = 0.003
     pose: float = 1.0
     steps: int = 15
     enough: float = 1e-4
@@ -105,7 +106,11 @@ class _Motion:
         self.near = np.flatnonzero(hand.is_active & self.there)
         self.to_object_m = hand.to_object_m[self.near]
         trust = np.exp(-0.5 * (self.to_object_m**2).sum(-1) / settings.reach_m**2)
-        self.trust = np.nan_to_num(trust) / settings.surface_m**2
+        trust = np.nan_to_num(trust)
+        self.trust = trust / settings.surface_m**2
+        squares = np.full(len(self.there), settings.keypoint_m**2)
+        squares[self.near] += (settings.touching_m**2 - settings.keypoint_m**2) * trust.max(axis=1)
+        self.held = self.there / squares
         self.to_object_m = np.nan_to_num(self.to_object_m)
         self.tied = np.zeros(len(self.there))
         self.tied[2:] = (self.there[2:] & self.there[1:-1] & self.there[:-2]) / settings.acceleration_m**2
@@ -142,8 +147,8 @@ class _Motion:
     ) -> float:
         """Robust: Cauchy's for keypoints, Geman and McClure's for the surface."""
         own, off = self.settings, pose.fingers.reshape(-1, 45) - self.mean
-        miss = ((points - self.target_m) ** 2).sum(-1)[self.there]
-        total = (own.outlier_m / own.keypoint_m) ** 2 * np.log1p(miss / own.outlier_m**2).sum()
+        miss = ((points - self.target_m) ** 2).sum(-1)
+        total = own.outlier_m**2 * (self.held * np.log1p(miss / own.outlier_m**2).sum(axis=1)).sum()
         total += (self.trust * surface**2 / (1 + (surface / own.stray_m) ** 2)).sum()
         total += (depth**2).sum() / own.depth_m**2 + (self.tied * (difference**2).sum(1)).sum()
         return float(total + own.pose * ((off @ self.precision) * off).sum())
@@ -154,7 +159,7 @@ class _Motion:
         derivative = self.skin.all_derivatives(chain)
         blocks, vector = acceleration_equations(derivative, seen.difference, self.tied)
         miss = seen.points_m - self.target_m
-        robust = self.there[:, None] / (1 + (miss**2).sum(-1) / own.outlier_m**2) / own.keypoint_m**2
+        robust = self.held[:, None] / (1 + (miss**2).sum(-1) / own.outlier_m**2)
         weight = robust[..., None, None] * np.eye(3)
         pull = robust[..., None] * miss
         believed = self.trust / (1 + (seen.surface_m / own.stray_m) ** 2) ** 2

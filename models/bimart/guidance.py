@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 AT_ONCE = 1 << 22  # pairs of a place and a keypoint looked at together
-NEAR_M = 0.02  # places the map says are farther than this from the hand matter less and less
+GUIDED_WITHIN_M = 0.02  # places the map says are farther than this from the hand matter less and less
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def metre_step(keypoints_m: Tensor, wanted: Map) -> Tensor:
     A step of Gauss-Newton with the diagonal alone; places the map says are far from the hand count little.
     """
     found = discrepancy(keypoints_m, wanted)
-    near = torch.exp(-wanted.contact_m / NEAR_M).unflatten(-1, (2, -1)) * wanted.known.unflatten(-1, (2, -1))
+    near = torch.exp(-wanted.contact_m / GUIDED_WITHIN_M).unflatten(-1, (2, -1)) * wanted.known.unflatten(-1, (2, -1))
     ask = _on_keypoints(near[..., None] * found.error_m[..., None] * found.away, found.nearest, keypoints_m)
     total = _on_keypoints(near[..., None].expand_as(found.away), found.nearest, keypoints_m)
     return -ask / (total + 0.5)

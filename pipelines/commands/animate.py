@@ -12,7 +12,8 @@ def animate(
     what: Annotated[
         str,
         typer.Argument(
-            metavar="TRAJECTORIES|CLIP", help="A .csv, .npz or ManipNet .txt file (README), or a stored clip's id."
+            metavar="TRAJECTORIES|CLIP",
+            help="A .csv, .npz or ManipNet .txt file (docs/fingers.md), or a clip's id.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
@@ -36,7 +37,7 @@ def animate(
     project = enter_project()
     from hoidata.clips.clip import SIDES
     from pipelines.animation import AnimateWish, animate_files
-    from pipelines.generation import MeshWish
+    from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
     paths = [str(here / name) if name and (here / name).is_file() else name for name in (what, object)]

@@ -50,7 +50,8 @@ def generate(
     from hoidata.clips.clip import FPS
     from models.common.sampling import SamplerConfig
     from models.text2hoi.generation import Wish
-    from pipelines.generation import Asked, MeshWish, generate_files
+    from pipelines.generation import Asked, generate_files
+    from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
     where: dict[str, Any] = {"models": _given_models(models)} if models else {}

@@ -5,6 +5,7 @@ a file of such a name is ``./diff``.
 """
 
 import json as json_module
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -71,7 +72,7 @@ def of(
         write_lineage_page(page, tree, found.record, sources)
     if json or mermaid or openlineage or prov:
         form = "json" if json else "mermaid" if mermaid else "openlineage" if openlineage else "prov"
-        typer.echo(_written(form, tree, found, sources if raw else None, here), nl=False)
+        typer.echo(_written(form, tree, found, sources if raw else None, here, root), nl=False)
     elif raw:
         _print_raw(sources)
     else:
@@ -122,18 +123,34 @@ def uses(
 @app.command()
 def check(
     target: Annotated[str, typer.Argument(help="Only what is behind this; everything when left out.")] = "",
+    against: Annotated[
+        Path | None, typer.Option(help="A table of a whole run, such as docs/digests/embedded.json.", resolve_path=True)
+    ] = None,
+    write: Annotated[Path | None, typer.Option(help="Write such a table of what is here.", resolve_path=True)] = None,
 ) -> None:
-    """Hash everything again: outputs, seals of checkpoints, raw files. Exit code 0 when all is as it was written."""
+    """Hash everything again: outputs, seals of checkpoints, raw files. Exit code 0 when all is as it was written.
+
+    With --against: whether the data and networks here are those that somebody else's run made.
+    """
     here, root = Path.cwd(), enter_project()
     from pipelines.lineage.check import check as check_all
+    from pipelines.lineage.made import compare_made, write_made
     from pipelines.lineage.targets import find_target
+    from pipelines.params import read_params
 
-    nodes = check_all(root, find_target(root, target, here) if target else None)
-    wrong = [node for node in nodes if node.status != "same"]
+    if against:
+        nodes = compare_made(root, against)
+    else:
+        nodes = check_all(root, find_target(root, target, here) if target else None)
+    other = [node for node in nodes if node.status != "same"]
+    wrong = [node for node in other if node.status != "recorded"]
     console = Console()
-    for node in wrong:
+    for node in other:
         console.print(_label(node), soft_wrap=True)
-    console.print(f"{len(nodes)} looked at, {len(wrong)} not as they were written", highlight=False)
+    excused = f", {len(other) - len(wrong)} of another machine" * (len(other) > len(wrong))
+    console.print(f"{len(nodes)} looked at, {len(wrong)} not as they were written{excused}", highlight=False)
+    if write and not wrong:
+        write_made(root, read_params(root)["profile"], write)
     raise typer.Exit(1 if wrong else 0)
 
 
@@ -172,14 +189,17 @@ def _raw_of_motion(root: Path | None, checkpoints: dict[str, str]) -> list:
     return list({source.store: source for record in records for source in raw_sources(root, record)}.values())
 
 
-def _written(form: str, tree, target, sources: list | None, here: Path) -> str:
+def _written(form: str, tree, target, sources: list | None, here: Path, root: Path | None) -> str:
     """One of the forms for machines, with its last newline."""
     from pipelines.lineage import formats
 
     if form == "mermaid":
         return formats.mermaid(tree, target.record)
     if form == "openlineage":
-        events = formats.openlineage(tree, target.record, _made_at(here, target))
+        from pipelines.sidecar import read_run
+
+        known = partial(read_run, root) if root else None
+        events = formats.openlineage(tree, target.record, _made_at(here, target), known)
         return "".join(f"{json_module.dumps(event, ensure_ascii=False)}\n" for event in events)
     values = formats.prov(tree, target.record) if form == "prov" else _json(tree, target.record, sources)
     return json_module.dumps(values, indent=2, ensure_ascii=False) + "\n"

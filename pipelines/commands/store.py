@@ -1,4 +1,4 @@
-"""``hoidata validate`` and ``hoidata migrate``: whether files are whole and sound, and bringing a store up to date."""
+"""``hoidata validate``, ``migrate``, ``push`` and ``pull``: stores sound, up to date, and elsewhere."""
 
 from pathlib import Path
 from typing import Annotated
@@ -35,3 +35,20 @@ def migrate(store: Store) -> None:
     found = migrate_store(store)
     done = "nothing to do" if is_current(found) else f"rewritten as {SCHEMA_VERSION}"
     typer.echo(f"{store}: schema {found}, {done}")
+
+
+def push(store: Store, address: Annotated[str, typer.Argument(help="Such as s3://bucket/grab.")]) -> None:
+    """Send a store to an object store or another disk; mind the licence: `hoidata info` says what may be shared."""
+    from hoidata.store.remote import push_store
+
+    typer.echo(f"{address}: {push_store(store, address):,} bytes sent")
+
+
+def pull(
+    address: Annotated[str, typer.Argument(help="Such as s3://bucket/grab.")],
+    store: Annotated[Path, typer.Argument(help="The folder to make.", resolve_path=True)],
+) -> None:
+    """Fetch a store that was sent, whole or not at all, each file held against its digest."""
+    from hoidata.store.remote import pull_store
+
+    typer.echo(f"{store}: {pull_store(address, store):,} bytes fetched")

@@ -1,7 +1,9 @@
 """A lineage in the forms of others: Mermaid, OpenLineage events, PROV-JSON. All come from the record alone."""
 
 import uuid
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from datetime import datetime, timedelta
 from typing import Any
 from urllib.parse import quote
 
@@ -94,24 +96,38 @@ def _mermaid_text(text: str) -> str:
     return "".join(char if char.isalnum() or char in "/._-@: " else f"#{ord(char)};" for char in text)
 
 
-def openlineage(tree: Node, record: dict[str, Any], when: str) -> list[dict[str, Any]]:
-    """One COMPLETE event per run, the earliest stage first. when: ISO time; a record holds none."""
-    return [_event(step, when) for step in reversed(steps(tree, record))]
+def openlineage(
+    tree: Node, record: dict[str, Any], when: str, run_facts: Callable[[str], dict[str, Any]] | None = None
+) -> list[dict[str, Any]]:
+    """A START and a COMPLETE event per run, the earliest stage first.
+
+    when: ISO time for runs whose own is not known; a record holds none. run_facts: by stage, as the sidecar has them;
+    those of a run other than the recorded one cannot be told apart, so they are of the stage's last run here.
+    """
+    return [event for step in reversed(steps(tree, record)) for event in _events(step, when, run_facts)]
 
 
-def _event(step: Step, when: str) -> dict[str, Any]:
+def _events(step: Step, when: str, run_facts: Callable[[str], dict[str, Any]] | None) -> Iterator[dict[str, Any]]:
+    facts = run_facts(step.name) if run_facts else {}
+    began = datetime.fromisoformat(facts["began_at"] if facts else when)
+    times = {"START": began, "COMPLETE": began + timedelta(seconds=facts.get("seconds", 0))}
+    for kind, time in times.items():
+        yield _event(step, kind, time.isoformat(), facts)
+
+
+def _event(step: Step, kind: str, when: str, facts: dict[str, Any]) -> dict[str, Any]:
     run = uuid.uuid5(
         uuid.NAMESPACE_URL, f"{PRODUCER}:{value_digest([step.name, step.params, step.code_digest, step.inputs])}"
     )
     facet = {"_producer": PRODUCER, "_schemaURL": f"{PRODUCER}:run-facet:1"}
     return {
-        "eventType": "COMPLETE",
+        "eventType": kind,
         "eventTime": when,
         "producer": PRODUCER,
         "schemaURL": _RUN_EVENT,
         "run": {
             "runId": str(run),
-            "facets": {"hoidata": {**facet, "params": step.params, "codeDigest": step.code_digest}},
+            "facets": {"hoidata": {**facet, "params": step.params, "codeDigest": step.code_digest, "run": facts}},
         },
         "job": {"namespace": NAMESPACE, "name": step.name},
         "inputs": [_dataset(path, digest) for path, digest in step.inputs.items()],

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -15,8 +16,8 @@ from hoidata.errors import BadInput
 from hoidata.files.written import md5_file
 
 CACHE = Path(".dvc/cache/files/md5")
-# Neither DVC (.dvcignore) nor we count these.
-_IGNORED = {"__pycache__"}
+# Neither DVC (.dvcignore) nor we count these: compiled code, and work under way or left by a killed run.
+_IGNORED = re.compile(r"__pycache__|.*\.pyc|\..*\.(work|part|old|lock)")
 
 
 @dataclass(frozen=True)
@@ -67,9 +68,13 @@ def dvc_digest(path: Path) -> str | None:
         return md5_file(path)
     if not path.is_dir():
         return None
-    files = (item for item in path.rglob("*") if item.is_file() and not _IGNORED & set(item.parts))
-    entries = {item.relative_to(path).as_posix(): md5_file(item) for item in files if item.suffix != ".pyc"}
-    return listing_digest(entries)
+    return listing_digest({name: md5_file(path / name) for name in _files_below(path)})
+
+
+def _files_below(folder: Path) -> list[str]:
+    """The files that count, relative to the folder."""
+    names = [item.relative_to(folder) for item in folder.rglob("*") if item.is_file()]
+    return [name.as_posix() for name in names if not any(map(_IGNORED.fullmatch, name.parts))]
 
 
 def listing_digest(entries: Mapping[str, str]) -> str:
@@ -122,6 +127,5 @@ def other_files(root: Path, lock: Locked, out: str) -> list[str]:
     before = {path: md5 for path, md5 in written_files(root, lock).items() if Path(path).is_relative_to(out)}
     if not before:
         return [out]
-    there = [path for path in (root / out).rglob("*") if path.is_file()] if (root / out).is_dir() else []
-    names = {*before, *(path.relative_to(root).as_posix() for path in there)}
+    names = {*before, *(f"{out}/{name}" for name in _files_below(root / out))}
     return sorted(name for name in names if dvc_digest(root / name) != before.get(name))

@@ -1,7 +1,7 @@
 """Manifests: which raw files a dataset consists of, without the files.
 
 A manifest is small public JSON (relative paths, sizes, SHA-256, licence) that stands for raw data DVC never sees.
-A folder of per-frame text files is one entry, digested as ``RawTree.read_folder`` does.
+A folder of per-frame files is one entry, digested as ``RawTree.read_folder`` does.
 """
 
 import json
@@ -19,7 +19,7 @@ from hoidata.errors import BadInput
 from hoidata.files import write_whole
 
 SCHEMA = "hoidata.manifest/1"
-FRAME_FILE = re.compile(r"\d{6}\.txt")
+FRAME_FILE = re.compile(r"\d{6}\.txt|\d{1,6}\.(?:json|pickle)")
 NEVER_READ = re.compile(r"\.(png|jpe?g|mp4|avi|mkv|zip|tar|tgz|tar\.gz|part[a-z]*)$", re.IGNORECASE)
 
 

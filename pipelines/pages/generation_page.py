@@ -1,47 +1,33 @@
 """What a generated motion is written as: motion.npz (arrays), motion.glb (animated) and a page that plays it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.clip import FPS, SIDES
 from hoidata.contact.agreement import f1_score
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.arrays import write_npz
 from hoidata.files.digest import canonical_json
 from hoidata.hands import HandPair, track_joints
-from hoidata.objects.user_mesh import thinned
 from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import GeneratedMotion
 from pipelines.pages.glb import write_glb
+from pipelines.pages.motion_files import ARRAYS as SHARED
+from pipelines.pages.motion_files import clip_joints_m, drawn, mesh_arrays, motion_arrays
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
 from pipelines.pages.view import touched_side
-
-MOST_FACES_DRAWN = 30_000
 
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
 ARRAYS = {
     "text": "the sentence",
     "checkpoints": "JSON: SHA-256 of each network's file by its path; `hoidata lineage motion.npz` reads it",
-    "fps": "frames per second",
     "seed": "what the motion was drawn from",
-    "gravity": "(3,) direction things fall; empty where unknown",
-    "valid": "(S, F) whether the hand takes part",
-    "joints_m": "(S, F, 21, 3) MANO's 16 joints, then the tips of index, middle, pinky, ring, thumb",
-    "coarse_joints_m": "(S, F, 21, 3) the same before refinement",
-    "wrist_m": "(S, F, 3) world position of the wrist joint",
-    "global_orient": "(S, F, 3) axis-angle about the wrist joint",
-    "hand_pose": "(S, F, 45) axis-angle of the 15 finger joints; zero is the flat hand",
-    "betas": "(S, 1 or F, 10) hand shape",
-    "object_rotvec": "(F, 3) axis-angle of world from object",
-    "object_translation_m": "(F, 3) world position of the object's origin",
-    "object_hinge_rad": "(F,) hinge angle of an articulated object",
-    "object_vertices_m": "(vertex, 3) mesh in the object's own frame",
-    "object_faces": "(face, 3) vertex numbers",
-    "object_part": "(vertex,) 1 where the hinge moves it",
+    **SHARED,
+    "coarse_joints_m": "(S, F, 21, 3) the joints before refinement",
     "contact_points_m": "(P, 3) points of the object, in its own frame",
     "contact_part": "(P,) 1 where the hinge moves the point",
     "contact": "(P,) the contact map the motion was made for",
@@ -78,7 +64,7 @@ def write_generation(
     for motion in motions:
         name = f"motion-{number}" if (number := motion.evidence["number"]) else "motion"
         made_from = checkpoint_digests(motion, checkpoints)
-        write_npz(folder / f"{name}.npz", motion_arrays(motion, hands, made_from))
+        write_npz(folder / f"{name}.npz", generated_arrays(motion, hands, made_from))
         paint = _paint(motion, motion.contact)
         write_glb(folder / f"{name}.glb", motion.clip, hands, paint, extras={"checkpoints": made_from})
         paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
@@ -92,7 +78,7 @@ def write_generation(
         motions=[_shown(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
         facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
         files=[(path.name, _FILE_WORDS[path.suffix]) for path in paths],
-        arrays=[(name, ARRAYS[name]) for name in motion_arrays(first, hands, {})],
+        arrays=[(name, ARRAYS[name]) for name in generated_arrays(first, hands, {})],
         has_players=True,
     )
     return [*paths, folder / "index.html"]
@@ -107,7 +93,7 @@ _FILE_WORDS = {
 def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> _Shown:
     """What the page shows of one motion; large meshes are thinned, the files keep them whole."""
     text, reached = str(motion.evidence["text"]), reached_contact(motion, hands)
-    clip, coarse = (_drawn(shown) for shown in (motion.clip, motion.coarse))
+    clip, coarse = (drawn(shown) for shown in (motion.clip, motion.coarse))
     title = f"{caption}: {text}"
     paints = {"asked for": _paint(motion, motion.contact), "reached": _paint(motion, reached)}
     asked, got = (
@@ -117,10 +103,6 @@ def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> _Shown:
     player = motion_player(clip, hands, title, caption, paints["reached"], "contact reached")
     before = motion_player(coarse, hands, f"{title}, before refinement", caption)
     return _Shown(caption, player, before, asked, got, _agreement(motion.contact, reached))
-
-
-def _drawn(clip: Clip) -> Clip:
-    return replace(clip, object=replace(clip.object, model=thinned(clip.object.model, MOST_FACES_DRAWN)))
 
 
 def _agreement(asked: np.ndarray, reached: np.ndarray) -> str:
@@ -171,50 +153,16 @@ def checkpoint_digests(motion: GeneratedMotion, folder: str) -> dict[str, str]:
     return {f"{folder}/{name}/{FILE_NAME}": digest for name, digest in sorted(names.items())}
 
 
-def motion_arrays(motion: GeneratedMotion, hands: HandPair, made_from: dict[str, str]) -> dict[str, np.ndarray]:
-    """The arrays of motion.npz, as ``ARRAYS`` explains them. made_from: see ``checkpoint_digests``.
-
-    Metres, radians, 30 fps, the clip's world frame. Rows of a hand where ``valid`` is False are zero.
-    """
-    clip = motion.clip
-    valid = np.stack([clip.hands[side].valid for side in SIDES])
-    joints, coarse = (
-        _where_valid([track_joints(shown.hands[side], hands[side]) for side in SIDES], valid)
-        for shown in (clip, motion.coarse)
-    )
-    arrays = {
+def generated_arrays(motion: GeneratedMotion, hands: HandPair, made_from: dict[str, str]) -> dict[str, np.ndarray]:
+    """The arrays of motion.npz, as ``ARRAYS`` explains them. made_from: see ``checkpoint_digests``."""
+    return {
         "text": np.array(str(motion.evidence["text"])),
         "checkpoints": np.array(canonical_json(made_from)),
-        "fps": np.array(FPS),
         "seed": np.array(motion.evidence["seed"]),
-        "gravity": np.zeros(0) if clip.gravity is None else np.asarray(clip.gravity),
-        "valid": valid,
-        "joints_m": joints,
-        "coarse_joints_m": coarse,
-    }
-    for name in ("wrist_m", "global_orient", "hand_pose"):
-        arrays[name] = _where_valid([getattr(clip.hands[side], name) for side in SIDES], valid)
-    betas = np.broadcast_arrays(*(clip.hands[side].betas for side in SIDES))
-    return arrays | {"betas": np.stack(betas).astype(np.float32)} | _object_arrays(motion)
-
-
-def _object_arrays(motion: GeneratedMotion) -> dict[str, np.ndarray]:
-    track = motion.clip.object
-    arrays = {
-        "object_rotvec": track.rotvec.astype(np.float32),
-        "object_translation_m": track.translation_m.astype(np.float32),
-        "object_vertices_m": track.model.vertices_m.astype(np.float32),
-        "object_faces": track.model.faces.astype(np.int32),
-        "object_part": track.model.part.astype(np.uint8),
+        **motion_arrays(motion.clip, hands),
+        **mesh_arrays(motion.clip.object.model),
+        "coarse_joints_m": clip_joints_m(motion.coarse, hands),
         "contact_points_m": motion.points.points_m,
         "contact_part": motion.points.part,
         "contact": np.asarray(motion.contact, dtype=bool),
     }
-    if track.hinge_rad is not None:
-        arrays["object_hinge_rad"] = track.hinge_rad.astype(np.float32)
-    return arrays
-
-
-def _where_valid(values: list[np.ndarray], valid: np.ndarray) -> np.ndarray:
-    stacked = np.stack(values).astype(np.float32)
-    return np.where(valid.reshape(*valid.shape, *[1] * (stacked.ndim - 2)), stacked, np.float32(0))

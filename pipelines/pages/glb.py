@@ -52,8 +52,12 @@ def glb_bytes(
     contact: ContactPaint | None = None,
     ghosts: Mapping[Side, HandTrack] = MappingProxyType({}),
     extras: dict | None = None,
+    markers: Mapping[Side, np.ndarray] = MappingProxyType({}),
 ) -> bytes:
-    """The bytes of ``write_glb``; hands None: the objects alone."""
+    """The bytes of ``write_glb``; hands None: the objects alone.
+
+    markers: (frame, 21, 3) world joints, metres, added as empty nodes called ``<side> joint <name>``.
+    """
     facts = {"clip": clip.clip_id, "synthetic": clip.synthetic, "fps": FPS}
     builder = GltfBuilder(clip.clip_id, facts | (extras or {}))
     world = builder.node("world", None, rotation=upright_rotation(clip.gravity).as_quat().round(9).tolist())
@@ -67,6 +71,9 @@ def glb_bytes(
     for side, track in ghosts.items():
         if hands is not None and track.valid.any():
             _add_hand(builder, world, times, hands[side], track, "recorded ", GHOST_COLOUR, GHOST_OPACITY)
+    for side, joints_m in markers.items():
+        for number, name in enumerate(JOINT_NAMES):
+            builder.animate(builder.node(f"{side} joint {name}", world), "translation", times, joints_m[:, number])
     return builder.to_bytes()
 
 

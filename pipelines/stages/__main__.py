@@ -54,16 +54,20 @@ def main() -> int:
 
 
 def _run(module, options: argparse.Namespace) -> int:
+    from hoidata.cluster import choose_workers
     from hoidata.errors import BadInput, HoidataError, told_in_words
     from pipelines.params import read_params
+    from pipelines.sidecar import noted_run
     from pipelines.stages.base import StagePaths
 
     paths = StagePaths(options.profile, options.dataset, options.model, options.family)
     try:
-        chosen = read_params(Path())["profile"]
+        params = read_params(Path())
+        chosen = params["profile"]
         if paths.profile not in ("", chosen):
             raise BadInput("--profile", f"{chosen}, which params.yaml chooses", paths.profile, "choose it there")
-        with told_in_words():
+        choose_workers(os.environ.get("HOIDATA_WORKERS") or str(params.get("workers", "local")))
+        with told_in_words(), noted_run(f"{options.stage}@{paths}"):
             module.run(replace(paths, profile=chosen))
     except HoidataError as error:
         print(f"{options.stage} of {paths}: {error}", file=sys.stderr)

@@ -1,6 +1,6 @@
 """Stage contact: contact maps and sparse distances on sampled points of every object."""
 
-from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, print_counts, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, print_counts, write_empty
 
 
 def run(paths: StagePaths) -> None:
@@ -12,4 +12,5 @@ def run(paths: StagePaths) -> None:
     from hoidata.contact.stage import contact_store
 
     settings = load_settings(ContactSettings, "contact")
-    print_counts(paths, contact_store(paths.clips, paths.contact, settings, hands=load_hands(paths.profile)))
+    hands = load_hands(paths.profile)
+    print_counts(paths, contact_store(paths.clips, paths.contact, settings, hands=hands, jobs=jobs()))

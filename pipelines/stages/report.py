@@ -9,8 +9,11 @@ from pipelines.stages.base import StagePaths, load_hands
 def run(paths: StagePaths) -> None:
     """Write the page; datasets without clips are listed with their reason."""
     from hoidata.files.atomic import atomic_folder
-    from pipelines.pages.report import write_report
+    from pipelines.figures import write_figures
+    from pipelines.pages.report import ReportFolders, write_report
 
     params = read_params(Path())
     with atomic_folder(paths.report) as partial:
         write_report(partial, paths.profile, params["datasets"], params["families"], load_hands(paths.profile))
+        folders = ReportFolders.of(paths.profile)
+        write_figures(partial, folders.metrics, folders.checkpoints, params["datasets"], params["families"])

@@ -5,14 +5,16 @@ from pathlib import Path
 import pytest
 
 from hoidata.clips.clip import SourceFile
+from hoidata.datasets import RawTree, get_adapter
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput, MissingResource
 from pipelines.lineage.closure import SourceTree
-from pipelines.lineage.manifests import Manifest, read_manifest, write_manifest
+from pipelines.lineage.manifests import Manifest, read_manifest, scan_files, write_manifest
 from pipelines.params import read_file
 from pipelines.stages.adapters import ConvertSettings, ensure_manifests, raw_files
 from pipelines.stages.base import StagePaths, load_settings
 from pipelines.stages.code import closures, own_settings
+from tests.builders import hoi4d
 
 PROJECT = Path(__file__).parents[2]
 
@@ -50,6 +52,18 @@ def test_a_variant_has_the_adapter_and_raw_files_of_its_source_and_settings_of_i
     # A generated corpus is each variant's own: its manifest may hold another recipe.
     with pytest.raises(MissingResource, match=r"\.hoidata/raw/embedded/arctic-whole"):
         raw_files(StagePaths("embedded", "arctic-whole"))
+
+
+def test_a_folder_with_a_file_per_frame_is_one_entry_of_a_manifest(tmp_path):
+    """HOI4D has 2,971 recordings of 900 such files."""
+    adapter, root = get_adapter("hoi4d"), hoi4d.write_two(tmp_path)
+    listed = {entry.path: entry for entry in scan_files(root, adapter.parts)}
+    assert f"HOI4D_annotations/{hoi4d.SAFE}/objpose" in listed
+    assert len(listed) < 30
+    assert adapter.load(RawTree(root, listed), hoi4d.key_of(hoi4d.SAFE), hoi4d.HANDS)
+    (root / f"HOI4D_annotations/{hoi4d.SAFE}/objpose/7.json").write_text("{}")
+    with pytest.raises(BadInput, match="SHA-256"):
+        adapter.load(RawTree(root, listed), hoi4d.key_of(hoi4d.SAFE), hoi4d.HANDS)
 
 
 def test_the_code_of_a_variant_is_that_of_its_source_and_its_settings_concern_it_alone():

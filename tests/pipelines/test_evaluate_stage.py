@@ -19,6 +19,7 @@ from tests.builders.annotated import write_annotated_dataset
 
 PROJECT = Path(__file__).parents[2]
 PATHS = StagePaths("embedded", "grab", family="ours")
+BIMART = ("--metrics", "bimart")
 
 
 @pytest.fixture
@@ -42,6 +43,17 @@ def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
     assert found["diagnostics"] == {"length": {"mae_frames": 3.5}}
 
 
+def test_lists_of_figures_are_computed_where_params_name_them(clips):
+    write_samples(clips)
+    Path("params.yaml").write_text("{profile: embedded, evaluate: {metrics: [bimart]}}")
+    evaluate.run(PATHS)
+    figures = json.loads(PATHS.metrics.read_text())["figures"]
+    assert (figures["contact_f1"], figures["bimart_con_paper"], figures["cams_pen_corrected"]) == (1, 100, 0)
+    Path("params.yaml").write_text("{profile: embedded, evaluate: {metrics: [omomo]}}")
+    with pytest.raises(BadInput, match=r"evaluate.metrics: expected names of bimart, got omomo"):
+        evaluate.run(PATHS)
+
+
 def test_a_subset_no_split_has_is_refused_and_not_empty(clips):
     with pytest.raises(BadInput, match="train, validation, test"):
         load_annotated(PATHS.data).ids("dev")
@@ -53,13 +65,14 @@ def test_the_reason_passes_through_where_there_are_no_motions(clips):
     assert json.loads(PATHS.metrics.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
 
 
-def test_a_store_written_by_the_script_of_the_readme_is_measured_by_the_command(clips):
-    script = re.search(r"```python\n(# Your system.*?)```", (PROJECT / "README.md").read_text(), re.DOTALL)[1]
+def test_a_store_written_by_the_ten_line_script_of_the_docs_is_measured_by_the_command(clips):
+    script = re.search(r"```python\n(# Your system.*?)```", (PROJECT / "docs/measure.md").read_text(), re.DOTALL)[1]
     assert sum(1 for line in script.splitlines() if line and not line.startswith("#")) <= 10
-    exec(compile(script, "README.md", "exec"), {})
-    done = CliRunner().invoke(app, ["evaluate", "mine", "--reference", str(PATHS.data), "--out", "mine.json"])
+    exec(compile(script, "measure.md", "exec"), {})
+    done = CliRunner().invoke(app, ["evaluate", "mine", "--reference", str(PATHS.data), "--out", "mine.json", *BIMART])
     assert done.exit_code == 0, done.output
     assert "joint error of the best sample" in done.output
     found = json.loads(Path("mine.json").read_text())
     assert found["figures"]["joint_error_mm"] == pytest.approx(10.0, abs=0.01)
     assert found["motions"] == 4
+    assert found["figures"]["bimart_accel_paper"] > 0

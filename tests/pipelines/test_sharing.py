@@ -1,6 +1,7 @@
 """What is derived from licensed data stays here unless the user says otherwise."""
 
 import shutil
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -54,3 +55,15 @@ def test_dvc_push_sends_nothing_derived_until_it_is_shared(project, project_tool
     assert project_tools.run(project, "hoidata", "share", "--off").returncode == 0
     shutil.rmtree(tmp_path / "remote")
     assert pushed() == kept
+
+
+def test_plain_dvc_and_prefect_typed_in_this_folder_send_nothing_home(monkeypatch):
+    from dvc.analytics import is_enabled
+    from dvc.config import Config
+
+    for name in ("DVC_NO_ANALYTICS", "DO_NOT_TRACK", "DVC_TEST"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.chdir(PROJECT)
+    assert not is_enabled()
+    assert not Config.from_cwd()["core"]["check_update"]
+    assert tomllib.loads((PROJECT / "prefect.toml").read_text())["server"]["analytics_enabled"] is False

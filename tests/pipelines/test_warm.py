@@ -18,12 +18,12 @@ what = sys.argv[1]
 print(what, os.getcwd(), os.environ["WORD"], "HOIDATA_WARM" in os.environ, __name__, flush=True)
 print("said", file=sys.stderr)
 if what == "wait":
-    Path("began").touch()
-    try:
-        time.sleep(60)
-    except KeyboardInterrupt:
-        Path("interrupted").touch()
+    def stop(*_):
+        Path("stopped").touch()
         sys.exit(7)
+    signal.signal(signal.SIGTERM, stop)
+    Path("began").touch()
+    time.sleep(60)
 if what == "die":
     os.kill(os.getpid(), signal.SIGKILL)
 if what == "raise":
@@ -79,9 +79,9 @@ def test_a_stage_says_and_answers_what_it_would_by_itself(warm, tmp_path: Path, 
 def test_a_signal_for_the_one_that_asks_is_for_the_stage(warm, tmp_path: Path) -> None:
     asking = ask(warm, tmp_path, "wait")
     until((tmp_path / "began").exists)
-    asking.send_signal(signal.SIGINT)
+    asking.send_signal(signal.SIGTERM)
     assert asking.wait(20) == 7
-    assert (tmp_path / "interrupted").exists()
+    assert (tmp_path / "stopped").exists()
 
 
 def test_a_stage_ends_with_the_one_that_asked(warm, tmp_path: Path) -> None:

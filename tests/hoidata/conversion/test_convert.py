@@ -212,21 +212,21 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     adapter = get_adapter(name)
     assert isinstance(adapter, Adapter)
     assert adapter.name == name
-    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic", "taco"))
+    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic", "taco", "hoi4d"))
     assert adapter.licence
     assert adapter.where_to_register
     assert adapter.frame.note
     assert adapter.hand_convention.note
     assert adapter.parts
     assert not any(part.is_in(tmp_path) for part in adapter.parts)
-    assert adapter.source_fps >= 30
+    assert adapter.source_fps >= 15
     assert pickle.loads(pickle.dumps(adapter)) == adapter
     assert adapter.sequences(tmp_path) == []
 
 
 def test_an_unknown_adapter_is_answered_with_the_known_ones():
-    assert adapter_names()[:5] == ["arctic", "grab", "h2o", "manipnet", "taco"]
-    with pytest.raises(MissingResource, match="arctic, grab, h2o, manipnet, taco"):
+    assert adapter_names()[:6] == ["arctic", "grab", "h2o", "hoi4d", "manipnet", "taco"]
+    with pytest.raises(MissingResource, match="arctic, grab, h2o, hoi4d, manipnet, taco"):
         get_adapter("tacos")
 
 

@@ -295,6 +295,14 @@ def test_the_list_costs_nothing_until_it_is_asked_for(write_annotated, moved, tm
     assert own - set(found["figures"]) == rigid
     with pytest.raises(BadInput, match="bimart"):
         with_lists(["bimart", "omomo"])
+    one, other, *_ = (asked_of(clip) for clip in predicted)
+    wrong = {predicted[0].clip_id: one._replace(vertex=one.vertex + 100), predicted[1].clip_id: AskedDistances(*(
+        array[:5] for array in other
+    ))}  # fmt: skip
+    write_asked_distances(tmp_path / "two", wrong)
+    reasons = {item["clip_id"]: item["reason"] for item in evaluate_store(tmp_path / "two" / "clips", root)["left_out"]}
+    for own, says in zip(wrong, ("beyond the object's 8", "5 frames, not 12"), strict=True):
+        assert says in reasons[own]
 
 
 def test_names_and_titles_of_all_lists_are_different():

@@ -65,9 +65,9 @@ def test_one_changed_byte_anywhere_in_an_array_is_told(tmp_path: Path):
     for place in range(0, len(whole), 7):
         changed = bytearray(whole)
         changed[place] ^= 1 << place % 8
-        (tmp_path / "b.npz").write_bytes(changed)
+        (tmp_path / f"{place}.npz").write_bytes(changed)
         try:
-            found = map_npz(tmp_path / "b.npz")
+            found = map_npz(tmp_path / f"{place}.npz")
         except BadInput:
             told += 1
             continue

@@ -11,12 +11,44 @@ from openlineage.client import event_v2 as openlineage
 from prov.model import ProvActivity, ProvDocument, ProvEntity
 from typer.testing import CliRunner
 
+from hoidata.errors import BadInput
 from pipelines.cli import app
 
 CONTACT = "checkpoints/embedded/grab/contact"
 WEIGHTS = f"{CONTACT}/model.safetensors"
 CLIPS = "data/embedded/grab/clips"
 TRAIN = "models/text2hoi/dvc.yaml:train@embedded-grab-contact"
+FACETS = {
+    "type": "object",
+    "additionalProperties": {
+        "type": "object",
+        "required": ["_producer", "_schemaURL"],
+        "properties": {name: {"type": "string", "pattern": "^[a-z]+:"} for name in ("_producer", "_schemaURL")},
+    },
+}
+NAMED = {
+    "type": "object",
+    "required": ["namespace", "name"],
+    "properties": {"namespace": {"type": "string"}, "name": {"type": "string"}, "facets": FACETS},
+}
+RUN_EVENT = {
+    "type": "object",
+    "required": ["eventTime", "producer", "schemaURL", "run", "job"],
+    "properties": {
+        "eventType": {"enum": ["START", "RUNNING", "COMPLETE", "ABORT", "FAIL", "OTHER"]},
+        "eventTime": {"type": "string", "pattern": r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)$"},
+        "producer": {"type": "string", "pattern": "^[a-z]+:"},
+        "schemaURL": {"const": "https://openlineage.io/spec/2-0-2/OpenLineage.json#/$defs/RunEvent"},
+        "run": {
+            "type": "object",
+            "required": ["runId"],
+            "properties": {"runId": {"type": "string", "format": "uuid"}, "facets": FACETS},
+        },
+        "job": NAMED,
+        "inputs": {"type": "array", "items": NAMED},
+        "outputs": {"type": "array", "items": NAMED},
+    },
+}
 BOX = re.compile(r'    (n\d+)(?:\["[\w/.@: #;-]+"\]|\("[\w/.@: #;-]+"\))')
 ARROW = re.compile(r"    (n\d+) --> (n\d+)")
 STYLE = re.compile(r"    style (n\d+) fill:#[0-9a-f]{6}")
@@ -83,11 +115,23 @@ def test_a_hostile_name_does_not_leave_its_box_in_mermaid_or_the_page(typed, ran
 
 
 @pytest.mark.parametrize("target", [CONTACT, CLIPS, "metrics/embedded/grab/text2hoi.json"])
-def test_openlineage_events_are_taken_by_openlineages_own_classes(typed, target):
+def test_openlineage_events_keep_the_schema_and_are_taken_by_openlineages_own_classes(typed, ran, target):
+    """The package brings no schema: what the specification 2-0-2 asks of a run event is written down here."""
+    facts = {"schema": "hoidata.run/1", "began_at": "2026-01-02T03:04:05+00:00", "seconds": 5.0, "device": "cpu"}
+    (ran.root / ".hoidata/runs").mkdir(parents=True)
+    (ran.root / ".hoidata/runs/raw@embedded-grab.json").write_text(json.dumps(facts))
     lines = typed(target, "--openlineage")[1].splitlines()
     seen: set[str] = set()
+    pairs: dict[str, list[str]] = {}
+    validator = jsonschema.Draft202012Validator(RUN_EVENT, format_checker=jsonschema.FormatChecker())
     for line in lines:
         values = json.loads(line)
+        validator.validate(values)
+        pairs.setdefault(values["run"]["runId"], []).append(values["eventType"])
+        if values["job"]["name"] == "raw@embedded-grab":
+            second = 5 if values["eventType"] == "START" else 10
+            assert values["eventTime"] == f"2026-01-02T03:04:{second:02}+00:00"
+            assert values["run"]["facets"]["hoidata"]["run"] == facts
         facets = [values["run"]["facets"]["hoidata"]]
         inputs, outputs = ([(item["namespace"], item["name"]) for item in values[key]] for key in ("inputs", "outputs"))
         event = openlineage.RunEvent(
@@ -105,6 +149,7 @@ def test_openlineage_events_are_taken_by_openlineages_own_classes(typed, target)
         made_later = {name for _, name in inputs if name.startswith("data/")} - seen
         assert not made_later, "an input stands before the run that makes it"
         seen |= {name for _, name in outputs}
+    assert set(map(tuple, pairs.values())) == {("START", "COMPLETE")}
 
 
 @pytest.mark.parametrize("target", [CONTACT, CLIPS, "metrics/embedded/grab/text2hoi.json"])
@@ -146,3 +191,39 @@ def test_the_sub_commands_say_by_their_exit_codes_what_they_found(typed, ran):
     code, output = typed("check")
     assert code == 1
     assert f"data {CLIPS} tampered" in output
+
+
+def test_a_table_of_a_whole_run_tells_whether_another_made_the_same(typed, ran):
+    table = ran.root / "made.json"
+    assert typed("check", "--write", str(table))[0] == 0
+    assert typed("check", "--against", str(table))[0] == 0
+    values = json.loads(table.read_text())
+    assert {CLIPS, "data/embedded/grab/raw.json"} <= values["outputs"].keys()
+    assert WEIGHTS in values["networks"]
+    assert not [name for name in values["outputs"] if not name.startswith("data/")]
+    values["networks"][WEIGHTS] = "0" * 64
+    table.write_text(json.dumps(values))
+    assert typed("check", "--against", str(table))[0] == 1  # other weights, the same processor and libraries
+    table.write_text(json.dumps({**values, "processor": "another one"}))
+    code, output = typed("check", "--against", str(table))
+    assert (code, "1 of another machine" in output, "processor another one there" in output) == (0, True, True)
+    (ran.root / "data/embedded/grab/raw.json").write_text("{}")
+    assert typed("check", "--against", str(table))[0] == 1
+
+
+def test_facts_of_a_run_are_kept_beside_its_outputs_also_when_it_fails(tmp_path, monkeypatch):
+    from pipelines.sidecar import noted_run, read_run
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("DVC_STAGE", "models/text2hoi/dvc.yaml:train@embedded-grab-contact")
+    with noted_run("train@embedded-grab-contact"):
+        pass
+    facts = read_run(tmp_path, "models/text2hoi/dvc.yaml:train@embedded-grab-contact")
+    assert facts["ended"] == "complete"
+    assert {"began_at", "seconds", "processor_seconds", "peak_mib", "host", "device", "cores", "commit"} <= facts.keys()
+    monkeypatch.delenv("DVC_STAGE")
+    with pytest.raises(BadInput), noted_run("convert@embedded-grab"):
+        raise BadInput("a", "b", "c")
+    assert read_run(tmp_path, "convert@embedded-grab")["ended"] == "failed"
+    (tmp_path / ".hoidata/runs/convert@embedded-grab.json").write_text("{")
+    assert read_run(tmp_path, "convert@embedded-grab") == {}

@@ -1,0 +1,242 @@
+"""The drawings of docs/concepts, made from the data of `make demo`: python docs/make/drawings.py PROJECT."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+
+from hoidata.clips.clip import SIDES, HandTrack
+from hoidata.dataset_folders import dataset_facts
+from hoidata.datasets.registry import get_adapter
+from hoidata.hands import load_embedded_hands
+from hoidata.hands.tracks import track_vertices
+from hoidata.store.annotated import load_annotated
+from hoidata.surface.store import open_surface
+from pipelines.lineage.graph import written_graph
+
+IMAGES = Path(__file__).parents[1] / "images"
+BLUE, SAND, GREY, RED = "#7a9fc6", "#e6b087", "#d6d4cc", "#c4571b"
+COLOURS = {"left": BLUE, "right": SAND}
+CLIP = "grab/s10/mug_drink_1"
+TOUCH = matplotlib.colors.LinearSegmentedColormap.from_list("touch", ["#d6d4cc", "#f29e40", "#c71f24"])
+PARTS = {"train": "#9fb8d3", "validation": "#e9c46a", "test": "#c4571b", "left out": "#eeeeee"}
+HANDS = load_embedded_hands()
+
+
+def mesh(axes, vertices: np.ndarray, faces: np.ndarray, colour, opacity: float = 1.0) -> None:
+    """A shaded surface: vertices (vertex, 3) metres; colour: one, or (face, 3)."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-12
+    light = 0.62 + 0.38 * np.abs(normals @ np.array((0.35, -0.5, 0.79)))
+    rgb = np.atleast_2d(matplotlib.colors.to_rgba_array(colour))[:, :3]
+    axes.add_collection3d(Poly3DCollection(corners, facecolors=np.clip(rgb * light[:, None], 0, 1), alpha=opacity))
+
+
+def frame_of(axes, centre: np.ndarray, radius: float, view: tuple[float, float] = (18, -60)) -> None:
+    """The part of the world that is seen, without the box around it."""
+    for set_limits, middle in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, strict=True):
+        set_limits(middle - radius, middle + radius)
+    axes.set_box_aspect((1, 1, 1), zoom=1.5)
+    axes.view_init(*view)
+    axes.set_axis_off()
+
+
+def triad(
+    axes, origin: np.ndarray, length: float, names: tuple[str, ...] = ("x", "y", "z"), up: int | None = 2
+) -> None:
+    """Three axes; the one that points up is drawn bold."""
+    for number, name in enumerate(names):
+        tip = origin + length * np.eye(3)[number]
+        bold = number == up
+        axes.plot(*np.stack([origin, tip]).T, color=RED if bold else "#555555", linewidth=2.4 if bold else 1.1)
+        axes.text(*(tip + 0.12 * (tip - origin)), f"{name}, up" if bold else name, fontsize=8, color="#333333")
+
+
+def hand_vertices(side: str, track, frame: int) -> np.ndarray:
+    """(778, 3) world vertices of one hand in one frame, metres."""
+    return track_vertices(track.take(slice(frame, frame + 1)), HANDS[side])[0]
+
+
+def draw_clip(figure: Figure, data: Path) -> None:
+    """Four moments of one clip, all in the source's world."""
+    clip = load_annotated(data / "grab", HANDS).clip(CLIP)
+    for number, frame in enumerate(np.linspace(0, clip.n_frames - 1, 4).astype(int)):
+        axes = figure.add_subplot(1, 4, number + 1, projection="3d")
+        model = clip.object.model
+        moment = clip.object.points_in_world(model.vertices_m, model.part)[frame]
+        mesh(axes, moment, model.faces, GREY)
+        for side in SIDES:
+            if clip.hands[side].valid[frame]:
+                mesh(axes, hand_vertices(side, clip.hands[side], frame), HANDS[side].faces, COLOURS[side])
+        centre = clip.object.translation_m.mean(axis=0)
+        frame_of(axes, centre, 0.24)
+        triad(axes, centre - np.array((0.2, 0.2, 0.2)), 0.08)
+        axes.set_title(f"frame {frame}, {frame / 30:.2f} s", fontsize=9, y=-0.02)
+
+
+def draw_conventions(figure: Figure, data: Path) -> None:
+    """What zero angles, the translation and up mean in each source, drawn on the same right hand."""
+    model = HANDS["right"]
+    wrist = model.wrist_offset_m(np.zeros((1, 10)))[0]
+    for number, name in enumerate(("h2o", "grab", "arctic", "manipnet", "taco", "hoi4d")):
+        adapter, facts = get_adapter(name), dataset_facts(name)
+        convention, frame = adapter.hand_convention, adapter.frame
+        axes = figure.add_subplot(2, 3, number + 1, projection="3d")
+        pose = model.mean_pose if convention.fingers == "mean-relative" else np.zeros(45)
+        vertices = posed(pose)
+        mesh(axes, vertices, model.faces, SAND, 0.9)
+        place = wrist if convention.translation == "wrist" else np.zeros(3)
+        axes.computed_zorder = False
+        axes.scatter(*place, color=RED, s=34, depthshade=False, zorder=5)
+        axes.plot(*np.stack([place, wrist]).T, color=RED, linewidth=2, zorder=4)
+        frame_of(axes, np.array((0.0, 0.0, 0.0)), 0.14, (14, -82))
+        up = None if frame.up_axis is None else "xyz".index(frame.up_axis[-1])
+        triad(axes, np.array((-0.1, 0.0, -0.13)), 0.05, up=up)
+        where = "the wrist" if convention.translation == "wrist" else "J0 short of the wrist"
+        lines = [
+            f"translation: {where}",
+            f"zero angles: {'the mean pose' if convention.fingers == 'mean-relative' else 'a flat hand'}",
+            f"shape: {convention.shape}",
+            f"up: {frame.up_axis or frame.gravity}",
+            f"{facts.source_fps:g} per second" if facts else "",
+        ]
+        axes.set_title(facts.title if facts else name, fontsize=11, fontweight="bold")
+        axes.text2D(0.5, -0.02, "\n".join(lines), transform=axes.transAxes, ha="center", va="top", fontsize=8)
+
+
+def posed(pose: np.ndarray) -> np.ndarray:
+    """(778, 3) vertices of the right hand at its model's origin with absolute finger angles (45,)."""
+    model, zero = HANDS["right"], np.zeros((1, 3))
+    wrist = model.wrist_offset_m(np.zeros((1, 10)))
+    track = HandTrack(wrist, zero, np.asarray(pose)[None], np.zeros((1, 10)), np.ones(1, bool))
+    return hand_vertices("right", track, 0)
+
+
+def draw_contact(figure: Figure, data: Path) -> None:
+    """The contact map of a clip, and BimArt's distances of one frame, on the same 1,024 points."""
+    annotated = load_annotated(data / "grab", HANDS)
+    clip, surface = annotated.clip(CLIP), open_surface(data / "grab/surface")
+    points = annotated.points(annotated.object_key(CLIP)).points_m
+    frame, side = clip.n_frames // 2, annotated.hand_type(CLIP)
+    side = "right" if side == "both" else side
+    touched = annotated.touched_frames(CLIP, side)
+    maps = {
+        "touched within 2 cm of a joint": (touched / clip.n_frames, TOUCH, "share of the frames"),
+        f"metres to the {side} hand, frame {frame}": (surface.bimart_map(CLIP, side)[frame], "RdYlBu", "m"),
+    }
+    for number, (title, (values, colours, unit)) in enumerate(maps.items()):
+        axes = figure.add_subplot(1, 2, number + 1, projection="3d")
+        drawn = axes.scatter(*points.T, c=values, cmap=colours, s=9, depthshade=False)
+        frame_of(axes, points.mean(axis=0), np.ptp(points, axis=0).max() * 0.5)
+        axes.set_title(title, fontsize=10)
+        figure.colorbar(drawn, ax=axes, shrink=0.6, label=unit)
+
+
+def draw_hand_type(figure: Figure, data: Path) -> None:
+    """How near each hand comes in every frame: what decides who acts."""
+    annotated = load_annotated(data / "grab", HANDS)
+    evidence = annotated.hand_evidence(CLIP)
+    axes: Axes = figure.add_subplot()
+    for side in SIDES:
+        axes.plot(evidence.distance_m[side] * 100, color=COLOURS[side], linewidth=2, label=f"{side} hand")
+    axes.axhline(evidence.threshold_m * 100, color="#555555", linestyle="--", linewidth=1, label="threshold, 2 cm")
+    axes.set_xlabel("frame, 30 per second")
+    axes.set_ylabel("nearest joint to the object, cm")
+    axes.set_yscale("log")
+    axes.set_title(f"{CLIP}: hand type {annotated.hand_type(CLIP)}", loc="left", fontsize=10)
+    axes.legend(frameon=False)
+
+
+def draw_splits(figure: Figure, data: Path) -> None:
+    """Subjects by objects, coloured by the part their clips are in, for two named splits of one corpus."""
+    annotated = load_annotated(data / "grab", HANDS)
+    rows = pd.read_parquet(data / "grab/splits/splits.parquet").merge(annotated.store.sequences.reset_index(drop=True))
+    rows["subject"] = rows["subject"].astype(str)
+    subjects = sorted(set(rows["subject"]), key=lambda name: (len(name), name))
+    objects = sorted(set(rows["object"]))
+    for number, name in enumerate(("text2hoi", "unseen-object")):
+        axes: Axes = figure.add_subplot(1, 2, number + 1)
+        for _, row in rows.iterrows():
+            part = PARTS.get(str(row[name]), PARTS["left out"])
+            axes.scatter(objects.index(row["object"]), subjects.index(row["subject"]), marker="s", s=70, color=part)
+        axes.set_xticks(range(len(objects)), objects, rotation=90, fontsize=7)
+        axes.set_yticks(range(len(subjects)), subjects, fontsize=8)
+        axes.set_title(name, loc="left", fontsize=10)
+    legend = [Patch(color=colour, label=part) for part, colour in PARTS.items()]
+    figure.legend(handles=legend, ncol=4, loc="outside upper right", frameon=False, fontsize=8)
+
+
+def draw_lineage(figure: Figure, data: Path) -> None:
+    """The stages of one dataset and family as DVC has them, each below all it is made from."""
+    known = written_graph(data.parents[1])
+    graph = {name: stage for name, stage in known.items() if _is_drawn(name)}
+    made = {out: name for name, stage in graph.items() for out in stage.outs}
+    parents = {name: {made[path] for path in stage.data if path in made} for name, stage in graph.items()}
+    depth: dict[str, int] = {}
+    while len(depth) < len(parents):
+        ready = [name for name in parents if name not in depth and parents[name] <= depth.keys()]
+        depth |= {name: 1 + max((depth[parent] for parent in parents[name]), default=-1) for name in ready}
+    levels = [[name for name in depth if depth[name] == level] for level in range(max(depth.values()) + 1)]
+    places = {n: ((i + 0.5) / len(level), -row) for row, level in enumerate(levels) for i, n in enumerate(level)}
+    axes: Axes = figure.add_subplot()
+    arrow = {"arrowstyle": "-|>", "color": "#9aa0a6", "shrinkA": 11, "shrinkB": 11}
+    for name, above in parents.items():
+        for parent in above:
+            axes.annotate("", places[name], places[parent], arrowprops=arrow)
+    box = {"boxstyle": "round,pad=0.4", "facecolor": "#eef3f8", "edgecolor": BLUE}
+    for name, place in places.items():
+        axes.text(*place, _label(name), ha="center", va="center", fontsize=9, bbox=box)
+    axes.set_ylim(-len(levels) + 0.5, 0.5)
+    axes.set_xlim(0, 1)
+    axes.set_axis_off()
+
+
+def _is_drawn(name: str) -> bool:
+    stage, _, rest = name.rpartition(":")[2].partition("@")
+    if (
+        stage in ("code", "controls", "evaluator", "report")
+        or not rest.startswith("embedded-grab")
+        or "manipnet" in name
+    ):
+        return False
+    return not stage.startswith(("sample", "evaluate")) or rest == "embedded-grab-text2hoi"
+
+
+def _label(name: str) -> str:
+    stage, _, rest = name.rpartition(":")[2].partition("@")
+    network = rest.removeprefix("embedded-grab").removeprefix("-").removeprefix("text2hoi")
+    return f"{stage.replace('-', ' ')} {network}".strip()
+
+
+DRAWINGS: dict[str, tuple[Callable[[Figure, Path], None], tuple[float, float]]] = {
+    "clip": (draw_clip, (12, 3.2)),
+    "conventions": (draw_conventions, (9, 8.5)),
+    "contact": (draw_contact, (10, 4.2)),
+    "hand-type": (draw_hand_type, (8, 3.2)),
+    "splits": (draw_splits, (11, 4.4)),
+    "lineage": (draw_lineage, (9, 6)),
+}
+
+
+def main(project: Path, names: list[str]) -> None:
+    """Draw all, or the named ones, into docs/images."""
+    for name, (draw, inches) in DRAWINGS.items():
+        if not names or name in names:
+            figure = Figure(
+                figsize=inches, layout="constrained" if name in ("hand-type", "splits", "lineage") else None
+            )
+            draw(figure, project / "data/embedded")
+            figure.savefig(IMAGES / f"{name}.png", dpi=90, bbox_inches="tight", metadata={"Software": None})
+            print(IMAGES / f"{name}.png")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), sys.argv[2:])

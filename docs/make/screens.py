@@ -1,0 +1,133 @@
+"""Pictures of the pages of `make demo`, taken in headless Chromium: python docs/make/screens.py PROJECT.
+
+A generated motion as an animated WebP, the page of one, the report on a wide and a narrow screen, and its intervals.
+"""
+
+import asyncio
+import base64
+import io
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import urllib.request
+from os import chdir
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+from websockets.asyncio.client import ClientConnection, connect
+
+from hoidata.hands import load_embedded_hands
+from models.text2hoi.generation import Wish
+from pipelines.generation import Asked, generate_files
+from pipelines.showing import write_shown_of
+
+IMAGES = Path(__file__).parents[1] / "images"
+PORT = 9333
+SWITCHES = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader")
+MOTION, CLIP, FRAMES = "samples/embedded/grab/text2hoi/clips", "grab/s10/mug_drink_1~0", 36
+READY = "document.documentElement.dataset.players >= {}"
+CANVAS = "JSON.stringify(document.querySelector('canvas').getBoundingClientRect())"
+SHOW = """(async () => {{ const bar = document.querySelector('input[type=range]'); bar.value = {};
+bar.dispatchEvent(new Event('input')); await new Promise((done) => setTimeout(done, 120)); }})()"""
+
+
+INTERVALS = "const all = document.querySelector('details .charts').parentElement; all.open = true; all.scrollIntoView()"
+SENTENCE = "Drink from a mug with the right hand."
+
+
+class Page:
+    """One tab, driven through Chromium's own protocol."""
+
+    def __init__(self, socket: ClientConnection) -> None:
+        self.socket, self.count = socket, 0
+
+    async def call(self, method: str, **values: Any) -> dict[str, Any]:
+        self.count += 1
+        await self.socket.send(json.dumps({"id": self.count, "method": method, "params": values}))
+        while (answer := json.loads(await self.socket.recv())).get("id") != self.count:
+            pass
+        return answer["result"]
+
+    async def run(self, script: str) -> Any:
+        found = await self.call("Runtime.evaluate", expression=script, awaitPromise=True)
+        return found["result"].get("value")
+
+    async def open(self, path: Path, width: int, height: int, players: int) -> None:
+        await self.call(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
+        )
+        await self.call("Page.navigate", url=path.resolve().as_uri())
+        for _ in range(200):
+            if await self.run(READY.format(players)):
+                return
+            await asyncio.sleep(0.3)
+        raise TimeoutError(f"{path} shows no motion")
+
+    async def picture(self, **clip: float) -> Image.Image:
+        area = {"clip": {**clip, "scale": 1}} if clip else {}
+        found = await self.call("Page.captureScreenshot", format="png", **area)
+        return Image.open(io.BytesIO(base64.b64decode(found["data"]))).convert("RGB")
+
+
+async def take(project: Path, folder: Path) -> None:
+    address = next(tab for tab in _tabs() if tab["type"] == "page")["webSocketDebuggerUrl"]
+    async with connect(address, max_size=None) as socket:
+        page = Page(socket)
+        shown = write_shown_of(project / MOTION, CLIP, load_embedded_hands(), folder)
+        await page.open(shown, 520, 700, 1)
+        box = json.loads(await page.run(CANVAS))
+        area = {name: box[name] for name in ("x", "y", "width", "height")}
+        frames = []
+        for number in range(FRAMES):
+            await page.run(SHOW.format(number / (FRAMES - 1)))
+            frames.append(await page.picture(**area))
+        options = {"save_all": True, "append_images": frames[1:], "duration": 100, "loop": 0, "quality": 70}
+        frames[0].save(IMAGES / "motion.webp", **options)
+        for name, width, height in (("report", 1200, 1150), ("report-phone", 390, 1500)):
+            await page.open(project / "report/embedded/index.html", width, height, 3)
+            await asyncio.sleep(3)
+            (await page.picture()).save(IMAGES / f"{name}.png", optimize=True)
+        await page.open(project / "report/embedded/index.html", 1200, 900, 3)
+        await page.run(INTERVALS)
+        await asyncio.sleep(1)
+        (await page.picture()).save(IMAGES / "charts.png", optimize=True)
+        await page.open(generated(project, folder), 1200, 1150, 3)
+        await asyncio.sleep(3)
+        (await page.picture()).save(IMAGES / "generate.png", optimize=True)
+
+
+def generated(project: Path, folder: Path) -> Path:
+    """The page of two motions for a sentence, made in the project."""
+    chdir(project)
+    asked = Asked(SENTENCE, "mug", "embedded", ("grab",), wish=Wish(seed=1, samples=2))
+    return generate_files(asked, folder / "generated").paths[-1]
+
+
+def _tabs() -> list[dict[str, Any]]:
+    with urllib.request.urlopen(f"http://127.0.0.1:{PORT}/json") as answer:
+        return json.load(answer)
+
+
+def main(project: Path) -> None:
+    """Take all pictures."""
+    chromium = shutil.which("chromium") or shutil.which("google-chrome")
+    if chromium is None:
+        sys.exit("no chromium on PATH")
+    with tempfile.TemporaryDirectory() as folder:
+        command = [chromium, *SWITCHES, f"--remote-debugging-port={PORT}", f"--user-data-dir={folder}/profile"]
+        browser = subprocess.Popen([*command, "--hide-scrollbars", "about:blank"], stderr=subprocess.PIPE, text=True)
+        try:
+            assert browser.stderr is not None
+            while "DevTools listening" not in browser.stderr.readline():
+                pass
+            asyncio.run(take(project, Path(folder)))
+        finally:
+            browser.terminate()
+            browser.wait()
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]).resolve())

@@ -1,0 +1,41 @@
+"""Hook of mkdocs: pages that stand elsewhere in the repository join the site, and links to them lead there."""
+
+import os
+import posixpath
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[2]
+PAGES = {
+    "ARCHITECTURE.md": "architecture.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changes.md",
+    "hoidata/store/README.md": "reference/schema.md",
+    "hoidata/metrics/README.md": "reference/metrics.md",
+    "hoidata/datasets/CONVENTIONS.md": "reference/conventions.md",
+    "hoidata/datasets/README.md": "reference/adapters.md",
+    "hoidata/files/README.md": "reference/files.md",
+}
+LINK = re.compile(r"\]\(((?:\.\./)*)([\w./-]+\.md)(#[^)]*)?\)")
+
+
+def on_files(files, config):
+    """Add the pages, as they stand, to the files of the site."""
+    for source, target in PAGES.items():
+        files.append(File.generated(config, target, content=(ROOT / source).read_text(encoding="utf-8")))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Links of a page in ``docs`` to a page elsewhere lead to its place in the site."""
+    here = posixpath.dirname(page.file.src_uri)
+
+    def lead(match: re.Match) -> str:
+        path = posixpath.normpath(posixpath.join("docs", here, match[1] + match[2]))
+        if path not in PAGES:
+            return match[0]
+        return f"]({os.path.relpath(PAGES[path], here or '.')}{match[3] or ''})"
+
+    return LINK.sub(lead, markdown)

@@ -1,0 +1,1 @@
+"""Stores in the forms other projects read, each with the licences of its arrays (``hoidata export``)."""

@@ -1,0 +1,127 @@
+"""A store written in another project's form, with croissant.json, README.md and export.json beside what was written."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import orjson
+from rich.console import Console
+from rich.progress import Progress
+
+from hoidata.clips.clip import Clip
+from hoidata.errors import BadInput
+from hoidata.files import atomic_folder
+from hoidata.store.store import Store
+from pipelines.exports import bvh, glb, hugging_face, lerobot, spider, usd, web_dataset
+from pipelines.exports.describe import write_description
+from pipelines.exports.licences import (
+    HANDS,
+    MESHES,
+    OBJECT,
+    OWN_USE,
+    PERSON,
+    SKIN,
+    WORDS,
+    Kind,
+    check_may_be_passed_on,
+    licences_of,
+)
+from pipelines.exports.motion import ExportedClip, Source
+
+_MOTION = (HANDS, OBJECT, WORDS)
+_SCENE = (HANDS, OBJECT, MESHES, PERSON, SKIN)
+
+
+def _everything(_: Clip) -> str:
+    return ""
+
+
+@dataclass(frozen=True)
+class Format:
+    """meaning: one line for people. kinds: the arrays it holds. cannot: why it has no form for a clip, "" where it has.
+
+    write: (folder, clips); None: a description alone.
+    """
+
+    meaning: str
+    kinds: tuple[Kind, ...]
+    write: Callable[[Path, Iterable[ExportedClip]], None] | None
+    cannot: Callable[[Clip], str] = _everything
+
+
+FORMATS = {
+    "croissant": Format("croissant.json and a dataset card for the store itself, to lie beside its meta/", (), None),
+    "lerobot": Format("LeRobot v3: 2 x 21 joints, object, sentences as tasks", _MOTION, lerobot.write),
+    "huggingface": Format("Parquet with features: datasets.load_dataset(DIR)", _MOTION, hugging_face.write),
+    "webdataset": Format("tar shards with .npz and .json of each clip", _MOTION, web_dataset.write),
+    "glb": Format("an animated scene per clip", _SCENE, glb.write),
+    "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write),
+    "bvh": Format("a skeleton per hand, and the object's motion", (HANDS, OBJECT), bvh.write),
+    "spider": Format("SPIDER's keypoints and meshes", (HANDS, OBJECT, MESHES), spider.write, spider.cannot),
+}
+
+
+def export_store(
+    store: Store, to: str, out: Path, clip_ids: tuple[str, ...] = (), for_own_use: bool = False, progress: bool = True
+) -> dict[str, Any]:
+    """Write the clips of a store as the new folder ``out``; equal stores give equal bytes; returns export.json.
+
+    to: a key of ``FORMATS``. clip_ids: by default all. Raises BadInput for an unknown format or clip, for a store
+    without clips, for an ``out`` that is there, and where a licence forbids passing on what is not for_own_use.
+    """
+    form = _format(to)
+    if out.exists():
+        raise BadInput(out, "a folder that is not there yet", "something else", "choose another name, or remove it")
+    _check_clips(store, clip_ids)
+    check_may_be_passed_on(str(store.folder), store.info, form.kinds, for_own_use)
+    source, left_out = Source(store, clip_ids), {}
+    with atomic_folder(out) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
+        if form.write is not None:
+            task = bar.add_task(f"export to {to}", total=len(source.ids))
+            form.write(partial, _clips(source, form, left_out, lambda: bar.advance(task)))
+        if len(left_out) == len(source.ids):
+            reason = next(iter(left_out.values()))
+            raise BadInput(store.folder, f"clips that {to} has a form for", f"none: {reason}", "choose another format")
+        facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(left_out), "left_out": left_out}
+        (partial / "export.json").write_bytes(orjson.dumps(facts, option=orjson.OPT_INDENT_2) + b"\n")
+        write_description(partial, store, to, form.meaning, for_own_use)
+    return facts
+
+
+def _format(to: str) -> Format:
+    if to not in FORMATS:
+        raise BadInput("--to", f"one of {', '.join(FORMATS)}", repr(to), "choose one")
+    return FORMATS[to]
+
+
+def _check_clips(store: Store, clip_ids: tuple[str, ...]) -> None:
+    if not len(store):
+        raise BadInput(store.folder, "a store with clips", "none", "convert raw data first")
+    if unknown := [clip_id for clip_id in clip_ids if clip_id not in store.sequences.index]:
+        near = ", ".join(store.ids[:3])
+        raise BadInput("--clip", f"ids of clips of {store.folder}", unknown[0], f"choose one, such as {near}")
+
+
+def _clips(source: Source, form: Format, left_out: dict[str, str], done: Callable[[], None]) -> Iterator[ExportedClip]:
+    """The clips the format has a form for, one at a time; ``left_out`` gets the reason of the others."""
+    for clip_id in source.ids:
+        item = source.clip(clip_id)
+        if reason := form.cannot(item.clip):
+            left_out[clip_id] = reason
+        else:
+            yield item
+        done()
+
+
+def _facts(store: Store, to: str, form: Format, for_own_use: bool) -> dict[str, Any]:
+    info, rows = store.info, licences_of(store.info)
+    return {
+        "format": to,
+        "dataset": info["dataset"],
+        "dataset_version": info["dataset_version"],
+        "synthetic": info["synthetic"],
+        "hand_model": info["hand_model"],
+        "terms": OWN_USE if for_own_use else "may be passed on under the licences below",
+        "licences": [row.as_json() for row in rows if row.kind in (form.kinds or [row.kind])],
+    }

@@ -1,0 +1,121 @@
+"""USD: per clip one stage with the hands' and objects' meshes moving, in metres, y up.
+
+``/world`` turns the clip's world so that gravity is -y. Hands are meshes with points per frame (pose correctives and
+personal shape in them), their 21 joints point prims; objects are meshes below a transform per frame, the moving part
+about its hinge.
+"""
+
+from collections.abc import Iterable
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
+from hoidata.errors import MissingResource
+from hoidata.hands import track_vertices
+from pipelines.exports.motion import ExportedClip, hinge_of
+from pipelines.pages.glb import (
+    HAND_COLOURS,
+    MOVING_PART_COLOUR,
+    OBJECT_COLOUR,
+    continuous_quaternions,
+    upright_rotation,
+)
+
+
+def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
+    """Write <clip>.usdc. Raises MissingResource without usd-core."""
+    for item in clips:
+        _write_stage(folder / f"{item.file_name}.usdc", item)
+
+
+@cache
+def _usd(module: str) -> Any:
+    """A module of usd-core, whose type stubs name nothing that is in it."""
+    try:
+        return import_module(f"pxr.{module}")
+    except ImportError as error:
+        raise MissingResource("USD needs usd-core: pip install 'hoidata[export]'") from error
+
+
+def _write_stage(path: Path, item: ExportedClip) -> None:
+    stage: Any = _usd("Usd").Stage.CreateInMemory()
+    _usd("UsdGeom").SetStageUpAxis(stage, _usd("UsdGeom").Tokens.y)
+    _usd("UsdGeom").SetStageMetersPerUnit(stage, 1.0)
+    stage.SetTimeCodesPerSecond(FPS)
+    stage.SetFramesPerSecond(FPS)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(item.clip.n_frames - 1)
+    world = _transform(stage, "/world", np.zeros((1, 3)), upright_rotation(item.clip.gravity).as_rotvec()[None])
+    stage.SetDefaultPrim(world)
+    world.SetCustomDataByKey("clip", item.clip.clip_id)
+    _add_object(stage, "/world/object", item.clip.object)
+    for number, track in enumerate(item.clip.other_objects):
+        _add_object(stage, f"/world/other_object_{number}", track)
+    for side in SIDES:
+        if item.clip.hands[side].valid.any():
+            _add_hand(stage, item, side)
+    stage.Export(str(path))
+
+
+def _add_hand(stage: Any, item: ExportedClip, side: Side) -> None:
+    track = item.clip.hands[side]
+    vertices = track_vertices(track, item.hands[side])
+    mesh = _mesh(stage, f"/world/{side}_hand", vertices[0], np.asarray(item.hands[side].faces), HAND_COLOURS[side])
+    joints = _usd("UsdGeom").Points.Define(stage, f"/world/{side}_joints")
+    joints.CreateWidthsAttr([0.004] * 21)
+    for frame in range(track.n_frames):
+        mesh.GetPointsAttr().Set(_points(vertices[frame]), frame)
+        joints.GetPointsAttr().Set(_points(item.joints[side][frame]), frame)
+    words = _usd("UsdGeom").Tokens
+    for prim in (mesh, joints):
+        seen = prim.CreateVisibilityAttr()
+        for frame in np.flatnonzero(np.diff(track.valid, prepend=~track.valid[:1])):
+            seen.Set(words.inherited if track.valid[frame] else words.invisible, int(frame))
+
+
+def _add_object(stage: Any, path: str, track: ObjectTrack) -> None:
+    model = track.model
+    _transform(stage, path, track.translation_m, track.rotvec)
+    _part_mesh(stage, f"{path}/base", model.vertices_m, model.faces_of(0), OBJECT_COLOUR)
+    if model.hinge is None:
+        return
+    turn = model.hinge.axis * hinge_of(track)[:, None]
+    _transform(stage, f"{path}/moving_part", np.broadcast_to(model.hinge.origin_m, turn.shape), turn)
+    vertices = model.vertices_m - model.hinge.origin_m
+    _part_mesh(stage, f"{path}/moving_part/mesh", vertices, model.faces_of(1), MOVING_PART_COLOUR)
+
+
+def _part_mesh(stage: Any, path: str, vertices_m: np.ndarray, faces: np.ndarray, colour: tuple) -> None:
+    used, compact = np.unique(faces, return_inverse=True)
+    _mesh(stage, path, vertices_m[used], compact.reshape(-1, 3), colour)
+
+
+def _mesh(stage: Any, path: str, vertices_m: np.ndarray, faces: np.ndarray, colour: tuple) -> Any:
+    mesh = _usd("UsdGeom").Mesh.Define(stage, path)
+    mesh.CreateSubdivisionSchemeAttr(_usd("UsdGeom").Tokens.none)
+    mesh.CreatePointsAttr(_points(vertices_m))
+    mesh.CreateFaceVertexCountsAttr(_usd("Vt").IntArray.FromNumpy(np.full(len(faces), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(_usd("Vt").IntArray.FromNumpy(np.ascontiguousarray(faces, np.int32).ravel()))
+    mesh.CreateDisplayColorAttr([colour])
+    return mesh
+
+
+def _points(places_m: np.ndarray) -> Any:
+    return _usd("Vt").Vec3fArray.FromNumpy(np.ascontiguousarray(places_m, np.float32))
+
+
+def _transform(stage: Any, path: str, places_m: np.ndarray, rotvec: np.ndarray) -> Any:
+    """A prim whose children move: (frame, 3) places and axis-angles; one frame stands still."""
+    xform = _usd("UsdGeom").Xform.Define(stage, path)
+    double = _usd("UsdGeom").XformOp.PrecisionDouble
+    move, turn = xform.AddTranslateOp(double), xform.AddOrientOp(double)
+    quaternions = continuous_quaternions(rotvec)
+    for frame, (place, (x, y, z, w)) in enumerate(zip(places_m.tolist(), quaternions.tolist(), strict=True)):
+        time = _usd("Usd").TimeCode.Default() if len(places_m) == 1 else _usd("Usd").TimeCode(frame)
+        move.Set(_usd("Gf").Vec3d(*place), time)
+        turn.Set(_usd("Gf").Quatd(w, x, y, z), time)
+    return xform.GetPrim()

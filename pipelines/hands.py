@@ -1,0 +1,314 @@
+"""Hands for a motion of an object that a person made up, or that a clip or a generated motion has, as files."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, Slerp
+
+from hoidata.clips.clip import FPS, SIDES, HandType, ObjectTrack
+from hoidata.clips.features import upright
+from hoidata.errors import BadInput, MissingResource
+from hoidata.files import sha256_file
+from hoidata.files.numpy_files import load_npz_arrays
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import HandPair
+from hoidata.object_paths import keyframed_path, read_keyframes, scripted_path
+from hoidata.object_paths.path import PathStep
+from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.user_mesh import read_user_object
+from hoidata.store.annotated import load_annotated
+from hoidata.store.store import Store, open_store
+from models.bimart.family import BIMART, HandsForPaths
+from models.bimart.hands import MadeHands, MotionWish, hands_for
+from models.common.checkpoints import FILE_NAME, read_info
+from models.common.family import Sources
+from models.common.repeatable import make_repeatable
+from pipelines.objects import MeshWish, stored_object
+from pipelines.pages.hands_page import write_hands
+from pipelines.showing import find_clip
+from pipelines.stages.base import StagePaths, empty_reason, load_hands
+
+MOST_FRAMES = 3600
+CLIPS_FOR_RANGE = 60  # of an object, whose hinge angles say how far it opens
+GENERATED = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
+
+
+@dataclass(frozen=True)
+class HandsWish:
+    """What ``hoidata hands`` is told; "" for what is not.
+
+    object: a mesh file, or the name of a dataset's object. script: its words, or a file of them; keyframes: a file;
+    clip: a stored clip's id; motion: a motion.npz of ``hoidata generate``. One of these four. hinge_range: "0:110",
+    degrees. length_s: how long the motion is to last instead of its own time. model: the dataset whose networks to use.
+    """
+
+    object: str = ""
+    script: str = ""
+    keyframes: str = ""
+    clip: str = ""
+    motion: str = ""
+    mesh: MeshWish = field(default_factory=MeshWish)
+    hinge_range: str = ""
+    hand: HandType = "both"
+    samples: int = 1
+    seed: int = 0
+    length_s: float | None = None
+    model: str = ""
+
+
+class Asked(NamedTuple):
+    """thing: the motion. steps: what happens when, of a path. source: where it is from, in words."""
+
+    thing: ObjectTrack
+    wish: MotionWish
+    steps: tuple[PathStep, ...]
+    source: str
+    notes: list[str]
+
+
+class WrittenHands(NamedTuple):
+    """paths of the files; notes: what was assumed, for the person who asked."""
+
+    paths: list[Path]
+    notes: list[str]
+
+
+def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: Path) -> WrittenHands:
+    """Make hands, and write arrays, an animated GLB each and a page that plays them into ``out``.
+
+    Raises MissingResource or BadInput that says what is not there or cannot be meant, and what to do.
+    """
+    make_repeatable(threads=1)
+    hands = load_hands(profile)
+    asked = asked_motion(wish, profile, datasets, hands)
+    paths, sampler = chosen_networks(wish.model, profile, datasets, hands)
+    motions = hands_for(sampler, asked.thing, asked.wish)
+    made_from = {f"{paths.checkpoints}/{name}/{FILE_NAME}": _digest(paths, name) for name in BIMART.uses}
+    facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} ({_known(paths)})")]
+    notes = [*asked.notes, *_notes(motions)]
+    return WrittenHands(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)
+
+
+def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Asked:
+    """The motion of the object that hands are asked for."""
+    given = {name: value for name in ("script", "keyframes", "clip", "motion") if (value := getattr(wish, name))}
+    if len(given) != 1:
+        got = " and ".join(f"--{name}" for name in given) or "none"
+        raise BadInput("object's motion", "one of --script, --keyframes, --clip or --motion", got, "give one of them")
+    own = MotionWish(wish.seed, wish.samples, wish.hand)
+    if wish.clip:
+        asked = _of_clip(wish, profile, datasets, hands, own)
+    elif wish.motion:
+        asked = _of_generated(wish, profile, datasets, hands, own)
+    else:
+        asked = _of_path(wish, profile, datasets, hands, own)
+    if wish.length_s is not None:
+        asked = _lasting(asked, wish.length_s)
+    if asked.thing.n_frames > MOST_FRAMES:
+        got = f"{asked.thing.n_frames / FPS:.0f} s"
+        raise BadInput("object's motion", f"at most {MOST_FRAMES / FPS:.0f} s", got, "make two of it")
+    return asked
+
+
+def chosen_networks(
+    model: str, profile: str, datasets: tuple[str, ...], hands: HandPair
+) -> tuple[StagePaths, HandsForPaths]:
+    """The networks of the dataset asked for, or of the first that has them. Raises MissingResource where none has."""
+    runs = [StagePaths(profile, name) for name in ((model,) if model else datasets)]
+    trained = [paths for paths in runs if all(_is_trained(paths, name) for name in BIMART.uses)]
+    if not trained:
+        where = ", ".join(str(paths) for paths in runs)
+        raise MissingResource(
+            f"no networks of bimart ({where}): list bimart under families in params.yaml, then `hoidata repro`"
+        )
+    paths = trained[0]
+    for name in BIMART.uses:
+        facts = read_info(paths.checkpoints / name / FILE_NAME)["facts"]
+        if facts["hand_digest"] != hands.digest:
+            remedy = "train it with the hand of this profile"
+            raise BadInput(paths.checkpoints / name, f"hand {facts['hand']}", hands.name, remedy)
+    sources = Sources(load_annotated(paths.data, hands), paths.checkpoints, hands, torch.device("cpu"))
+    return paths, HandsForPaths.load(sources)
+
+
+def _is_trained(paths: StagePaths, name: str) -> bool:
+    folder = paths.checkpoints / name
+    return not empty_reason(folder) and (folder / FILE_NAME).is_file()
+
+
+def _digest(paths: StagePaths, name: str) -> str:
+    return sha256_file(paths.checkpoints / name / FILE_NAME)
+
+
+def _known(paths: StagePaths) -> str:
+    facts = read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"]
+    kind = "SYNTHETIC" if facts["synthetic"] else "recorded"
+    return ", ".join(f"learnt from {count} {kind} {name} clips" for name, count in facts["datasets"].items())
+
+
+def _notes(motions: list[MadeHands]) -> list[str]:
+    """What a person should know of the motions: an open mesh, a hand that never touches."""
+    first, notes = motions[0], []
+    if first.standing.deepest_m is None:
+        notes.append("the mesh is open and has no inside: hands are drawn to its surface, not pushed out of it")
+    for motion in motions:
+        idle = [side for side, touching in motion.standing.touching.items() if not touching.any()]
+        if idle:
+            notes.append(f"sample {motion.number + 1}: the {' and the '.join(idle)} hand touches nothing")
+    return notes
+
+
+class _Thing(NamedTuple):
+    """An object to be moved. limits_rad: the stops of its hinge. standing: see ``checked_path``. notes: what was
+    assumed."""
+
+    model: ObjectModel
+    limits_rad: tuple[float, float] | None
+    standing: np.ndarray | None
+    notes: list[str]
+
+
+def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> _Thing:
+    if not wish.object:
+        raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb) or a dataset's object", "none", "name it first")
+    limits = hinge_range(wish.hinge_range) if wish.hinge_range else None
+    if Path(wish.object).is_file():
+        user = read_user_object(Path(wish.object), wish.mesh.unit, wish.mesh.up, wish.mesh.hinge)
+        notes = list(user.notes)
+        if user.model.is_articulated and limits is None:
+            notes.append("how far the hinge opens is not known; --hinge-range 0:110 has it checked")
+        return _Thing(user.model, limits, None, notes)
+    names = (wish.model,) if wish.model else datasets
+    known = [paths for name in names if not empty_reason((paths := StagePaths(profile, name)).clips)]
+    for paths in known:
+        store = open_store(paths.clips, hands)
+        if wish.object in list(store.objects["object"]):
+            return _recorded(store, wish.object, limits)
+    if not known:
+        raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb)", wish.object, "correct the path")
+    stored_object(wish.object, known[0].clips, hands)  # says which there are
+    raise AssertionError
+
+
+def _recorded(store: Store, name: str, limits: tuple[float, float] | None) -> _Thing:
+    """An object of a dataset: it stands as in the first frame of its first clip, and opens to the side it did there."""
+    rows = [clip_id for clip_id, own in zip(store.ids, store.sequences["object"], strict=True) if own == name]
+    clips, notes = [store.clip(clip_id) for clip_id in rows[:CLIPS_FOR_RANGE]], list[str]()
+    first = clips[0]
+    standing = upright(first.gravity) @ rotvec_to_rotmat(first.object.rotvec[0].astype(np.float64))
+    angles = [clip.object.hinge_rad for clip in clips if clip.object.hinge_rad is not None]
+    if angles and limits is None:
+        low, high = min(0.0, *(float(a.min()) for a in angles)), max(0.0, *(float(a.max()) for a in angles))
+        notes.append(f"recorded with its hinge at {np.degrees(low):.0f} to {np.degrees(high):.0f} deg")
+        # Recordings say to which side it opens, not how far it could.
+        limits = (-np.pi, high) if -low > high else (low, np.pi)
+    return _Thing(store.object_model(name), limits, standing, notes)
+
+
+def hinge_range(text: str) -> tuple[float, float]:
+    """ "0:110", degrees, as radians."""
+    try:
+        low, high = (float(word) for word in text.split(":"))
+        if not -360 <= low <= 0 <= high <= 360 or low == high:
+            raise ValueError
+    except ValueError as error:
+        remedy = "write e.g. 0:110; 0 is the hinge as the mesh is drawn"
+        raise BadInput("--hinge-range", "two angles in degrees, with 0 among them", text[:40], remedy) from error
+    return float(np.radians(low)), float(np.radians(high))
+
+
+def _of_path(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
+    thing = _object(wish, profile, datasets, hands)
+    if wish.keyframes:
+        keys = read_keyframes(wish.keyframes)
+        path = keyframed_path(thing.model, keys, thing.limits_rad, wish.keyframes, thing.standing)
+        return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", thing.notes)
+    text = wish.script
+    if "\n" not in text and len(text) < 250 and Path(text).is_file():
+        text = Path(text).read_text(encoding="utf-8", errors="replace")
+    path = scripted_path(thing.model, text, thing.limits_rad, standing=thing.standing)
+    return Asked(path.track, own, path.steps, f"script: {' '.join(text.split())}", thing.notes)
+
+
+def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
+    """A stored clip's object motion, for the hands of its person."""
+    if wish.object:
+        raise BadInput("object", "none beside --clip, which has its own", wish.object, "leave it out")
+    paths = find_clip(wish.clip, profile, list(datasets))
+    clip = open_store(paths.clips, hands).clip(wish.clip)
+    tracks = [clip.hands[side] for side in SIDES]
+    templates = [track.template_m for track in tracks if track.template_m is not None]
+    notes = [] if clip.gravity is not None else ["where down is is not known of this clip: z is taken for up"]
+    gravity = own.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
+    own = replace(
+        own,
+        words=clip.object_words,
+        gravity=gravity,
+        betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
+        template_m=np.stack(templates) if len(templates) == 2 else None,
+    )
+    return Asked(clip.object, own, (), f"clip {wish.clip}", notes)
+
+
+def _of_generated(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
+    """The object's motion of a motion.npz that ``hoidata generate`` wrote, with the mesh in it or the one told."""
+    path = Path(wish.motion)
+    if not path.is_file():
+        raise BadInput(path, "a motion.npz of `hoidata generate`", "nothing there", "correct the path")
+    arrays = load_npz_arrays(path)
+    missing = [name for name in GENERATED if name not in arrays]
+    if missing:
+        raise BadInput(path, "a motion.npz of `hoidata generate`", f"no {missing[0]}", "give one, or --keyframes")
+    if wish.object:
+        model, _, _, notes = _object(wish, profile, datasets, hands)
+    else:
+        model, notes = _mesh_of(arrays, path), []
+    angle = arrays.get("object_hinge_rad")
+    if model.is_articulated != (angle is not None):
+        remedy = "give the same object as `hoidata generate` had, with its hinge"
+        raise BadInput(path, "an object with a hinge where the motion has one", model.name, remedy)
+    thing = ObjectTrack(model, arrays["object_rotvec"], arrays["object_translation_m"], angle)
+    _check_track(thing, path)
+    gravity = arrays.get("gravity", np.zeros(0))
+    own = replace(own, gravity=np.asarray(gravity, np.float64) if gravity.shape == (3,) else own.gravity)
+    return Asked(thing, own, (), f"generated for {str(arrays.get('text', path.name))!r}", notes)
+
+
+def _mesh_of(arrays: dict[str, np.ndarray], path: Path) -> ObjectModel:
+    hinge = None
+    if "object_hinge_rad" in arrays:
+        if "object_hinge_axis" not in arrays:
+            raise BadInput(path, "an object_hinge_axis", "none", "name the object too, or generate the motion anew")
+        hinge = Hinge(arrays["object_hinge_axis"], arrays["object_hinge_origin_m"])
+    vertices, faces, part = (arrays[f"object_{name}"] for name in ("vertices_m", "faces", "part"))
+    fits = vertices.shape == (len(part), 3) and faces.ndim == 2 and faces.shape[1] == 3 and faces.dtype.kind in "iu"
+    if not fits or not len(faces) or not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+        raise BadInput(path, "a mesh", f"{vertices.shape}, {faces.shape}", "generate the motion anew")
+    return ObjectModel("object", vertices.astype(np.float64), faces.astype(np.int64), part, hinge)
+
+
+def _check_track(thing: ObjectTrack, path: Path) -> None:
+    count = len(thing.translation_m)
+    arrays = [thing.rotvec, thing.translation_m] + ([] if thing.hinge_rad is None else [thing.hinge_rad])
+    shapes = [(count, 3), (count, 3), (count,)][: len(arrays)]
+    if [a.shape for a in arrays] != shapes or not all(a.dtype.kind == "f" and np.isfinite(a).all() for a in arrays):
+        raise BadInput(path, "finite poses of every frame", f"{[a.shape for a in arrays]}", "generate the motion anew")
+
+
+def _lasting(asked: Asked, seconds: float) -> Asked:
+    """The same way in another time."""
+    thing, count = asked.thing, round(seconds * FPS) + 1
+    if not 8 <= count <= MOST_FRAMES:
+        raise BadInput("--length", f"0.3 to {MOST_FRAMES / FPS:.0f} s", f"{seconds:g} s", "ask for another length")
+    old, new = np.arange(thing.n_frames), np.linspace(0, thing.n_frames - 1, count)
+    pace = (count - 1) / (thing.n_frames - 1)
+    turned = Slerp(old, Rotation.from_rotvec(thing.rotvec))(new).as_rotvec().astype(np.float32)
+    place = CubicSpline(old, thing.translation_m)(new).astype(np.float32)
+    hinge = None if thing.hinge_rad is None else CubicSpline(old, thing.hinge_rad)(new).astype(np.float32)
+    steps = tuple(PathStep(step.words, step.start_s * pace, step.end_s * pace) for step in asked.steps)
+    slowed = ObjectTrack(thing.model, turned, place, hinge)
+    return asked._replace(thing=slowed, steps=steps, source=f"{asked.source}, in {seconds:g} s")

@@ -1,0 +1,28 @@
+"""The object a command is told: the user's mesh file, or one of a dataset."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from hoidata.errors import BadInput
+from hoidata.hands import HandPair
+from hoidata.objects.model import ObjectModel
+from hoidata.store.store import open_store
+
+
+@dataclass(frozen=True)
+class MeshWish:
+    """How to read the user's mesh file; "" for what is to be assumed or found, as in ``read_user_object``."""
+
+    unit: str = ""
+    up: str = ""
+    hinge: str = ""
+
+
+def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
+    """An object of the dataset by name. Raises BadInput that lists the names there are."""
+    store = open_store(clips, hands)
+    names = list(store.objects["object"])
+    if name not in names:
+        expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
+        raise BadInput("--object", expected, name, "correct the name or path")
+    return store.object_model(name)

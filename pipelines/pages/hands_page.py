@@ -1,0 +1,195 @@
+"""What hands for a motion of an object are written as: motion.npz, motion.glb and a page that plays all samples."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, Side
+from hoidata.files.arrays import write_npz
+from hoidata.files.digest import canonical_json
+from hoidata.hands import HandPair
+from hoidata.object_paths.path import PathStep
+from models.bimart.hands import TOUCH_M, MadeHands, Standing
+from pipelines.pages.glb import HAND_COLOURS, write_glb
+from pipelines.pages.motion_files import ARRAYS as SHARED
+from pipelines.pages.motion_files import clip_joints_m, drawn, mesh_arrays, motion_arrays
+from pipelines.pages.player import Player, contact_player, css_colour, motion_player, write_page
+from pipelines.pages.surface import ContactPaint
+from pipelines.pages.view import touched_side
+
+FACES_OF_STILLS = 8_000
+FADES_M = 0.02  # where paint ends
+
+# Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
+ARRAYS = SHARED | {
+    "checkpoints": "JSON: SHA-256 of each network's file by its path; `hoidata lineage motion.npz` reads it",
+    "seed": "what the motion was drawn from",
+    "before_joints_m": "(S, F, 21, 3) the joints before refinement",
+    "touching": "(S, F) whether a vertex of the hand is within 5 mm of the surface",
+    "contact_points_m": "(P, 3) points of the object, in its own frame",
+    "contact_part": "(P,) 1 where the hinge moves the point",
+    "contact_distance_m": "(S, F, P) float16 distance of each point to the nearest vertex of the hand",
+    "asked_distance_m": "(S, P) the least of them over all frames, as the contact model asked; infinite: not looked at",
+}
+_FILE_WORDS = {
+    ".glb": "an animated model for any glTF 2.0 viewer; painted: how near the hands come",
+    ".npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
+}
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Bars over the time of the motion. bars: (start, width) in per cent, with what they say."""
+
+    name: str
+    colour: str
+    bars: list[tuple[float, float, str]]
+
+
+@dataclass(frozen=True)
+class _Shown:
+    """One motion on the page. maps: by hand, the contact map asked for and the one reached, and how far they agree."""
+
+    caption: str
+    player: Player
+    before: Player
+    strips: list[Strip]
+    maps: list[tuple[str, Player, Player, str]]
+    figures: list[tuple[str, ...]]
+
+
+def write_hands(
+    out_dir: str | Path,
+    motions: Sequence[MadeHands],
+    hands: HandPair,
+    steps: Sequence[PathStep],
+    made_from: Mapping[str, str],
+    facts: Sequence[tuple[str, str]],
+    notes: Sequence[str] = (),
+) -> list[Path]:
+    """Write motion.npz, motion.glb (for further motions motion-1.npz, ...) and index.html; gives their paths.
+
+    steps: what the object does when. made_from: digests of the networks by their files. The same motions give the same
+    bytes.
+    """
+    folder = Path(out_dir)
+    folder.mkdir(parents=True, exist_ok=True)
+    paths, first = [], motions[0]
+    for motion in motions:
+        name = f"motion-{motion.number}" if motion.number else "motion"
+        write_npz(folder / f"{name}.npz", hands_arrays(motion, hands, made_from))
+        paint = _paint(motion, motion.reached_m.min(axis=(0, 1)))
+        write_glb(folder / f"{name}.glb", motion.clip, hands, paint, extras={"checkpoints": dict(made_from)})
+        paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
+    length = f"{first.clip.n_frames} frames, {first.clip.n_frames / FPS:.2f} s at {FPS} fps"
+    digests = ", ".join(f"{Path(path).parent.name} {digest[:12]}" for path, digest in made_from.items())
+    write_page(
+        folder / "index.html",
+        "hands.html",
+        title=f"Hands for {first.clip.object_words}",
+        synthetic=first.clip.synthetic,
+        notes=list(notes),
+        touch_mm=round(1000 * TOUCH_M),
+        fades_cm=round(100 * FADES_M),
+        motions=[_shown(motion, hands, steps) for motion in motions],
+        facts=[*facts, ("length", length), ("hand model", hands.name), ("sha256", digests)],
+        files=[(path.name, _FILE_WORDS[path.suffix]) for path in paths],
+        arrays=[(name, ARRAYS[name]) for name in hands_arrays(first, hands, {})],
+        has_players=True,
+    )
+    return [*paths, folder / "index.html"]
+
+
+def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """The arrays of motion.npz, as ``ARRAYS`` explains them."""
+    touching = motion.standing.touching
+    nothing = np.zeros(motion.clip.n_frames, bool)
+    return {
+        "checkpoints": np.array(canonical_json(dict(made_from))),
+        "seed": np.array(motion.seed),
+        **motion_arrays(motion.clip, hands),
+        **mesh_arrays(motion.clip.object.model),
+        "before_joints_m": clip_joints_m(motion.before, hands),
+        "touching": np.stack([touching.get(side, nothing) for side in SIDES]),
+        "contact_points_m": motion.points.points_m,
+        "contact_part": motion.points.part,
+        "contact_distance_m": motion.reached_m.astype(np.float16),
+        "asked_distance_m": motion.asked_m,
+    }
+
+
+def _shown(motion: MadeHands, hands: HandPair, steps: Sequence[PathStep]) -> _Shown:
+    caption = f"sample {motion.number + 1}"
+    title = f"{caption}: hands for {motion.clip.object_words}"
+    paint = _paint(motion, motion.reached_m.min(axis=(0, 1)))
+    return _Shown(
+        caption,
+        motion_player(drawn(motion.clip), hands, title, caption, paint, f"a hand comes within {100 * FADES_M:.0f} cm"),
+        motion_player(drawn(motion.before), hands, f"{title}, before refinement", caption),
+        _strips(motion, steps),
+        [_map(motion, side, title) for side in motion.standing.touching],
+        _figures(motion.standing_before, motion.standing),
+    )
+
+
+def _map(motion: MadeHands, side: Side, title: str) -> tuple[str, Player, Player, str]:
+    row = SIDES.index(side)
+    asked, reached = motion.asked_m[row], motion.reached_m[row].min(axis=0)
+    still = drawn(motion.clip, FACES_OF_STILLS)
+    paints = {"asked for": _paint(motion, asked), "reached": _paint(motion, reached)}
+    look = touched_side(still, paints["reached"])
+    first, second = (
+        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", look, name)
+        for name, paint in paints.items()
+    )
+    near = asked < FADES_M
+    if not near.any():
+        return side, first, second, f"{side} hand: it was not asked to come near the object"
+    off = 100 * np.abs(asked - reached)[near].mean()
+    share = 100 * (reached[near] < FADES_M).mean()
+    words = f"{near.sum()} points were to be neared to {100 * FADES_M:.0f} cm, {share:.0f} % of them were"
+    return side, first, second, f"{side} hand: {words}; distances differ by {off:.1f} cm on average"
+
+
+def _paint(motion: MadeHands, distance_m: np.ndarray) -> ContactPaint:
+    """Full where a hand touches, fading to where it stays 2 cm away; distance_m: (point,)."""
+    value = np.clip((FADES_M - distance_m) / (FADES_M - TOUCH_M), 0, 1)
+    return ContactPaint(motion.points.points_m, motion.points.part, value)
+
+
+def _strips(motion: MadeHands, steps: Sequence[PathStep]) -> list[Strip]:
+    frames = motion.clip.n_frames
+    end_s = (frames - 1) / FPS
+    strips = [
+        Strip(f"{side} hand touches", css_colour(HAND_COLOURS[side]), _runs(touching))
+        for side, touching in motion.standing.touching.items()
+    ]
+    if motion.standing.deepest_m is not None:
+        strips.append(Strip("deeper than 5 mm", "#b5371f", _runs(motion.standing.deepest_m > 0.005)))
+    bars = [(100 * step.start_s / end_s, 100 * (step.end_s - step.start_s) / end_s, step.words) for step in steps]
+    return [Strip("object", "#d6d4cc", bars), *strips] if bars else strips
+
+
+def _runs(mask: np.ndarray) -> list[tuple[float, float, str]]:
+    """Start and width, per cent, of each interval in which ``mask (frame,)`` holds."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], mask.astype(np.int8), [0]))))
+    return [
+        (100 * start / len(mask), 100 * (stop - start) / len(mask), f"{start / FPS:.2f} to {stop / FPS:.2f} s")
+        for start, stop in edges.reshape(-1, 2)
+    ]
+
+
+def _figures(before: Standing, after: Standing) -> list[tuple[str, ...]]:
+    """Rows (name, before, after)."""
+    rows: list[tuple[str, ...]] = [
+        (f"{side} hand touches", *(f"{100 * own.touching[side].mean():.0f} % of frames" for own in (before, after)))
+        for side in after.touching
+    ]
+    if before.deepest_m is not None and after.deepest_m is not None:
+        deep = [1000 * own.deepest_m for own in (before, after) if own.deepest_m is not None]
+        rows.append(("deepest vertex", *(f"{own.max():.1f} mm" for own in deep)))
+        rows.append(("frames deeper than 1 cm", *(f"{100 * (own > 10).mean():.0f} %" for own in deep)))
+    rows.append(("mean acceleration", *(f"{own.acceleration_m_s2:.2f} m/s²" for own in (before, after))))
+    return rows

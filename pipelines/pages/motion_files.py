@@ -1,0 +1,85 @@
+"""The arrays every made motion is written with: hands, the object's motion, its mesh and hinge."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.hands import HandPair, track_joints
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.user_mesh import thinned
+
+MOST_FACES_DRAWN = 30_000
+
+# What the arrays mean. Axes: S = 2 sides (left, right), F frames.
+ARRAYS = {
+    "fps": "frames per second",
+    "gravity": "(3,) direction things fall; empty where unknown",
+    "valid": "(S, F) whether the hand takes part",
+    "joints_m": "(S, F, 21, 3) MANO's 16 joints, then the tips of index, middle, pinky, ring, thumb",
+    "wrist_m": "(S, F, 3) world position of the wrist joint",
+    "global_orient": "(S, F, 3) axis-angle about the wrist joint",
+    "hand_pose": "(S, F, 45) axis-angle of the 15 finger joints; zero is the flat hand",
+    "betas": "(S, 1 or F, 10) hand shape",
+    "object_rotvec": "(F, 3) axis-angle of world from object",
+    "object_translation_m": "(F, 3) world position of the object's origin",
+    "object_hinge_rad": "(F,) hinge angle of an articulated object",
+    "object_vertices_m": "(vertex, 3) mesh in the object's own frame",
+    "object_faces": "(face, 3) vertex numbers",
+    "object_part": "(vertex,) 1 where the hinge moves it",
+    "object_hinge_axis": "(3,) direction of the hinge of an articulated object, in its own frame",
+    "object_hinge_origin_m": "(3,) a point on the hinge",
+}
+
+
+def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
+    """Of both hands and the object's motion: metres, radians, 30 fps, world frame.
+
+    Rows of a hand where ``valid`` is False are zero.
+    """
+    tracks = [clip.hands[side] for side in SIDES]
+    valid = np.stack([track.valid for track in tracks])
+    values = {"joints_m": clip_joints_m(clip, hands)}
+    for name in ("wrist_m", "global_orient", "hand_pose"):
+        values[name] = _where_valid([getattr(track, name) for track in tracks], valid)
+    arrays = {
+        "fps": np.array(FPS),
+        "gravity": np.zeros(0) if clip.gravity is None else np.asarray(clip.gravity),
+        "valid": valid,
+        **values,
+        "betas": np.stack(np.broadcast_arrays(*(track.betas for track in tracks))).astype(np.float32),
+        "object_rotvec": clip.object.rotvec.astype(np.float32),
+        "object_translation_m": clip.object.translation_m.astype(np.float32),
+    }
+    if clip.object.hinge_rad is not None:
+        arrays["object_hinge_rad"] = clip.object.hinge_rad.astype(np.float32)
+    return arrays
+
+
+def mesh_arrays(model: ObjectModel) -> dict[str, np.ndarray]:
+    """The object at rest, in its own frame."""
+    arrays = {
+        "object_vertices_m": model.vertices_m.astype(np.float32),
+        "object_faces": model.faces.astype(np.int32),
+        "object_part": model.part.astype(np.uint8),
+    }
+    if model.hinge is not None:
+        arrays["object_hinge_axis"] = np.asarray(model.hinge.axis, np.float64)
+        arrays["object_hinge_origin_m"] = np.asarray(model.hinge.origin_m, np.float64)
+    return arrays
+
+
+def clip_joints_m(clip: Clip, hands: HandPair) -> np.ndarray:
+    """(2, frame, 21, 3) world joints of both hands, zero where they are not valid."""
+    valid = np.stack([clip.hands[side].valid for side in SIDES])
+    return _where_valid([track_joints(clip.hands[side], hands[side]) for side in SIDES], valid)
+
+
+def drawn(clip: Clip, most_faces: int = MOST_FACES_DRAWN) -> Clip:
+    """The clip for a page: large meshes are thinned, the files keep them whole."""
+    return replace(clip, object=replace(clip.object, model=thinned(clip.object.model, most_faces)))
+
+
+def _where_valid(values: list[np.ndarray], valid: np.ndarray) -> np.ndarray:
+    stacked = np.stack(values).astype(np.float32)
+    return np.where(valid.reshape(*valid.shape, *[1] * (stacked.ndim - 2)), stacked, np.float32(0))

@@ -1,0 +1,92 @@
+"""Facts of each run of a stage (when, how long, where) in ``.hoidata/runs``: beside its outputs, never in them.
+
+They differ from run to run, so that DVC must not see them: nothing here is read by a stage, and all may be deleted.
+"""
+
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+RUNS = Path(".hoidata/runs")
+SCHEMA = "hoidata.run/1"
+
+
+@contextmanager
+def noted_run(name: str) -> Iterator[None]:
+    """Keep the facts of what the block does as those of the stage ``name``, also when it fails.
+
+    name: taken where DVC does not say which stage it runs.
+    """
+    stage, began, start = os.environ.get("DVC_STAGE", name), datetime.now(UTC), time.monotonic()
+    ended = "failed"
+    try:
+        yield
+        ended = "complete"
+    finally:
+        facts = {
+            "schema": SCHEMA,
+            "stage": stage,
+            "ended": ended,
+            "began_at": began.isoformat(),
+            "seconds": round(time.monotonic() - start, 3),
+            **_cost(),
+            **_machine(),
+        }
+        with suppress(OSError):  # of a full disk the stage itself has told
+            path = run_file(Path(), stage)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(facts, indent=1) + "\n")
+
+
+def run_file(root: Path, stage: str) -> Path:
+    return root / RUNS / f"{stage.replace('/', '-').replace(':', '-')}.json"
+
+
+def read_run(root: Path, stage: str) -> dict[str, Any]:
+    """The facts of a stage's last run here; empty where none are kept."""
+    try:
+        facts = json.loads(run_file(root, stage).read_bytes())
+        datetime.fromisoformat(facts["began_at"])
+        return facts if facts["schema"] == SCHEMA and isinstance(facts["seconds"], float | int) else {}
+    except (OSError, ValueError, KeyError, TypeError):
+        return {}
+
+
+def _cost() -> dict[str, float]:
+    """Processor time and largest memory of this process and those it waited for."""
+    own, others = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    seconds = own.ru_utime + own.ru_stime + others.ru_utime + others.ru_stime
+    return {"processor_seconds": round(seconds, 2), "peak_mib": max(own.ru_maxrss, others.ru_maxrss) // 1024}
+
+
+def _machine() -> dict[str, Any]:
+    from pipelines.lineage.made import processor
+
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    git = subprocess.run(["git", "rev-parse", "--verify", "--quiet", "HEAD"], capture_output=True, text=True)
+    return {
+        "host": platform.node(),
+        "processor": processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "memory_gib": round(memory / 2**30, 1),
+        "device": _device(),
+        "python": platform.python_version(),
+        "system": platform.platform(),
+        "commit": git.stdout.strip(),
+    }
+
+
+def _device() -> str:
+    """The GPU that was used, else cpu; torch is not loaded to find out."""
+    torch = sys.modules.get("torch")
+    used = torch is not None and torch.cuda.is_initialized()
+    return torch.cuda.get_device_name() if torch is not None and used else "cpu"

@@ -1,0 +1,101 @@
+"""Keyframes are reached at their times, and nothing happens between them that was not asked for."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.errors import BadInput
+from hoidata.object_paths import keyframed_path, parse_keyframes, read_keyframes
+from tests.builders.objects import box_model, hinged_box
+
+CSV = b"""# a box is lifted, opened and put down elsewhere
+time_s,x_cm,z_cm,rz_deg,hinge_deg
+0, 0,  0,  0,  0
+1, 0, 20,  0,  0
+2, 5, 20, 90,-60
+3, 5, 20, 90,-60
+4.5, 5, 0, 90, 0
+"""
+
+
+def test_every_key_is_reached_at_its_time_and_a_hold_stays():
+    path = keyframed_path(hinged_box(), parse_keyframes(CSV, "k.csv"))
+    track = path.track
+    assert track.n_frames == 4.5 * 30 + 1
+    shift = (track.world_from_object @ np.array([[0.0, -0.005, 0]]))[:, 0]  # the middle of box and lid
+    shift = shift - shift[0]
+    assert shift[[30, 60, 90, 135]] == pytest.approx(
+        np.array([[0, 0, 0.2], [0.05, 0, 0.2], [0.05, 0, 0.2], [0.05, 0, 0]]), abs=1e-6
+    )
+    assert np.degrees(track.hinge_rad[[30, 60, 135]]) == pytest.approx([0, -60, 0], abs=1e-4)
+    assert np.degrees(track.rotvec[60]) == pytest.approx([0, 0, 90], abs=1e-4)
+    assert np.ptp(shift[60:91], axis=0).max() < 1e-6
+    assert shift[:, 2].max() < 0.2 + 1e-6  # nothing overshoots
+
+
+def test_json_csv_quaternions_and_every_unit_mean_the_same():
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    x, y, z, w = turn.as_quat()
+    rows = [{"time_ms": 0, "z_mm": 0, "qw": 1, "qx": 0, "qy": 0, "qz": 0}]
+    rows.append({"time_ms": 1500, "z_mm": 400, "qw": w, "qx": x, "qy": y, "qz": z})
+    one = parse_keyframes(json.dumps({"keyframes": rows}).encode(), "k.json")
+    vector = ",".join(f"{value:.17g}" for value in np.degrees(turn.as_rotvec()))
+    other = parse_keyframes(f"time_s,z_m,rx_deg,ry_deg,rz_deg\n2,0,0,0,0\n3.5,0.4,{vector}\n".encode(), "k.csv")
+    tracks = [keyframed_path(box_model(), keys).track for keys in (one, other)]
+    assert tracks[0].rotvec == pytest.approx(tracks[1].rotvec, abs=1e-6)
+    assert tracks[0].translation_m == pytest.approx(tracks[1].translation_m, abs=1e-6)
+
+
+def test_velocity_passes_through_a_key_without_a_stop():
+    keys = parse_keyframes(b"time_s,x_cm\n0,0\n1,10\n2,20\n3,30\n", "k.csv")
+    x = keyframed_path(box_model(), keys).track.translation_m[:, 0].astype(float)
+    assert np.gradient(x, 1 / 30)[30] == pytest.approx(0.1, rel=0.02)
+    assert np.abs(np.diff(x, 2)).max() * 900 < 1.0
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"", "2 to 5000 keyframes"),
+        (b"time_s,x\n0,0\n1,1\n", "x_m, x_cm, x_mm"),
+        (b"time_s,zcm\n0,0\n1,1\n", "did you mean z_cm?"),
+        (b"time_s,z_cm,z_m\n0,0,0\n1,1,1\n", "in one unit"),
+        (b"time_s,z_cm\n0,0\n1\n", "2 numbers"),
+        (b"time_s,z_cm\n0,0\n1,high\n", "high"),
+        (b"time_s,z_cm\n0,0\n1,nan\n", "nan"),
+        (b"z_cm\n0\n1\n", "add the time"),
+        (b"time_s,z_cm\n0,0\n0,5\n", "a time after the key before"),
+        (b"time_s,z_cm\n0,0\n3000,5\n", "time_ms"),
+        (b"time_s,z_m\n0,0\n1,15\n", "x_cm or x_mm"),
+        (b"time_s,qw\n0,1\n1,1\n", "one of the two, whole"),
+        (b"time_s,qw,qx,qy,qz\n0,1,0,0,0\n1,2,0,0,0\n", "length 2"),
+        (b"time_s,z_cm\n0,0\n1,-5\n", "under it"),
+        (b"time_s,z_cm\n0,0\n0.1,100\n", "times as long"),
+        (b"time_s,rz_deg\n0,0\n2,175\n", "add a key in between"),
+        (b"time_s,hinge_deg\n0,0\n2,40\n", "is rigid"),
+        (b"[1, 2]", "a list of objects"),
+        (b'[{"time_s": 0}, {"time_s": 1, "z_m": 0.1}]', "the same names"),
+        (b'[{"time_s": [0]}, {"time_s": 1}]', "a number"),
+        (b"\xff\xfe", "export it anew"),
+        (b"[" * 100_000, "export it anew"),
+    ],
+)
+def test_what_cannot_be_gets_an_answer_that_says_what_to_do(data, words):
+    with pytest.raises(BadInput) as error:
+        keyframed_path(box_model(), parse_keyframes(data, "k"))
+    assert words in str(error.value)
+
+
+def test_an_angle_beyond_the_stop_names_the_stop():
+    keys = parse_keyframes(b"time_s,hinge_deg\n0,0\n2,-80\n", "k.csv")
+    with pytest.raises(BadInput, match="-45 to 0 deg, got -80 deg"):
+        keyframed_path(hinged_box(), keys, (np.radians(-45), 0.0))
+
+
+def test_a_file_that_is_not_there_is_an_answer(tmp_path):
+    with pytest.raises(BadInput, match="correct the path"):
+        read_keyframes(tmp_path / "none.csv")
+    (tmp_path / "keys.csv").write_bytes(CSV)
+    assert len(read_keyframes(tmp_path / "keys.csv").time_s) == 5

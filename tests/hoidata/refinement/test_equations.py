@@ -1,0 +1,104 @@
+"""The parts of the solver, each against an independent formula."""
+
+import numpy as np
+import pytest
+import torch
+
+from hoidata.clips.clip import ObjectTrack
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands import HandKinematics, load_embedded_hands
+from hoidata.objects.distance import signed_distance
+from hoidata.refinement.banded import acceleration_equations, second_differences, solve_blocks
+from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
+from hoidata.refinement.object_field import ObjectField
+from hoidata.refinement.skin import HandPose, Skin
+from tests.builders.objects import hinged_box
+
+FRAMES = 3
+IDS = np.array([0, 5, 100, 317, 445, 556, 673, 745, 760])
+
+
+def any_pose(seed: int = 0, frames: int = FRAMES) -> HandPose:
+    random = np.random.default_rng(seed)
+    turn = rotvec_to_rotmat(random.normal(size=(frames, 3)))
+    return HandPose(random.normal(size=(frames, 3)), turn, random.normal(0, 0.5, (frames, 15, 3)))
+
+
+def kinematics_vertices(pose: HandPose, betas: np.ndarray, template_m: np.ndarray) -> np.ndarray:
+    """The same hand by the project's torch kinematics."""
+    layer = HandKinematics(load_embedded_hands().left, torch.float64)
+    turns = np.concatenate((pose.orient[:, None], rotvec_to_rotmat(pose.fingers)), 1)
+    arrays = (pose.wrist_m, turns, betas[None], template_m)
+    return layer(*(torch.from_numpy(array) for array in arrays))[0].numpy()
+
+
+def test_vertices_and_their_derivatives_are_those_of_the_hand_model_with_shape_mesh_and_pose_correctives():
+    random, model = np.random.default_rng(1), load_embedded_hands().left
+    betas, template = random.normal(size=10), model.template_m + random.normal(0, 0.001, (778, 3))
+    skin, pose = Skin(model, betas, template, IDS), any_pose()
+    chain = skin.chain(pose, slopes=True)
+    assert skin.vertices_m(chain) == pytest.approx(kinematics_vertices(pose, betas, template)[:, IDS], abs=1e-12)
+    derivative, step = skin.all_derivatives(chain).reshape(FRAMES, len(IDS), 3, N_UNKNOWNS), 1e-6
+    for unknown in range(N_UNKNOWNS):
+        way = np.zeros((FRAMES, N_UNKNOWNS))
+        way[:, unknown] = step
+        ahead, behind = (kinematics_vertices(pose.moved(sign * way), betas, template)[:, IDS] for sign in (1, -1))
+        assert derivative[..., unknown] == pytest.approx((ahead - behind) / (2 * step), abs=1e-8)
+
+
+def test_the_field_has_the_distances_of_both_parts_where_they_are_and_their_slope():
+    model, random = hinged_box(), np.random.default_rng(2)
+    turn, place = random.normal(size=(2, FRAMES, 3)).astype(np.float32)
+    thing = ObjectTrack(model, turn, place, np.array([0.0, -0.5, -1.2], np.float32))
+    places = thing.world_from_object @ random.uniform(-0.06, 0.06, (FRAMES, 200, 3))
+    distance, slope = ObjectField(thing).distances(places)
+    for frame in range(FRAMES):
+        vertices = thing.take(slice(frame, frame + 1)).points_in_world(model.vertices_m, model.part)[0]
+        each = [signed_distance(vertices, model.faces_of(part), places[frame]).distance_m for part in (0, 1)]
+        exact = np.min(each, axis=0)
+        near = exact < 0.01  # beyond the grid the way to its rim is added
+        assert near.sum() > 100
+        assert distance[frame, near] == pytest.approx(exact[near], abs=0.0015)
+    ahead, behind = (
+        np.stack([ObjectField(thing).distances(places + step * np.eye(3)[axis])[0] for axis in range(3)], -1)
+        for step in (1e-6, -1e-6)
+    )
+    assert np.median(np.abs(slope - (ahead - behind) / 2e-6)) < 1e-6
+    assert np.mean(np.abs(slope - (ahead - behind) / 2e-6).max(axis=-1) < 1e-3) > 0.98  # all but at edges of cells
+    some, _ = ObjectField(thing).distances(places[[2, 0]], np.array([2, 0]))
+    assert np.array_equal(some, distance[[2, 0]])
+
+
+def test_the_banded_system_is_the_dense_one_of_the_same_residuals():
+    random, frames, rows, n = np.random.default_rng(3), 6, 7, 4
+    derivative = random.normal(size=(frames, rows, n))
+    weight = np.concatenate(([0, 0], random.uniform(1, 2, frames - 2)))
+    weight[4] = 0  # a gap ties nothing
+    value = random.normal(size=(frames, rows))
+    stacked = np.zeros((frames, rows, frames, n))
+    for frame in range(2, frames):
+        for back, factor in enumerate((1, -2, 1)):
+            stacked[frame, :, frame - back] = factor * derivative[frame - back]
+    dense = stacked.reshape(frames * rows, frames * n)
+    heavy = np.repeat(weight, rows)
+    matrix = dense.T @ (heavy[:, None] * dense) + np.eye(frames * n)
+    difference = second_differences(value)
+    vector = -dense.T @ (heavy * difference.ravel())
+    blocks, own = acceleration_equations(derivative, difference, weight)
+    blocks[0] = blocks[0] + np.eye(n)
+    assert own.ravel() == pytest.approx(vector)
+    assert solve_blocks(blocks, own).ravel() == pytest.approx(np.linalg.solve(matrix, vector))
+
+
+def test_squares_of_scattered_residuals_add_up_as_their_products_do():
+    random, pairs = np.random.default_rng(4), 20
+    frame, slope = random.integers(0, 2, pairs), random.normal(size=(pairs, 3))
+    derivative, weight = random.normal(size=(pairs, 3, N_UNKNOWNS)), random.uniform(size=pairs)
+    miss = random.normal(size=pairs)
+    matrix, vector = np.zeros((2, N_UNKNOWNS, N_UNKNOWNS)), np.zeros((2, N_UNKNOWNS))
+    add_squares(frame, slope, derivative, weight, miss, matrix, vector)
+    row = np.einsum("pa,pan->pn", slope, derivative)
+    for one in range(2):
+        own = frame == one
+        assert np.tril(matrix[one]) == pytest.approx(np.tril((row[own].T * weight[own]) @ row[own]))
+        assert vector[one] == pytest.approx(-row[own].T @ (weight[own] * miss[own]))

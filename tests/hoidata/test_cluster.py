@@ -1,0 +1,133 @@
+"""Work shared out on a Dask cluster: the same bytes as here, also when workers die."""
+
+import os
+import signal
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from hoidata import cluster
+from hoidata.contact.stage import contact_store
+from hoidata.conversion.convert import convert_dataset
+from hoidata.datasets.grab.adapter import GrabAdapter
+from hoidata.errors import BadInput
+from hoidata.files.digest import sha256_file
+from hoidata.hands import load_embedded_hands
+from hoidata.workers import in_order, in_workers
+from tests.hoidata.conversion.killable import write_grab
+
+distributed = pytest.importorskip("distributed")
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # of Dask's own threads, as they end
+DIES = "s1/mug_lift_002"
+
+
+@dataclass(frozen=True)
+class DyingOnce(GrabAdapter):
+    """Takes its worker along the first time it is asked for one sequence; ``note`` tells that it did."""
+
+    note: str = ""
+
+    def load(self, raw, key, hands):
+        if key.name == DIES and not os.path.exists(self.note):
+            Path(self.note).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().load(raw, key, hands)
+
+
+@dataclass(frozen=True)
+class DyingAlways(GrabAdapter):
+    def load(self, raw, key, hands):
+        if key.name == DIES:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().load(raw, key, hands)
+
+
+@pytest.fixture(scope="module")
+def corpus(tmp_path_factory) -> Path:
+    """Raw files, and what one process here makes of them."""
+    folder, hands = tmp_path_factory.mktemp("corpus"), load_embedded_hands()
+    write_grab(folder / "raw", hands, 9)
+    convert_dataset(GrabAdapter(), folder / "raw", hands, folder / "clips", progress=False)
+    contact_store(folder / "clips", folder / "contact")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """The address of a cluster that runs already: two workers, processes of their own."""
+    import dask
+
+    with (
+        dask.config.set({"distributed.scheduler.allowed-failures": 1}),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as started,
+    ):
+        yield started.scheduler_address
+
+
+@pytest.fixture
+def on_it(scheduler):
+    cluster.choose_workers(scheduler)
+    yield
+    cluster.choose_workers("local")
+
+
+def digests(folder: Path) -> dict[str, str]:
+    return {str(path.relative_to(folder)): sha256_file(path) for path in folder.rglob("*") if path.is_file()}
+
+
+def test_a_cluster_makes_the_same_store_and_contact_as_one_process_here(corpus, hands, on_it, tmp_path, monkeypatch):
+    monkeypatch.chdir(corpus)  # relative paths are those of the one that asks
+    convert_dataset(GrabAdapter(), "raw", hands, tmp_path / "clips", progress=False)
+    assert digests(tmp_path / "clips") == digests(corpus / "clips")
+    contact_store("clips", tmp_path / "contact")
+    assert digests(tmp_path / "contact") == digests(corpus / "contact")
+
+
+def test_a_worker_of_the_cluster_that_is_killed_changes_no_byte(corpus, hands, on_it, tmp_path):
+    adapter = DyingOnce(note=str(tmp_path / "died"))
+    convert_dataset(adapter, corpus / "raw", hands, tmp_path / "clips", progress=False)
+    assert (tmp_path / "died").exists()
+    assert digests(tmp_path / "clips") == digests(corpus / "clips")
+
+
+def test_a_sequence_that_ends_every_worker_is_left_out_and_the_others_are_not(corpus, hands, on_it, tmp_path):
+    summary = convert_dataset(DyingAlways(), corpus / "raw", hands, tmp_path / "clips", progress=False)
+    assert summary.clips == 8
+    (left_out,) = summary.left_out
+    assert left_out.source_key == f"grab/{DIES}"
+    assert "several workers" in left_out.got
+
+
+def doubled(number: int) -> int:
+    if number < 0:
+        raise BadInput("number", "0 or more", str(number), "correct it")
+    return 2 * number
+
+
+def test_what_the_function_raises_is_raised_here_and_results_come_in_order_when_asked(on_it):
+    numbers = list(range(40))
+    assert list(in_order(in_workers(doubled, numbers, 1), numbers)) == [(number, 2 * number) for number in numbers]
+    with pytest.raises(BadInput, match="0 or more"):
+        list(in_workers(doubled, [1, -1, 2], 1))
+
+
+def test_a_cluster_started_for_the_work_ends_with_it(monkeypatch):
+    cluster.choose_workers("dask")
+    try:
+        assert not cluster.is_used_for(1)
+        assert sorted(in_workers(doubled, [1, 2, 3], 2)) == [(1, 2), (2, 4), (3, 6)]
+    finally:
+        cluster.choose_workers("local")
+
+
+def test_an_address_where_nothing_runs_or_no_address_says_so(monkeypatch):
+    monkeypatch.setattr(cluster, "PATIENCE_S", 1)
+    with pytest.raises(BadInput, match="local, dask or"):
+        cluster.choose_workers("ray")
+    cluster.choose_workers("tcp://127.0.0.1:9")
+    try:
+        with pytest.raises(BadInput, match="a Dask scheduler at"):
+            list(in_workers(doubled, [1, 2], 1))
+    finally:
+        cluster.choose_workers("local")

@@ -1,0 +1,125 @@
+"""Hands for a motion that was never recorded: repeatable, of the object as it was given, as files and a page."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import KDTree
+
+from hoidata.clips.clip import SIDES
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.object_paths import ObjectPath, scripted_path
+from hoidata.objects.surface_index import surface_index
+from hoidata.sensors.keypoints import hand_keypoints
+from hoidata.sensors.part_bps import BasisSettings
+from models.bimart.family import FamilyConfig, HandsForPaths
+from models.bimart.hands import MadeHands, MotionWish, hands_for
+from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
+from models.bimart.sampler import OURS, BimArt
+from models.bimart.scene import FeatureConfig
+from models.common.sampling import SamplerConfig
+from models.common.transformer import TransformerConfig
+from pipelines.pages.hands_page import ARRAYS, write_hands
+from tests.builders.objects import hinged_box
+
+PAIR = load_embedded_hands()
+FEATURES = FeatureConfig(BasisSettings(16), keypoints=24, window=16, state="local", most_m=0.2)
+TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)
+
+
+@pytest.fixture(scope="module")
+def sampler() -> HandsForPaths:
+    """Networks that have learnt nothing, whose hands are about the size of hands."""
+    torch.manual_seed(0)
+    contact, motion = ContactModel(TINY), MotionModel(TINY)
+    ids = hand_keypoints(PAIR.right, FEATURES.keypoints)
+    places = np.concatenate([PAIR[side].template_m[ids] + [0, 0, 0.03] for side in SIDES]).ravel()
+    with torch.no_grad():
+        motion.mean[: len(places)] = torch.from_numpy(places)
+        motion.scale.fill_(0.003)
+        motion.keypoint_ids.copy_(torch.from_numpy(ids))
+        contact.mean.fill_(0.02)
+        contact.scale.fill_(0.005)
+    config = FamilyConfig(replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5)))
+    model = BimArt(contact.eval(), motion.eval(), config.sampling, torch.device("cpu"))
+    return HandsForPaths(model, PAIR, config, synthetic=True)
+
+
+@pytest.fixture(scope="module")
+def path() -> ObjectPath:
+    return scripted_path(hinged_box(), "lift 5 cm in 0.4 s, open 20 deg in 0.4 s", (-0.1, 1.0), rest_s=0.1)
+
+
+@pytest.fixture(scope="module")
+def made(sampler, path) -> list[MadeHands]:
+    return hands_for(sampler, path.track, MotionWish(seed=3, samples=2, words="box"))
+
+
+def test_the_object_moves_exactly_as_it_was_given_and_both_hands_have_every_frame(made, path):
+    for motion in made:
+        assert motion.clip.object is path.track
+        assert motion.clip.object_words == "box"
+        assert all(motion.clip.hands[side].valid.all() for side in SIDES)
+        assert motion.clip.synthetic
+
+
+def test_a_motion_is_the_same_again_and_whatever_others_are_asked_for(sampler, path, made):
+    alone = hands_for(sampler, path.track, MotionWish(seed=3))[0]
+    for side in SIDES:
+        first, again, other = (motion.clip.hands[side] for motion in (made[0], alone, made[1]))
+        assert all(np.array_equal(getattr(first, name), getattr(again, name)) for name in first.PER_FRAME)
+        assert not np.array_equal(first.wrist_m, other.wrist_m)
+
+
+def test_only_the_hand_that_was_asked_for_is_made(sampler, path):
+    left = hands_for(sampler, path.track, MotionWish(hand="left"))[0]
+    assert left.clip.hands["left"].valid.all()
+    assert not left.clip.hands["right"].valid.any()
+    assert list(left.standing.touching) == ["left"]
+    assert np.isinf(left.reached_m[1]).all()
+    assert np.isinf(left.asked_m[1]).all()
+
+
+def test_how_the_contact_stands_is_measured_on_the_hands_themselves(made):
+    motion, index = made[0], surface_index(hinged_box())
+    thing = motion.clip.object
+    for row, side in enumerate(SIDES):
+        skin = track_vertices(motion.clip.hands[side], PAIR[side])
+        points = thing.points_in_world(motion.points.points_m, motion.points.part)
+        frame = 20
+        assert motion.reached_m[row, frame] == pytest.approx(KDTree(skin[frame]).query(points[frame])[0], abs=1e-5)
+        seen = thing.world_from_object.inverse() @ skin.astype(np.float64)
+        distance = index.distance_m(seen, thing.hinge_rad).min(axis=1)
+        assert np.array_equal(motion.standing.touching[side], distance < 0.005)
+    assert np.isfinite(motion.asked_m).sum() > 20
+    assert motion.standing.deepest_m.max() < motion.standing_before.deepest_m.max()
+
+
+def test_too_short_a_motion_is_an_answer(sampler, path):
+    with pytest.raises(BadInput, match="give a longer motion"):
+        hands_for(sampler, path.track.take(slice(0, 5)))
+
+
+def test_files_and_page_are_written_repeat_and_explain_every_array(made, path, tmp_path):
+    def written(folder: str) -> list[Path]:
+        digests = {"checkpoints/bimart-motion/model.safetensors": "ab" * 32}
+        return write_hands(
+            tmp_path / folder, made, PAIR, path.steps, digests, [("object's motion", "a <script>")], ["so"]
+        )
+
+    first, again = written("a"), written("b")
+    names = ["motion.npz", "motion.glb", "motion-1.npz", "motion-1.glb", "index.html"]
+    assert [file.name for file in first] == names
+    assert [file.read_bytes() for file in first] == [file.read_bytes() for file in again]
+    with np.load(first[0]) as arrays:
+        assert set(arrays.files) == set(ARRAYS)
+        assert arrays["contact_distance_m"].shape == (2, path.track.n_frames, len(arrays["contact_points_m"]))
+        assert np.array_equal(arrays["object_hinge_axis"], path.track.model.hinge.axis)
+    page = first[-1].read_text(encoding="utf-8")
+    assert page.count('<figure class="player') == 2 * (2 + 4)
+    assert "lift 5 cm in 0.4 s" in page
+    assert "a &lt;script&gt;" in page
+    assert "http" not in page.split("<main")[1].split("<script")[0]

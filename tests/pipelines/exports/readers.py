@@ -1,0 +1,149 @@
+"""Each export read back without hoidata's writers: by the target's own library, else after its documentation.
+
+A reader takes the exported folder and gives, by clip, (left joints, right joints, world_from_object): (frame, 21, 3),
+(frame, 21, 3) and (frame, 4, 4), in the clip's world; None for joints the format does not carry.
+"""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pygltflib
+from scipy.spatial.transform import Rotation
+
+Read = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def transforms(places: Any, quaternions_xyzw: Any) -> np.ndarray:
+    found = np.tile(np.eye(4), (len(places), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = Rotation.from_quat(quaternions_xyzw).as_matrix(), places
+    return found
+
+
+def lerobot(folder: Path) -> Read:
+    """After "LeRobotDataset v3.0" of huggingface/lerobot: info.json names the files, meta/episodes the rows in them."""
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert info["codebase_version"] == "v3.0"
+    found = {}
+    for episode in pd.read_parquet(folder / "meta" / "episodes").to_dict("records"):
+        where = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
+        frames = pd.read_parquet(folder / info["data_path"].format(**where))
+        frames = frames[frames["episode_index"] == episode["episode_index"]]
+        assert frames["index"].tolist() == list(range(episode["dataset_from_index"], episode["dataset_to_index"]))
+        state, pose = (np.stack(list(frames[f"observation.{name}"])) for name in ("state", "environment_state"))
+        for name, values in (("observation.state", state), ("observation.environment_state", pose)):
+            assert info["features"][name]["shape"] == [values.shape[1]] == [len(info["features"][name]["names"])]
+        joints = state.reshape(-1, 2, 21, 3)
+        found[episode["clip_id"]] = (joints[:, 0], joints[:, 1], transforms(pose[:, :3], pose[:, 3:7]))
+    return found
+
+
+def huggingface(folder: Path, cache: Path) -> Read:
+    import datasets
+
+    loaded = datasets.load_dataset(str(folder), cache_dir=str(cache))
+    rows = [row for split in loaded.values() for row in split.with_format("numpy")]
+    return {str(row["clip_id"]): _of_columns(row) for row in rows}
+
+
+def webdataset(folder: Path) -> Read:
+    from webdataset import autodecode, tariterators
+
+    found = {}
+    for shard in folder.glob("*.tar"):
+        with open(shard, "rb") as stream:  # WebDataset(shard) itself leaves the file open
+            files = tariterators.tar_file_expander([{"url": str(shard), "stream": stream}])
+            for sample in map(autodecode.Decoder([]), tariterators.group_by_keys(files)):
+                found[sample["json"]["clip_id"]] = _of_columns(sample["npz"])
+    return found
+
+
+def _of_columns(row: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    pose = transforms(np.asarray(row["object_translation_m"]), np.asarray(row["object_quaternion_xyzw"]))
+    return np.asarray(row["left_joints_m"]), np.asarray(row["right_joints_m"]), pose
+
+
+def glb(folder: Path) -> Read:
+    return {_id(path): _of_glb(path) for path in folder.glob("*.glb")}
+
+
+def _of_glb(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    document = pygltflib.GLTF2().load_binary(str(path))
+    data, tracks = document.binary_blob(), {}
+    for channel in document.animations[0].channels:
+        accessor = document.accessors[document.animations[0].samplers[channel.sampler].output]
+        view = document.bufferViews[accessor.bufferView]
+        values = np.frombuffer(data, np.float32, view.byteLength // 4, view.byteOffset).reshape(accessor.count, -1)
+        tracks[document.nodes[channel.target.node].name, channel.target.path] = values
+    names = [node.name for node in document.nodes]
+    sides = [
+        np.stack([tracks[name, "translation"] for name in names if name.startswith(f"{side} joint ")], axis=1)
+        for side in ("left", "right")
+    ]
+    return sides[0], sides[1], transforms(tracks["object", "translation"], tracks["object", "rotation"])
+
+
+def usd(folder: Path) -> Read:
+    return {_id(path): _of_usd(path) for path in folder.glob("*.usdc")}
+
+
+def _of_usd(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    from pxr import Usd, UsdGeom
+
+    stage: Any = Usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageMetersPerUnit(stage) == 1
+    times = np.arange(stage.GetStartTimeCode(), stage.GetEndTimeCode() + 1)
+    left, right = (
+        np.array([UsdGeom.Points.Get(stage, f"/world/{side}_joints").GetPointsAttr().Get(time) for time in times])
+        for side in ("left", "right")
+    )
+    poses = []
+    for time in times:
+        cache = UsdGeom.XformCache(time)
+        world, placed = (cache.GetLocalToWorldTransform(stage.GetPrimAtPath(p)) for p in ("/world", "/world/object"))
+        poses.append(np.array(placed * world.GetInverse()).T)  # USD multiplies rows
+    return left, right, np.array(poses)
+
+
+def bvh(folder: Path) -> Read:
+    found = {}
+    for clip in (path for path in folder.iterdir() if path.is_dir()):
+        left, right = (_of_bvh(clip / f"{side}.bvh")[:, :, :3, 3] for side in ("left", "right"))
+        found[clip.name.replace("__", "/")] = (left, right, _of_bvh(clip / "object.bvh")[:, 0])
+    return found
+
+
+def _of_bvh(path: Path) -> np.ndarray:
+    """(frame, joint, 4, 4) in the file's order, after the format's description: the channels of each joint in turn."""
+    header, motion = path.read_text().split("MOTION")
+    names, parents, channels, open_joints = [], [], [], []
+    for words in map(str.split, header.splitlines()):
+        if words[0] in ("ROOT", "JOINT"):
+            parents.append(next((j for j in reversed(open_joints) if j is not None), -1))
+            names.append(words[1])
+            pending = len(names) - 1
+        elif words[0] == "End":
+            pending = None
+        elif words[0] == "{":
+            open_joints.append(pending)
+        elif words[0] == "}":
+            open_joints.pop()
+        elif words[0] == "CHANNELS":
+            channels.append(words[2:])
+    rows = np.loadtxt(motion.strip().splitlines()[2:], ndmin=2).reshape(-1, len(names), 6)
+    placed: list[np.ndarray] = []
+    for joint, parent in enumerate(parents):
+        order = "".join(name[0] for name in channels[joint][3:])
+        turn = Rotation.from_euler(order, rows[:, joint, 3:], degrees=True)
+        own = transforms(rows[:, joint, :3], turn.as_quat())
+        placed.append(own if parent < 0 else placed[parent] @ own)
+    by_name = dict(zip(names, placed, strict=True))
+    from hoidata.hands import JOINT_NAMES
+
+    return np.stack([by_name[name] for name in (JOINT_NAMES if "wrist" in names else names)], axis=1)
+
+
+def _id(path: Path) -> str:
+    return path.stem.replace("__", "/")

@@ -1,0 +1,237 @@
+"""Exports: what was in the clip is in what others read, and nothing is passed on that may not be."""
+
+import dataclasses
+import json
+import shutil
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from hoidata.clips import SIDES
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.store.fields import STORE_FILES, TABLES
+from hoidata.store.info import generated_info
+from hoidata.store.store import Store, open_store, write_store
+from pipelines.cli import app
+from pipelines.exports.export import FORMATS, export_store
+from pipelines.exports.licences import KINDS, MANO, licences_of, spdx_of
+from tests.builders.clips import build_clip, with_hand
+from tests.builders.stores import write_annotated
+from tests.pipelines.exports import readers
+
+TOLERANCE = 1e-4
+READ_BACK = ("lerobot", "huggingface", "webdataset", "glb", "usd", "bvh")
+GRAB = "GRAB licence (MPI): non-commercial research, no redistribution"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory) -> Store:
+    """A rigid and a hinged object, a personal hand, betas per frame, gravity along y, frames without a hand."""
+    rigid = build_clip(5, "both", seed=1, clip_id="toy/s1/lift_1", gravity=(0.0, -1.0, 0.0))
+    template = load_embedded_hands().right.template_m.astype(np.float32) * np.float32(1.1)
+    rigid = with_hand(rigid, "right", template_m=template)
+    hinged = build_clip(4, "both", articulated=True, seed=2, clip_id="toy/s2/open_1", subject="s2", verb="open")
+    betas = np.random.default_rng(0).normal(size=(4, 10)).astype(np.float32)
+    hinged = with_hand(hinged, "left", betas=betas, valid=np.array([True, False, True, True]))
+    root = tmp_path_factory.mktemp("toy")
+    return open_store(write_annotated(root, [rigid, hinged], points=64) / "clips")
+
+
+@pytest.fixture(scope="module")
+def exported(store, tmp_path_factory) -> dict[str, Path]:
+    """Every format, written once."""
+    root = tmp_path_factory.mktemp("exported")
+    for name in FORMATS:
+        export_store(store, name, root / name, progress=False)
+    return {name: root / name for name in FORMATS}
+
+
+def read(name: str, folder: Path, cache: Path) -> readers.Read:
+    reader = getattr(readers, name)
+    return reader(folder, cache) if name == "huggingface" else reader(folder)
+
+
+@pytest.mark.parametrize("name", READ_BACK)
+def test_joints_and_object_come_back_from_every_format(name, store, exported, tmp_path):
+    found = read(name, exported[name], tmp_path)
+    assert set(found) == set(store.ids)
+    for clip_id, (left, right, world_from_object) in found.items():
+        for side, joints in zip(SIDES, (left, right), strict=True):
+            assert np.abs(joints - store.joints(clip_id, side)).max() <= TOLERANCE
+        track = store.clip(clip_id).object
+        corner = np.array([0.1, -0.1, 0.1])
+        expected = Rotation.from_rotvec(track.rotvec).apply(corner) + track.translation_m
+        assert np.abs(world_from_object[:, :3, :3] @ corner + world_from_object[:, :3, 3] - expected).max() <= TOLERANCE
+
+
+def test_spider_gets_tips_and_object_with_z_up_and_is_told_what_it_has_no_form_for(store, exported):
+    folder = exported["spider"]
+    (path,) = folder.rglob("trajectory_keypoints.npz")
+    arrays, clip = np.load(path), store.clip("toy/s1/lift_1")
+    z_up = Rotation.from_euler("x", 90, degrees=True)  # gravity is -y in this clip
+    for side in SIDES:
+        joints = store.joints(clip.clip_id, side)
+        tips = np.stack([z_up.apply(joints[:, joint]) for joint in (20, 16, 17, 19, 18)], axis=1)
+        assert np.abs(arrays[f"qpos_finger_{side}"][:, :, :3] - tips).max() <= TOLERANCE
+        assert np.abs(arrays[f"qpos_wrist_{side}"][:, :3] - z_up.apply(joints[:, 0])).max() <= TOLERANCE
+        to_middle = z_up.apply(joints[:, 4] - joints[:, 0])
+        along = Rotation.from_quat(arrays[f"qpos_wrist_{side}"][:, [4, 5, 6, 3]]).apply([0, 0, 1])
+        assert np.cross(along, to_middle) == pytest.approx(0, abs=1e-6)
+    pose = arrays["qpos_obj_right"]
+    assert np.abs(pose[:, :3] - z_up.apply(clip.object.translation_m)).max() <= TOLERANCE
+    turn = z_up * Rotation.from_rotvec(clip.object.rotvec)
+    assert (Rotation.from_quat(pose[:, [4, 5, 6, 3]]).inv() * turn).magnitude().max() < 1e-6
+    info = json.loads((path.parents[1] / "task_info.json").read_text())
+    assert (folder / info["right_object_mesh_dir"] / "visual.obj").is_file()
+    assert "hinge" in json.loads((folder / "export.json").read_text())["left_out"]["toy/s2/open_1"]
+
+
+def test_a_hand_that_is_not_tracked_is_not_seen_in_usd(exported):
+    from pxr import Usd, UsdGeom
+
+    stage: Any = Usd.Stage.Open(str(exported["usd"] / "toy__s2__open_1.usdc"))
+    seen = UsdGeom.Imageable(stage.GetPrimAtPath("/world/left_hand"))
+    assert [seen.ComputeVisibility(frame) for frame in range(4)] == ["inherited", "invisible", "inherited", "inherited"]
+
+
+def test_lerobot_tasks_are_the_sentences_and_splits_are_ranges_of_episodes(store, exported):
+    import pandas as pd
+
+    folder = exported["lerobot"]
+    tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
+    said = pd.read_parquet(store.folder.parent / "annotation" / "text.parquet")["sentence"]
+    assert set(tasks.index) == set(said)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    assert info["splits"] == {"train": "0:1", "validation": "1:2"}
+    stats = json.loads((folder / "meta" / "stats.json").read_text())
+    states = np.stack(list(pd.read_parquet(folder / "data")["observation.state"]))
+    assert stats["observation.state"]["mean"] == pytest.approx(states.mean(axis=0), abs=1e-6)
+    assert stats["observation.state"]["std"] == pytest.approx(states.std(axis=0), abs=1e-6)
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_equal_stores_give_equal_bytes(name, store, exported, tmp_path):
+    export_store(open_store(store.folder), name, tmp_path / "again", progress=False)
+    first, again = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+        for root in (exported[name], tmp_path / "again")
+    )
+    assert first == again
+
+
+@pytest.mark.filterwarnings("ignore:ConjunctiveGraph is deprecated", "ignore:The inplace keyword")  # of mlcroissant
+@pytest.mark.parametrize("name", FORMATS)
+def test_croissant_is_valid_and_reads_the_tables(name, store, exported, tmp_path):
+    mlcroissant = pytest.importorskip("mlcroissant", reason="the extra croissant, which pyright must not see")
+    folder = exported[name]
+    if name == "croissant":
+        folder = shutil.copytree(store.folder, tmp_path / "store")
+        shutil.copy(exported[name] / "croissant.json", folder)
+    dataset = mlcroissant.Dataset(jsonld=folder / "croissant.json")
+    assert not dataset.metadata.ctx.issues.errors
+    assert dataset.metadata.data_collection
+    assert dataset.metadata.personal_sensitive_information
+    if name == "croissant":
+        ids = [row["meta_sequences/clip_id"].decode() for row in dataset.records("meta_sequences")]
+        assert ids == store.ids
+
+
+def test_the_card_names_licence_and_files(exported):
+    _, front, text = (exported["huggingface"] / "README.md").read_text().split("---\n", 2)
+    facts = yaml.safe_load(front)
+    assert facts["license"] == "other"  # "none: generated" is no SPDX licence
+    files = [row["path"] for row in facts["configs"][0]["data_files"]]
+    assert files
+    assert all((exported["huggingface"] / path).is_file() for path in files)
+    assert all(f"| {kind.name} |" in text for kind in KINDS)
+
+
+def test_every_stored_array_has_one_licence():
+    described = {file.path for file in STORE_FILES} - {"meta/info.json"} - {file.path for file in TABLES.values()}
+    assert described <= {path for kind in KINDS for path in kind.arrays.replace(":", ",").split(", ")} | {
+        "arrays/source_hands.npz"
+    }
+    frames = next(file for file in STORE_FILES if file.path == "arrays/frames-*.npz")
+    patterns = [kind.arrays.split(": ")[1].split(", ") for kind in KINDS if kind.arrays.startswith(f"{frames.path}: ")]
+    for field in frames.fields:
+        assert sum(any(fnmatch(field.name, pattern) for pattern in group) for group in patterns) == 1, field.name
+
+
+@pytest.mark.parametrize(
+    ("licence", "spdx"),
+    [
+        ("CC BY-NC 4.0", "CC-BY-NC-4.0"),
+        ("CC BY 4.0", "CC-BY-4.0"),
+        ("CC0-1.0 (generated in the files of grab)", "CC0-1.0"),
+        (GRAB, "LicenseRef-grab"),
+    ],
+)
+def test_licences_are_known_by_their_spdx_ids(licence, spdx):
+    assert spdx_of(licence, "grab") == spdx
+
+
+def bound_store(folder: Path, **facts: Any) -> Store:
+    """One clip under the facts of info.json given."""
+    write_store(folder, [build_clip(3)], generated_info("grab") | facts)
+    return open_store(folder)
+
+
+@pytest.mark.parametrize("name", [name for name in FORMATS if FORMATS[name].kinds])
+def test_what_may_not_be_passed_on_is_refused_with_the_licence(name, tmp_path):
+    bound = bound_store(tmp_path / "clips", licence=GRAB, may_be_shared=False)
+    with pytest.raises(
+        BadInput, match=r"no redistribution \(LicenseRef-grab\).*forbids passing this on.*--for-own-use"
+    ):
+        export_store(bound, name, tmp_path / "out", progress=False)
+    assert not (tmp_path / "out").exists()
+
+
+def test_for_own_use_it_is_written_and_says_so(tmp_path):
+    bound = bound_store(tmp_path / "clips", licence=GRAB, may_be_shared=False)
+    export_store(bound, "huggingface", tmp_path / "out", for_own_use=True, progress=False)
+    for name in ("export.json", "croissant.json", "README.md"):
+        assert "not to be passed on" in (tmp_path / "out" / name).read_text(), name
+
+
+def test_the_mesh_of_mano_is_not_passed_on_even_where_the_data_may_be(store, tmp_path):
+    info = {**store.info, "licence": "CC BY 4.0", "hand_model": {"name": "mano", "digest": "0" * 64}}
+    by_kind = {row.kind.name: row for row in licences_of(info)}
+    assert by_kind["hands"].may_be_shared
+    assert (by_kind["hand surface"].licence, by_kind["hand surface"].may_be_shared) == (MANO, False)
+    with pytest.raises(BadInput, match="hand surface under: MANO"):
+        export_store(dataclasses.replace(store, info=info), "usd", tmp_path / "out", progress=False)
+
+
+def test_the_command_writes_a_dataset_with_its_words_and_its_page_names_every_form(store, tmp_path):
+    asked = ["export", str(store.folder.parent), "--to", "webdataset", "--out", str(tmp_path / "a")]
+    found = CliRunner().invoke(app, asked)
+    assert found.exit_code == 0, found.output
+    assert {path.name for path in (tmp_path / "a").glob("*.tar")} == {"train-000000.tar", "validation-000000.tar"}
+    page = (Path(__file__).parents[3] / "docs" / "export.md").read_text()
+    assert all(f"| `{name}` |" in page for name in FORMATS)
+    said = " ".join(CliRunner().invoke(app, ["export", "--help"], env={"COLUMNS": "300"}).output.split())
+    assert f"{', '.join(list(FORMATS)[:-1])} or {list(FORMATS)[-1]}" in said
+
+
+def test_what_cannot_be_exported_is_answered(store, tmp_path):
+    (tmp_path / "there").mkdir()
+    answers: list[tuple[str, dict[str, Any]]] = [
+        ("one of croissant, lerobot", {"to": "fbx", "out": tmp_path / "a"}),
+        ("not there yet", {"to": "bvh", "out": tmp_path / "there"}),
+        ("ids of clips", {"to": "bvh", "out": tmp_path / "a", "clip_ids": ("toy/s9/none",)}),
+        ("has a hinge", {"to": "spider", "out": tmp_path / "a", "clip_ids": ("toy/s2/open_1",)}),
+    ]
+    for words, asked in answers:
+        with pytest.raises(BadInput, match=words):
+            export_store(store, **asked, progress=False)
+    write_store(tmp_path / "empty", [], generated_info("toy"))
+    with pytest.raises(BadInput, match="a store with clips"):
+        export_store(open_store(tmp_path / "empty"), "bvh", tmp_path / "a", progress=False)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "there"]

@@ -1,0 +1,391 @@
+"""Nothing is lost: whatever stops a run, outputs that were there stay, it says what to do, the next run ends the same.
+
+`make chaos` stages everything three times; `make test` has the cheaper situations once.
+"""
+
+import contextlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from typer.testing import CliRunner
+
+from hoidata.errors import BadInput, MachineTrouble, told_in_words
+from hoidata.files.written import ask_digests_of
+from pipelines.cli import app
+from pipelines.lineage.locks import dvc_digest, written_digest
+from pipelines.side_by_side import log_of
+from tests.pipelines.prefect_up import hoidata_up, wait_until
+
+IS_CHAOS = "HOIDATA_CHAOS" in os.environ
+TURNS = range(int(os.environ.get("HOIDATA_CHAOS", "1")))
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::ResourceWarning")]
+every_turn = pytest.mark.parametrize("turn", TURNS)
+only_in_chaos = pytest.mark.skipif(not IS_CHAOS, reason="`make chaos` stages it")
+in_namespace = pytest.mark.skipif(
+    subprocess.run(["unshare", "-m", "true"], capture_output=True).returncode != 0,
+    reason="mounting is not allowed here",
+)
+STAGE = ("python", "-m", "pipelines.stages")
+GRAB = ("--profile", "embedded", "--dataset", "grab")
+CONVERT, CONTACT = "convert@embedded-grab", "contact@embedded-grab"
+STAGES = {
+    "convert": ("convert", *GRAB),
+    "contact": ("contact", *GRAB),
+    "train": ("train", *GRAB, "--model", "contact"),
+    "sample": ("sample", *GRAB, "--family", "text2hoi"),
+}
+OUTPUTS = ("data/embedded", "checkpoints/embedded", "samples/embedded", "metrics/embedded", "report/embedded")
+
+
+@pytest.fixture(autouse=True)
+def _kept(built) -> Iterator[None]:
+    """Every output is after a test, and with it after the run that completes, what it was before."""
+    before = outputs(built)
+    assert len(before) == len(OUTPUTS)
+    yield
+    assert outputs(built) == before
+
+
+def outputs(project: Path) -> dict[str, str | None]:
+    """Digest of every kind of output, as DVC counts: without what a killed run left beside them."""
+    return {name: dvc_digest(project / name) for name in OUTPUTS}
+
+
+@pytest.fixture
+def typed(built, project_tools):
+    """Call it with a command: what came of it. It must not end in a traceback."""
+
+    def run(*command: str, **more) -> subprocess.CompletedProcess:
+        done = subprocess.run(
+            command, cwd=built, env=project_tools.environment(), capture_output=True, text=True, timeout=300, **more
+        )
+        assert "Traceback" not in done.stderr + done.stdout, done.stderr + done.stdout
+        return done
+
+    return run
+
+
+@pytest.fixture
+def begun(built, project_tools):
+    """Call it with a command that is to be disturbed: its process, in a group of its own; stdout and stderr are one."""
+    started: list[subprocess.Popen] = []
+
+    def start(*command: str, **environment: str) -> subprocess.Popen:
+        told = (built.parent / f"told-{len(started)}.log").open("w+b")
+        process = subprocess.Popen(
+            command,
+            cwd=built,
+            env=project_tools.environment(**environment),
+            stdout=told,
+            stderr=told,
+            start_new_session=True,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
+        )
+        process.told = Path(told.name)  # pyright: ignore
+        started.append(process)
+        return process
+
+    yield start
+    for process in started:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
+
+
+def make_stale(project: Path, stage: str) -> None:
+    """The stage has to run again, and gives the same."""
+    with (project / f"pipelines/stages/{stage}.py").open("a") as stream:
+        stream.write("# edited\n")
+
+
+def completes(typed, *targets: str) -> None:
+    done = typed("hoidata", "repro", *targets)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def text_of(log: Path) -> str:
+    return log.read_text(errors="replace") if log.is_file() else ""
+
+
+def moment(turn: int, least: float, most: float) -> float:
+    return random.Random(turn).uniform(least, most)
+
+
+@every_turn
+@pytest.mark.parametrize("what", ["absent", "changed", "one gone"] if IS_CHAOS else ["one gone"])
+def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, typed, turn, what):
+    raw, aside = built / ".hoidata/raw/embedded/grab", built / "aside"
+    file = sorted(raw.glob("grab/*/*.npz"))[turn]
+    whole = file.read_bytes()
+    if what == "absent":
+        shutil.move(raw, aside)
+    elif what == "changed":
+        file.write_bytes(whole[:200] + bytes([whole[200] ^ 1]) + whole[201:])
+    else:
+        file.unlink()
+    before = outputs(built)
+    done = typed(*STAGE, *STAGES["convert"])
+    assert done.returncode == 1
+    remedy = {
+        "absent": "hoidata synth write grab",
+        "changed": "restore the file",
+        "one gone": "1 gone, first",
+    }
+    assert remedy[what] in done.stderr
+    assert outputs(built) == before
+    if what == "absent":
+        shutil.move(aside, raw)
+    else:
+        file.write_bytes(whole)
+    assert typed(*STAGE, *STAGES["convert"]).returncode == 0
+
+
+@every_turn
+@pytest.mark.parametrize("stage", ["convert", "contact", "train", "sample"] if IS_CHAOS else ["train"])
+def test_a_stage_that_is_killed_leaves_what_was_there(built, typed, begun, turn, stage):
+    process = begun(*STAGE, *STAGES[stage], HOIDATA_JOBS="2")
+    time.sleep(moment(turn, 0.5, 4))
+    before = outputs(built)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    assert outputs(built) == before
+    assert typed(*STAGE, *STAGES[stage]).returncode == 0
+
+
+@only_in_chaos
+@every_turn
+def test_a_worker_that_is_killed_costs_nothing_but_its_time(built, begun, turn):
+    process = begun(*STAGE, *STAGES["convert"], HOIDATA_JOBS="2")
+    parent = psutil.Process(process.pid)
+    workers: list[psutil.Process] = []
+    while process.poll() is None and len(workers) < 2:
+        workers = [child for child in parent.children() if "spawn_main" in " ".join(child.cmdline())]
+    time.sleep(moment(turn, 0, 2))
+    with contextlib.suppress(psutil.NoSuchProcess):
+        workers[turn % 2].kill()
+    assert process.wait(120) == 0, process.told.read_text()  # pyright: ignore
+
+
+@every_turn
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL] if IS_CHAOS else [signal.SIGINT])
+def test_a_run_that_is_interrupted_or_killed_takes_its_stages_along(built, typed, begun, turn, sent):
+    make_stale(built, "convert")
+    log = built / log_of(CONVERT)
+    log.unlink(missing_ok=True)
+    process = begun("hoidata", "repro", CONVERT)
+    wait_until(lambda: "Running stage" in text_of(log), 60, process, process.told)
+    time.sleep(moment(turn, 0, 2))
+    children = [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
+    os.kill(process.pid, sent)
+    code = process.wait(60)
+    told = process.told.read_text()
+    if sent == signal.SIGINT:
+        assert (code, "run it again" in told, "Traceback" in told) == (130, True, False), told
+    deadline = time.monotonic() + 30
+    while any(is_at_work(pid) for pid in children):
+        assert time.monotonic() < deadline, "stages go on although nobody waits for them"
+        time.sleep(0.1)
+    completes(typed, CONVERT)
+
+
+def is_at_work(pid: int) -> bool:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    return False
+
+
+@every_turn
+@pytest.mark.parametrize("stage", ["convert", "contact", "train"] if IS_CHAOS else ["contact"])
+def test_a_disk_that_takes_no_more_is_told_and_costs_nothing(built, typed, turn, stage):
+    """A limit on the length of files stands for a full disk: writing stops in the middle, the file stays cut."""
+    most = (3_000, 30_000, 100_000)[turn]
+    before = outputs(built)
+    done = typed(*STAGE, *STAGES[stage], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)))
+    assert (done.returncode, "make some" in done.stderr) == (1, True), done.stderr
+    assert outputs(built) == before
+    assert typed(*STAGE, *STAGES[stage]).returncode == 0
+
+
+@only_in_chaos
+@in_namespace
+@every_turn
+@pytest.mark.parametrize("stage", ["convert", "contact", "train"])
+def test_a_disk_that_is_full_is_told_and_costs_nothing(built, typed, turn, stage):
+    """The folder of the outputs is a small disk of its own with next to no room left."""
+    folder = "checkpoints/embedded/grab" if stage == "train" else "data/embedded/grab"
+    script = f"""
+        set -e
+        room=$(( $(du -sk {folder} | cut -f1) + {(16, 60, 150)[turn]} ))
+        mount -t tmpfs -o size=${{room}}k none /mnt
+        cp -a {folder}/. /mnt/
+        mount --bind /mnt {folder}
+        code=0
+        {" ".join(STAGE)} {" ".join(STAGES[stage])} || code=$?
+        find {folder} -name '.*' -prune -o -type f -print | sort | xargs md5sum > "$OUT"
+        exit $code
+    """
+    listing = built.parent / "listing"
+    before = subprocess.run(
+        f"find {folder} -name '.*' -prune -o -type f -print | sort | xargs md5sum",
+        shell=True, cwd=built, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    done = typed("unshare", "-m", "env", f"OUT={listing}", "sh", "-c", script)
+    assert (done.returncode, "No space left" in done.stderr) == (1, True), done.stderr
+    assert listing.read_text() == before
+    assert typed(*STAGE, *STAGES[stage]).returncode == 0
+
+
+@only_in_chaos
+@in_namespace
+@every_turn
+def test_a_cache_that_cannot_be_written_is_told_before_anything_runs(built, typed, turn):
+    make_stale(built, "contact")
+    before = outputs(built)
+    script = "mount --bind .dvc/cache .dvc/cache && mount -o remount,ro,bind .dvc/cache && hoidata repro " + CONTACT
+    done = typed("unshare", "-m", "sh", "-c", script)
+    assert (done.returncode, "allow writing there" in done.stderr) == (1, True), done.stderr
+    assert "contact" not in done.stdout
+    assert outputs(built) == before
+    completes(typed, CONTACT)
+
+
+@only_in_chaos
+@every_turn
+def test_of_two_runs_at_once_the_second_says_so_and_the_first_completes(built, typed, begun, turn):
+    make_stale(built, "convert")
+    first = begun("hoidata", "repro", CONVERT)
+    wait_until(lambda: (built / ".hoidata/.repro.lock").is_file(), 60, first, first.told)
+    time.sleep(moment(turn, 0.5, 2))
+    second = typed("hoidata", "repro", CONVERT)
+    assert (second.returncode, "wait for that run to end" in second.stderr) == (1, True), second.stderr
+    stage = typed(*STAGE, *STAGES["convert"])  # the same stage by hand, which may come before or after
+    assert stage.returncode == 0 or "at work on it" in stage.stderr
+    assert first.wait(120) == 0, first.told.read_text()
+    completes(typed, CONVERT)
+
+
+@only_in_chaos
+@every_turn
+def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built, project_tools, typed, turn):
+    make_stale(built, "convert")
+    with hoidata_up(built, project_tools) as up:
+        started = project_tools.run(built, "prefect", "deployment", "run", "convert-grab", **up.settings)
+        assert started.returncode == 0, started.stdout + started.stderr
+        log = built / log_of(CONVERT)
+        log.unlink(missing_ok=True)
+        wait_until(
+            lambda: log.is_file() and "Running stage" in log.read_text(errors="replace"), 120, up.process, up.log
+        )
+        time.sleep(moment(turn, 0, 2))
+        for child in psutil.Process(up.process.pid).children(recursive=True):
+            if "uvicorn" in " ".join(child.cmdline()) or "server" in " ".join(child.cmdline()):
+                child.kill()
+        time.sleep(2)
+    completes(typed, CONVERT)
+
+
+def flipped(data: bytes, turn: int) -> bytes:
+    """One bit changed, in the middle of the file."""
+    place = len(data) // 2 + turn
+    return data[:place] + bytes([data[place] ^ 1 << turn % 8]) + data[place + 1 :]
+
+
+DAMAGED = {
+    "an array": ("data/embedded/grab/clips/arrays/frames-00000.npz", ["info", "data/embedded/grab/clips"]),
+    "a table": ("data/embedded/grab/clips/meta/sequences.parquet", ["info", "data/embedded/grab/clips"]),
+    "facts": ("data/embedded/grab/clips/meta/info.json", ["info", "data/embedded/grab/clips"]),
+    "words": ("data/embedded/grab/annotation/text.parquet", ["corpus", "data/embedded/grab"]),
+    "a checkpoint": ("checkpoints/embedded/grab/contact/model.safetensors", ["validate", "checkpoints/embedded/grab"]),
+    "figures": ("metrics/embedded/grab/text2hoi.json", ["table", "metrics/embedded/grab", "--metrics", "contact_f1"]),
+}
+
+
+@every_turn
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_one_changed_byte_is_named_by_validate_and_check_and_no_reader_shows_it(built, monkeypatch, turn, kind):
+    monkeypatch.chdir(built)
+    name, reader = DAMAGED[kind]
+    path = built / name
+    whole = path.read_bytes()
+    path.write_bytes(flipped(whole, turn))
+    ask_digests_of(written_digest)
+    try:
+        for words in (["validate", str(path.parent)], ["lineage", "check", str(path)]):
+            done = CliRunner().invoke(app, words, env={"COLUMNS": "400"})
+            assert done.exit_code == 1, done.output
+            assert path.name in done.output.replace("\n", "")
+        done = CliRunner().invoke(app, reader)
+        if kind != "an array":
+            assert done.exit_code == 1
+            assert isinstance(done.exception, BadInput | SystemExit), done.exception
+        else:  # `info` opens no array; a clip is refused
+            from hoidata.store.store import open_store
+
+            store = open_store(path.parents[1])
+            with pytest.raises(BadInput, match="checksum"):
+                store.clip(store.ids[0])
+    finally:
+        ask_digests_of(lambda path: None)
+        path.write_bytes(whole)
+
+
+def test_facts_without_an_entry_name_it_and_the_file(built):
+    from hoidata.store.store import open_store
+
+    path = built / "data/embedded/grab/clips/meta/info.json"
+    whole = path.read_text()
+    path.write_text(json.dumps({key: value for key, value in json.loads(whole).items() if key != "counts"}))
+    try:
+        with pytest.raises(BadInput, match=r"info\.json: counts"):
+            open_store(path.parents[1])
+    finally:
+        path.write_text(whole)
+
+
+def test_names_that_are_not_utf_8_are_told_and_not_raised(built, typed, tmp_path):
+    for words in (["validate"], ["lineage"], ["generate", "Lift it.", "--out", "out", "--object"])[not IS_CHAOS :]:
+        done = typed("hoidata", *words, os.fsdecode(b"b\xffd.obj"))
+        assert done.returncode in (1, 2)
+        assert "d.obj" in done.stderr
+    raw = tmp_path / "raw"
+    shutil.copytree(built / ".hoidata/raw/embedded/grab", raw)
+    sequence = sorted(raw.glob("grab/s1/*.npz"))[0]
+    shutil.copy(sequence, os.fsencode(sequence.parent) + b"/m\xffg_lift_9.npz")
+    code = f"""
+from hoidata.conversion.convert import convert_dataset
+from hoidata.datasets.grab.adapter import GrabAdapter
+from hoidata.hands import load_embedded_hands
+done = convert_dataset(GrabAdapter(), {str(raw)!r}, load_embedded_hands(), {str(tmp_path / "out")!r}, progress=False)
+print(done.clips, len(done.left_out), done.left_out[0].remedy)
+"""
+    done = typed(sys.executable, "-c", code)
+    clips = len(list(raw.glob("grab/*/*.npz"))) - 1
+    assert done.stdout == f"{clips} 1 rename it\n", done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (OSError(28, "No space left on device", "a"), "make some"),
+        (OSError("1000 requested and 12 written"), "make some"),
+        (OSError(30, "Read-only file system", "a"), "allow writing there"),
+        (OSError(5, "Input/output error", "a"), "the disk fails"),
+        (MemoryError("Unable to allocate 7 GiB"), "lower --jobs"),
+    ],
+)
+def test_trouble_of_the_machine_says_what_to_do_and_a_defect_stays_one(error, words):
+    with pytest.raises(MachineTrouble, match=words), told_in_words():
+        raise error
+    with pytest.raises(FileNotFoundError), told_in_words():
+        raise FileNotFoundError(2, "No such file", "a")

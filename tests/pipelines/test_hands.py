@@ -1,0 +1,116 @@
+"""What `hoidata hands` takes an object's motion from, and its answers to what it cannot take."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from hoidata.errors import BadInput
+from hoidata.files.arrays import write_npz
+from hoidata.hands import load_embedded_hands
+from hoidata.object_paths import scripted_path
+from pipelines.hands import Asked, HandsWish, asked_motion, hinge_range
+from pipelines.objects import MeshWish
+from pipelines.pages.motion_files import mesh_arrays, motion_arrays
+from tests.builders.clips import clip_of
+from tests.builders.objects import hinged_box
+
+HANDS = load_embedded_hands()
+HINGE = "0,10,2 -1,0,0"  # of the laptop below, centimetres
+
+
+@pytest.fixture
+def laptop(tmp_path) -> Path:
+    """Two boxes that do not touch, 30 x 20 x 2 cm and its lid, centimetres, z up."""
+    base, lid = trimesh.creation.box((30, 20, 2)), trimesh.creation.box((30, 20, 1))
+    trimesh.util.concatenate([base, lid.apply_translation((0, 0, 1.6))]).export(tmp_path / "laptop.obj")
+    return tmp_path / "laptop.obj"
+
+
+def asked(**wish) -> Asked:
+    return asked_motion(HandsWish(**wish), "embedded", (), HANDS)
+
+
+def test_a_mesh_in_centimetres_with_its_hinge_is_moved_by_a_script_in_words_or_in_a_file(laptop, tmp_path):
+    script = "lift 10 cm\nopen to 60 deg\n# closed again\nclose, put down\n"
+    (tmp_path / "moves.txt").write_text(script)
+    told = {"object": str(laptop), "mesh": MeshWish("cm", "z", HINGE), "hinge_range": "0:90"}
+    one, other = asked(script=script, **told), asked(script=str(tmp_path / "moves.txt"), **told)
+    assert np.degrees(one.thing.hinge_rad.max()) == pytest.approx(60, abs=1e-4)
+    assert np.ptp(one.thing.translation_m[:, 2]) == pytest.approx(0.10, abs=1e-5)
+    assert np.array_equal(one.thing.translation_m, other.thing.translation_m)
+    assert [step.words for step in one.steps[1:-1]] == ["lift 10 cm", "open to 60 deg", "close", "put down"]
+
+
+def test_length_tells_the_pace_and_the_way_stays(laptop):
+    told = {"object": str(laptop), "script": "lift 20 cm, hold 1 s", "mesh": MeshWish("cm", "z")}
+    own, slow = asked(**told), asked(length_s=6, **told)
+    assert slow.thing.n_frames == 6 * 30 + 1
+    assert slow.thing.translation_m[[0, -1]] == pytest.approx(own.thing.translation_m[[0, -1]], abs=1e-6)
+    assert slow.thing.translation_m[:, 2].max() < own.thing.translation_m[:, 2].max() + 1e-4
+    assert slow.steps[1].end_s / own.steps[1].end_s == pytest.approx(180 / (own.thing.n_frames - 1))
+
+
+def test_keyframes_of_a_file_are_taken(laptop, tmp_path):
+    (tmp_path / "keys.csv").write_text("time_s,z_cm\n0,0\n1,20\n")
+    found = asked(object=str(laptop), keyframes=str(tmp_path / "keys.csv"), mesh=MeshWish("cm", "z"))
+    assert found.thing.n_frames == 31
+
+
+def test_the_objects_motion_of_a_generated_file_comes_back_with_mesh_and_hinge(tmp_path):
+    path = scripted_path(hinged_box(), "lift 5 cm, open 20 deg")
+    clip = clip_of("generated/a/b", path.track)
+    write_npz(tmp_path / "motion.npz", motion_arrays(clip, HANDS) | mesh_arrays(path.track.model))
+    thing = asked(motion=str(tmp_path / "motion.npz")).thing
+    model = path.track.model
+    before = path.track.points_in_world(model.vertices_m, model.part)
+    assert thing.points_in_world(thing.model.vertices_m, thing.model.part) == pytest.approx(before, abs=1e-6)
+    arrays = {name: array for name, array in mesh_arrays(model).items() if "hinge" not in name}
+    write_npz(tmp_path / "old.npz", motion_arrays(clip, HANDS) | arrays)
+    with pytest.raises(BadInput, match="name the object too"):
+        asked(motion=str(tmp_path / "old.npz"))
+    write_npz(tmp_path / "other.npz", {"a": np.zeros(3)})
+    with pytest.raises(BadInput, match="hoidata generate"):
+        asked(motion=str(tmp_path / "other.npz"))
+    bad = motion_arrays(clip, HANDS) | mesh_arrays(model)
+    write_npz(tmp_path / "bad.npz", bad | {"object_rotvec": bad["object_rotvec"][:-1]})
+    with pytest.raises(BadInput, match="finite poses"):
+        asked(motion=str(tmp_path / "bad.npz"))
+
+
+@pytest.mark.parametrize(
+    ("wish", "words"),
+    [
+        ({}, "give one of them"),
+        ({"script": "hold", "clip": "a"}, "--script and --clip"),
+        ({"script": "hold", "object": ""}, "name it first"),
+        ({"script": "hold", "object": "nothing.obj"}, "correct the path"),
+        ({"script": "open to 10 deg"}, "--hinge"),
+        ({"script": "hold", "mesh": MeshWish("m")}, "--unit cm"),
+        ({"script": "hold", "hinge_range": "110"}, "0:110"),
+        ({"script": "hold", "hinge_range": "10:110"}, "0:110"),
+        ({"script": "open to 100 deg", "mesh": MeshWish("cm", "z", HINGE), "hinge_range": "0:90"}, "0 to 90 deg"),
+        ({"script": "hold", "length_s": 0.1}, "another length"),
+        ({"motion": "none.npz"}, "nothing there"),
+        ({"keyframes": "none.csv"}, "correct the path"),
+    ],
+)
+def test_what_cannot_be_gets_an_answer_that_says_what_to_do(laptop, wish, words):
+    told = {"object": str(laptop), "mesh": MeshWish("cm", "z")} if wish.get("object") is None and wish else {}
+    with pytest.raises(BadInput) as error:
+        asked(**{**told, **wish})
+    assert words in str(error.value)
+
+
+def test_a_range_of_angles_is_read_in_degrees():
+    assert hinge_range("-90:0") == pytest.approx((-np.pi / 2, 0))
+
+
+def test_an_open_mesh_is_moved_like_any_other(tmp_path):
+    sheet = trimesh.creation.box((0.1, 0.1, 0.1))
+    sheet.update_faces(np.arange(len(sheet.faces)) > 1)
+    sheet.export(tmp_path / "open.obj")
+    wish = HandsWish(object=str(tmp_path / "open.obj"), script="lift 5 cm")
+    assert asked_motion(replace(wish, mesh=MeshWish("m", "z")), "embedded", (), HANDS).thing.n_frames > 30
