@@ -89,12 +89,12 @@ class HandsForPaths:
         if self.change in ("none", "zero map", "no map"):
             return Scene.of(request.object, thing, basis)
         assert self.annotated is not None
-        others = [clip for clip in training_clips(self.annotated) if clip.length >= request.n_frames]
-        alike = self.change == "other path"
-        others = [clip for clip in others if (clip.object_model.name == request.object.name) == alike]
+        alike, clips = self.change == "other path", training_clips(self.annotated)
+        others = [clip for clip in clips if (clip.object_model.name == request.object.name) == alike] or clips
         other = others[request.seed % len(others)]
-        if alike:
-            return Scene.of(request.object, other.object[: request.n_frames], basis)
+        if alike:  # a shorter motion stays where it ends
+            rows = np.minimum(np.arange(request.n_frames), other.length - 1)
+            return Scene.of(request.object, other.object[rows], basis)
         return Scene.of(other.object_model, thing, basis)
 
     def generated(self, request: Request, made: Made) -> dict[Side, GeneratedHand]:

@@ -16,7 +16,7 @@ from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.contact_training import CONTACT
-from models.bimart.family import BIMART, OTHER_OBJECT, UNREFINED, ZERO_MAP, HandsForPaths
+from models.bimart.family import BIMART, NO_MAP, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, HandsForPaths
 from models.bimart.learning import LossConfig, learn_statistics, targets_of, window_losses
 from models.bimart.lookups import NEAREST_WINDOW, OBJECT_MEAN_POSE
 from models.bimart.motion_training import MOTION
@@ -170,7 +170,7 @@ def test_refinement_and_controls_change_the_hands_and_never_the_object(
     asked = requests_for(samples[1], PredictionConfig(samples=1))
     plain = UNREFINED.load(sources).sample(asked)[0]
     assert isinstance(plain, Clip)
-    for family in (BIMART, ZERO_MAP, OTHER_OBJECT):
+    for family in (BIMART, ZERO_MAP, NO_MAP, OTHER_OBJECT, OTHER_PATH):
         made = family.load(sources).sample(asked)[0]
         assert isinstance(made, Clip)
         assert not same(plain, made)
