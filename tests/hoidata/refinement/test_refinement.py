@@ -122,6 +122,7 @@ def test_a_hand_that_takes_no_part_is_not_pushed_out(scene):
     assert depth_mm(refined(idle, scene["fitted"]))[:, 14:].min() > 8
 
 
+@pytest.mark.slow
 def test_how_a_surface_is_cut_into_triangles_changes_nothing(scene):
     mesh = BOX
     for _ in range(4):
@@ -141,6 +142,7 @@ def _quartered(model: ObjectModel) -> ObjectModel:
     return ObjectModel("box", faces.reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3), np.zeros(3 * len(faces)))
 
 
+@pytest.mark.slow
 def test_the_beginning_of_a_motion_is_refined_as_if_its_end_were_not_there(scene):
     longer = {
         side: GeneratedHand(
@@ -159,6 +161,7 @@ def test_a_mesh_without_an_inside_is_touched_and_not_pushed_from(scene):
     assert all(np.isfinite(skin(side, found[side])).all() for side in SIDES)
 
 
+@pytest.mark.slow
 def test_a_hand_moves_with_an_object_that_carries_it(scene):
     place = np.tile(np.float32([1.0, 2.0, 3.0]), (FRAMES, 1))
     turn = np.tile(np.float32([0.3, -0.4, 1.2]), (FRAMES, 1))

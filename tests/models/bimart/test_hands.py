@@ -66,6 +66,7 @@ def test_the_object_moves_exactly_as_it_was_given_and_both_hands_have_every_fram
         assert motion.clip.synthetic
 
 
+@pytest.mark.slow
 def test_a_motion_is_the_same_again_and_whatever_others_are_asked_for(sampler, path, made):
     alone = hands_for(sampler, path.track, MotionWish(seed=3))[0]
     for side in SIDES:
@@ -74,6 +75,7 @@ def test_a_motion_is_the_same_again_and_whatever_others_are_asked_for(sampler, p
         assert not np.array_equal(first.wrist_m, other.wrist_m)
 
 
+@pytest.mark.slow
 def test_only_the_hand_that_was_asked_for_is_made(sampler, path):
     left = hands_for(sampler, path.track, MotionWish(hand="left"))[0]
     assert left.clip.hands["left"].valid.all()
@@ -103,6 +105,7 @@ def test_too_short_a_motion_is_an_answer(sampler, path):
         hands_for(sampler, path.track.take(slice(0, 5)))
 
 
+@pytest.mark.slow
 def test_files_and_page_are_written_repeat_and_explain_every_array(made, path, tmp_path):
     def written(folder: str) -> list[Path]:
         digests = {"checkpoints/bimart-motion/model.safetensors": "ab" * 32}
