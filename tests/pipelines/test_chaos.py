@@ -379,6 +379,7 @@ print(done.clips, len(done.left_out), done.left_out[0].remedy)
     [
         (OSError(28, "No space left on device", "a"), "make some"),
         (OSError("1000 requested and 12 written"), "make some"),
+        (RuntimeError("I/O error: File too large (os error 27)"), "make some"),
         (OSError(30, "Read-only file system", "a"), "allow writing there"),
         (OSError(5, "Input/output error", "a"), "the disk fails"),
         (MemoryError("Unable to allocate 7 GiB"), "lower --jobs"),
@@ -387,5 +388,6 @@ print(done.clips, len(done.left_out), done.left_out[0].remedy)
 def test_trouble_of_the_machine_says_what_to_do_and_a_defect_stays_one(error, words):
     with pytest.raises(MachineTrouble, match=words), told_in_words():
         raise error
-    with pytest.raises(FileNotFoundError), told_in_words():
-        raise FileNotFoundError(2, "No such file", "a")
+    for defect in (FileNotFoundError(2, "No such file", "a"), ValueError("disk")):
+        with pytest.raises(type(defect)), told_in_words():
+            raise defect
