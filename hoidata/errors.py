@@ -57,6 +57,8 @@ def _trouble(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return f"not enough memory ({error}); end other programs or lower --jobs, and run again"
     told = re.search(r"\(os error (\d+)\)", str(error))  # so libraries in Rust tell it (safetensors)
+    if type(error).__name__ == "OperationalError" and ("disk" in str(error) or "readonly" in str(error)):
+        return f"DVC's database: {error}: no room, or it cannot be written; mend that and run again"
     if not isinstance(error, OSError) and not told:
         return ""
     number = int(told[1]) if told else getattr(error, "errno", None)
