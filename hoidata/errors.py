@@ -1,6 +1,7 @@
 """Errors that name the place, what was expected, what came, and what to do."""
 
 import errno
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -43,23 +44,31 @@ def told_in_words() -> Iterator[None]:
     """What the system says of a full or read-only disk, or of too little memory, raised as MachineTrouble."""
     try:
         yield
-    except (OSError, MemoryError) as error:
+    except HoidataError:
+        raise
+    except Exception as error:
         if isinstance(error, BrokenPipeError) or not (words := _trouble(error)):
             raise
         raise MachineTrouble(words) from error
 
 
-def _trouble(error: OSError | MemoryError) -> str:
+def _trouble(error: Exception) -> str:
     """The trouble and what to do, in words; empty where the error is more likely a defect."""
     if isinstance(error, MemoryError):
         return f"not enough memory ({error}); end other programs or lower --jobs, and run again"
+    told = re.search(r"\(os error (\d+)\)", str(error))  # so libraries in Rust tell it (safetensors)
+    if type(error).__name__ == "OperationalError" and ("disk" in str(error) or "readonly" in str(error)):
+        return f"DVC's database: {error}: no room, or it cannot be written; mend that and run again"
+    if not isinstance(error, OSError) and not told:
+        return ""
+    number = int(told[1]) if told else getattr(error, "errno", None)
     kept = "what was there before is as it was. Run again: finished work is taken up"
     # NumPy and Arrow tell of a write that came short without a number.
-    if error.errno in _NO_ROOM or (error.errno is None and "written" in str(error)) or "No space left" in str(error):
+    if number in _NO_ROOM or (number is None and "written" in str(error)) or "No space left" in str(error):
         return f"{error}: no room; make some, {kept}"
-    if error.errno in _NOT_ALLOWED:
+    if number in _NOT_ALLOWED:
         return f"{error}: allow writing there; {kept}"
-    return f"{error}: the disk fails; {kept}" if error.errno == errno.EIO else ""
+    return f"{error}: the disk fails; {kept}" if number == errno.EIO else ""
 
 
 class MissingResource(HoidataError):

@@ -10,6 +10,7 @@ import random
 import resource
 import shutil
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
@@ -212,7 +213,7 @@ def test_a_disk_that_takes_no_more_is_told_and_costs_nothing(built, typed, turn,
     most = (3_000, 30_000, 100_000)[turn]
     before = outputs(built)
     done = typed(*STAGE, *STAGES[stage], preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (most, most)))
-    assert (done.returncode, "make some" in done.stderr) == (1, True), done.stderr
+    assert (done.returncode, "no room" in done.stderr) == (1, True), done.stderr
     assert outputs(built) == before
     assert typed(*STAGE, *STAGES[stage]).returncode == 0
 
@@ -379,6 +380,8 @@ print(done.clips, len(done.left_out), done.left_out[0].remedy)
     [
         (OSError(28, "No space left on device", "a"), "make some"),
         (OSError("1000 requested and 12 written"), "make some"),
+        (RuntimeError("I/O error: File too large (os error 27)"), "make some"),
+        (sqlite3.OperationalError("disk I/O error"), "no room, or it cannot be written"),
         (OSError(30, "Read-only file system", "a"), "allow writing there"),
         (OSError(5, "Input/output error", "a"), "the disk fails"),
         (MemoryError("Unable to allocate 7 GiB"), "lower --jobs"),
@@ -387,5 +390,6 @@ print(done.clips, len(done.left_out), done.left_out[0].remedy)
 def test_trouble_of_the_machine_says_what_to_do_and_a_defect_stays_one(error, words):
     with pytest.raises(MachineTrouble, match=words), told_in_words():
         raise error
-    with pytest.raises(FileNotFoundError), told_in_words():
-        raise FileNotFoundError(2, "No such file", "a")
+    for defect in (FileNotFoundError(2, "No such file", "a"), ValueError("disk")):
+        with pytest.raises(type(defect)), told_in_words():
+            raise defect
