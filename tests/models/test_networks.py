@@ -258,6 +258,7 @@ def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatc
     assert drawn.min() >= 8
 
 
+@pytest.mark.slow
 def test_the_generator_overfits_two_clips(batch: ClipBatch) -> None:
     two = two_clips(batch)
     model = diffusion_model().train()

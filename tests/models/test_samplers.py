@@ -57,6 +57,7 @@ def off(kind: Any, steps: int) -> float:
     return float(torch.maximum((mean - wanted[0]).abs() / wanted[1], (spread / wanted[1] - 1).abs()).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "few", "many"), [("ddim", 10, 250), ("dpm++", 6, 60), ("ddpm", 20, 1000)])
 def test_moments_of_gaussians_are_met_within_3_percent_and_nearer_with_more_steps(
     kind: str, few: int, many: int

@@ -31,6 +31,8 @@ from models.common.training import train_network
 from models.common.transformer import TransformerConfig
 from tests.models.bimart.test_sampling import FAST
 
+pytestmark = pytest.mark.slow
+
 HANDS = load_embedded_hands()
 PARAMS: dict[str, Any] = {
     "network": {

@@ -25,6 +25,8 @@ from models.common.transformer import TransformerConfig
 from pipelines.pages.hands_page import ARRAYS, write_hands
 from tests.builders.objects import hinged_box
 
+pytestmark = pytest.mark.slow
+
 PAIR = load_embedded_hands()
 FEATURES = FeatureConfig(BasisSettings(16), keypoints=24, window=16, state="local", most_m=0.2)
 TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)

@@ -26,6 +26,8 @@ from tests.builders.clips import build_clip, with_hand
 from tests.builders.stores import write_annotated
 from tests.pipelines.exports import readers
 
+pytestmark = pytest.mark.slow
+
 TOLERANCE = 1e-4
 READ_BACK = ("lerobot", "huggingface", "webdataset", "glb", "usd", "bvh")
 GRAB = "GRAB licence (MPI): non-commercial research, no redistribution"

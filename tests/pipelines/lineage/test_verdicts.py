@@ -17,6 +17,8 @@ from pipelines.lineage.raw import raw_sources
 from pipelines.lineage.targets import find_target
 from pipelines.lineage.tree import overall_status, target_tree
 
+pytestmark = pytest.mark.slow
+
 CONTACT = "checkpoints/embedded/grab/contact/model.safetensors"
 CLIPS = "data/embedded/grab/clips"
 RAW = ".hoidata/raw/embedded/grab"
