@@ -152,8 +152,9 @@ def test_raw_data_that_is_absent_or_changed_meanwhile_stops_a_conversion(built, 
     assert typed(*STAGE, *STAGES["convert"]).returncode == 0
 
 
+@only_in_chaos
 @every_turn
-@pytest.mark.parametrize("stage", ["convert", "contact", "train", "sample"] if IS_CHAOS else ["train"])
+@pytest.mark.parametrize("stage", ["convert", "contact", "train", "sample"])
 def test_a_stage_that_is_killed_leaves_what_was_there(built, typed, begun, turn, stage):
     process = begun(*STAGE, *STAGES[stage], HOIDATA_JOBS="2")
     time.sleep(moment(turn, 0.5, 4))
@@ -206,8 +207,9 @@ def is_at_work(pid: int) -> bool:
     return False
 
 
+@only_in_chaos
 @every_turn
-@pytest.mark.parametrize("stage", ["convert", "contact", "train"] if IS_CHAOS else ["contact"])
+@pytest.mark.parametrize("stage", ["convert", "contact", "train"])
 def test_a_disk_that_takes_no_more_is_told_and_costs_nothing(built, typed, turn, stage):
     """A limit on the length of files stands for a full disk: writing stops in the middle, the file stays cut."""
     most = (3_000, 30_000, 100_000)[turn]

@@ -57,7 +57,7 @@ def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
         "import sys; from pipelines.stages import controls; from pipelines.stages.base import StagePaths;"
         "controls.run(StagePaths('embedded', 'grab')); sys.exit('torch' in sys.modules)"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    subprocess.run([sys.executable, "-c", code], env={"PYTHONPATH": str(PROJECT)}, check=True, capture_output=True)
     assert empty_reason(SAMPLES) == empty_reason(METRICS_OF) == "off: params.yaml names no families under controls"
 
 
