@@ -27,7 +27,8 @@ MASK_COLUMNS = ("timestamp[ns]", "stream_id", "mask")
 UID = re.compile(r"[0-9]{1,20}")
 TIME = re.compile(r"[0-9]{1,18}")
 NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-LARGEST_JSON, LARGEST_ROWS = 4 << 20, 64 << 20  # real ones have 0.6 and 12 MB
+LARGEST_JSON, LARGEST_ROWS = 4 << 20, 32 << 20  # real ones have 0.6 and 12 MB
+MOST_ROWS = 100_000  # real ones have 43,000
 LONGEST_LINE = 1 << 16  # of hand poses; a real one has 3 kB
 HEADSETS = ("Aria", "Quest3")
 
@@ -122,6 +123,7 @@ def read_json(data: bytes, where: str) -> Any:
 
 def _lines(data: bytes, where: str) -> Iterator[tuple[str, Any]]:
     for number, line in enumerate(io.BytesIO(data), 1):
+        _not_too_many(where, number)
         if len(line) > LONGEST_LINE:
             raise BadInput(f"{where}:{number}", f"a line of at most {LONGEST_LINE} bytes", f"{len(line)} bytes")
         yield f"{where}:{number}", read_json(line, f"{where}:{number}")
@@ -138,16 +140,22 @@ def _row(where: str, mapping: Any, name: str, count: int) -> list:
 
 def _table(data: bytes, where: str, columns: tuple[str, ...]) -> Iterator[tuple[str, list[str]]]:
     """Name and cells of each row, in the order of ``columns``, whatever the file's own is."""
-    lines = io.StringIO(data.decode("utf-8", errors="replace"))
+    lines = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
     header = lines.readline().rstrip().split(",")
     if sorted(header) != sorted(columns):
         raise BadInput(where, f"the columns {','.join(columns)}", repr(",".join(header))[:80])
     order = [header.index(name) for name in columns]
     for number, line in enumerate(lines, 2):
+        _not_too_many(where, number)
         cells = line.rstrip().split(",", len(columns))
         if len(cells) != len(columns):
             raise BadInput(f"{where}:{number}", f"{len(columns)} cells", f"{len(cells)}")
         yield f"{where}:{number}", [cells[at] for at in order]
+
+
+def _not_too_many(where: str, number: int) -> None:
+    if number > MOST_ROWS:
+        raise BadInput(where, f"at most {MOST_ROWS} rows", "more")
 
 
 def _time(where: str, text: str) -> int:
