@@ -80,6 +80,16 @@ class _Thing(NamedTuple):
     there: np.ndarray
 
 
+class _Recording(NamedTuple):
+    """All frames of a recording. times_ns: (frame,); failed: (frame,) bool, the makers' check found a fault there."""
+
+    headset: str
+    times_ns: np.ndarray
+    failed: np.ndarray
+    hands: _Hands
+    things: list[_Thing]
+
+
 class _Found(NamedTuple):
     """frames: intervals that become clips; short, still: touches too short, or of an object that does not move."""
 
@@ -124,42 +134,56 @@ class Hot3dAdapter(Described):
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per folder named as a recording; its participant is the subject."""
-        names = sorted(path.name for path in Path(root).glob("P*_*") if path.is_dir())
+        names = sorted(path.name for path in Path(root).glob("P[0-9]*_*") if path.is_dir())
         return [SequenceKey(self.name, name.partition("_")[0], name) for name in names]
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """A clip per interval in which a hand is at an object that moves, and what was left out."""
-        world = WORLD_FROM[files.headset(raw.read(f"{key.name}/{METADATA}", LARGEST_JSON), f"{key.name}/{METADATA}")]
-        kind, poses = self._hand_poses(raw, key)
-        placed = files.object_poses(raw.read(f"{key.name}/{OBJECTS}", LARGEST_ROWS), f"{key.name}/{OBJECTS}")
-        times = frame_times(key.name, [own.time_ns for own in (*poses.values(), *placed.values())])
-        if kind == "mano":
-            own_hands = _parameter_hands(poses, times, hands, world)
-        else:
-            path = f"{key.name}/{PROFILE}"
-            own_hands = _fitted_hands(
-                umetrack.parse_profile(raw.read(path, LARGEST_JSON), path), poses, times, hands, world
-            )
-        names = files.object_names(raw.read(f"{ASSETS}/instance.json", LARGEST_JSON), f"{ASSETS}/instance.json")
-        things = [_thing(raw, names, uid, own, times, world) for uid, own in placed.items()]
-        failed = self._failed(raw, key, times)
+        recording = self._read(raw, key, hands)
+        source_from_world = np.eye(4)
+        source_from_world[:3, :3] = WORLD_FROM[recording.headset].T
         whole = Clip(
             clip_id=str(key),
             dataset=self.name,
             subject=key.subject,
             sequence=key.name,
-            hands=own_hands.tracks,
-            object=things[0].track,
-            source_frames=np.arange(len(times), dtype=np.int32),
+            hands=recording.hands.tracks,
+            object=recording.things[0].track,
+            source_frames=np.arange(len(recording.times_ns), dtype=np.int32),
             gravity=GRAVITY,
             verb=None,
             object_words="",
-            source_from_world=np.block([[world.T, np.zeros((3, 1))], [np.zeros((1, 3)), np.ones((1, 1))]]),
+            source_from_world=source_from_world,
             source_fps=self.source_fps,
-            hands_from="parameters" if kind == "mano" else "keypoints",
+            hands_from="parameters" if recording.hands.error_m is None else "keypoints",
             sources=raw.sources,
         )
-        return list(self._cut(whole, things, own_hands, times, failed, hands))
+        items = list(self._cut(whole, recording, hands))
+        if not items:
+            expected = f"a hand within {100 * TOUCH_M:g} cm of an object that moves"
+            raise BadInput(key.name, expected, "none in any frame", "nothing to do if nobody moves anything")
+        return items
+
+    def _read(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> _Recording:
+        def read(path: str, largest: int) -> tuple[bytes, str]:
+            return raw.read(path, largest), path
+
+        headset = files.headset(*read(f"{key.name}/{METADATA}", LARGEST_JSON))
+        world = WORLD_FROM[headset]
+        kind, poses = self._hand_poses(raw, key)
+        placed = files.object_poses(*read(f"{key.name}/{OBJECTS}", LARGEST_ROWS))
+        times = frame_times(key.name, [own.time_ns for own in (*poses.values(), *placed.values())])
+        if kind == "mano":
+            own_hands = _parameter_hands(poses, times, hands, world)
+        else:
+            profile = umetrack.parse_profile(*read(f"{key.name}/{PROFILE}", LARGEST_JSON))
+            own_hands = _fitted_hands(profile, poses, times, hands, world)
+        names = files.object_names(*read(f"{ASSETS}/instance.json", LARGEST_JSON))
+        things = [_thing(raw, names, uid, own, times, world) for uid, own in placed.items()]
+        failed, path = np.zeros(len(times), bool), f"{key.name}/{CHECKED}"
+        if raw.has(path):
+            failed = rows_of_frames(times, files.failed_times(*read(path, LARGEST_ROWS))) >= 0
+        return _Recording(headset, times, failed, own_hands, things)
 
     def _hand_poses(self, raw: RawTree, key: SequenceKey) -> tuple[HandFormat, dict[Side, Poses]]:
         """The first format that has a hand, in the order of the settings."""
@@ -170,48 +194,27 @@ class Hot3dAdapter(Described):
         remedy = "nothing to do: of some participants the makers withhold the ground truth"
         raise BadInput(f"{key.name}/{HANDS[self.hands]}", "poses of a hand", "none", remedy)
 
-    def _failed(self, raw: RawTree, key: SequenceKey, times: np.ndarray) -> np.ndarray:
-        """(frame,) bool: the makers' check found a fault in some camera's view of it; none where there is no check."""
-        path = f"{key.name}/{CHECKED}"
-        if not raw.has(path):
-            return np.zeros(len(times), bool)
-        return rows_of_frames(times, files.failed_times(raw.read(path, LARGEST_ROWS), path)) >= 0
-
-    def _cut(
-        self, whole: Clip, things: list[_Thing], own: _Hands, times: np.ndarray, failed: np.ndarray, hands: HandPair
-    ) -> Iterator[Clip | Quarantined]:
-        if failed.any():
-            yield _left_out(whole, "failed", "frames that passed the makers' check", runs(failed))
+    def _cut(self, whole: Clip, recording: _Recording, hands: HandPair) -> Iterator[Clip | Quarantined]:
+        if recording.failed.any():
+            yield _left_out(whole, "failed", "frames that passed the makers' check", runs(recording.failed))
         joints = [np.where(t.valid[:, None, None], track_joints(t, hands[s]), np.nan) for s, t in whole.hands.items()]
         together = np.concatenate(joints, axis=1).astype(np.float64)
-        number = 0
-        for thing in things:
+        for thing in recording.things:
             name = thing.track.model.name
-            found = self._intervals(thing, thing.there & ~failed, times, together)
+            found = self._intervals(thing, thing.there & ~recording.failed, recording.times_ns, together)
             if found.short:
                 yield _left_out(whole, f"{name}/short", f"touches of {self.shortest_frames} frames", found.short)
             if found.still:
                 yield _left_out(whole, f"{name}/still", f"an object that moves {100 * MOVED_M:g} cm", found.still)
-            for start, stop in found.frames:
-                number += 1
-                clip_id = f"{whole.clip_id}/{start:05d}-{stop - 1:05d}-{name}"
-                yield self._clip(whole, clip_id, slice(start, stop), thing, things, own.error_m)
-        if not number and not failed.any():
-            expected = f"a hand within {100 * TOUCH_M:g} cm of an object that moves"
-            raise BadInput(whole.sequence, expected, "none in any frame", "nothing to do if nobody moves anything")
+            for interval in found.frames:
+                yield self._clip(whole, interval, thing, recording)
 
-    def _clip(
-        self, whole: Clip, clip_id: str, frames: slice, thing: _Thing, things: list[_Thing], error_m: np.ndarray | None
-    ) -> Clip | Quarantined:
-        others = (t for t in things if t is not thing and t.there[frames].all())
-        everything = replace(
-            whole,
-            clip_id=clip_id,
-            object=thing.track,
-            object_words=object_words(thing.track.model.name),
-            other_objects=tuple(other.track for other in others),
-        )
-        clip = everything.take(frames)
+    def _clip(self, whole: Clip, interval: Interval, thing: _Thing, recording: _Recording) -> Clip | Quarantined:
+        name, frames, error_m = thing.track.model.name, slice(*interval), recording.hands.error_m
+        others = [other.track for other in recording.things if other is not thing and other.there[frames].all()]
+        clip_id = f"{whole.clip_id}/{interval.start:05d}-{interval.stop - 1:05d}-{name}"
+        everything = replace(whole, clip_id=clip_id, object=thing.track, other_objects=tuple(others))
+        clip = replace(everything.take(frames), object_words=object_words(name))
         if error_m is None:
             return clip
         mean_m = float(np.nanmean(error_m[frames]))
