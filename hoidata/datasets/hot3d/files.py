@@ -30,6 +30,7 @@ NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 LARGEST_JSON, LARGEST_ROWS = 4 << 20, 32 << 20  # real ones have 0.6 and 12 MB
 MOST_ROWS = 100_000  # real ones have 43,000
 LONGEST_LINE = 1 << 16  # of hand poses; a real one has 3 kB
+LARGEST_NUMBER = 1000
 HEADSETS = ("Aria", "Quest3")
 
 
@@ -113,6 +114,14 @@ def object_names(data: bytes, where: str) -> dict[str, str]:
     return names
 
 
+def small_table(where: str, value: Any, columns: int, rows: int | None = None) -> np.ndarray:
+    """``checks.table`` of numbers up to 1,000: no metre, angle or weight, and no millimetre of a hand, is larger."""
+    table = checks.table(where, value, columns, rows, "rows")
+    if np.abs(table).max() > LARGEST_NUMBER:
+        raise BadInput(where, f"numbers up to {LARGEST_NUMBER}", f"{np.abs(table).max():.3g}")
+    return table
+
+
 def read_json(data: bytes, where: str) -> Any:
     """What a JSON file holds. Raises BadInput that names it."""
     try:
@@ -170,7 +179,7 @@ def _poses(where: str, rows: list[tuple[int, list]], columns: Mapping[str, int])
     time_ns = np.array([time for time, _ in rows], dtype=np.int64)
     if (np.diff(time_ns) == 0).any():
         raise BadInput(where, "each time once", f"{time_ns[:-1][np.diff(time_ns) == 0][0]} twice")
-    numbers = checks.table(where, [values for _, values in rows], sum(columns.values()))
+    numbers = small_table(where, [values for _, values in rows], sum(columns.values()))
     edges = np.cumsum([*columns.values()])[:-1]
     translation_m, turn, *further = np.split(numbers, edges, axis=1)
     length = np.linalg.norm(turn, axis=1)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hoidata.clips.clip import Side
 from hoidata.datasets import checks
-from hoidata.datasets.hot3d.files import Poses, read_json
+from hoidata.datasets.hot3d.files import Poses, read_json, small_table
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
@@ -42,7 +42,7 @@ def parse_profile(data: bytes, where: str) -> Profile:
     hand = checks.entry(where, read_json(data, where), "hand_model")
 
     def rows(name: str, count: int) -> np.ndarray:
-        return checks.table(f"{where}: {name}", checks.entry(where, hand, name), 3, count, "rows")
+        return small_table(f"{where}: {name}", checks.entry(where, hand, name), 3, count)
 
     axes, places = (rows(f"joint_{name}", N_ANGLES + 2)[:N_ANGLES] for name in ("rotation_axes", "rest_positions"))
     if (np.abs(np.linalg.norm(axes, axis=1) - 1) > 1e-3).any():

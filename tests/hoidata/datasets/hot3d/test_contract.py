@@ -140,6 +140,7 @@ class TestHot3d(AdapterContract):
         yield Row("times of 120 Hz", "times", line(set_in("timestamp_ns", value=56752117188860)), "1/30 s apart")
         yield Row("an empty line", ":1", at(HAND, lambda data: b"\n" + data), "JSON text")
         yield Row("a missing column", OBJECT, holding(OBJECT, OBJECT_HEAD.replace("q_wo_w,", "")), "q_wo_w")
+        yield Row("a place beyond the town", OBJECT, cell("1e200", 2), "numbers up to 1000")
         yield Row("no rows", OBJECT, holding(OBJECT, OBJECT_HEAD + "\n"), "poses of an object")
         yield Row("too many cells", f"{OBJECT}:3", cell("1,2", 2), "9 cells")
         yield Row("digits of another script", f"{OBJECT}:3", cell("٣", 2), "numbers")
