@@ -335,7 +335,7 @@ def hot3d_tars() -> list[bytes]:
         {"000000.objects.json": {}, "000001.objects.json": {}},
     )
     found = [_tar({**whole, **change}) for change in changes]
-    return [*found, found[0][:700], b"", _tar({f"{number:06d}.objects.json": {} for number in range(2002)})]
+    return [*found, found[0][:700], b""]
 
 
 def _tar(members: dict[str, object]) -> bytes:
