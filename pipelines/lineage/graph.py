@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from hoidata.errors import BadInput
-from pipelines.params import read_file
+from pipelines.params import load_yaml, read_file
 
 # What ``written_graph`` knows of a stage in dvc.yaml; DVC is asked where there is anything else.
 _KNOWN = {
@@ -91,8 +91,7 @@ def _family_files(root: Path) -> list[str]:
 
 def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
     """The stages of one dvc.yaml, matrix resolved. Raises ValueError for what is not understood here."""
-    with open(root / file, "rb") as stream:
-        stages = yaml.load(stream, getattr(yaml, "CSafeLoader", yaml.SafeLoader))["stages"]
+    stages = load_yaml((root / file).read_bytes())["stages"]
     prefix = "" if file == "dvc.yaml" else f"{file}:"
     for name, body in stages.items():
         if unknown := body.keys() - _KNOWN:
