@@ -12,7 +12,10 @@ from hoidata.settings import refuse_unknown
 # embedded and study: made here, two corpora for two ends; own: the user's files.
 PROFILES = ("embedded", "study", "own")
 # dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
-TEMPLATED = ("profile", "profiles", "datasets", "families", "train.preset", "train.size")
+TEMPLATED = (
+    *("profile", "profiles", "datasets", "families", "train.preset", "train.size"),
+    *("tables.datasets", "tables.runs"),
+)
 
 
 def read_params(root: Path) -> dict[str, Any]:
