@@ -3,6 +3,7 @@
 ``[project.entry-points."hoidata.families"]  mine = "my_package.family:MINE"``.
 """
 
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
@@ -119,6 +120,7 @@ def _address(name: str) -> str:
     return (added | FAMILIES)[name]
 
 
+@cache
 def _added() -> list[EntryPoint]:
-    """Entry points of other packages; a built-in name cannot be taken over."""
+    """Entry points of other packages, looked for once a process; a built-in name cannot be taken over."""
     return [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name not in FAMILIES]

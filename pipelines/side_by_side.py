@@ -22,7 +22,7 @@ from hoidata.errors import BadInput, told_in_words
 from hoidata.files.atomic import exclusive, write_whole
 from pipelines.warm import WarmProcess
 
-CODE = "code"
+CODE = "pipelines/dvc.yaml:code"
 RUN = Path(".hoidata/repro")
 LOGS = Path(".hoidata/logs")
 DURATIONS = Path(".hoidata/durations.json")
