@@ -74,7 +74,8 @@ def stages_of(joints_m: np.ndarray, scene: Scene) -> list[Stage]:
     edges = np.flatnonzero((both[1:] != both[:-1]).any(axis=1)) + 1
     starts = [0]
     for start, stop in pairwise([*edges.tolist(), len(both)]):
-        starts += [start] if stop - start >= LEAST_FRAMES else []
+        is_new = (both[start] != both[starts[-1]]).any()  # not after a short one that was left out
+        starts += [start] if stop - start >= LEAST_FRAMES and is_new else []
     pieces = pairwise([*starts, len(both)])
     return [Stage(start, stop, (int(both[start, 0]), int(both[start, 1]))) for start, stop in pieces]
 
