@@ -28,6 +28,8 @@ FAMILIES = {
     "bimart-unrefined": "models.bimart.family:UNREFINED",
     "nearest-window": "models.bimart.lookups:NEAREST_WINDOW",
     "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
+    "random-window": "models.bimart.lookups:RANDOM_WINDOW",
+    "cams-b": "models.bimart_tables.cams:CAMS_B",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
@@ -42,6 +44,9 @@ FAMILIES = {
     "other-hands": "models.baselines.controls:OTHER_HANDS",
     "hands-away": "models.baselines.controls:HANDS_AWAY",
     "pressed": "models.baselines.controls:PRESSED",
+    "pressed-deep": "models.baselines.controls:PRESSED_DEEP",
+    "hands-still": "models.baselines.controls:HANDS_STILL",
+    "hands-shifted": "models.baselines.controls:HANDS_SHIFTED",
     "noise": "models.baselines.controls:NOISE",
     "bimart-other-path": "models.bimart.family:OTHER_PATH",
     "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
@@ -57,11 +62,14 @@ NETWORKS = {
     "manipnet": "models.manipnet.training:MANIPNET",
     "bimart-contact": "models.bimart.contact_training:CONTACT",
     "bimart-motion": "models.bimart.motion_training:MOTION",
+    "cams-b": "models.bimart_tables.cams:CAMS",
 }
 # Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
 IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
 # Networks of such a family under other names.
 LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
+# Networks of the tables that BimArt is compared in.
+IN_TABLES = ("bimart-contact", "bimart-motion", "cams-b")
 
 
 def family_names() -> list[str]:

@@ -14,7 +14,10 @@ from hoidata.settings import refuse_unknown
 PROFILES = ("embedded", "study", "own")
 MOST_NESTED = 2000
 # dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
-TEMPLATED = ("profile", "profiles", "datasets", "families", "train.preset", "train.size")
+TEMPLATED = (
+    *("profile", "profiles", "datasets", "families", "train.preset", "train.size"),
+    *("tables.datasets", "tables.runs"),
+)
 
 
 def read_params(root: Path) -> dict[str, Any]:
