@@ -1,8 +1,8 @@
 """Do the fingers of ManipNet's rollouts stay on course, and how well do they fill gaps?
 
 ``python -m bench manipnet-course`` with HOIDATA_MANIPNET, after ``python -m bench manipnet``, whose networks it takes
-(or trains, where there is none). Rollouts of half a minute from three starts, each of a recording that its network never
-saw, and their way to each other as a picture in .hoidata/manipnet. Gaps of 0.5 to 4 s in what did not train, beside
+(or trains, where there is none). Rollouts of half a minute from three starts, each of a recording that its network
+never saw, and their way to each other as a picture in .hoidata/manipnet. Gaps of 0.5 to 4 s in what did not train, beside
 ways that need no network: the first held-out round of each recording (two tenths, one after the other) chooses a way
 for each length, the second is reported.
 """
