@@ -4,6 +4,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+import pytest
+
 import hoidata.datasets
 import hoidata.files
 from hoidata.dataset_folders import built_in_names
@@ -13,10 +15,11 @@ from tests.hoidata.datasets.contract import AdapterContract
 from tests.hoidata.datasets.grab.test_contract import TestGrab as Grab
 from tests.hoidata.datasets.h2o.test_contract import TestH2O as OfH2O
 from tests.hoidata.datasets.hoi4d.test_contract import TestHoi4d as Hoi4d
+from tests.hoidata.datasets.hot3d.test_contract import TestHot3d as Hot3d
 from tests.hoidata.datasets.manipnet.test_contract import TestManipNet as ManipNet
 from tests.hoidata.datasets.taco.test_contract import TestTaco as Taco
 
-CONTRACTS: tuple[type[AdapterContract], ...] = (OfH2O, Grab, Arctic, ManipNet, Taco, Hoi4d)
+CONTRACTS: tuple[type[AdapterContract], ...] = (OfH2O, Grab, Arctic, ManipNet, Taco, Hoi4d, Hot3d)
 ROOM = Path(hoidata.datasets.__file__).parent
 
 
@@ -37,6 +40,7 @@ def test_every_built_in_dataset_is_under_contract() -> None:
     assert sorted(kind.name for kind in CONTRACTS) == built_in_names()
 
 
+@pytest.mark.slow
 def test_the_readme_of_files_prints_the_problems_of_all_contracts() -> None:
     assert as_markdown(CONTRACTS) in Path(hoidata.files.__file__).with_name("README.md").read_text()
 
