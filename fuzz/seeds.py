@@ -5,6 +5,7 @@ import io
 import json
 import pickle
 import struct
+import tarfile
 import zipfile
 from collections import OrderedDict
 from functools import cache
@@ -313,6 +314,40 @@ def hot3d_tables() -> list[bytes]:
     return [*(text.encode() for text in found), row.replace("0.5", "0.9").join((head, "")).encode(), b""]
 
 
+def hot3d_tars() -> list[bytes]:
+    """A clip of two frames, and clips with one thing wrong."""
+    place = {"translation_xyz": [0.1, -2, 3], "quaternion_wxyz": [0.5, 0.5, -0.5, 0.5]}
+    mano = {"thetas": [0.5] * 15, "wrist_xform": [0.1, 0.2, 0.3, 1, 2, 3]}
+    hand = {"mano_pose": mano, "umetrack_pose": {"joint_angles": [0.1] * 20, "T_world_from_wrist": place}}
+    thing = {"object_name": "mug_white", "T_world_from_object": place}
+    whole = {"__hand_shapes.json__": {"mano": [0.1] * 10, "umetrack": {}}}
+    for frame in (0, 1):
+        whole[f"{frame:06d}.hands.json"] = {"left": hand, "right": None if frame else hand}
+        whole[f"{frame:06d}.objects.json"] = {"9": [thing]}
+    changes: tuple[dict, ...] = (
+        {},
+        {"000001.hands.json": [1]},
+        {"000001.hands.json": {"left": {"mano_pose": mano}}},
+        {"000001.hands.json": {"left": {**hand, "mano_pose": {**mano, "thetas": [1]}}}},
+        {"000001.objects.json": {"9": [thing, thing]}},
+        {"000001.objects.json": [thing]},
+        {"000001.objects.json": {"9": [{**thing, "object_name": "Mug"}]}},
+        {"000000.objects.json": {}, "000001.objects.json": {}},
+    )
+    found = [_tar({**whole, **change}) for change in changes]
+    return [*found, found[0][:700], b"", _tar({f"{number:06d}.objects.json": {} for number in range(2002)})]
+
+
+def _tar(members: dict[str, object]) -> bytes:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w") as archive:
+        for name, value in members.items():
+            text, info = json.dumps(value).encode(), tarfile.TarInfo(name)
+            info.size = len(text)
+            archive.addfile(info, io.BytesIO(text))
+    return stream.getvalue()
+
+
 def hot3d_json() -> list[bytes]:
     """Metadata, instances, and a profile whose 21 landmarks hang on bones 0 to 16."""
     profile = {
@@ -325,7 +360,12 @@ def hot3d_json() -> list[bytes]:
     wrong = ({"joint_rotation_axes": [[0, 0, 2]] * 22}, {"landmark_rest_bone_indices": [[17, 0, 0]] * 21})
     values = [{"hand_model": {**profile, **change}} for change in ({}, *wrong)]
     names = ({"1": {"instance_name": "mug_white"}}, {"1": {"instance_name": "../a"}}, [1])
-    return as_json(*values, *names, {"headset": "Aria"}, {"headset": 5})
+    clips = (
+        {"7": {"sequence_id": "P0003_c701bd11", "device": "Aria"}},
+        {"7": {"sequence_id": 5}},
+        {"8": {"sequence_id": 5}},
+    )
+    return as_json(*values, *names, *clips, {"headset": "Aria"}, {"headset": 5})
 
 
 # Files that are nearly right: each leads to one refusal that chance alone seldom finds.

@@ -32,7 +32,7 @@ from hoidata.datasets.base import RawTree
 from hoidata.datasets.h2o import files as h2o_files
 from hoidata.datasets.hoi4d import files as hoi4d_files
 from hoidata.datasets.hot3d import files as hot3d_files
-from hoidata.datasets.hot3d import umetrack
+from hoidata.datasets.hot3d import packed, umetrack
 from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.datasets.manipnet import bvh
 from hoidata.errors import BadInput
@@ -505,13 +505,13 @@ def _hoi4d_json(data: bytes) -> object:
 
 def _hot3d() -> list[Target]:
     words = (b"NaN", b"null", b"-", b"1e999", b"[", b"]", b"{", b'"', b",", b"\n", b"\xff", b"true", b"_", b"0")
-    rows = (hot3d_files._table, hot3d_files._time, hot3d_files._poses)
+    rows = (hot3d_files._table, hot3d_files._time, hot3d_files.poses_of)
     return [
         Target(
             "hot3d-hands",
             seeds.hot3d_hands,
             lambda data: hot3d_files.hand_poses(data, "a.jsonl", "umetrack" if b"angles" in data else "mano"),
-            (hot3d_files.hand_poses, hot3d_files._lines, hot3d_files._row, hot3d_files._poses),
+            (hot3d_files.hand_poses, hot3d_files._lines, hot3d_files.row_of, hot3d_files.poses_of),
             (*words, b'"hand_poses"', b'"q_wxyz"', b'"pose"', b'"2"'),
         ),
         Target(
@@ -522,10 +522,32 @@ def _hot3d() -> list[Target]:
             (*words, b"True", b"False", b"mask", "٣".encode(), b"1e400", b"object_uid"),
         ),
         Target(
+            "hot3d-tar",
+            seeds.hot3d_tars,
+            lambda data: packed.read_packed(data, "a.tar"),
+            functions_of(packed),
+            (
+                *words,
+                b"000001.hands.json\0",
+                b"__hand_shapes.json__\0",
+                b'"mano_pose"',
+                b'"thetas"',
+                b"ustar",
+                b"0000777",
+            ),
+        ),
+        Target(
             "hot3d-json",
             seeds.hot3d_json,
             _hot3d_json,
-            (hot3d_files.headset, hot3d_files.object_names, hot3d_files.read_json, *functions_of(umetrack)),
+            (
+                hot3d_files.headset,
+                hot3d_files.headset_of,
+                hot3d_files.object_names,
+                hot3d_files.checked_name,
+                hot3d_files.read_json,
+                *functions_of(umetrack),
+            ),
             (*words, b'"headset"', b"17", b"1.5", b'"instance_name"', b'"hand_model"'),
         ),
     ]
@@ -533,6 +555,8 @@ def _hot3d() -> list[Target]:
 
 def _hot3d_json(data: bytes) -> object:
     """Whichever of the three kinds of file it looks like; joints of a profile that was read are finite or not told."""
+    if b"sequence_id" in data:
+        return packed.definition(data, "clip_definitions.json", 7)
     if b"headset" in data:
         return hot3d_files.headset(data, "metadata.json")
     if b"hand_model" not in data:

@@ -3,8 +3,10 @@
 Nothing of the adapter is used: rotations are SciPy's, UmeTrack's joints are built bone by bone, GLB is packed here.
 """
 
+import io
 import json
 import struct
+import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -233,6 +235,45 @@ def write_recording(root: Path, name: str, headset: str, kind: str, seed: int, u
     (folder / "dynamic_objects.csv").write_text(object_table(rows))
     (folder / "masks/mask_qa_pass.csv").write_text(mask_table(whole, headset, {}))
     return whole
+
+
+def write_clip(root: Path, headset: str, number: int, recording: str, whole: Truth, without: str = "") -> Path:
+    """The first frames as one of HOT3D-Clips: a tar with JSON files of each frame, and an image that is none.
+
+    without: a format of hands the clip does not have.
+    """
+    world, path = HEADSET_FROM[headset], root / f"train_{headset.lower()}/clip-{number:06d}.tar"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    betas = whole.hands["left"][0]["betas"]
+    members = {"__hand_shapes.json__": json.dumps({"mano": betas, "umetrack": profile()["hand_model"]})}
+    for frame in range(N_FRAMES):
+        hands: dict = {"left": None} if frame == 5 else {}
+        for side in SIDES if frame != 5 else ("right",):
+            numbers, turn, place = whole.hands[side]
+            rest = rest_points(HANDS[side], betas)[0]
+            wrist = [*(world * turn[frame]).as_rotvec(), *(world.apply(place[frame] + rest) - rest)]
+            angles = {"joint_angles": list(ANGLES[:20]), "T_world_from_wrist": rigid(world * turn[frame], wrist[3:])}
+            hands[side] = {"mano_pose": {"thetas": numbers["pose"], "wrist_xform": wrist}, "umetrack_pose": angles}
+            hands[side].pop(f"{without}_pose", None)
+        pose = rigid(world * whole.turn[frame], world.apply(whole.place[frame]))
+        thing = {"object_bop_id": "9", "object_uid": MUG, "object_name": "mug_white", "T_world_from_object": pose}
+        members[f"{frame:06d}.hands.json"] = json.dumps(hands)
+        members[f"{frame:06d}.objects.json"] = json.dumps({"9": [thing]})
+        members[f"{frame:06d}.image_1201-1.jpg"] = "no image"
+    with tarfile.open(path, "w") as archive:
+        for name, text in members.items():
+            info = tarfile.TarInfo(name)
+            info.size = len(text.encode())
+            archive.addfile(info, io.BytesIO(text.encode()))
+    table = {str(number): {"sequence_id": recording, "device": headset, "timestamps_ns": [1, 2]}}
+    (root / "clip_definitions.json").write_text(json.dumps(table))
+    (root / "object_models_eval").mkdir(exist_ok=True)
+    (root / "object_models_eval/obj_000009.glb").write_bytes(glb(box(HALF_BOX_M)))
+    return path
+
+
+def rigid(turn: Rotation, place) -> dict:
+    return {"translation_xyz": [float(number) for number in place], "quaternion_wxyz": wxyz(turn)}
 
 
 def write_two(root: Path) -> Path:

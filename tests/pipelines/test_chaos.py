@@ -237,7 +237,7 @@ def test_a_disk_that_is_full_is_told_and_costs_nothing(built, typed, turn, stage
     folder = "checkpoints/embedded/grab" if stage == "train" else "data/embedded/grab"
     script = f"""
         set -e
-        room=$(( $(du -sk {folder} | cut -f1) + {(16, 60, 150)[turn]} ))
+        room=$(( $(du -sk {folder} | cut -f1) + {(8, 24, 60)[turn]} ))
         mount -t tmpfs -o size=${{room}}k none /mnt
         cp -a {folder}/. /mnt/
         mount --bind /mnt {folder}
@@ -278,7 +278,9 @@ def test_of_two_runs_at_once_the_second_says_so_and_the_first_completes(built, t
     first = begun("hoidata", "repro", CONVERT)
     wait_until(lambda: (built / ".hoidata/.repro.lock").is_file(), 60, first, first.told)
     time.sleep(moment(turn, 0.5, 2))
+    os.kill(first.pid, signal.SIGSTOP)  # else it may be done before the second has begun
     second = typed("hoidata", "repro", CONVERT)
+    os.kill(first.pid, signal.SIGCONT)
     assert (second.returncode, "wait for that run to end" in second.stderr) == (1, True), second.stderr
     stage = typed(*STAGE, *STAGES["convert"])  # the same stage by hand, which may come before or after
     assert stage.returncode == 0 or "at work on it" in stage.stderr

@@ -93,6 +93,17 @@ def test_what_follows_from_a_failure_is_left_and_everything_else_is_done(upstrea
     assert failing in describe_run(run)
 
 
+START = """
+import signal
+with open("imported", "a") as stream:
+    stream.write("x")
+if __name__ == "__main__":
+    from pipelines.side_by_side import reproduce_side_by_side
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    reproduce_side_by_side([], 2)
+"""
+
+
 def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
     """A DVC project of GRAPH: each stage joins what it needs and its own source to one text."""
     body = "import sys, time, pathlib; t = [pathlib.Path(p).read_text() for p in sys.argv[2:]]; "
@@ -155,9 +166,8 @@ def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
 def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes(tmp_path, sent):
     tiny_project(tmp_path, sleep=20)
-    command = "from pipelines.side_by_side import reproduce_side_by_side as r; r([], 2)"
-    start = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {command}"
-    process = subprocess.Popen([sys.executable, "-c", start], cwd=tmp_path, env={"PYTHONPATH": str(PROJECT)})
+    (tmp_path / "start.py").write_text(START)
+    process = subprocess.Popen([sys.executable, "start.py"], cwd=tmp_path, env={"PYTHONPATH": str(PROJECT)})
     while not log_of("a").is_file() or "make.py" not in log_of("a").read_text():
         time.sleep(0.1)
     with pytest.raises(BadInput, match="at work on it"):
@@ -166,5 +176,6 @@ def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes
     assert process.wait(timeout=15) != 0
     with exclusive(RUN, wait_s=0):
         assert not (tmp_path / "a.out").exists()
+    assert (tmp_path / "imported").read_text() == "x", "a stage imports what the run was started with, as Prefect"
     (tmp_path / "make.py").write_text((tmp_path / "make.py").read_text().replace("time.sleep(20)", "None"))
     assert reproduce_side_by_side([], jobs=2).failed == {}

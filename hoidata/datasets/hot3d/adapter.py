@@ -6,7 +6,7 @@ Worlds are those of the headset, z up with Aria, y up with Quest 3; the latter a
 headset_trajectory.csv is not read: it tells where the device is, not its cameras.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -20,8 +20,9 @@ from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHan
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.hot3d import files, umetrack
-from hoidata.datasets.hot3d.files import LARGEST_JSON, LARGEST_ROWS, HandFormat, Poses
+from hoidata.datasets.hot3d import umetrack
+from hoidata.datasets.hot3d.files import HandFormat, Poses
+from hoidata.datasets.hot3d.sources import PARTS, Source, read_source
 from hoidata.datasets.hot3d.words import object_words
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, runs, widened
@@ -32,9 +33,6 @@ from hoidata.objects.distance import closest_points
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_mesh_file
 
-OBJECTS, METADATA, PROFILE = "dynamic_objects.csv", "metadata.json", "umetrack_hand_user_profile.json"
-HANDS: Mapping[HandFormat, str] = {kind: f"{kind}_hand_pose_trajectory.jsonl" for kind in get_args(HandFormat)}
-ASSETS, CHECKED = "assets", "masks/mask_qa_pass.csv"
 STEP_NS = 1e9 / 30
 SAME_NS = 2_000_000  # the cameras of one Aria look a tenth of a millisecond apart; each time has rows of its own
 TOUCH_M, MOVED_M, BRIDGE_FRAMES = 0.02, 0.02, 10
@@ -57,13 +55,6 @@ FITTED = HandConvention(
     left_shape="unused",
     note="UmeTrack: a MANO-layout hand was fitted to 20 joints and tips, one shape per recording",
 )
-PARTS = (
-    DatasetPart("hand motion", tuple(f"P*/{name}" for name in HANDS.values()), "Aria and Quest downloads"),
-    DatasetPart("object motion and headset", (f"P*/{OBJECTS}", f"P*/{METADATA}"), "Aria and Quest downloads"),
-    DatasetPart("object meshes and names", (f"{ASSETS}/*.glb", f"{ASSETS}/instance.json"), "Assets download"),
-    DatasetPart("UmeTrack's profiles", (f"P*/{PROFILE}",), "Aria and Quest downloads", optional=True),
-    DatasetPart("frames the makers checked", (f"P*/{CHECKED}",), "Aria and Quest downloads", optional=True),
-)
 
 
 class _Hands(NamedTuple):
@@ -81,9 +72,9 @@ class _Thing(NamedTuple):
 
 
 class _Recording(NamedTuple):
-    """All frames of a recording. times_ns: (frame,); failed: (frame,) bool, the makers' check found a fault there."""
+    """All frames of a sequence. times_ns: (frame,); failed: (frame,) bool, the makers' check found a fault there."""
 
-    headset: str
+    source: Source
     times_ns: np.ndarray
     failed: np.ndarray
     hands: _Hands
@@ -102,6 +93,8 @@ class _Found(NamedTuple):
 class Hot3dAdapter(Described):
     """Raw root: ``P<participant>_<recording>/`` with hands, objects and metadata, and ``assets/`` with GLB meshes.
 
+    Or HOT3D-Clips: ``train_aria/clip-*.tar``, ``clip_definitions.json`` and ``object_models_eval/``; a clip's sequence
+    is the recording it is from. Have one of the two: the clips are cut from the recordings.
     hands: "mano", and UmeTrack where a recording has no MANO file; or "umetrack" throughout, which needs no MANO files.
     margin_frames: frames kept before and after each interval. shortest_frames: shorter intervals give no clip;
     longest_frames: longer ones are divided evenly. most_fit_error_mm: clips whose fitted hands miss UmeTrack's joints
@@ -133,20 +126,23 @@ class Hot3dAdapter(Described):
         return PARAMETERS if self.needs_mano else FITTED
 
     def sequences(self, root: Path) -> list[SequenceKey]:
-        """One key per folder named as a recording; its participant is the subject."""
-        names = sorted(path.name for path in Path(root).glob("P[0-9]*_*") if path.is_dir())
-        return [SequenceKey(self.name, name.partition("_")[0], name) for name in names]
+        """One key per folder named as a recording, whose participant is the subject, and per clip of HOT3D-Clips."""
+        names = [path.name for path in Path(root).glob("P[0-9]*_*") if path.is_dir()]
+        clips = [path for path in Path(root).glob("*_*/clip-*.tar") if path.stem[5:].isdecimal()]
+        keys = [SequenceKey(self.name, name.partition("_")[0], name) for name in names]
+        return sorted(keys + [SequenceKey(self.name, "clips", f"{path.parent.name}/{path.stem}") for path in clips])
 
     def load(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> list[Clip | Quarantined]:
         """A clip per interval in which a hand is at an object that moves, and what was left out."""
-        recording = self._read(raw, key, hands)
+        source = read_source(raw, key, self.hands)
+        recording = _recording(raw, source, hands)
         source_from_world = np.eye(4)
-        source_from_world[:3, :3] = WORLD_FROM[recording.headset].T
+        source_from_world[:3, :3] = WORLD_FROM[source.headset].T
         whole = Clip(
-            clip_id=str(key),
+            clip_id=f"{self.name}/{source.place}",
             dataset=self.name,
-            subject=key.subject,
-            sequence=key.name,
+            subject=source.recording.partition("_")[0],
+            sequence=source.recording,
             hands=recording.hands.tracks,
             object=recording.things[0].track,
             source_frames=np.arange(len(recording.times_ns), dtype=np.int32),
@@ -155,7 +151,7 @@ class Hot3dAdapter(Described):
             object_words="",
             source_from_world=source_from_world,
             source_fps=self.source_fps,
-            hands_from="parameters" if recording.hands.error_m is None else "keypoints",
+            hands_from="keypoints" if source.profile else "parameters",
             sources=raw.sources,
         )
         items = list(self._cut(whole, recording, hands))
@@ -163,36 +159,6 @@ class Hot3dAdapter(Described):
             expected = f"a hand within {100 * TOUCH_M:g} cm of an object that moves"
             raise BadInput(key.name, expected, "none in any frame", "nothing to do if nobody moves anything")
         return items
-
-    def _read(self, raw: RawTree, key: SequenceKey, hands: HandPair) -> _Recording:
-        def read(path: str, largest: int) -> tuple[bytes, str]:
-            return raw.read(path, largest), path
-
-        headset = files.headset(*read(f"{key.name}/{METADATA}", LARGEST_JSON))
-        world = WORLD_FROM[headset]
-        kind, poses = self._hand_poses(raw, key)
-        placed = files.object_poses(*read(f"{key.name}/{OBJECTS}", LARGEST_ROWS))
-        times = frame_times(key.name, [own.time_ns for own in (*poses.values(), *placed.values())])
-        if kind == "mano":
-            own_hands = _parameter_hands(poses, times, hands, world)
-        else:
-            profile = umetrack.parse_profile(*read(f"{key.name}/{PROFILE}", LARGEST_JSON))
-            own_hands = _fitted_hands(profile, poses, times, hands, world)
-        names = files.object_names(*read(f"{ASSETS}/instance.json", LARGEST_JSON))
-        things = [_thing(raw, names, uid, own, times, world) for uid, own in placed.items()]
-        failed, path = np.zeros(len(times), bool), f"{key.name}/{CHECKED}"
-        if raw.has(path):
-            failed = rows_of_frames(times, files.failed_times(*read(path, LARGEST_ROWS))) >= 0
-        return _Recording(headset, times, failed, own_hands, things)
-
-    def _hand_poses(self, raw: RawTree, key: SequenceKey) -> tuple[HandFormat, dict[Side, Poses]]:
-        """The first format that has a hand, in the order of the settings."""
-        for kind in ("mano", "umetrack") if self.hands == "mano" else ("umetrack",):
-            path = f"{key.name}/{HANDS[kind]}"
-            if raw.has(path) and (found := files.hand_poses(raw.read(path, LARGEST_ROWS), path, kind)):
-                return kind, found
-        remedy = "nothing to do: of some participants the makers withhold the ground truth"
-        raise BadInput(f"{key.name}/{HANDS[self.hands]}", "poses of a hand", "none", remedy)
 
     def _cut(self, whole: Clip, recording: _Recording, hands: HandPair) -> Iterator[Clip | Quarantined]:
         if recording.failed.any():
@@ -221,8 +187,9 @@ class Hot3dAdapter(Described):
         if mean_m * 1000 <= self.most_fit_error_mm:
             return replace(clip, fit_error_m=mean_m)
         expected = f"hands that miss UmeTrack's joints by {self.most_fit_error_mm} mm or less on average"
-        where = f"{whole.sequence}/{HANDS['umetrack']}"
-        return Quarantined(clip_id, where, expected, f"{1000 * mean_m:.1f} mm", "nothing to do, or raise the limit")
+        return Quarantined(
+            clip_id, recording.source.place, expected, f"{1000 * mean_m:.1f} mm", "nothing to do, or raise the limit"
+        )
 
     def _intervals(self, thing: _Thing, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray) -> _Found:
         """Usable frames without a gap in time in which a hand is at the object, in intervals of suitable length."""
@@ -239,6 +206,17 @@ class Hot3dAdapter(Described):
                 else:
                     found.frames.extend(_divided(interval, self.longest_frames))
         return found
+
+
+def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
+    world = WORLD_FROM[source.headset]
+    times = frame_times(source.place, [own.time_ns for own in (*source.poses.values(), *source.placed.values())])
+    if source.profile is None:
+        own_hands = _parameter_hands(source.poses, times, hands, world)
+    else:
+        own_hands = _fitted_hands(source.profile, source.poses, times, hands, world)
+    things = [_thing(raw, *source.models[key], own, times, world) for key, own in source.placed.items()]
+    return _Recording(source, times, rows_of_frames(times, source.failed_ns) >= 0, own_hands, things)
 
 
 def frame_times(where: str, times_ns: list[np.ndarray]) -> np.ndarray:
@@ -310,12 +288,9 @@ def _rows(poses: Poses | None, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return np.maximum(rows, 0), rows >= 0
 
 
-def _thing(raw: RawTree, names: dict[str, str], uid: str, poses: Poses, times: np.ndarray, world: np.ndarray) -> _Thing:
-    if uid not in names:
-        raise BadInput(f"{ASSETS}/instance.json", f"the object {uid}", f"{len(names)} others")
-    path = f"{ASSETS}/{uid}.glb"
+def _thing(raw: RawTree, name: str, path: str, poses: Poses, times: np.ndarray, world: np.ndarray) -> _Thing:
     place = raw.file(path)
-    model = _model(names[uid], place, raw.recorded(path)[0].sha256)
+    model = _model(name, place, raw.recorded(path)[0].sha256)
     rows, there = _rows(poses, times)
     rotvec = rotmat_to_rotvec(world @ poses.rotation)[rows].astype(np.float32)
     return _Thing(ObjectTrack(model, rotvec, (poses.translation_m @ world.T)[rows].astype(np.float32)), there)

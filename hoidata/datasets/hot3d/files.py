@@ -60,9 +60,9 @@ def hand_poses(data: bytes, where: str, kind: HandFormat) -> dict[Side, Poses]:
         for key, hand in hands.items():
             own = f"{place}: hand {key}"
             wrist = checks.entry(own, hand, "wrist_xform")
-            values = [_row(own, wrist if name in WRIST else hand, name, count) for name, count in columns.items()]
+            values = [row_of(own, wrist if name in WRIST else hand, name, count) for name, count in columns.items()]
             rows[OF_KEY[key]].append((time_ns, list(chain.from_iterable(values))))
-    return {side: _poses(f"{where}: {side} hand", rows[side], columns) for side in SIDES if rows[side]}
+    return {side: poses_of(f"{where}: {side} hand", rows[side], columns) for side in SIDES if rows[side]}
 
 
 def object_poses(data: bytes, where: str) -> dict[str, Poses]:
@@ -79,7 +79,7 @@ def object_poses(data: bytes, where: str) -> dict[str, Poses]:
     if not rows:
         raise BadInput(where, "poses of an object", "none")
     columns = {"t_wo": 3, "q_wo": 4}
-    return {uid: _poses(f"{where}: object {uid}", own, columns) for uid, own in sorted(rows.items())}
+    return {uid: poses_of(f"{where}: object {uid}", own, columns) for uid, own in sorted(rows.items())}
 
 
 def failed_times(data: bytes, where: str) -> np.ndarray:
@@ -96,9 +96,13 @@ def failed_times(data: bytes, where: str) -> np.ndarray:
 
 def headset(data: bytes, where: str) -> str:
     """The device of ``metadata.json``, whose world's axes the recording has."""
-    found = checks.entry(where, read_json(data, where), "headset")
+    return headset_of(f"{where}: headset", checks.entry(where, read_json(data, where), "headset"))
+
+
+def headset_of(where: str, found: Any) -> str:
+    """Checked to be one of the two."""
     if found not in HEADSETS:
-        raise BadInput(f"{where}: headset", " or ".join(HEADSETS), repr(found)[:40])
+        raise BadInput(where, " or ".join(HEADSETS), repr(found)[:40])
     return found
 
 
@@ -108,10 +112,14 @@ def object_names(data: bytes, where: str) -> dict[str, str]:
     if not isinstance(content, dict):
         raise BadInput(where, "a dictionary of objects by id", type(content).__name__)
     names = {uid: checks.entry(f"{where}: {uid}", about, "instance_name") for uid, about in content.items()}
-    for uid, name in names.items():
-        if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", name):
-            raise BadInput(f"{where}: {uid}.instance_name", "a name of lower-case words", repr(name)[:40])
-    return names
+    return {uid: checked_name(f"{where}: {uid}", name) for uid, name in names.items()}
+
+
+def checked_name(where: str, name: Any) -> str:
+    """An object's name, which becomes part of a clip's."""
+    if not isinstance(name, str) or not re.fullmatch(r"[a-z0-9]+(_[a-z0-9]+)*", name):
+        raise BadInput(where, "a name of lower-case words", repr(name)[:40])
+    return name
 
 
 def small_table(where: str, value: Any, columns: int, rows: int | None = None) -> np.ndarray:
@@ -138,7 +146,8 @@ def _lines(data: bytes, where: str) -> Iterator[tuple[str, Any]]:
         yield f"{where}:{number}", read_json(line, f"{where}:{number}")
 
 
-def _row(where: str, mapping: Any, name: str, count: int) -> list:
+def row_of(where: str, mapping: Any, name: str, count: int) -> list:
+    """So many numbers of a list that is an entry of ``mapping``."""
     values = checks.entry(where, mapping, name)
     if not isinstance(values, list) or not all(type(value) in (int, float) for value in values):
         raise BadInput(f"{where}: {name}", f"{count} numbers", repr(values)[:40])
@@ -173,7 +182,7 @@ def _time(where: str, text: str) -> int:
     return int(text)
 
 
-def _poses(where: str, rows: list[tuple[int, list]], columns: Mapping[str, int]) -> Poses:
+def poses_of(where: str, rows: list[tuple[int, list]], columns: Mapping[str, int]) -> Poses:
     """Rows of a time and all numbers: three of the place, four of the turn (w first), then the further ones."""
     rows = sorted(rows, key=lambda row: row[0])
     time_ns = np.array([time for time, _ in rows], dtype=np.int64)

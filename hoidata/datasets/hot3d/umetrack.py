@@ -5,7 +5,7 @@ digit has four hinges one after the other, given by an axis and a point at rest;
 bone follows. Landmarks hang on bones with weights.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,7 +39,11 @@ class Profile(NamedTuple):
 
 def parse_profile(data: bytes, where: str) -> Profile:
     """``umetrack_hand_user_profile.json``; the mesh it also holds is not looked at."""
-    hand = checks.entry(where, read_json(data, where), "hand_model")
+    return profile_of(checks.entry(where, read_json(data, where), "hand_model"), where)
+
+
+def profile_of(hand: Any, where: str) -> Profile:
+    """From what a file says of the hand."""
 
     def rows(name: str, count: int) -> np.ndarray:
         return small_table(f"{where}: {name}", checks.entry(where, hand, name), 3, count)

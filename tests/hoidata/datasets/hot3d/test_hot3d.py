@@ -1,6 +1,7 @@
 """HOT3D's adapter on recordings of a known truth: intervals, what the makers checked, UmeTrack's hands, licences."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conversion.convert import convert_dataset
 from hoidata.dataset_folders import BUILT_IN, facts_beside
-from hoidata.datasets import Quarantined, RawTree
+from hoidata.datasets import Quarantined, RawTree, SequenceKey
 from hoidata.datasets.hot3d.adapter import Hot3dAdapter
 from hoidata.datasets.hot3d.words import NOUNS, object_words
 from hoidata.errors import BadInput
@@ -23,6 +24,7 @@ from pipelines.exports.licences import licences_of
 from tests.builders import hot3d
 from tests.builders.formulas import chain, rest_points
 from tests.builders.hot3d import ARIA, HANDS, KEYBOARD, MUG, N_FRAMES, QUEST, UMETRACK
+from tests.builders.spoilt import replaced
 
 MASK = f"{ARIA}/masks/mask_qa_pass.csv"
 
@@ -150,6 +152,75 @@ def test_an_object_that_is_touched_and_does_not_move_gives_no_clip(root: Path) -
     (item,) = load(root)
     assert isinstance(item, Quarantined)
     assert (item.source_key, item.expected) == (f"hot3d/{ARIA}/mug_white/still", "an object that moves 2 cm")
+
+
+PACKED = SequenceKey("hot3d", "clips", "train_quest3/clip-001849")
+
+
+def load_packed(root: Path, **settings) -> list[Clip | Quarantined]:
+    return Hot3dAdapter(**settings).load(RawTree(root), PACKED, HANDS)
+
+
+def test_a_clip_of_hot3d_clips_says_what_its_recording_does(root: Path, tmp_path: Path) -> None:
+    """The same truth packed into a tar: the same motion, under the name and person of the recording."""
+    hot3d.write_clip(tmp_path / "clips", "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1))
+    assert Hot3dAdapter().sequences(tmp_path / "clips") == [PACKED]
+    (clip,) = load_packed(tmp_path / "clips")
+    assert isinstance(clip, Clip)
+    whole = only_clip(root, QUEST)
+    assert check_clip(clip).clip_id == f"hot3d/{QUEST}/clip-001849/00000-00035-mug_white"
+    assert (clip.sequence, clip.subject, clip.object_words) == (QUEST, "P0002", "white mug")
+    assert np.flatnonzero(~clip.hands["left"].valid).tolist() == [5]
+    for side in SIDES:
+        own = [track_joints(item.hands[side], HANDS[side])[clip.hands[side].valid] for item in (clip, whole)]
+        assert np.abs(own[0] - own[1]).max() < 1e-5
+    np.testing.assert_allclose(clip.object.translation_m, whole.object.translation_m, atol=1e-6)
+    np.testing.assert_allclose(clip.object.rotvec, whole.object.rotvec, atol=1e-5)
+    np.testing.assert_array_equal(clip.source_from_world, whole.source_from_world)
+    assert [source.path for source in clip.sources] == [
+        "clip_definitions.json",
+        "object_models_eval/obj_000009.glb",
+        "train_quest3/clip-001849.tar",
+    ]
+
+
+@pytest.mark.slow
+def test_a_clip_of_hot3d_clips_without_manos_numbers_gets_fitted_hands(tmp_path: Path) -> None:
+    hot3d.write_clip(tmp_path, "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1), without="mano")
+    assert all(item.hands_from == "keypoints" for item in load_packed(tmp_path) if isinstance(item, Clip))
+    assert load_packed(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "message"),
+    [
+        (f"{PACKED.name}.tar", lambda data: data[:300], "a whole .tar archive"),
+        (f"{PACKED.name}.tar", lambda data: b"", "a whole .tar archive"),
+        (f"{PACKED.name}.tar", lambda data: data[:0] + bytes(10240), "of test clips they are withheld"),
+        (f"{PACKED.name}.tar", replaced(b'"wrist_xform": [', b'"wrist_xform": {'), "JSON text"),
+        (f"{PACKED.name}.tar", replaced(b'"thetas": [', b'"thetaz": ['), "the entry 'thetas'"),
+        (f"{PACKED.name}.tar", replaced(b'"object_name": "mug', b'"object_name": "MUG'), "lower-case words"),
+        (f"{PACKED.name}.tar", replaced(b'{"9": [', b'{"x": ['), "a number, and one object"),
+        (f"{PACKED.name}.tar", replaced(b'{"mano": ', b'{"nano": '), "the entry 'mano'"),
+        ("clip_definitions.json", lambda data: b"{}", "the entry '1849'"),
+        ("clip_definitions.json", replaced(b"P0002_", b"../02_"), "a recording such as"),
+        ("clip_definitions.json", replaced(b"Quest3", b"Quest4"), "Aria or Quest3"),
+        ("object_models_eval/obj_000009.glb", lambda data: b"", "a readable mesh"),
+    ],
+)
+def test_a_spoilt_clip_of_hot3d_clips_is_named(tmp_path: Path, packed_root: Path, path, change, message) -> None:
+    root = shutil.copytree(packed_root, tmp_path / "clips")
+    (root / path).write_bytes(change((root / path).read_bytes()))
+    with pytest.raises(BadInput, match=message) as caught:
+        load_packed(root)
+    assert path in caught.value.where
+
+
+@pytest.fixture(scope="module")
+def packed_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("packed")
+    hot3d.write_clip(root, "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1))
+    return root
 
 
 @pytest.fixture(scope="module")
