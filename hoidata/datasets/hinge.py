@@ -1,18 +1,16 @@
-"""Two parts that were tracked one by one, as one object with a hinge; and which tracked part is which mesh."""
+"""Two parts that were tracked one by one, as one object with a hinge."""
 
-from collections.abc import Sequence
-from itertools import permutations
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotation_angle
-from hoidata.objects.model import Hinge
+from hoidata.clips.quarantine import Quarantined
+from hoidata.geometry.rotations import rotation_angle, rotmat_to_rotvec
+from hoidata.objects.model import Hinge, ObjectModel
 
-MOST_OFF = 0.15  # of a part's extents: boxes are annotated to some per cent
-CLEARLY = 2.0  # another assignment must be so many times worse
 ROUNDS = 3
+LEAST_TURN_RAD = np.deg2rad(15)  # parts that turn less against each other do not tell where their hinge is
 
 
 class HingeFit(NamedTuple):
@@ -27,40 +25,23 @@ class HingeFit(NamedTuple):
     residual_m: np.ndarray
     residual_rad: np.ndarray
 
+    def off(self, most_mm: float, most_deg: float) -> np.ndarray:
+        """(frame,) bool: the parts lie farther than that from one hinge."""
+        return (self.residual_m > most_mm / 1000) | (self.residual_rad > np.deg2rad(most_deg))
 
-def matched(
-    where: str, tracked_m: np.ndarray, names: Sequence[str], meshes_m: np.ndarray
-) -> tuple[list[int], np.ndarray]:
-    """Which of the tracked boxes each mesh is, and the ratio of their extents (mesh, 3).
+    @property
+    def note(self) -> str:
+        """How well the parts keep to the hinge, in words."""
+        mm, degrees = (np.percentile(v, 95) for v in (1000 * self.residual_m, np.rad2deg(self.residual_rad)))
+        return f"hinge: {mm:.2f} mm and {degrees:.2f} degrees off in 95 % of frames"
 
-    tracked_m: (box, 3) and meshes_m: (mesh, 3) extents along each one's own axes. Raises BadInput where no assignment
-    fits to 15 %, or a second one fits nearly as well.
-    """
-    off = np.abs(np.log(tracked_m[None] / meshes_m[:, None])).max(axis=2)  # (mesh, box)
-    ways = sorted(
-        (max(off[mesh, box] for mesh, box in enumerate(way)), way)
-        for way in permutations(range(len(tracked_m)), len(names))
-    )
-    if not ways or ways[0][0] > np.log1p(MOST_OFF):
-        got = "none" if not ways else f"at best {np.expm1(ways[0][0]):.0%} off"
-        remedy = "nothing to do: poses of other objects, or fewer than its parts"
-        raise BadInput(where, f"boxes of the size of {', '.join(names)}", got, remedy)
-    if len(ways) > 1 and ways[1][0] < CLEARLY * max(ways[0][0], np.log1p(0.02)):
-        got = f"parts of nearly the same size: {ways[0][0]:.1%} and {ways[1][0]:.1%} off"
-        raise BadInput(where, "parts that their sizes tell apart", got, "nothing to do: which is which cannot be told")
-    chosen = list(ways[0][1])
-    return chosen, tracked_m[chosen] / meshes_m
-
-
-def aligned_from_whole(where: str, aligned_m: np.ndarray, whole_m: np.ndarray) -> np.ndarray:
-    """(4, 4) rigid transform between two copies of a mesh with the same vertices. Raises BadInput for others."""
-    if aligned_m.shape != whole_m.shape:
-        raise BadInput(where, f"{len(whole_m)} vertices as in the whole object", f"{len(aligned_m)}")
-    transform = rigid_fit(whole_m[None], aligned_m[None])[0]
-    off = float(np.abs(whole_m @ transform[:3, :3].T + transform[:3, 3] - aligned_m).max())
-    if off > 1e-4 * max(1.0, float(np.ptp(whole_m))):
-        raise BadInput(where, "the same mesh, turned and moved", f"one {off:.3g} m off", "download the models again")
-    return transform
+    def left_out(self, source_key: str, where: str, frames: np.ndarray, most_mm: int, most_deg: int) -> Quarantined:
+        """The frames of the source (frame,) in which the parts lie farther off, as one reason."""
+        far = frames[self.off(most_mm, most_deg)]
+        worst = f"up to {1000 * self.residual_m.max():.1f} mm and {np.rad2deg(self.residual_rad.max()):.1f} degrees"
+        expected = f"both parts within {most_mm} mm and {most_deg} degrees of one hinge"
+        got = f"{worst} in {len(far)} frames, the first {far[0]}"
+        return Quarantined(source_key, where, expected, got, "nothing to do, or raise most_off_mm")
 
 
 def rigid_fit(from_m: np.ndarray, to_m: np.ndarray) -> np.ndarray:
@@ -94,6 +75,34 @@ def fit_hinge(base: np.ndarray, moving: np.ndarray, hinge: Hinge, corners_m: tup
     relative = pose[:, :3, :3].transpose(0, 2, 1) @ moving[:, :3, :3]
     left = hinge.turn(angle).rotation.transpose(0, 2, 1) @ relative
     return HingeFit(pose, angle, np.sqrt((off**2).mean(axis=1)), rotation_angle(left))
+
+
+def find_hinge(turned: np.ndarray) -> Hinge | None:
+    """The axis that the turns of a part against its base (frame, 4, 4) share; None where it turns too little to tell.
+
+    turned: base from the part as it lies at rest. The axis points the way of its largest component.
+    """
+    rotvec = rotmat_to_rotvec(turned[:, :3, :3])
+    axis = np.linalg.eigh(rotvec.T @ rotvec)[1][:, -1]
+    axis *= np.sign(axis[np.abs(axis).argmax()])
+    if np.ptp(np.unwrap(_angle_about(axis, turned[:, :3, :3]))) < LEAST_TURN_RAD:
+        return None
+    plane = np.linalg.svd(axis[None])[2][1:].T  # (3, 2): along the axis its origin may lie anywhere
+    ways = (np.eye(3) - turned[:, :3, :3]) @ plane
+    place = np.linalg.lstsq(ways.reshape(-1, 2), turned[:, :3, 3].reshape(-1), rcond=None)[0]
+    return Hinge(axis, plane @ place)
+
+
+def hinged_model(name: str, vertices_m: list[np.ndarray], faces: list[np.ndarray], hinge: Hinge) -> ObjectModel:
+    """Two meshes as one object at rest, the base first."""
+    counts = [len(own) for own in vertices_m]
+    part = np.repeat(np.array([0, 1], np.uint8), counts)
+    return ObjectModel(name, np.concatenate(vertices_m), np.concatenate([faces[0], faces[1] + counts[0]]), part, hinge)
+
+
+def box_corners(points_m: np.ndarray) -> np.ndarray:
+    """(8, 3) of the box around points (point, 3)."""
+    return np.array(list(product(*np.stack([points_m.min(axis=0), points_m.max(axis=0)]).T)))
 
 
 def _moved(transforms: np.ndarray, points_m: np.ndarray) -> np.ndarray:
