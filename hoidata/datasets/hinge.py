@@ -10,6 +10,7 @@ from hoidata.geometry.rotations import rotation_angle, rotmat_to_rotvec
 from hoidata.objects.model import Hinge, ObjectModel
 
 ROUNDS = 3
+LEAST_KEPT = 0.95
 LEAST_TURN_RAD = np.deg2rad(15)  # parts that turn less against each other do not tell where their hinge is
 
 
@@ -91,6 +92,25 @@ def find_hinge(turned: np.ndarray) -> Hinge | None:
     ways = (np.eye(3) - turned[:, :3, :3]) @ plane
     place = np.linalg.lstsq(ways.reshape(-1, 2), turned[:, :3, 3].reshape(-1), rcond=None)[0]
     return Hinge(axis, plane @ place)
+
+
+def hinge_between(
+    base: np.ndarray, turned: np.ndarray, corners_m: tuple[np.ndarray, np.ndarray], most_mm: int, most_deg: int
+) -> tuple[Hinge, HingeFit] | None:
+    """The hinge of two parts that were tracked apart; None where they turn too little, or keep to none.
+
+    base: (frame, 4, 4) world from the base; turned: (frame, 4, 4) base from the other part as it lies at rest;
+    corners_m: (8, 3) of each part's box at rest. Frames farther off than ``most_mm`` or ``most_deg`` are found out
+    and have no say; of more than 5 % the parts have no hinge.
+    """
+    kept = np.ones(len(base), bool)
+    for _ in range(2):
+        hinge = find_hinge(turned[kept]) if kept.any() else None
+        if hinge is None:
+            return None
+        fit = fit_hinge(base, base @ turned, hinge, corners_m)
+        kept = ~fit.off(most_mm, most_deg)
+    return (hinge, fit) if kept.mean() >= LEAST_KEPT else None
 
 
 def hinged_model(name: str, vertices_m: list[np.ndarray], faces: list[np.ndarray], hinge: Hinge) -> ObjectModel:

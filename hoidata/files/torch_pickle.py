@@ -23,6 +23,7 @@ from hoidata.files.npy_header import is_length
 from hoidata.files.pickle_check import REFUSED_OPCODES
 from hoidata.files.restricted_pickle import (
     ARRAYS,
+    Allow,
     Budget,
     CheckedArray,
     StandIn,
@@ -72,11 +73,11 @@ def load_torch_pickle(source: str | Path | bytes, where: str | Path, arrays: boo
         raise BadInput(where, "a pickle of tensors", f"{type(error).__name__}: {error.strerror}") from None
     with stream:
         data = read_at_most(stream, MAX_FILE_BYTES + 1)
-    allow = tensor_globals(len(data)) | (ARRAYS if arrays else {})
+    allow = {**tensor_globals(len(data)), **(ARRAYS if arrays else {})}
     return restricted_load(data, allow, where=where, max_bytes=MAX_FILE_BYTES)
 
 
-def tensor_globals(n_bytes: int) -> dict[tuple[str, str], Any]:
+def tensor_globals(n_bytes: int) -> Allow:
     """The exact allow-list of one file of ``n_bytes``, which also limits how large its tensors get together."""
     budget = Budget(2 * n_bytes + _REPEATED_BYTES)  # every storage, and every tensor of them
 
