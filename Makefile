@@ -9,7 +9,7 @@ export PREFECT_SERVER_ANALYTICS_ENABLED := false
 export HF_HUB_OFFLINE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo install install-dev docs test test-fast chaos fuzz lint types imports check bench clean
+.PHONY: demo install install-dev docs test test-fast test-long chaos fuzz lint types imports check bench clean
 
 demo: $(VENV)/.installed
 	hoidata repro
@@ -31,10 +31,14 @@ docs: install-dev
 	NO_MKDOCS_2_WARNING=1 mkdocs build --strict --quiet
 
 test: install-dev
-	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope
+	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not long"
 
 test-fast: install-dev
-	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow"
+	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m "not slow and not long"
+
+# Whole runs and trainings, each of 20 seconds or more; CI runs them after `make check`.
+test-long: install-dev
+	OMP_NUM_THREADS=1 pytest -n 2 --dist loadscope -m long
 
 # Every situation that may stop a run, three times each; `make test` has a share of it.
 chaos: install-dev

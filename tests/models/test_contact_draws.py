@@ -80,6 +80,7 @@ def test_a_clips_maps_do_not_depend_on_the_others_in_the_batch(batch: ClipBatch)
     torch.testing.assert_close(many[1:2], one, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_an_anchored_network_learns_two_regions_as_two_answers(batch: ClipBatch) -> None:
     """One object, one sentence, touched at the top in half of the clips and at the bottom in the other half."""
     torch.manual_seed(0)

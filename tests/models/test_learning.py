@@ -75,7 +75,7 @@ def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, n
     return fit(objective, corpus, training, 0, torch.device("cpu"))[0], normaliser
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_contact_and_length_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
     batch, maps = collate(learnt.clips), true_maps(learnt.clips)
     found = contact_probabilities(learnt.networks["contact"], learnt.clips, 16, 0)  # pyright: ignore[reportArgumentType]
@@ -87,7 +87,7 @@ def test_contact_and_length_of_two_clips_are_known_by_heart(learnt: Learnt) -> N
     torch.testing.assert_close(exchanged, frames.flip(0))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_motions_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
     batch = collate(learnt.clips)
     rows = Targets(learnt.generator.network.code, learnt.generator.normaliser, torch.device("cpu")).of(batch)
@@ -96,7 +96,7 @@ def test_motions_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
     assert joint_error_m(learnt, batch, *made) < 0.005
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_exchanged_prompts_exchange_the_paths_of_the_object(learnt: Learnt) -> None:
     batch = collate(learnt.clips)
     code, draws = learnt.generator.network.code, torch.Generator().manual_seed(0)
@@ -132,7 +132,7 @@ def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
     return torch.cat((hands[..., :3] + 0.01 * away, hands[..., 3:]), -1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_refiner_takes_more_than_half_of_planted_noise_away(learnt: Learnt) -> None:
     network, clips = load_network("refiner"), learnt.clips
     plan = Plan.of(network, DELIVERED.of("refiner"))

@@ -217,6 +217,7 @@ def two_clips(batch: ClipBatch) -> ClipBatch:
     return collate(list(batch.samples[:2]))
 
 
+@pytest.mark.slow
 def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
     torch.manual_seed(0)
     two = two_clips(batch)

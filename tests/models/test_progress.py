@@ -167,6 +167,7 @@ def test_a_training_that_gains_no_more_stops(annotated_root: Path, tmp_path: Pat
     assert [row.split(",")[0] for row in rows] == ["1", "2", "3", "4"]
 
 
+@pytest.mark.slow
 def test_a_training_in_bfloat16_keeps_its_weights_in_float32_and_learns_nearly_the_same(
     annotated_root: Path, out: Path
 ) -> None:

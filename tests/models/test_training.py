@@ -114,6 +114,7 @@ def bytes_of(made: GeneratedMotion) -> bytes:
     return b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
 
 
+@pytest.mark.slow
 def test_generation_repeats_its_bytes_and_uses_only_the_hands_asked_for(trained: Path) -> None:
     made = motion(trained, "Lift a box with the right hand.", 3)
     assert bytes_of(made) == bytes_of(motion(trained, "Lift a box with the right hand.", 3))
@@ -125,6 +126,7 @@ def test_generation_repeats_its_bytes_and_uses_only_the_hands_asked_for(trained:
     assert made.evidence["hand"]["source"] == "rule"
 
 
+@pytest.mark.slow
 def test_a_sample_is_the_same_however_many_are_asked_for_and_lengths_are_drawn_anew(trained: Path) -> None:
     model, text = generator(trained), "Lift a box with the right hand."
     many = model.generate(text, user_box(), Wish(samples=6))

@@ -119,9 +119,9 @@ def tried(mutant: Mutant, copy: Path) -> str:
     text, times = path.read_text(encoding="utf-8"), path.stat()
     path.write_text(text.replace(mutant.old, mutant.new), encoding="utf-8")
     try:
-        code = exit_code(copy, mutant.test_paths(copy), "not slow")
+        code = exit_code(copy, mutant.test_paths(copy), "not slow and not long")
         if code in PASSED:
-            code = exit_code(copy, mutant.test_paths(copy), "slow")
+            code = exit_code(copy, mutant.test_paths(copy), "slow or long")
     finally:
         path.write_text(text, encoding="utf-8")
         os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
@@ -131,7 +131,7 @@ def tried(mutant: Mutant, copy: Path) -> str:
 def check_unchanged(mutants: Sequence[Mutant], copy: Path) -> None:
     """Refuse to go on unless the tests that are not slow pass as long as nothing is changed."""
     tests = sorted({path for mutant in mutants for path in mutant.test_paths(copy)})
-    if exit_code(copy, tests, "not slow", None) != 0:
+    if exit_code(copy, tests, "not slow and not long", None) != 0:
         raise SystemExit(f"the tests fail before anything is changed: {copy / '.mutants.log'}")
 
 

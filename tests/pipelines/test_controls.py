@@ -142,7 +142,7 @@ def test_the_command_lists_promises_and_fails_where_one_is_broken(tmp_path):
 OF_MODELS = {"text2hoi", "other-prompt", "other-contact", "one-call"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_promise_that_needs_no_model_holds_on_a_small_part_of_the_study_corpus(tmp_path):
     """A lidded box opened, closed, lifted and pushed by one hand; the evaluator learns from one subject in a moment."""
     hands, verbs = load_embedded_hands(), ("open", "close", "lift", "push")

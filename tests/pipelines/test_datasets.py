@@ -79,7 +79,7 @@ def test_a_dataset_from_a_folder_outside_the_repository_takes_three_lines(here: 
     assert empty_reason(StagePaths("embedded", "kitchen").clips) == "kitchen is not present in the profile embedded"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_taco_goes_through_dvc_repro_by_its_word(here: Path, tmp_path: Path, project_tools) -> None:
     mano, root = tmp_path / "mano", taco.write_taco(tmp_path / "taco")
     mano.mkdir()

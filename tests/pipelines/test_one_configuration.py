@@ -124,6 +124,7 @@ def test_params_repeat_no_default_of_the_library():
     assert repeated == SHOWN_ON_PURPOSE
 
 
+@pytest.mark.slow
 def test_threshold_and_points_are_written_down_once_in_the_product():
     """Of all constants and default values in the code, one states the threshold and one the number of points."""
     homes: dict[float, list[str]] = {0.02: [], 1024: []}

@@ -340,7 +340,7 @@ def test_the_pool_takes_no_variable_from_a_run_even_with_the_key(up, name):
     assert_nothing_came_of_it(up)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_tools):
     """After the tests above: the worker that runs this flow has had time for every run they could have started.
 

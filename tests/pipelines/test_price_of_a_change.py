@@ -31,7 +31,7 @@ stages:
     outs: ["samples/${item.profile}/${item.dataset}/toy"]
 """
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 def touch(*paths: str) -> Callable[[Path], None]:

@@ -75,6 +75,7 @@ def test_lineage_check_finds_every_output_as_dvc_wrote_it(built, project_tools):
     assert result.stdout.endswith(", 0 not as they were written\n")
 
 
+@pytest.mark.long
 def test_lineage_rerun_trains_the_same_weights_in_a_clean_clone(built, project_tools):
     identity = ("-c", "user.name=t", "-c", "user.email=t@example.org")
     for words in (("add", "-A"), ("commit", "--quiet", "-m", "run")):
@@ -125,6 +126,7 @@ def test_a_failing_conversion_leaves_the_clips_in_place(built, project_tools):
         shutil.move(built / "moved", built / ".hoidata/raw/embedded/grab")
 
 
+@pytest.mark.long
 def test_going_to_the_other_profile_and_back_runs_nothing_again(built, project_tools):
     params = (built / "params.yaml").read_text()
     values = yaml.safe_load(params)
@@ -148,6 +150,7 @@ def test_a_dataset_that_becomes_present_runs_its_own_stages_only(built, project_
         manifest.write_text(text)
 
 
+@pytest.mark.long
 def test_the_same_seed_generates_the_same_bytes_on_a_mesh_of_the_users(built, project_tools, tmp_path):
     trimesh.creation.box((0.06, 0.08, 0.1)).export(tmp_path / "box.obj")
     for out in ("first", "second"):

@@ -9,7 +9,7 @@ import pytest
 
 from hoidata.files.sealed import read_metadata
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 FOLDER = Path(__file__).with_name("toy_family")
 OWN_STAGES = [
     name

@@ -53,6 +53,7 @@ def test_init_leaves_a_project_alone_and_adds_to_what_git_ignores(tmp_path):
         typed("init", tmp_path)
 
 
+@pytest.mark.slow
 def test_convert_gives_the_bytes_of_the_stage(tmp_path, monkeypatch, small_corpus):
     monkeypatch.chdir(tmp_path)
     corpus = small_corpus("grab")

@@ -56,6 +56,7 @@ def test_a_clips_choice_does_not_depend_on_the_clips_beside_it_or_on_how_many_ar
     assert len(set(same_words)) == len(same_words)
 
 
+@pytest.mark.slow
 def test_every_variation_reads_back_and_what_does_not_is_counted_by_what_was_lost() -> None:
     verbs, things = ("stamp", "brush", "watch", "lift"), ("stamp", "toothbrush", "watch", "hand")
     clips = [Wording(f"{verb} {thing}", verb, thing, "left") for verb in verbs for thing in things]

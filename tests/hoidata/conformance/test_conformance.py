@@ -69,7 +69,7 @@ def test_the_walk_throughs_example_keeps_every_rule(example: type, kitchen_root:
     assert [item.rule for item in findings if item.outcome == "skip"] == ["a worker process gives the same"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_command_checks_an_adapter_of_another_package(tmp_path: Path, kitchen_root: Path) -> None:
     module = kitchen.write_package(tmp_path / "site")
     run = partial_run(tmp_path / "site")

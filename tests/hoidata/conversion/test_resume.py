@@ -153,7 +153,7 @@ def test_a_worker_killed_once_costs_nothing(conversions, tmp_path):
     assert len(done.loaded) > N_SEQUENCES
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sequence_that_kills_its_worker_twice_is_left_out_and_stays_out_when_the_run_goes_on(conversions, tmp_path):
     out, deadly = tmp_path / "clips", "s1/mug_lift_002"
     late = {"at": "rename", "n": -1, "who": "group", "only": "parent"}

@@ -44,7 +44,7 @@ def peaks_mib(root: Path, out: Path, jobs: int, n_sequences: int) -> tuple[float
     return parent / 1024, worker / 1024
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_number_of_clips(tmp_path, hands):
     small, large = 70, 210
     assert small * (FRAMES - 12) > FRAMES_PER_SHARD  # both fill a shard; the larger one holds 60 MB more of clips

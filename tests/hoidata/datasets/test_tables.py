@@ -4,6 +4,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+import pytest
+
 import hoidata.datasets
 import hoidata.files
 from hoidata.dataset_folders import built_in_names
@@ -38,6 +40,7 @@ def test_every_built_in_dataset_is_under_contract() -> None:
     assert sorted(kind.name for kind in CONTRACTS) == built_in_names()
 
 
+@pytest.mark.slow
 def test_the_readme_of_files_prints_the_problems_of_all_contracts() -> None:
     assert as_markdown(CONTRACTS) in Path(hoidata.files.__file__).with_name("README.md").read_text()
 

@@ -47,6 +47,7 @@ def in_a_process_of_its_own(read: Callable[[Path], Any], path: Path) -> dict:
     return json.loads(told or b'{"end": "was ended", "seconds": 99, "megabytes": 9999}')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "make", "read"), ATTACKS, ids=[name for name, *_ in ATTACKS])
 def test_a_small_file_that_grows_without_bound_is_bad_input_at_once(tmp_path, name, make, read):
     path = tmp_path / name

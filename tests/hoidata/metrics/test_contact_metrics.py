@@ -126,6 +126,7 @@ def in_the_palm(clip, model):
     return replace(with_hand(clip, "right", **vars(hand)), object=ObjectTrack(model, still, still + middle))
 
 
+@pytest.mark.slow
 def test_a_ball_in_the_palm_shares_its_own_volume_with_the_hand_and_a_block_around_it_the_hand_s(make_clip, pair_of):
     clip = make_clip(7)
     held = in_the_palm(clip, model_of(trimesh.creation.icosphere(4, 0.006)))

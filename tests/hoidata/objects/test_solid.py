@@ -46,6 +46,7 @@ def mug_depth(places: np.ndarray) -> np.ndarray:
     return np.where(in_wall | in_floor, distance, 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("grid_from", [AT_ONCE, NEVER], ids=["grid", "no grid"])
 def test_the_cavity_of_a_mug_is_outside_and_its_wall_inside(grid_from: int) -> None:
     mug, rng = analytic_mug(), np.random.default_rng(0)
@@ -110,6 +111,7 @@ def test_a_small_hole_is_closed_and_said() -> None:
     assert index.distance_m(middle[None, None], None)[0, 0] > 0.001
 
 
+@pytest.mark.slow
 def test_a_cup_drawn_as_one_open_sheet_is_refused_with_the_reason() -> None:
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.05)
     bowl = sphere.faces[sphere.triangles_center[:, 2] < 0]

@@ -29,6 +29,7 @@ def test_residuals_and_decisions_are_scipys_on_a_thousand_random_systems():
     np.testing.assert_array_equal(ours < 0.01, theirs < 0.01)
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=100)
 @given(
     st.integers(1, 12).flatmap(lambda n: arrays(float, (6, n), elements=NUMBERS)), arrays(float, 6, elements=NUMBERS)

@@ -111,7 +111,7 @@ def test_worker_processes_change_no_byte(clips_folder, tmp_path, monkeypatch):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_worker_killed_once_changes_no_byte(clips_folder, tmp_path, monkeypatch):
     quality_store(clips_folder, tmp_path / "one", jobs=1, progress=False)
     monkeypatch.setattr(stage, "FRAMES_PER_JOB", 1)

@@ -32,6 +32,7 @@ def kinematics_vertices(pose: HandPose, betas: np.ndarray, template_m: np.ndarra
     return layer(*(torch.from_numpy(array) for array in arrays))[0].numpy()
 
 
+@pytest.mark.slow
 def test_vertices_and_their_derivatives_are_those_of_the_hand_model_with_shape_mesh_and_pose_correctives():
     random, model = np.random.default_rng(1), load_embedded_hands().left
     betas, template = random.normal(size=10), model.template_m + random.normal(0, 0.001, (778, 3))
@@ -46,6 +47,7 @@ def test_vertices_and_their_derivatives_are_those_of_the_hand_model_with_shape_m
         assert derivative[..., unknown] == pytest.approx((ahead - behind) / (2 * step), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_the_field_has_the_distances_of_both_parts_where_they_are_and_their_slope():
     model, random = hinged_box(), np.random.default_rng(2)
     turn, place = random.normal(size=(2, FRAMES, 3)).astype(np.float32)

@@ -37,6 +37,7 @@ BOTTLE = two_parts(lump((0.05, 0.04, 0.1), (0.03, 0, 0), 0), lump((0.05, 0.04, 0
 ANGLES = np.concatenate((np.linspace(-0.4, 2.0, 9), [0.0]))
 
 
+@pytest.mark.slow
 def test_vertices_are_those_of_a_tree_of_every_frame_and_part_the_moving_part_first() -> None:
     settings = BasisSettings(COUNT, seed=3)
     seen, scale = PartBps(BOTTLE, settings).look(ANGLES), object_scale(BOTTLE)

@@ -88,6 +88,7 @@ MESHES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESHES)
 def test_all_sensors_agree_with_slow_independent_code(name):
     hand, model = small_hand(), MESHES[name]
@@ -124,6 +125,7 @@ def test_a_box_is_sensed_as_its_closed_formulas_say():
         assert (found.ambient[frame, far] == 0).all()
 
 
+@pytest.mark.slow
 def test_a_sphere_and_a_cylinder_are_sensed_to_a_micrometre_where_their_meshes_are_that_fine():
     radius, points = 0.01, np.random.default_rng(0).normal(0, 0.03, (2000, 3))
     fine = trimesh.creation.icosphere(6, radius)

@@ -95,6 +95,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large])
 @given(clips=st.lists(any_clip(), max_size=5), frames_per_shard=st.sampled_from((1, 8, 1000)))
 def test_writing_what_was_read_gives_the_same_bytes_and_a_sound_store(clips, frames_per_shard):

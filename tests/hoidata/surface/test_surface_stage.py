@@ -221,7 +221,7 @@ def test_results_in_any_order_are_written_in_the_store_s_and_their_costs_added_u
         assert asked.pop() == expected
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bytes_do_not_depend_on_the_number_of_processes(written, monkeypatch):
     folder, _ = written
     monkeypatch.setattr("hoidata.surface.stage.FRAMES_PER_JOB", 10)

@@ -14,6 +14,7 @@ def _digests(root) -> dict[str, str]:
     return {str(path.relative_to(root)): sha256_file(path) for path in sorted(root.rglob("*")) if path.is_file()}
 
 
+@pytest.mark.long
 def test_a_corpus_is_the_same_bytes_for_any_number_of_jobs(small_corpus, tmp_path):
     write_corpus("grab", tmp_path / "together", seed=0, size="small", jobs=2)
     assert _digests(tmp_path / "together") == _digests(small_corpus("grab").raw)

@@ -128,7 +128,7 @@ def _digests(root) -> dict[str, str]:
     return {str(path.relative_to(root)): sha256_file(path) for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_study_corpus_is_the_same_bytes_for_any_number_of_jobs(made, tmp_path):
     write_corpus("arctic", tmp_path / "together", 1, "study-small", jobs=2)
     assert _digests(made["arctic"][0]) == _digests(tmp_path / "together")

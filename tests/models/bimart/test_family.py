@@ -166,6 +166,7 @@ def test_a_request_without_the_objects_motion_is_left_out_with_the_reason(
     assert isinstance(answers[1], Clip)
 
 
+@pytest.mark.slow
 def test_refinement_and_controls_change_the_hands_and_never_the_object(
     sources: Sources, samples: list[ClipSample]
 ) -> None:

@@ -81,6 +81,7 @@ def same(one: Clip, other: Clip) -> None:
             np.testing.assert_array_equal(getattr(one.hands[side], name), getattr(other.hands[side], name))
 
 
+@pytest.mark.slow
 def test_random_fingers_in_the_recording_give_the_same_motion(fingers: Fingers, samples: list[ClipSample]) -> None:
     draws = np.random.default_rng(0)
     for sample in samples:
@@ -116,6 +117,7 @@ def test_a_request_without_trajectories_is_left_out_with_the_reason(
     assert "trajectories" in answer.reason
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", ["off", "paper", "released"])
 def test_a_stream_gives_the_bits_of_the_clip(fingers: Fingers, samples: list[ClipSample], rule) -> None:
     sample, predictor = samples[0], replace(fingers.predictor, rule=rule)

@@ -42,7 +42,7 @@ def motion(seed: int) -> tuple[Control, np.ndarray]:
     return control, HAND.rest_rotmats @ rotvec_to_rotmat(waves(draws, 0.35, 15, 3))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_motions_of_five_seconds_are_learnt_and_followed_within_5_mm_in_nine_frames_of_ten() -> None:
     torch.manual_seed(0)
     motions, time_s = [motion(0), motion(1)], np.arange(FRAMES) / FPS

@@ -81,6 +81,7 @@ PLANTED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("planted", PLANTED)
 def test_exactly_the_planted_difference_is_told(ran, monkeypatch, planted):
     plant, expected = PLANTED[planted]

@@ -106,6 +106,7 @@ def test_graph_holds_the_stages_of_all_families_with_their_addresses(root):
     assert graph["convert@grab"].outs == ("data/grab",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["this project", "a small one"])
 def test_the_graph_read_without_dvc_is_the_one_dvc_reads(root, place):
     at = Path(__file__).parents[3] if place == "this project" else root

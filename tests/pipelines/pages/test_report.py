@@ -64,6 +64,7 @@ def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, han
     assert text.count("<svg") == 1
 
 
+@pytest.mark.slow
 def test_recorded_and_generated_motion_and_contact_maps_stand_side_by_side(sampled, hands, tmp_path):
     first, second = (write(sampled, hands, tmp_path / name, "grab") for name in "ab")
     assert first == second
