@@ -157,7 +157,10 @@ def oakink2_annotations() -> list[bytes]:
     faults = (
         *({"mocap_frame_id_list": frames} for frames in (["0"], [], [4, 1], [0, 1000])),
         *({"obj_list": ids} for ids in ([1], "a", ["../x"])),
-        *({"obj_transf": {"a": poses}} for poses in ([], {0: np.eye(3)}, {0: np.zeros((4, 4))}, {0: "words"}, {1: 0})),
+        *(
+            {"obj_transf": {"a": poses}}
+            for poses in ([], {0: np.eye(3)}, {0: np.zeros((4, 4))}, {0: "words"}, {1: 0}, {0: np.eye(4) * 1e300})
+        ),
         *({"raw_mano": hands} for hands in ([], {}, {0: {**both, "lh__pose_coeffs": np.zeros((1, 16, 4))}})),
     )
     return [pickle.dumps({**whole, **fault}, 4) for fault in ({}, *faults)]

@@ -72,7 +72,7 @@ def recording(name: str, seed: int, n_frames: int = N_FRAMES, **changes) -> Reco
     random, time = np.random.default_rng(seed), np.linspace(0, 1, n_frames)[:, None]
     turn = Rotation.from_rotvec(random.normal(0, 0.5, 3) + time * random.normal(0, 0.6, 3))
     pose = transforms(turn, np.array([0.2, 0.9, 0.1]) + time * random.normal(0, 0.2, 3))
-    stop = FIRST + n_frames
+    stop, grips = FIRST + n_frames, {side: pose for side in SIDES}
     if name == LAPTOP:
         swing = Rotation.from_rotvec(np.outer(0.2 + 1.5 * time[:, 0] ** 2, AXIS))
         relative = transforms(swing, ORIGIN - swing.apply(ORIGIN))
@@ -87,6 +87,7 @@ def recording(name: str, seed: int, n_frames: int = N_FRAMES, **changes) -> Reco
         off = transforms(Rotation.from_rotvec(np.outer(6 * time[:, 0], [0, 0, 1])), np.outer(time, [0.05, 0.02, 0.2]))
         cap, body = box((0.03, 0.03, 0.02), (0, 0, 0.11)), box((0.06, 0.06, 0.2), (0, 0, 0))
         parts, half = {CAP: (cap, pose @ off), BODY: (body, pose), MUG: (_mug(), pose)}, (0.03, 0.0, 0.0)
+        grips["left"] = pose @ off @ transforms(Rotation.identity(1), [[0.012, 0, 0.11]])
         program = (
             ((FIRST, stop), (FIRST + 4, stop), "unscrew", "lh_main", [CAP], [BODY]),
             ((FIRST + 40, FIRST + 60), None, "hold", "lh_main", [BODY], None),
@@ -96,7 +97,7 @@ def recording(name: str, seed: int, n_frames: int = N_FRAMES, **changes) -> Reco
     else:
         parts, half = {MUG: (_mug(), pose)}, (0.04, 0.0, 0.0)
         program = ((None, (FIRST, stop), "pour", "rh_main", None, [MUG]),)
-    hands = {side: holding(side, pose, half, random) for side in SIDES}
+    hands = {side: holding(side, grips[side], half, random) for side in SIDES}
     return replace(Recording(name, parts, hands, program), **changes)
 
 

@@ -25,6 +25,7 @@ Range = tuple[int, int]
 PART_ID = re.compile(r"\w[\w@-]{0,60}")
 _KEY = re.compile(r"[\d\s(),\[\]None]{1,100}")
 _MOST_GAPS = 10  # frame numbers may reach this much farther than there are frames
+_LARGEST = 1e6
 _LAST_FRAME = 10**7  # a day at 120 Hz
 
 
@@ -121,6 +122,8 @@ def _stacked(where: str, values: list[Any], shape: tuple[int, ...]) -> np.ndarra
         raise BadInput(where, f"arrays of shape {shape}", f"{wrong.dtype} of shape {wrong.shape}")
     rows = np.stack([own.reshape(shape) for own in arrays]).astype(np.float64)
     checks.finite(where, rows)
+    if np.abs(rows).max() > _LARGEST:
+        raise BadInput(where, f"metres and quaternions, at most {_LARGEST:g}", f"{np.abs(rows).max():.3g}")
     return rows
 
 

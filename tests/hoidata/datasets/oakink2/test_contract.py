@@ -116,6 +116,7 @@ class TestOakink2(AdapterContract):
         yield Row("no frames", frames, edited(set_in(frames, value=[])), "frame numbers from 0")
         yield Row("frames twice", frames, edited(set_in(frames, value=[5, 5, 6])), "rising")
         yield Row("frames of a year", frames, edited(set_in(frames, value=[0, 9_000_000])), "without great gaps")
+        yield Row("a place beyond all rooms", LID, pose(lambda matrix: matrix.__imul__(1e300)), "at most 1e+06")
         yield Row("a path as part", "obj_list", edited(set_in("obj_list", value=["../x"])), "part ids such as")
         yield Row("rows", "frame 14", pose(lambda matrix: matrix.__setitem__(slice(None), matrix.T.copy())), "rotation")
         yield Row("a mirror", "frame 14", pose(lambda matrix: matrix.__imul__([[-1], [1], [1], [1]])), "a mirror")
