@@ -8,8 +8,9 @@ from setuptools import find_packages, setup
 
 INSTALLED = "hoidata.installed"
 DATA = ["npz", "csv", "html", "json", "toml", "js", "css", "md"]
-PROJECT = ["dvc.yaml", "params.yaml", "prefect.toml", ".dvcignore", ".gitattributes", ".gitignore"]
-FOLDERS = [".dvc/config", ".dvc/.gitignore", "manifests/embedded/*.json", "manifests/study/*.json", "models/*/dvc.yaml"]
+GRAPHS = ["dvc.yaml", "pipelines/dvc.yaml", "models/*/dvc.yaml"]
+PROJECT = ["params.yaml", "prefect.toml", ".dvcignore", ".gitattributes", ".gitignore"]
+FOLDERS = [".dvc/config", ".dvc/.gitignore", "manifests/embedded/*.json", "manifests/study/*.json", *GRAPHS]
 
 own = find_packages(include=["hoidata*"])
 beside = [f"{INSTALLED}.{name}" for name in find_packages(include=["models*", "pipelines*"])]

@@ -15,6 +15,7 @@ from bench import (
     evaluator,
     kernels,
     manipnet,
+    manipnet_course,
     manipnet_speed,
     physics,
     realism,
@@ -46,6 +47,7 @@ BENCHMARKS = {
     "refinement": refinement.main,
     "borders": borders.main,
     "manipnet": manipnet.main,
+    "manipnet-course": manipnet_course.main,
 }
 
 

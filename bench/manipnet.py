@@ -1,8 +1,9 @@
 """Fingers for the wrists and objects of the real ManipNet recordings: the paper's table, with the controls it lacks.
 
 ``python -m bench manipnet`` with HOIDATA_MANIPNET: the data folder. HOIDATA_BENCH_SEEDS: how many trainings of each
-row (1 if not given); HOIDATA_BENCH_SIZE: small or full. What was computed is kept in .hoidata/manipnet (never
-committed: the data is CC BY-NC) and taken up again, so a run may be stopped at any time.
+row of objects seen (3 if not given); HOIDATA_BENCH_MINUTES: no row is begun that would end later (120);
+HOIDATA_BENCH_ROWS: some rows alone, by name with commas; HOIDATA_BENCH_SIZE: small or full. What was computed is kept
+in .hoidata/manipnet (never committed: the data is CC BY-NC) and taken up again, so a run may be stopped at any time.
 
 Objects seen: of five successive tenths of a recording three train, the last tests, 0.5 s around what is not trained on
 left out. Objects unseen: every recording left out in turn; the first test tenths of it are rolled out.
@@ -28,7 +29,7 @@ from hoidata.hands.tracked_hand import HandState
 from hoidata.physics.capsules import CapsuleContacts
 from hoidata.physics.realism import LARGEST_PENETRATION_M, VARIANTS, contacts_in, score, smoothness_m_s2
 from models.common.training import TrainingConfig
-from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared
+from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared, sized
 from models.manipnet.features import FeatureSettings
 from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
 from models.manipnet.network import ManipNet, NetworkConfig
@@ -70,11 +71,12 @@ class Piece(NamedTuple):
 
 @dataclass(frozen=True)
 class Trial:
-    """What trains and what tests: (recording, (frame,) bool) each. name: for what is kept."""
+    """What trains and what tests: (recording, (frame,) bool) each. name: for what is kept. rows: to be trained."""
 
     name: str
     train: tuple[tuple[HandRecording, np.ndarray], ...]
     pieces: tuple[Piece, ...]
+    rows: tuple[str, ...] = ()
 
 
 def main() -> None:
@@ -85,17 +87,69 @@ def main() -> None:
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     torch.use_deterministic_algorithms(True)
     recordings = [read_hands(Path(root), name) for name in NAMES]
-    size, seeds = os.environ.get("HOIDATA_BENCH_SIZE", "small"), int(os.environ.get("HOIDATA_BENCH_SEEDS", "1"))
-    seen = seen_trial(recordings)
-    rows = table(seen, VARIANTS_OF_OURS, size, seeds)
-    show_rows(f"Objects seen, {size} network, {seeds} seeds", rows)
-    for trial in unseen_trials(recordings):
-        show_rows(trial.name, table(trial, {name: VARIANTS_OF_OURS[name] for name in UNSEEN}, size, seeds))
+    size, seeds = os.environ.get("HOIDATA_BENCH_SIZE", "small"), int(os.environ.get("HOIDATA_BENCH_SEEDS", "3"))
+    wanted = os.environ.get("HOIDATA_BENCH_ROWS", ",".join(VARIANTS_OF_OURS)).split(",")
+    trials = [seen_trial(recordings), *unseen_trials(recordings)]
+    tables: dict[str, Rows] = {}
+    jobs = [Job(trial, name, 0) for trial in trials for name in trial.rows if name in wanted]
+    jobs += [Job(trials[0], name, seed) for seed in range(1, seeds) for name in trials[0].rows if name in wanted]
+    left_out = fill(tables, jobs, size, 60 * float(os.environ.get("HOIDATA_BENCH_MINUTES", "120")))
+    for name, rows in tables.items():
+        show_rows(f"Objects {name}, {size} network", rows)
+    if all(trial.name in tables for trial in trials):
+        show_rows(f"Objects unseen, all, {size} network", pooled([tables[trial.name] for trial in trials[1:]]))
+    if left_out:
+        print(f"no time was left for {len(left_out)} trainings: " + ", ".join(job.key(size) for job in left_out))
 
 
-def seen_trial(recordings: Sequence[HandRecording]) -> Trial:
+class Job(NamedTuple):
+    """A row to train."""
+
+    trial: "Trial"
+    name: str
+    seed: int
+
+    def key(self, size: str) -> str:
+        return f"{self.trial.name} {self.name} {size} {self.seed}"
+
+
+Rows = dict[str, list[dict[str, float]]]
+
+
+def fill(tables: dict[str, Rows], jobs: Sequence[Job], size: str, budget_s: float) -> list[Job]:
+    """Train row after row into the tables, one dictionary of figures per seed; those that there was no time for."""
+    began, longest, left_out = time.monotonic(), 0.0, []
+    for job in jobs:
+        start = time.monotonic()
+        if start - began + longest > budget_s:
+            left_out.append(job)
+            continue
+        if job.trial.name not in tables:
+            tables[job.trial.name] = control_rows(job.trial)
+        for rule, figures in kept(job.key(size), lambda job=job: trained_row(job, size)).items():
+            words = {"off": "", "ours": ", post-processed", "released": ", the demo's post-processing"}[rule]
+            tables[job.trial.name].setdefault(job.name + words, []).append(figures)
+        longest = max(longest, time.monotonic() - start)
+    return left_out
+
+
+def pooled(tables: Sequence[Rows]) -> Rows:
+    """Means over trials of rows that all of them have, every hand frame counting the same."""
+    names = [name for name in tables[0] if all(name in rows for rows in tables)]
+    weight = np.array([rows["raw data"][0]["frames"] for rows in tables])
+    found: Rows = {}
+    for name in names:
+        figures = {key: float(np.average([rows[name][0][key] for rows in tables], weights=weight)) for key in COLUMNS}
+        found[name] = [figures | {"frames": float(weight.sum())}]
+    return found
+
+
+def seen_trial(recordings: Sequence[HandRecording], kinds: tuple[int, ...] = TEST) -> Trial:
+    """Training tenths train; the test tenths, or others, are rolled out."""
     train = tuple((one, one.trains & one.usable) for one in recordings)
-    return Trial("seen", train, tuple(piece for one in recordings for piece in pieces(one, TEST)))
+    return Trial(
+        "seen", train, tuple(piece for one in recordings for piece in pieces(one, kinds)), tuple(VARIANTS_OF_OURS)
+    )
 
 
 def unseen_trials(recordings: Sequence[HandRecording]) -> list[Trial]:
@@ -103,7 +157,7 @@ def unseen_trials(recordings: Sequence[HandRecording]) -> list[Trial]:
     trials = []
     for out in recordings:
         train = tuple((one, one.usable) for one in recordings if one is not out)
-        trials.append(Trial(f"unseen {out.name}", train, tuple(pieces(out, (*TRAIN[:1], *TEST)))))
+        trials.append(Trial(f"unseen {out.name}", train, tuple(pieces(out, (*TRAIN[:1], *TEST))), UNSEEN))
     return trials
 
 
@@ -121,34 +175,35 @@ def pieces(recording: HandRecording, kinds: tuple[int, ...]) -> list[Piece]:
     return found
 
 
-def table(
-    trial: Trial, variants: dict[str, dict[str, Any]], size: str, seeds: int
-) -> dict[str, list[dict[str, float]]]:
-    """Figures of every row, one dictionary per seed."""
-    rows = {name: [figures] for name, figures in kept(f"{trial.name} controls", lambda: controls(trial)).items()}
-    for name, changes in variants.items():
-        for seed in range(seeds):
-            key = f"{trial.name} {name} {size} {seed}"
-            for rule, figures in kept(key, lambda c=changes, s=seed: trained_row(trial, c, size, s)).items():
-                rows.setdefault(f"{name}{'' if rule == 'off' else ', IK'}", []).append(figures)
-    return rows
+def control_rows(trial: Trial) -> Rows:
+    return {name: [figures] for name, figures in kept(f"{trial.name} controls", lambda: controls(trial)).items()}
 
 
-def trained_row(trial: Trial, changes: dict[str, Any], size: str, seed: int) -> dict[str, dict[str, float]]:
-    """Train one network and roll it out, without and with post-processing."""
-    began, changes = time.process_time(), dict(changes)
+def trained_row(job: Job, size: str) -> dict[str, dict[str, float]]:
+    """Train one network and roll it out, without and with post-processing; of ours also with the demo's."""
+    model = trained_network(job, size)
+    rules: tuple[Rule, ...] = ("off", "ours", "released")[: 3 if job.name == "ours" else 2]
+    return {rule: measured(job.trial, rolled(job.trial, model, rule)) for rule in rules}
+
+
+def trained_network(job: Job, size: str) -> ManipNet:
+    """The network of a row, kept with the figures."""
+    changes = dict(VARIANTS_OF_OURS[job.name])
     network, training = SIZES[size]
     astray = changes.pop("astray", True)
     config = replace(network, features=SETTINGS, **changes)
-    examples = examples_of(trial, astray)
-    torch.manual_seed(seed)
-    model = prepared(config, trial.train[0][0].hands["right"], examples)
-    fit_examples(model, examples, training, seed)
-    trained_s = time.process_time() - began
-    found = {}
-    for rule in ("off", "released"):
-        found[rule] = measured(trial, rolled(trial, model, rule)) | {"train_s": trained_s}
-    return found
+    path = kept_path(f"{job.key(size)} network", ".pt")
+    hand = job.trial.train[0][0].hands["right"]
+    if path.is_file():
+        model = ManipNet(sized(config, hand))
+        model.load_state_dict(torch.load(path, weights_only=True))
+        return model.eval()
+    examples = examples_of(job.trial, astray)
+    torch.manual_seed(job.seed)
+    model = prepared(config, hand, examples)
+    fit_examples(model, examples, training, job.seed)
+    torch.save(model.state_dict(), path)
+    return model
 
 
 _EXAMPLES: dict[tuple[str, Side, bool], Examples] = {}
@@ -326,13 +381,19 @@ def _moved_away(recording: HandRecording, frames: slice, state: HandState, way_m
 
 def kept(key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     """What was computed under a key before with the same settings, else what is computed now."""
-    digest = sha256(f"{key} {SIZES} {SETTINGS}".encode()).hexdigest()[:12]
-    path = KEPT / f"{key.replace(' ', '-').replace(',', '')}-{digest}.json"
+    path = kept_path(key, ".json")
     if not path.is_file():
-        began = time.perf_counter()
+        began, processor = time.perf_counter(), time.process_time()
         write_whole(path, json.dumps(make(), indent=1))
-        print(f"{key}: {time.perf_counter() - began:.0f} s", flush=True)
+        took = f"{time.perf_counter() - began:.0f} s, {time.process_time() - processor:.0f} s of one core"
+        print(f"{key}: {took}", flush=True)
     return json.loads(path.read_text())
+
+
+def kept_path(key: str, ending: str) -> Path:
+    digest = sha256(f"{key} {SIZES} {SETTINGS}".encode()).hexdigest()[:12]
+    KEPT.mkdir(parents=True, exist_ok=True)
+    return KEPT / f"{key.replace(' ', '-').replace(',', '')}-{digest}{ending}"
 
 
 COLUMNS = {

@@ -6,6 +6,7 @@ import json
 import pickle
 import pickletools
 import struct
+import tarfile
 import zipfile
 from collections import OrderedDict
 from functools import cache
@@ -286,6 +287,124 @@ def gzipped() -> list[bytes]:
 
 def as_json(*values: object) -> list[bytes]:
     return [json.dumps(value).encode() for value in values]
+
+
+def glb_files() -> list[bytes]:
+    """A tetrahedron where its node puts it, with corners of two and of four bytes; one without a scene, one empty."""
+    found = []
+    for kind, code in (("<u2", 5123), ("<u4", 5125)):
+        body = np.array(_CORNERS, "<f4").tobytes() + np.array(_FACES, kind).tobytes()
+        place = {"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 4}
+        corner = {"bufferView": 1, "componentType": code, "type": "SCALAR", "count": 9}
+        tree = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0, "translation": [0, 1, 2], "rotation": [0, 0, 0.6, 0.8]}],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+            "accessors": [place, corner],
+            "bufferViews": [
+                {"buffer": 0, "byteLength": 48},
+                {"buffer": 0, "byteOffset": 48, "byteLength": 9 * int(kind[2])},
+            ],
+            "buffers": [{"byteLength": len(body)}],
+        }
+        found += [_glb(tree, body), _glb({**tree, "scenes": [], "nodes": []}, body)]
+    huge = _glb({"accessors": [{"count": 10**9}], "meshes": [{"primitives": [{"attributes": {}}]}]}, b"")
+    return [*found, huge, b"glTF", b""]
+
+
+def _glb(tree: dict, body: bytes) -> bytes:
+    text = json.dumps(tree).encode()
+    text, body = text + b" " * (-len(text) % 4), body + b"\0" * (-len(body) % 4)
+    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(body), 0x004E4942) + body
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def hot3d_hands() -> list[bytes]:
+    """Two lines of MANO's and of UmeTrack's numbers, and lines with one thing wrong."""
+    wrist = {"t_xyz": [0.1, -0.2, 3], "q_wxyz": [0.5, -0.5, 0.5, 0.5]}
+    mano = {"pose": [0.1] * 15, "wrist_xform": wrist, "betas": [1.5] * 10}
+    umetrack = {"joint_angles": [0.1] * 22, "wrist_xform": wrist, "hand_confidence": 1.0}
+    found = []
+    for hand in (mano, umetrack):
+        lines = [json.dumps({"timestamp_ns": time, "hand_poses": {"0": hand, "1": hand}}) for time in (5, 9)]
+        found += ["\n".join(lines), "\n".join([lines[0], lines[0]])]
+    turned = {**mano, "wrist_xform": {**wrist, "q_wxyz": [2, 0, 0, 0]}}
+    hands: tuple[object, ...] = ({"2": mano}, {"0": 5}, {"0": {**mano, "pose": [1]}}, {"1": turned}, {})
+    found += [json.dumps({"timestamp_ns": 5, "hand_poses": own}) for own in hands]
+    return [*(text.encode() for text in found), b'{"timestamp_ns": 1.5, "hand_poses": {}}', b" " * 70_000, b"\n", b""]
+
+
+def hot3d_tables() -> list[bytes]:
+    head = "object_uid,timestamp[ns],t_wo_x[m],t_wo_y[m],t_wo_z[m],q_wo_w,q_wo_x,q_wo_y,q_wo_z\n"
+    row = "37787722328019,{},-0.2,7e-1,.5,0.5,0.5,-0.5,0.5\n"
+    rows = (
+        row.format(1) + row.format(2),
+        row.format(1) * 2,
+        row.format("x"),
+        row.format(1)[1:],
+        "a,1\n",
+        "a" + row,
+        "",
+    )
+    masks = ("1,214-1,True\n2,1201-1,False\n", "1,214-1,yes\n", "now,1,True\n")
+    found = [head + text for text in rows] + ["timestamp[ns],stream_id,mask\n" + text for text in masks]
+    return [*(text.encode() for text in found), row.replace("0.5", "0.9").join((head, "")).encode(), b""]
+
+
+def hot3d_tars() -> list[bytes]:
+    """A clip of two frames, and clips with one thing wrong."""
+    place = {"translation_xyz": [0.1, -2, 3], "quaternion_wxyz": [0.5, 0.5, -0.5, 0.5]}
+    mano = {"thetas": [0.5] * 15, "wrist_xform": [0.1, 0.2, 0.3, 1, 2, 3]}
+    hand = {"mano_pose": mano, "umetrack_pose": {"joint_angles": [0.1] * 20, "T_world_from_wrist": place}}
+    thing = {"object_name": "mug_white", "T_world_from_object": place}
+    whole = {"__hand_shapes.json__": {"mano": [0.1] * 10, "umetrack": {}}}
+    for frame in (0, 1):
+        whole[f"{frame:06d}.hands.json"] = {"left": hand, "right": None if frame else hand}
+        whole[f"{frame:06d}.objects.json"] = {"9": [thing]}
+    changes: tuple[dict, ...] = (
+        {},
+        {"000001.hands.json": [1]},
+        {"000001.hands.json": {"left": {"mano_pose": mano}}},
+        {"000001.hands.json": {"left": {**hand, "mano_pose": {**mano, "thetas": [1]}}}},
+        {"000001.objects.json": {"9": [thing, thing]}},
+        {"000001.objects.json": [thing]},
+        {"000001.objects.json": {"9": [{**thing, "object_name": "Mug"}]}},
+        {"000000.objects.json": {}, "000001.objects.json": {}},
+    )
+    found = [_tar({**whole, **change}) for change in changes]
+    return [*found, found[0][:700], b"", _tar({f"{number:06d}.objects.json": {} for number in range(2002)})]
+
+
+def _tar(members: dict[str, object]) -> bytes:
+    stream = io.BytesIO()
+    with tarfile.open(fileobj=stream, mode="w") as archive:
+        for name, value in members.items():
+            text, info = json.dumps(value).encode(), tarfile.TarInfo(name)
+            info.size = len(text)
+            archive.addfile(info, io.BytesIO(text))
+    return stream.getvalue()
+
+
+def hot3d_json() -> list[bytes]:
+    """Metadata, instances, and a profile whose 21 landmarks hang on bones 0 to 16."""
+    profile = {
+        "joint_rotation_axes": [[0, 0, 1.0]] * 22,
+        "joint_rest_positions": [[90, -1.5, 20]] * 22,
+        "landmark_rest_positions": [[100, 2, 3.5]] * 21,
+        "landmark_rest_bone_indices": [[number % 17, 1, 2] for number in range(21)],
+        "landmark_rest_bone_weights": [[0.5, 0.25, 0.25]] * 21,
+    }
+    wrong = ({"joint_rotation_axes": [[0, 0, 2]] * 22}, {"landmark_rest_bone_indices": [[17, 0, 0]] * 21})
+    values = [{"hand_model": {**profile, **change}} for change in ({}, *wrong)]
+    names = ({"1": {"instance_name": "mug_white"}}, {"1": {"instance_name": "../a"}}, [1])
+    clips = (
+        {"7": {"sequence_id": "P0003_c701bd11", "device": "Aria"}},
+        {"7": {"sequence_id": 5}},
+        {"8": {"sequence_id": 5}},
+    )
+    return as_json(*values, *names, *clips, {"headset": "Aria"}, {"headset": 5})
 
 
 # Files that are nearly right: each leads to one refusal that chance alone seldom finds.

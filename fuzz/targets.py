@@ -31,6 +31,8 @@ from hoidata.datasets.arctic import files as arctic_files
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.h2o import files as h2o_files
 from hoidata.datasets.hoi4d import files as hoi4d_files
+from hoidata.datasets.hot3d import files as hot3d_files
+from hoidata.datasets.hot3d import packed, umetrack
 from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.datasets.manipnet import bvh
 from hoidata.datasets.oakink2 import files as oakink2_files
@@ -46,7 +48,7 @@ from hoidata.files import (
 )
 from hoidata.hands import mano, model
 from hoidata.object_paths import keyframes, script
-from hoidata.objects import mesh
+from hoidata.objects import mesh, user_mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
 from models.manipnet import trajectory_files
@@ -123,6 +125,7 @@ def all_targets() -> dict[str, Target]:
         _texts(),
         _trajectories(),
         _hoi4d(),
+        _hot3d(),
         _oakink2(),
         _object_paths(),
         _json_files(),
@@ -312,6 +315,24 @@ def _meshes() -> list[Target]:
             on_disk("a.ply", mesh.load_mesh),
             binary,
             MESH_WORDS,
+        ),
+        Target(
+            "glb",
+            lambda: [*seeds.glb_files(), ABSENT],
+            on_disk("a.glb", user_mesh.read_mesh_file),
+            (user_mesh.read_mesh_file, user_mesh._check_glb, user_mesh._accessors),
+            (
+                b'"count": 9',
+                b"5126",
+                b"5125",
+                b"VEC3",
+                b'"mesh": 0',
+                b'"nodes": [0]',
+                b"null",
+                b"JSON",
+                b"BIN\0",
+                b"-1",
+            ),
         ),
     ]
 
@@ -515,6 +536,68 @@ def _hoi4d_json(data: bytes) -> object:
     with contextlib.suppress(BadInput):
         hoi4d_files._meshes_by_id(hoi4d_files.read_json(data, "result.json"), "result.json")
     return hoi4d_files.hinge_joint(data, tree, "mobility_v2.json", "result.json")
+
+
+def _hot3d() -> list[Target]:
+    words = (b"NaN", b"null", b"-", b"1e999", b"[", b"]", b"{", b'"', b",", b"\n", b"\xff", b"true", b"_", b"0")
+    rows = (hot3d_files._table, hot3d_files._time, hot3d_files.poses_of)
+    return [
+        Target(
+            "hot3d-hands",
+            seeds.hot3d_hands,
+            lambda data: hot3d_files.hand_poses(data, "a.jsonl", "umetrack" if b"angles" in data else "mano"),
+            (hot3d_files.hand_poses, hot3d_files._lines, hot3d_files.row_of, hot3d_files.poses_of),
+            (*words, b'"hand_poses"', b'"q_wxyz"', b'"pose"', b'"2"'),
+        ),
+        Target(
+            "hot3d-tables",
+            seeds.hot3d_tables,
+            lambda data: (hot3d_files.failed_times if b"mask" in data else hot3d_files.object_poses)(data, "a.csv"),
+            (hot3d_files.object_poses, hot3d_files.failed_times, *rows),
+            (*words, b"True", b"False", b"mask", "٣".encode(), b"1e400", b"object_uid"),
+        ),
+        Target(
+            "hot3d-tar",
+            seeds.hot3d_tars,
+            lambda data: packed.read_packed(data, "a.tar"),
+            functions_of(packed),
+            (
+                *words,
+                b"000001.hands.json\0",
+                b"__hand_shapes.json__\0",
+                b'"mano_pose"',
+                b'"thetas"',
+                b"ustar",
+                b"0000777",
+            ),
+        ),
+        Target(
+            "hot3d-json",
+            seeds.hot3d_json,
+            _hot3d_json,
+            (
+                hot3d_files.headset,
+                hot3d_files.headset_of,
+                hot3d_files.object_names,
+                hot3d_files.checked_name,
+                hot3d_files.read_json,
+                *functions_of(umetrack),
+            ),
+            (*words, b'"headset"', b"17", b"1.5", b'"instance_name"', b'"hand_model"'),
+        ),
+    ]
+
+
+def _hot3d_json(data: bytes) -> object:
+    """Whichever of the three kinds of file it looks like; joints of a profile that was read are finite or not told."""
+    if b"sequence_id" in data:
+        return packed.definition(data, "clip_definitions.json", 7)
+    if b"headset" in data:
+        return hot3d_files.headset(data, "metadata.json")
+    if b"hand_model" not in data:
+        return hot3d_files.object_names(data, "instance.json")
+    still = hot3d_files.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
+    return umetrack.joints_m(umetrack.parse_profile(data, "profile.json"), still, "right")
 
 
 def _segment_lists() -> tuple[str, str]:

@@ -30,6 +30,7 @@ class DatasetFacts:
     needs_mano: raw files hold MANO parameters. may_be_shared: the licence lets derived data be passed on.
     split: the one used unless params.yaml chooses another; "" where the user has to choose.
     conventions: what the source means by its numbers, in one line each, by the names of ``CONVENTIONS.md``'s rows.
+    licences: ``licence`` and ``may_be_shared`` of arrays that are not under the dataset's, as dataset cards name them.
     """
 
     name: str
@@ -43,10 +44,14 @@ class DatasetFacts:
     paper: str = ""
     split: str = ""
     conventions: dict[str, str] = field(default_factory=dict)
+    licences: dict[str, dict[str, Any]] = field(default_factory=dict)
 
 
 # What TOML gives for a field of each type.
-_KINDS: dict[Any, tuple[type, ...]] = {str: (str,), bool: (bool,), float: (float, int), dict[str, str]: (dict,)}
+_KINDS: dict[Any, tuple[type, ...]] = {
+    str: (str,), bool: (bool,), float: (float, int), dict[str, str]: (dict,), dict[str, dict[str, Any]]: (dict,),
+}  # fmt: skip
+_OF_ARRAYS = {"licence": str, "may_be_shared": bool}
 
 
 def built_in_names() -> list[str]:
@@ -97,10 +102,13 @@ def _read_facts(folder: Path) -> DatasetFacts:
     for key, value in values.items():
         if type(value) not in known[key]:
             raise BadInput(f"{path}: {key}", known[key][0].__name__, repr(value)[:40], REMEDY)
+    for kind, own in values.get("licences", {}).items():
+        if not isinstance(own, dict) or {name: type(value) for name, value in own.items()} != _OF_ARRAYS:
+            raise BadInput(f"{path}: licences.{kind}", "a licence and may_be_shared", repr(own)[:80], REMEDY)
     try:
         return DatasetFacts(folder.name, **values)
     except TypeError as error:
-        raise BadInput(path, "every fact but paper, split and conventions", str(error), REMEDY) from error
+        raise BadInput(path, "every fact but paper, split, conventions and licences", str(error), REMEDY) from error
 
 
 def _listed_in_settings() -> list[str]:

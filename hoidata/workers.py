@@ -144,9 +144,12 @@ def one_thread() -> Iterator[None]:
 def _start(function: Function, lock: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_serve, args=(function, theirs, _Descriptor(lock)), daemon=True)
+    process = context.Process(target=_serve, args=(theirs, _Descriptor(lock)), daemon=True)
     process.start()
     theirs.close()
+    # Not among the arguments: a process that died before it read more of them than a pipe holds would be waited for.
+    with contextlib.suppress(ConnectionError):
+        ours.send(function)
     return _Worker(process, ours)
 
 
@@ -155,7 +158,7 @@ def _give(worker: _Worker, waiting: Iterator[Any]) -> bool:
     worker.item = next(waiting, None)
     if worker.item is None:
         return False
-    with contextlib.suppress(BrokenPipeError):  # it is dead: found out when its answer does not come
+    with contextlib.suppress(ConnectionError):  # it is dead: found out when its answer does not come
         worker.connection.send(worker.item)
     return True
 
@@ -169,7 +172,7 @@ def _result_of(worker: _Worker) -> Any:
     """The worker's answer. Raises what the function raised, and BadInput for a process that went by itself."""
     try:
         result, problem = worker.connection.recv()
-    except (EOFError, ConnectionError):
+    except (EOFError, OSError):  # OSError: in the middle of its answer
         worker.process.join()
         code = worker.process.exitcode or 0
         if code >= 0:  # no fault of the item: such a process never began (a script without a __main__ guard)
@@ -196,12 +199,16 @@ def _received(copy: Any) -> _Descriptor:
     return _Descriptor(copy.detach())
 
 
-def _serve(function: Function, connection: Connection, lock: _Descriptor) -> None:
+def _serve(connection: Connection, lock: _Descriptor) -> None:
     """A worker's life. ``lock`` is held by being open until the process ends."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
     # Ctrl-C reaches the whole group: the parent decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    try:
+        function = connection.recv()
+    except EOFError:  # the parent is gone
+        return
     if torch := sys.modules.get("torch"):  # loaded with the function
         torch.set_num_threads(1)
     while True:

@@ -3,6 +3,7 @@
 ``[project.entry-points."hoidata.families"]  mine = "my_package.family:MINE"``.
 """
 
+from functools import cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ FAMILIES = {
     "bimart-unrefined": "models.bimart.family:UNREFINED",
     "nearest-window": "models.bimart.lookups:NEAREST_WINDOW",
     "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
+    "random-window": "models.bimart.lookups:RANDOM_WINDOW",
+    "cams-b": "models.bimart_tables.cams:CAMS_B",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
@@ -41,6 +44,9 @@ FAMILIES = {
     "other-hands": "models.baselines.controls:OTHER_HANDS",
     "hands-away": "models.baselines.controls:HANDS_AWAY",
     "pressed": "models.baselines.controls:PRESSED",
+    "pressed-deep": "models.baselines.controls:PRESSED_DEEP",
+    "hands-still": "models.baselines.controls:HANDS_STILL",
+    "hands-shifted": "models.baselines.controls:HANDS_SHIFTED",
     "noise": "models.baselines.controls:NOISE",
     "bimart-other-path": "models.bimart.family:OTHER_PATH",
     "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
@@ -56,11 +62,14 @@ NETWORKS = {
     "manipnet": "models.manipnet.training:MANIPNET",
     "bimart-contact": "models.bimart.contact_training:CONTACT",
     "bimart-motion": "models.bimart.motion_training:MOTION",
+    "cams-b": "models.bimart_tables.cams:CAMS",
 }
 # Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
 IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
 # Networks of such a family under other names.
 LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
+# Networks of the tables that BimArt is compared in.
+IN_TABLES = ("bimart-contact", "bimart-motion", "cams-b")
 
 
 def family_names() -> list[str]:
@@ -111,6 +120,7 @@ def _address(name: str) -> str:
     return (added | FAMILIES)[name]
 
 
+@cache
 def _added() -> list[EntryPoint]:
-    """Entry points of other packages; a built-in name cannot be taken over."""
+    """Entry points of other packages, looked for once a process; a built-in name cannot be taken over."""
     return [point for point in entry_points(group=ENTRY_POINT_GROUP) if point.name not in FAMILIES]

@@ -48,7 +48,7 @@ class AnimateWish:
     sides: tuple[Side, ...] = SIDES
     frames: str = ""
     model: str = ""
-    rule: Rule = "released"
+    rule: Rule = "ours"
     object: str = ""
     unit: str = "m"
     axes: Axes = "model"

@@ -18,14 +18,15 @@ NOTHING = 1e-4
 # Verbs that are each other backwards.
 REVERSES = (("open", "close"), ("lift", "place"), ("put in", "take out"))
 CONFUSED = "taken for its reverse by"
-Must = Literal["fall", "rise", "be equal", "be zero"]
+Must = Literal["fall", "rise", "stay", "be equal", "be zero"]
 
 
 @dataclass(frozen=True)
 class Promise:
     """control, beside: families. metric: its name, or "taken for its reverse by <classifier>".
 
-    must: fall or rise beyond the interval over clips of the row ``beside``; be equal to it in every digit; be zero.
+    must: fall or rise beyond the interval over clips of the row ``beside``; stay, so not fall beyond it; be equal to it
+    in every digit; be zero.
     """
 
     control: str
@@ -51,6 +52,7 @@ def _promises(must: Must, control: str, *metrics: str, beside: str = TRUTH) -> l
 ACCURACY = ("accuracy_top1_paper", "accuracy_top1_corrected")
 # A floor is of the recorded clips themselves and could not differ.
 SEEN_BY_PAPER = tuple(item.name for item in FEATURE_METRICS if item.encoder == "paper" and not item.floor_of)
+CONTACT = ("bimart_con_corrected", "bimart_art_corrected")
 PROMISES: tuple[Promise, ...] = (
     *_promises("be equal", "object-moved", *SEEN_BY_PAPER),
     *_promises("fall", "object-moved", "accuracy_top1_corrected", "contact_f1", "adherence", "realism_si"),
@@ -69,6 +71,15 @@ PROMISES: tuple[Promise, ...] = (
     *_promises("rise", "prompt-lookup", "memorised_share_path"),
     *_promises("fall", "other-prompt", "accuracy_top1_corrected", beside="text2hoi"),
     *_promises("fall", "other-contact", "adherence", beside="text2hoi"),
+    *_promises("fall", "hands-still", *CONTACT),
+    *_promises("fall", "hands-shifted", *CONTACT),
+    *_promises("fall", "pressed-deep", *CONTACT),
+    *_promises("stay", "pressed-deep", "bimart_con_paper", "bimart_art_paper"),
+    *_promises("fall", "bimart-other-path", "contact_f1", "bimart_art_corrected", beside="bimart"),
+    *_promises("fall", "bimart-other-object", "contact_f1", *CONTACT, beside="bimart"),
+    # Refinement brings hands to the surface wherever they are, so that contact alone does not see what a map asks for.
+    *_promises("fall", "bimart-zero-map", "contact_f1", beside="bimart"),
+    *_promises("rise", "bimart-zero-map", "bimart_cm_corrected", "joint_error_mm", beside="bimart"),
     *_promises("fall", "one-call", "multimodality_by_prompt_corrected", beside="text2hoi"),
 )
 
@@ -102,6 +113,7 @@ def _kept(rows: Mapping[str, Mapping[str, Any]], promise: Promise) -> Kept:
     holds = {
         "fall": value < min(low, reference),
         "rise": value > max(high, reference),
+        "stay": value >= min(low, reference),
         "be equal": value == reference,
         "be zero": abs(value) <= NOTHING,
     }

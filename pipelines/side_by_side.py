@@ -12,23 +12,26 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from hoidata.errors import BadInput, told_in_words
 from hoidata.files.atomic import exclusive, write_whole
 from pipelines.warm import WarmProcess
 
-CODE = "code"
+CODE = "pipelines/dvc.yaml:code"
 RUN = Path(".hoidata/repro")
 LOGS = Path(".hoidata/logs")
 DURATIONS = Path(".hoidata/durations.json")
 # What every run of a single stage would import anew, about a second each time.
 PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
 TAIL = 15
+_STARTING = threading.Lock()
 _ROOM = 1 << 20  # bytes that must fit beside the cache before anything is begun
 Upstream = Mapping[str, frozenset[str]]
 RunStage = Callable[[str], int]
@@ -241,7 +244,8 @@ class _Children:
         process = self.context.Process(
             target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, environment)
         )
-        process.start()
+        with _without_main():
+            process.start()
         self.processes.add(process)
         process.join()
         return process.exitcode or 0
@@ -249,6 +253,17 @@ class _Children:
 
 def _stop(*_: object) -> None:
     raise KeyboardInterrupt
+
+
+@contextmanager
+def _without_main() -> Iterator[None]:
+    """A child that starts meanwhile does not import what this process was started with: Prefect takes a second."""
+    with _STARTING:
+        main, sys.modules["__main__"] = sys.modules["__main__"], ModuleType("__main__")
+        try:
+            yield
+        finally:
+            sys.modules["__main__"] = main
 
 
 def _end_with_parent() -> None:

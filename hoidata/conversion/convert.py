@@ -183,6 +183,7 @@ def _why_empty(adapter: Adapter, root: str | Path | None) -> str:
 
 
 def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str | None) -> dict[str, object]:
+    of_arrays = {} if synthetic else getattr(adapter, "licences", {})
     return store_info(
         adapter.name,
         hands,
@@ -195,4 +196,5 @@ def _store_info(adapter: Adapter, hands: HandPair, synthetic: bool, reason: str 
         synthetic=synthetic,
         where_to_register=adapter.where_to_register,
         empty_reason=reason,
+        **({"licences": of_arrays} if of_arrays else {}),
     )

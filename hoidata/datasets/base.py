@@ -131,6 +131,7 @@ class Described:
     may_be_shared = property(attrgetter("facts.may_be_shared"))
     where_to_register = property(attrgetter("facts.where_to_register"))
     needs_mano = property(attrgetter("facts.needs_mano"))
+    licences = property(attrgetter("facts.licences"))
 
     @property
     def source_fps(self) -> float:

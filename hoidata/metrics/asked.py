@@ -2,14 +2,17 @@
 
     <folder>/clips/      the store     <folder>/asked.npz    motion_id (motion,) text; asked (motion, point) bool
     <folder>/asked-distances.npz    maps of distances, as BimArt's: motion_id (motion,) text; first (motion + 1,) row at
-        which each begins; vertex (row, point) int32; distance_m (row, 2, point) float16; hand_vertices (n,) int32
+        which each begins; distance_m (row, 2, point) float16; place_first (motion,) row at which its places begin;
+        place_m (row of places, point, 3) float16; hand_vertices (n,) int32
 
 In asked.npz a point is one of the contact stage's sampled points of the motion's object; true where some acting hand is
-to touch it. In asked-distances.npz a row is a frame, a point a vertex of the object's mesh, other ones in every frame.
+to touch it. In asked-distances.npz a row is a frame, a point a place of the object, another one in every frame; motions
+for one path of an object share their places.
 Families that ask for no contact write no file; a motion without a row has no adherence, and no error of its map.
 """
 
 from collections.abc import Mapping
+from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -28,12 +31,12 @@ REMEDY = "sample the family again"
 class AskedDistances(NamedTuple):
     """The map of distances one motion was made for, frame by frame.
 
-    vertex: (frame, point) int32 vertices of the object's mesh. distance_m: (frame, 2, point) from each of them to the
-    nearest vertex of the left and the right hand, metres, not finite where nothing was asked. hand_vertices: (n,) int32
-    of the 778 those the distances are to.
+    place_m: (frame, point, 3) places of the object where it is in that frame, object frame. distance_m: (frame, 2,
+    point) from each of them to the nearest vertex of the left and the right hand, metres, not finite where nothing was
+    asked. hand_vertices: (n,) int32 of the 778 those the distances are to.
     """
 
-    vertex: np.ndarray
+    place_m: np.ndarray
     distance_m: np.ndarray
     hand_vertices: np.ndarray
 
@@ -59,14 +62,22 @@ def read_asked(clips: str | Path) -> dict[str, np.ndarray]:
 def write_asked_distances(folder: str | Path, asked: Mapping[str, AskedDistances]) -> None:
     """Write ``folder/asked-distances.npz``. asked: by motion id, all of as many points and of the same hand vertices.
 
-    Distances are kept as float16: off by less than 0.1 mm below 20 cm.
+    Kept as float16: places off by less than 0.15 mm within 0.5 m, distances by less than 0.1 mm below 20 cm.
     """
-    maps = list(asked.values())
+    maps, pieces, starts, rows = list(asked.values()), list[np.ndarray](), dict[bytes, int](), list[int]()
+    for own in maps:
+        places = own.place_m.astype(np.float16)
+        key = sha256(places.tobytes()).digest()
+        if key not in starts:
+            starts[key] = sum(map(len, pieces))
+            pieces.append(places)
+        rows.append(starts[key])
     arrays = {
         "motion_id": np.array(list(asked)),
-        "first": np.cumsum([0, *(len(own.vertex) for own in maps)]),
-        "vertex": np.concatenate([own.vertex for own in maps]).astype(np.int32),
+        "first": np.cumsum([0, *(len(own.distance_m) for own in maps)]),
         "distance_m": np.concatenate([own.distance_m for own in maps]).astype(np.float16),
+        "place_first": np.array(rows),
+        "place_m": np.concatenate(pieces),
         "hand_vertices": maps[0].hand_vertices.astype(np.int32),
     }
     write_npz(Path(folder) / DISTANCES_NAME, arrays)
@@ -79,21 +90,22 @@ def read_asked_distances(clips: str | Path) -> dict[str, AskedDistances]:
         return {}
     arrays = read_npz(path)
     try:
-        names, first, vertex, distance_m, hand = (arrays[name] for name in _DISTANCE_ARRAYS)
-        rows, points = vertex.shape
-        in_order = first[0] == 0 and first[-1] == rows and (np.diff(first) >= 0).all()
-        if distance_m.shape != (rows, 2, points) or len(first) != len(names) + 1 or not in_order:
-            raise ValueError(f"{len(names)} motions, vertex {vertex.shape}, distance_m {distance_m.shape}")
-        if vertex.min(initial=0) < 0 or not (hand.min(initial=0) >= 0 and hand.max(initial=0) < N_VERTICES):
-            raise ValueError("numbers of vertices that are not there")
+        names, first, distance_m, starts, place_m, hand = (arrays[name] for name in _DISTANCE_ARRAYS)
+        counts = np.diff(first)
+        fits = distance_m.shape[1:] == (2, place_m.shape[1]) and place_m.shape[2:] == (3,) and len(names) == len(starts)
+        fits = fits and first[0] == 0 and first[-1] == len(distance_m) and (counts >= 0).all()
+        if not fits or starts.min(initial=0) < 0 or (starts + counts > len(place_m)).any():
+            raise ValueError(f"{len(names)} motions, place_m {place_m.shape}, distance_m {distance_m.shape}")
+        if not (hand.min(initial=0) >= 0 and hand.max(initial=0) < N_VERTICES):
+            raise ValueError("numbers of hand vertices that are not there")
         spans = [slice(*ends) for ends in pairwise(first.tolist())]
         return {
-            str(name): AskedDistances(vertex[span], distance_m[span], hand)
-            for name, span in zip(names, spans, strict=True)
+            str(name): AskedDistances(place_m[start : start + count], distance_m[span], hand)
+            for name, start, count, span in zip(names, starts, counts, spans, strict=True)
         }
     except (KeyError, ValueError, IndexError) as error:
-        expected = "motion_id (n,), first (n + 1,), vertex (row, point), distance_m (row, 2, point), hand_vertices"
+        expected = f"{', '.join(_DISTANCE_ARRAYS)} that fit each other"
         raise BadInput(path, expected, str(error), REMEDY) from error
 
 
-_DISTANCE_ARRAYS = ("motion_id", "first", "vertex", "distance_m", "hand_vertices")
+_DISTANCE_ARRAYS = ("motion_id", "first", "distance_m", "place_first", "place_m", "hand_vertices")

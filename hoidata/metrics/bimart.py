@@ -294,14 +294,15 @@ def _map_errors_cm(pair: Pair, every: int, hand_vertices: np.ndarray | None, cap
     asked, track, errors = pair.asked_distances, pair.predicted.clip.object, []
     if asked is None:
         return np.zeros(0)
+    world_from_object = track.world_from_object
     for side in pair.sides:
         hand, wanted = _vertices_m(pair.predicted, side), asked.distance_m[:, SIDES.index(side)]
         hand = hand if hand_vertices is None else hand[:, hand_vertices]
         for frame in pair.frames(side, every):
             known = np.isfinite(wanted[frame])
-            picked, own = asked.vertex[frame, known], wanted[frame, known].astype(np.float64)
-            here, rest_m, part = track.take(np.array([frame])), track.model.vertices_m[picked], track.model.part[picked]
-            made = KDTree(hand[frame]).query(here.points_in_world(rest_m, part)[0])[0]
+            own = wanted[frame, known].astype(np.float64)
+            places_m = world_from_object[int(frame)] @ asked.place_m[frame, known].astype(np.float64)
+            made = KDTree(hand[frame]).query(places_m)[0]
             if known.any():
                 errors.append(np.abs(np.minimum(made, cap_m) - np.minimum(own, cap_m)).mean())
     return 100 * np.array(errors)

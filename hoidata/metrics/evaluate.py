@@ -283,10 +283,8 @@ class _Bench:
 
 def _no_map_of(distances: AskedDistances, clip: Clip) -> str:
     """Why a map of distances is not one of this clip; nothing where it is."""
-    if len(distances.vertex) != clip.n_frames:
-        return f"the map of distances asked for has {len(distances.vertex)} frames, not {clip.n_frames}"
-    count = len(clip.object.model.vertices_m)
-    return "" if distances.vertex.max(initial=0) < count else f"its map names vertices beyond the object's {count}"
+    count = len(distances.distance_m)
+    return "" if count == clip.n_frames else f"the map of distances asked for has {count} frames, not {clip.n_frames}"
 
 
 def _number(sample: str, clip_id: str) -> int:

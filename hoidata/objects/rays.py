@@ -11,6 +11,7 @@ from numba import njit
 from hoidata.objects.triangle_tree import DEEPEST
 
 ENTERING, LEAVING, EITHER = -1, 1, 0
+FEW = 16  # triangles
 _CLEARLY = 1e-9
 _WIDER = 1 + 1e-9  # boxes are left out only when they are clearly missed
 
@@ -25,15 +26,31 @@ def first_hits(tree, start_m, direction, reach_m, facing, way_m):  # pragma: no 
     stack, ways = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
     for ray in range(len(start_m)):
         best = min(reach_m[ray], way_m[ray])
+        if _is_beyond(tree[1], start_m, direction, ray, best * _WIDER):
+            continue
         found = _first_hit(tree, start_m[ray], direction[ray], best, facing[ray], stack, ways)
         if found >= 0:
             way_m[ray] = found
 
 
+@njit(cache=True, inline="always")
+def _is_beyond(box, start_m, direction, ray, reach):  # pragma: no cover (compiled)
+    """Whether the way to ``reach`` lies on one side of all triangles: no division, and most rays of a hand do."""
+    for axis in range(3):
+        first = start_m[ray, axis]
+        last = first + reach * direction[ray, axis]
+        if max(first, last) < box[0, axis] - _CLEARLY or min(first, last) > box[0, axis + 3] + _CLEARLY:
+            return True
+    return False
+
+
 @njit(cache=True, error_model="numpy")
 def _first_hit(tree, start, way, reach, facing, stack, ways):  # pragma: no cover (compiled)
     """Way to the first triangle met within ``reach``; -1 where there is none. way: the ray's direction."""
-    box, link, over, axes = tree[1], tree[2], (1 / way[0], 1 / way[1], 1 / way[2]), _axes(way)
+    box, link, axes = tree[1], tree[2], _axes(way)
+    if len(tree[4]) <= FEW:  # looking at all takes less than asking which
+        return _hit_in_leaf(tree, 0, len(tree[4]), start, way, axes, facing, reach)
+    over = (1 / way[0], 1 / way[1], 1 / way[2])
     best, hit, waiting = reach, -1.0, 1
     stack[0], ways[0] = 0, _way_to_box(box, 0, start, over)
     while waiting:

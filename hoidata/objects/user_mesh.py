@@ -43,7 +43,7 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
     pieces of which the second in the file moves.
     Raises BadInput for a size that cannot be meant, naming the unit that may be, and for a hinge that does not fit.
     """
-    mesh = _read(path)
+    mesh = read_mesh_file(path)
     scale, notes = _scale(path, mesh, unit), list[str]()
     vertices = mesh.vertices * scale
     if not up:
@@ -90,7 +90,12 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
     return ObjectModel(model.name, model.vertices_m[first], faces[apart], model.part[first], model.hinge)
 
 
-def _read(path: Path) -> Mesh:
+def read_mesh_file(path: Path) -> Mesh:
+    """Vertices and triangles of an OBJ, PLY, STL or GLB file in its own unit and axes.
+
+    Of STL and GLB, vertices in the same place become one; a GLB's nodes stand where its scene puts them.
+    Raises BadInput for a file that holds no finite triangle mesh.
+    """
     if path.suffix.lower() not in (".stl", ".glb"):
         return load_mesh(path)
     if not path.is_file():

@@ -1,6 +1,7 @@
-"""Hands from generated keypoints: fitted, then refined against the object as one motion of any length."""
+"""Hands from generated keypoints, fitted and refined against the object; generated hands that hold what they touch."""
 
 from hoidata.refinement.fitting import GeneratedHand, fit_hands
+from hoidata.refinement.holding import HoldSettings, hold_hands
 from hoidata.refinement.refining import RefinementSettings, refine_hands
 
-__all__ = ["GeneratedHand", "RefinementSettings", "fit_hands", "refine_hands"]
+__all__ = ["GeneratedHand", "HoldSettings", "RefinementSettings", "fit_hands", "hold_hands", "refine_hands"]

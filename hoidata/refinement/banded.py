@@ -5,6 +5,7 @@ from scipy.linalg import solveh_banded
 
 # How the second difference of frame t weighs the frames t, t - 1 and t - 2.
 _DIFFERENCE = (1.0, -2.0, 1.0)
+_TINY = 1e-6  # keeps a frame without any data where it is
 
 
 def second_differences(values: np.ndarray) -> np.ndarray:
@@ -49,3 +50,11 @@ def solve_blocks(blocks: list[np.ndarray], vector: np.ndarray) -> np.ndarray:
     return solveh_banded(band.reshape(len(band), -1), vector.ravel(), lower=True, check_finite=False).reshape(
         n_frames, n
     )
+
+
+def solve_damped(blocks: list[np.ndarray], vector: np.ndarray, damping: float) -> np.ndarray:
+    """``solve_blocks`` damped by Marquardt's share of the diagonal."""
+    damped = blocks[0].copy()
+    diagonal = np.einsum("fii->fi", damped)
+    diagonal += damping * diagonal + _TINY
+    return solve_blocks([damped, *blocks[1:]], vector)

@@ -137,3 +137,27 @@ def lower_signed(low_m, cell_m, value, rotation, offset, places_m, distance_m, s
             sw = (near_up - near) / cell_m if way_w == 0.0 else way_w / way
             for axis in range(3):
                 slope[f, p, axis] = turn[0, axis] * su + turn[1, axis] * sv + turn[2, axis] * sw
+
+
+@njit(cache=True)
+def lower_capsules(start_m, end_m, radius_m, places_m, distance_m, slope):  # pragma: no cover (compiled)
+    """Where a capsule is nearer than ``distance_m (frame, place)``, set it and its ``slope (frame, place, 3)``.
+
+    start_m, end_m: (frame, capsule, 3) ends of the axes; radius_m: (capsule,). NaN: not there. Capsules more than
+    0.3 m from the first place of a frame are not looked at.
+    """
+    for f in range(places_m.shape[0]):
+        for c in range(len(radius_m)):
+            start, axis = start_m[f, c], end_m[f, c] - start_m[f, c]
+            if not ((start - places_m[f, 0]) ** 2).sum() < 0.09:
+                continue
+            square = max((axis**2).sum(), 1e-12)
+            for p in range(places_m.shape[1]):
+                x, y, z = (places_m[f, p, 0] - start[0], places_m[f, p, 1] - start[1], places_m[f, p, 2] - start[2])
+                along = min(max((x * axis[0] + y * axis[1] + z * axis[2]) / square, 0.0), 1.0)
+                x, y, z = x - along * axis[0], y - along * axis[1], z - along * axis[2]
+                away = np.sqrt(x * x + y * y + z * z)
+                if away - radius_m[c] < distance_m[f, p]:
+                    distance_m[f, p] = away - radius_m[c]
+                    away = max(away, 1e-9)
+                    slope[f, p, 0], slope[f, p, 1], slope[f, p, 2] = x / away, y / away, z / away

@@ -22,6 +22,19 @@ class ObjectField:
             for part, surface in index.filled.items()  # one grid per part, whatever the frames and angles
         ]
 
+    @property
+    def moves(self) -> bool:
+        """The object has a part that a hinge moves."""
+        return len(self._parts) > 1
+
+    def nearest_part(self, places_m: np.ndarray) -> np.ndarray:
+        """(frame, place) number of the part whose surface is nearest to places (frame, place, 3), world."""
+        each = []
+        for grid, (rotation, offset) in self._parts:
+            each.append(np.full(places_m.shape[:2], np.inf))
+            lower_signed(*grid, rotation, offset, np.ascontiguousarray(places_m), each[-1], np.zeros(places_m.shape))
+        return np.argmin(each, axis=0)
+
     def distances(self, places_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Signed distances (frame, place), metres, and their slope (frame, place, 3), world frame.
 

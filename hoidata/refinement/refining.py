@@ -14,13 +14,11 @@ import numpy as np
 from hoidata.clips.clip import HandTrack, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.hands.model import HandModel, HandPair, Side
-from hoidata.refinement.banded import acceleration_equations, second_differences, solve_blocks
+from hoidata.refinement.banded import acceleration_equations, second_differences, solve_damped
 from hoidata.refinement.fitting import GeneratedHand, check_generated, pose_prior
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, Skin
-
-_TINY = 1e-6  # keeps a frame without any data where it is
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ class _Motion:
         for _ in range(self.settings.steps):
             blocks, vector = self._equations(seen)
             while True:
-                moved = self._see(seen.pose.moved(_solved(blocks, vector, damping)))
+                moved = self._see(seen.pose.moved(solve_damped(blocks, vector, damping)))
                 if moved.cost < seen.cost or damping > 1e4:
                     break
                 damping *= 10
@@ -185,11 +183,3 @@ class _Motion:
         weight = np.full(len(row), self.settings.depth_m**-2.0)
         slope, depth = seen.depth_slope[row, vertex], seen.depth_m[row, vertex]
         add_squares(self.near[row], slope, derivative, weight, depth, matrix, vector)
-
-
-def _solved(blocks: list[np.ndarray], vector: np.ndarray, damping: float) -> np.ndarray:
-    """(frame, 51) step, damped by Marquardt's share of the diagonal."""
-    damped = blocks[0].copy()
-    diagonal = np.einsum("fii->fi", damped)
-    diagonal += damping * diagonal + _TINY
-    return solve_blocks([damped, *blocks[1:]], vector)

@@ -7,6 +7,7 @@ import torch
 
 from hoidata.clips.clip import HandTrack
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import N_ROTATIONS, PARENTS, HandModel
 from hoidata.hands.solver import left_jacobian
 from hoidata.refinement.kernels import N_UNKNOWNS, vertex_derivatives
@@ -32,6 +33,17 @@ class HandPose(NamedTuple):
         """After a step (frame, 51) of the unknowns."""
         orient = rotvec_to_rotmat(step[:, 3:6]) @ self.orient
         return HandPose(self.wrist_m + step[:, :3], orient, self.fingers + step[:, 6:].reshape(-1, 15, 3))
+
+    def step_to(self, other: "HandPose") -> np.ndarray:
+        """(frame, 51) the step that leads to the other pose."""
+        turn = rotmat_to_rotvec(other.orient @ self.orient.swapaxes(-1, -2))
+        fingers = (other.fingers - self.fingers).reshape(len(turn), -1)
+        return np.concatenate((other.wrist_m - self.wrist_m, turn, fingers), 1)
+
+    def seen_from(self, a_from_world: RigidTransform) -> "HandPose":
+        """The same hand in frame a, ``a_from_world`` (frame,) transforms."""
+        wrist = (a_from_world @ self.wrist_m[:, None])[:, 0]
+        return HandPose(wrist, a_from_world.rotation @ self.orient, self.fingers)
 
     def where(self, chosen: np.ndarray, other: "HandPose") -> "HandPose":
         """Per frame this pose where ``chosen (frame,)``, else the other."""
@@ -79,6 +91,8 @@ class Skin:
         self.pose_directions = np.ascontiguousarray(model.pose_directions[ids], np.float64)
         feels = np.zeros((len(ids), N_ROTATIONS), bool)
         feels[:, 1:] = self.pose_directions.reshape(len(ids), 3, 15, 9).any(axis=(1, 3))
+        owner = self.weights.argmax(axis=1)
+        self._segments = [np.flatnonzero(owner == joint) for joint in range(N_ROTATIONS)]
         self._skin = (self.weights, self.rest_joints_m, self.pose_directions, feels)
 
     def chain(self, pose: HandPose, slopes: bool = False) -> Chain:
@@ -108,6 +122,11 @@ class Skin:
         moves = np.concatenate((chain.rotation, shift[..., None]), -1).reshape(len(shift), N_ROTATIONS, 12)
         blended = (self.weights @ moves).reshape(len(shift), len(self.shaped_m), 3, 4)
         return (blended[..., :3] @ chain.rested_m[..., None])[..., 0] + blended[..., 3]
+
+    def nearest_of_segments(self, distance_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(frame, 16) of each joint's skin the vertex with the least of distances (frame, vertex), and its distance."""
+        vertex = np.stack([own[distance_m[:, own].argmin(axis=1)] for own in self._segments], 1)
+        return vertex, np.take_along_axis(distance_m, vertex, 1)
 
     def derivatives(self, chain: Chain, frame: np.ndarray, vertex: np.ndarray) -> np.ndarray:
         """(pair, 3, 51) of vertices (pair,), numbers among those of the skin, in frames (pair,)."""

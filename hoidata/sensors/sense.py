@@ -129,8 +129,10 @@ def _forward(rays: _Rays, inside: np.ndarray, touching: np.ndarray, settings: Se
     """As the release: a touching sensor's ray starts behind it and goes a little beyond it."""
     back = np.where(touching, settings.behind_m, 0.0)
     reach = np.where(touching, settings.behind_m + 2 * settings.touching_m, settings.reach_m)
-    moved = [(surface, start - back[:, None] * way, way) for surface, start, way in rays]
-    met = _first_hits(moved, reach, np.full(len(reach), ENTERING))
+    behind = np.flatnonzero(touching)
+    for _, start, way in rays:
+        start[behind] -= settings.behind_m * way[behind]
+    met = _first_hits(rays, reach, np.full(len(reach), ENTERING))
     missed = np.where(touching, np.where(inside, -settings.behind_m, 0.0), settings.reach_m)
     return np.where(np.isfinite(met), met - back, missed)
 
@@ -158,12 +160,12 @@ def _ambient(hand: TrackedHand, state: HandState, parts: list[_Part], settings: 
     if settings.ambient_turn == "knuckle":
         turn = state.joint_rotmats[:, hand.middle_knuckle] @ turn
     turn = np.broadcast_to(turn, (len(knuckle), 3, 3))
-    cells = RigidTransform(turn, middle) @ (_CELLS * settings.cell_m)
+    wrist_from_cells, cells = RigidTransform(turn, middle), _CELLS * settings.cell_m
     half = settings.cell_m / 2
-    distance, met = np.full(cells.shape[0] * CELLS**3, np.inf), np.zeros(cells.shape[0] * CELLS**3, bool)
+    distance, met = np.full(len(knuckle) * CELLS**3, np.inf), np.zeros(len(knuckle) * CELLS**3, bool)
     for part in parts:
         now = part.from_wrist[:, 0]
-        own = _rows(now @ cells)
+        own = _rows(now @ wrist_from_cells @ cells)
         inside = part.surface.inside(own)
         outside = np.flatnonzero(~inside)
         far = np.zeros(len(own))
@@ -174,7 +176,7 @@ def _ambient(hand: TrackedHand, state: HandState, parts: list[_Part], settings: 
         cut = np.zeros(len(corner), bool)
         mark_cut_cubes(part.surface.tree, own[corner], (now.rotation @ turn)[corner // CELLS**3], half, cut)
         met[corner] = cut
-    return np.where(met, 1 - distance / settings.cell_m, 0.0).reshape(len(cells), -1)
+    return np.where(met, 1 - distance / settings.cell_m, 0.0).reshape(len(knuckle), -1)
 
 
 _CELLS = np.stack(np.meshgrid(*[np.arange(CELLS) - (CELLS - 1) / 2] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -17,6 +17,7 @@ OBJECT_MOVED_M = 0.10
 # From a joint to a sampled point: 2 cm of air, and the finger around the joint.
 HANDS_AWAY_M = 0.03
 PRESSED_M = 0.01
+PRESSED_DEEP_M = SHIFTED_M = 0.03
 # Of a wrist along each axis and of every angle: together 5 mm at a joint.
 NOISE_WRIST_M, NOISE_RAD = 0.0018, 0.025
 FRAMES_LOOKED_AT = 8
@@ -104,9 +105,31 @@ def hands_away(clip: Clip, known: Recording) -> Clip | str:
     return _with_hands(clip, {side: _held_off(clip, known, side) for side in known.sides})
 
 
-def pressed(clip: Clip, known: Recording) -> Clip | str:
+def pressed(clip: Clip, known: Recording, by_m: float = PRESSED_M) -> Clip | str:
     """Each hand moved 1 cm into the object, against the surface at the point a joint comes nearest to."""
-    return _with_hands(clip, {side: _pressed_in(clip, known, side) for side in known.sides})
+    return _with_hands(clip, {side: _pressed_in(clip, known, side, by_m) for side in known.sides})
+
+
+def pressed_deep(clip: Clip, known: Recording) -> Clip | str:
+    """The same, 3 cm."""
+    return pressed(clip, known, PRESSED_DEEP_M)
+
+
+def hands_still(clip: Clip, known: Recording) -> Clip | str:
+    """Each hand as it is at its first contact; the object moves as recorded."""
+    tracks: dict[Side, HandTrack | None] = {}
+    for side in known.sides:
+        touching, track = known.touching_frames(side), clip.hands[side]
+        frames = np.full(clip.n_frames, touching[0]) if len(touching) else None
+        tracks[side] = None if frames is None else track.take(_seen(track.valid, frames))
+    return _with_hands(clip, tracks)
+
+
+def hands_shifted(clip: Clip, known: Recording) -> Clip:
+    """Each hand 3 cm along an axis of the object or against it, another for each motion: the whole recording long."""
+    ways = np.concatenate((np.eye(3), -np.eye(3)))
+    by_m = clip.object.world_from_object.rotation @ (SHIFTED_M * known.draws.choice(ways))
+    return replace(clip, hands={**clip.hands, **{side: _shifted(clip.hands[side], by_m) for side in known.sides}})
 
 
 def noisy(clip: Clip, known: Recording) -> Clip:
@@ -182,14 +205,14 @@ def _shortest_way_out(apart: np.ndarray, clear_m: float) -> np.ndarray:
     return far.min() * WAYS[far.argmin()]
 
 
-def _pressed_in(clip: Clip, known: Recording, side: Side) -> HandTrack | None:
+def _pressed_in(clip: Clip, known: Recording, side: Side, by_m: float) -> HandTrack | None:
     entries = known.annotated.distances(known.request.clip_id, side).window(0, clip.n_frames)
     if not len(entries.frame):
         return None
     points, nearest = known.request.points, entries.point[entries.distance_m.argmin()]
     ends = points.points_m[nearest] + np.outer((0.0, 1.0), points.normals[nearest])
     placed = clip.object.points_in_world(ends.astype(np.float64), np.repeat(points.part[nearest], 2))
-    return _shifted(clip.hands[side], -PRESSED_M * (placed[:, 1] - placed[:, 0]))
+    return _shifted(clip.hands[side], -by_m * (placed[:, 1] - placed[:, 0]))
 
 
 def _shifted(track: HandTrack, by_m: np.ndarray) -> HandTrack:
@@ -206,6 +229,9 @@ REVERSED = _spoilt("reversed", "truth backwards", backwards)
 OBJECT_MOVED = _spoilt("object-moved", "truth, object 10 cm away", object_moved, drawn=True)
 HANDS_AWAY = _spoilt("hands-away", "truth, hands 2 cm off", hands_away)
 PRESSED = _spoilt("pressed", "truth, hands 1 cm in", pressed)
+PRESSED_DEEP = _spoilt("pressed-deep", "truth, hands 3 cm in", pressed_deep)
+HANDS_STILL = _spoilt("hands-still", "truth, hands held still", hands_still)
+HANDS_SHIFTED = _spoilt("hands-shifted", "truth, hands 3 cm to one side", hands_shifted, drawn=True)
 NOISE = _spoilt("noise", "truth with 5 mm of noise", noisy, drawn=True)
 OTHER_HANDS = Family(
     "other-hands",

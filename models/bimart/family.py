@@ -13,17 +13,20 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
+from hoidata.hands.model import N_VERTICES
+from hoidata.metrics.asked import AskedDistances
 from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.contact_training import CONTACT
 from models.bimart.diagnostics import diagnose
-from models.bimart.lookups import training_clips
+from models.bimart.lookups import moved_hands, training_clips
 from models.bimart.motion_training import MOTION
 from models.bimart.sampler import BimArt, Made, Path, SamplingConfig
 from models.bimart.scene import Scene
 from models.common.checkpoints import load_checkpoint
 from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
+from models.common.features import proper_hands
 
 NO_OBJECT_MOTION = "it makes hands for the motion of an object, and none was given"
 AT_ONCE = 16  # motions of one length that share a batch
@@ -52,22 +55,35 @@ class HandsForPaths:
 
     @classmethod
     def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "HandsForPaths":
+        """Without contact maps (MDM) there need be no contact model."""
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
-        trained = [load_checkpoint(sources.checkpoints / one.name, one, sources.device) for one in (CONTACT, MOTION)]
         sampling = replace(config.sampling, with_map=config.sampling.with_map and change != "no map")
-        model = BimArt.of(trained[0], trained[1], sampling, sources.device)
-        synthetic = bool(trained[1].facts["synthetic"])
+        motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
+        folder = sources.checkpoints / CONTACT.name
+        contact = load_checkpoint(folder, CONTACT, sources.device) if sampling.with_map or folder.is_dir() else None
+        model = BimArt.of(contact, motion, sampling, sources.device)
+        synthetic = bool(motion.facts["synthetic"])
         config = replace(config, refined=config.refined and refined)
         return cls(model, sources.hands, config, synthetic, change, sources.annotated)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+        return self.sample_asked(requests)[0]
+
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[AskedDistances | None]]:
+        """Motions, and the contact map each was made for; None where it was made for none."""
         found: dict[int, Made] = {}
         for rows in self._alike(requests):
             found |= zip(rows, self.made([requests[row] for row in rows]), strict=True)
-        return [
+        answers: list[Clip | LeftOut] = [
             self.clip(request, found[row]) if row in found else LeftOut(request.motion_id, NO_OBJECT_MOTION)
             for row, request in enumerate(requests)
         ]
+        told = self.model.config.with_map and self.model.motion.config.features.between == "map"
+        told = told and self.change in ("none", "zero map")  # other places are not of this object
+        maps = [
+            self.asked(request, found[row]) if told and row in found else None for row, request in enumerate(requests)
+        ]
+        return answers, maps
 
     def _alike(self, requests: Sequence[Request]) -> list[list[int]]:
         """Rows of requests of one length, at most so many together."""
@@ -79,15 +95,14 @@ class HandsForPaths:
     def made(self, requests: Sequence[Request]) -> list[Made]:
         """Maps, keypoints and ways to the object for requests of one length, canonical frame."""
         paths = [Path(self._scene(request), request.active_hands, request.seed) for request in requests]
-        maps = torch.zeros(len(paths), len(paths[0].scene), len(self.model.contact.mean))
+        maps = torch.zeros(len(paths), len(paths[0].scene), self.model.motion.config.features.contact_size)
         return self.model.make(paths, maps if self.change == "zero map" else None)
 
     def _scene(self, request: Request) -> Scene:
         """The motion of a request, or what a control takes for it."""
-        assert request.trajectories is not None
-        basis, thing = self.model.motion.config.features.basis, request.trajectories.object[: request.n_frames]
+        basis, thing = self.model.motion.config.features.basis, _path(request)
         if self.change in ("none", "zero map", "no map"):
-            return Scene.of(request.object, thing, basis)
+            return self._true_scene(request)
         assert self.annotated is not None
         alike, clips = self.change == "other path", training_clips(self.annotated)
         others = [clip for clip in clips if (clip.object_model.name == request.object.name) == alike] or clips
@@ -97,17 +112,22 @@ class HandsForPaths:
             return Scene.of(request.object, other.object[rows], basis)
         return Scene.of(other.object_model, thing, basis)
 
+    def asked(self, request: Request, made: Made) -> AskedDistances:
+        """The contact map a motion was made for, at places of its object; not a number for hands that take no part."""
+        scene, features = self._scene(request), self.model.motion.config.features
+        places = scene.object_from_canonical @ scene.place_m.astype(np.float64)
+        known = np.concatenate([scene.there & bool(hand) for hand in request.active_hands])
+        distance = np.where(known, made.contact_m, np.nan).reshape(len(places), 2, -1)
+        skin = np.arange(N_VERTICES) if features.map_of == "skin" else self.model.motion.keypoint_ids.cpu().numpy()
+        return AskedDistances(places.astype(np.float32), distance, skin)
+
     def generated(self, request: Request, made: Made) -> dict[Side, GeneratedHand]:
         """Keypoints and ways to the object in the world, of the hands that take part."""
-        assert request.trajectories is not None
-        thing = request.trajectories.object[: request.n_frames]
-        body = Scene.of(request.object, thing, self.model.motion.config.features.basis).model_from_canonical
-        rotation, offset = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
-        world_from_canonical = RigidTransform(rotation @ body.rotation, body.translation @ rotation.T + offset)
+        world = world_from_canonical(request, self._true_scene(request))
         return {
             side: GeneratedHand(
-                world_from_canonical @ made.keypoints_m[row].astype(np.float64),
-                world_from_canonical.turn(made.to_object_m[row].astype(np.float64)),
+                world @ made.keypoints_m[row].astype(np.float64),
+                world.turn(made.to_object_m[row].astype(np.float64)),
                 made.active[row],
             )
             for row, side in enumerate(SIDES)
@@ -115,16 +135,43 @@ class HandsForPaths:
         }
 
     def clip(self, request: Request, made: Made) -> Clip:
-        """The hands fitted to what was made, and refined against the object."""
-        assert request.trajectories is not None
-        hands, generated = self.generated(request, made), torch.zeros(2, request.n_frames, HAND_FEATURES)
-        generated[..., GLOBAL_ORIENT_6D.start :: 6] = generated[..., GLOBAL_ORIENT_6D.start + 3 :: 6] = 1
-        clip = motion_clip(request, generated, torch.from_numpy(request.trajectories.object), self.synthetic)
+        """The hands fitted to what was made, and refined against the object; of rotations, as they were made."""
+        if self.model.motion.config.features.hands == "mano":
+            own = proper_hands(torch.from_numpy(np.concatenate((made.keypoints_m[:, :, 0], made.rest), axis=-1)))
+            moved = moved_hands(own.numpy(), self._true_scene(request).model_from_canonical)
+            return _motion_clip(request, torch.from_numpy(moved), self.synthetic)
+        hands, clip = self.generated(request, made), clip_without_hands(request, self.synthetic)
         ids = self.model.motion.keypoint_ids.cpu().numpy()
         tracks = fit_hands(self.pair, request.betas, ids, hands, request.template_m)
         if self.config.refined:
             tracks = refine_hands(self.pair, ids, hands, tracks, clip.object, self.config.refinement)
         return replace(clip, hands={**clip.hands, **tracks})
+
+    def _true_scene(self, request: Request) -> Scene:
+        return Scene.of(request.object, _path(request), self.model.motion.config.features.basis)
+
+
+def _path(request: Request) -> np.ndarray:
+    assert request.trajectories is not None
+    return request.trajectories.object[: request.n_frames]
+
+
+def world_from_canonical(request: Request, scene: Scene) -> RigidTransform:
+    """Of every frame of a request."""
+    rotation, offset = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
+    body = scene.model_from_canonical
+    return RigidTransform(rotation @ body.rotation, body.translation @ rotation.T + offset)
+
+
+def clip_without_hands(request: Request, synthetic: bool) -> Clip:
+    """The object as it is asked for, and hands that nobody has placed yet."""
+    nothing = torch.zeros(2, request.n_frames, HAND_FEATURES)
+    nothing[..., GLOBAL_ORIENT_6D.start :: 6] = nothing[..., GLOBAL_ORIENT_6D.start + 3 :: 6] = 1
+    return _motion_clip(request, nothing, synthetic)
+
+
+def _motion_clip(request: Request, hands: torch.Tensor, synthetic: bool) -> Clip:
+    return motion_clip(request, hands, torch.from_numpy(_path(request)), synthetic)
 
 
 def _figures(sources: Sources) -> Figures:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import ClipBatch
 from hoidata.hands import HandPair
 from hoidata.sensors.keypoints import hand_keypoints
-from models.bimart.network import ContactModel, Denoiser, MotionModel, Windows, contact_channels
+from models.bimart.network import ContactModel, Denoiser, MotionModel, Windows
 from models.bimart.scene import Recorded, recorded_clip
 from models.bimart.windows import Asked, windows_of
 from models.common.family import Losses, Setup
@@ -28,7 +28,7 @@ class LossConfig:
     """windows: drawn of every clip of a batch. skip_first, skip_last: frames at the ends of a clip in which no window
     starts (the release: 100, and 100 after the end of the last window). contact_dropout: how often a contact map is not
     told; per "window", or the whole "batch" alike (released). velocity_weight: of the same error of differences between
-    frames.
+    frames. error: "square", or "absolute" (OMOMO).
     """
 
     windows: int = 1
@@ -37,6 +37,7 @@ class LossConfig:
     contact_dropout: float = 0.5
     dropout_of: Literal["window", "batch"] = "window"
     velocity_weight: float = 0.0
+    error: Literal["square", "absolute"] = "square"
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,8 @@ def window_losses(network: Denoiser, target: Targets, loss: LossConfig, generato
     noise = torch.randn(clean.shape, generator=generator).to(device)
     made = network(add_noise(clean, noise, steps, network.signal), steps, target.windows, drop)
     wrong = (made - clean) / network.config.signal_scale
-    found = {"simple": masked_mean(wrong.square(), target.known)}
+    size = wrong.square() if loss.error == "square" else wrong.abs()
+    found = {"simple": masked_mean(size, target.known)}
     total = found["simple"]
     if loss.velocity_weight:
         found["velocity"] = masked_mean(wrong.diff(dim=1).square(), target.known[:, 1:] & target.known[:, :-1])
@@ -155,11 +157,10 @@ def targets_of(network: Denoiser, drawn: Sequence[tuple[Recorded, int]]) -> Targ
     motion = [clip.motion[own] for (clip, _), own in zip(drawn, rows, strict=True)]
     clean = contact_m if isinstance(network, ContactModel) else _padded(motion, length)
     present = _padded([clip.present[:, own].T for (clip, _), own in zip(drawn, rows, strict=True)], length).bool()
-    mapped = present.repeat_interleave(config.features.places, 2) & contact_channels(windows)
+    mapped = present.repeat_interleave(config.features.told_size, 2) & network.told_channels(windows)
     known = mapped
     if isinstance(network, MotionModel):
-        seen = present.repeat_interleave(3 * config.features.keypoints, 2).repeat(1, 1, 2)
-        known = seen & network.channel_mask(windows)
+        known = config.features.of_hands(present) & network.channel_mask(windows)
     return Targets(windows, clean, known, mapped)
 
 
@@ -195,7 +196,7 @@ def learn_statistics(network: Denoiser, every: Sequence[tuple[Recorded, int]], a
         "contact": [slice(None)],
     }
     if isinstance(network, MotionModel):
-        groups[""] = [slice(0, len(network.mean) // 2), slice(len(network.mean) // 2, None)]
+        groups[""] = [slice(0, 6 * features.points), slice(6 * features.points, None)]
     for name, moments in sums.items():
         mean, spread = moments.found()
         for own in groups[name]:

@@ -34,10 +34,11 @@ def training_clips(annotated: AnnotatedStore) -> tuple[ClipSample, ...]:
 
 def canonical_hands(hands: np.ndarray, model_from_canonical: RigidTransform) -> np.ndarray:
     """Features (side, frame, 99) of the model frame in the canonical one."""
-    return _moved(hands, model_from_canonical.inverse())
+    return moved_hands(hands, model_from_canonical.inverse())
 
 
-def _moved(hands: np.ndarray, frame: RigidTransform) -> np.ndarray:
+def moved_hands(hands: np.ndarray, frame: RigidTransform) -> np.ndarray:
+    """Features (side, frame, 99) taken along by a transform of every frame."""
     made = hands.astype(np.float64)
     made[..., WRIST] = (frame @ made[..., WRIST].swapaxes(0, 1)).swapaxes(0, 1)
     made[..., GLOBAL_ORIENT_6D] = rotmat_to_rot6d(frame.rotation @ rot6d_to_rotmat(made[..., GLOBAL_ORIENT_6D]))
@@ -53,18 +54,20 @@ def told(scene: Scene) -> np.ndarray:
 
 @dataclass(frozen=True)
 class NearestWindow:
-    """For every window of a request the hands of the training window most like it, of the same hands.
+    """For every window of a request the hands of the training window most like it, of the same hands; or any window's.
 
     clips: by hands that take part, what is told (frame, number), normalised, and hands (2, frame, 99) canonical.
+    drawn: any window, by the request's seed.
     """
 
     clips: dict[tuple[bool, bool], list[tuple[np.ndarray, np.ndarray]]]
     mean: np.ndarray
     spread: np.ndarray
     synthetic: bool
+    drawn: bool = False
 
     @classmethod
-    def load(cls, sources: Sources) -> "NearestWindow":
+    def load(cls, sources: Sources, drawn: bool = False) -> "NearestWindow":
         samples = training_clips(sources.annotated)
         scenes = [Scene.of(sample.object_model, sample.object, BASIS) for sample in samples]
         rows = [told(scene) for scene in scenes]
@@ -76,7 +79,7 @@ class NearestWindow:
         for sample, scene, row in zip(samples, scenes, rows, strict=True):
             own = (row - every.mean(axis=0)) / spread, canonical_hands(sample.hands, scene.model_from_canonical)
             clips.setdefault(_hands(sample.active_hands), []).append(own)
-        return cls(clips, every.mean(axis=0), spread, any(sample.synthetic for sample in samples))
+        return cls(clips, every.mean(axis=0), spread, any(sample.synthetic for sample in samples), drawn)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self._answer(request) for request in requests]
@@ -91,11 +94,14 @@ class NearestWindow:
             self._nearest(asked[start : start + WINDOW], request, rank=request.number)
             for start in range(0, len(asked), WINDOW)
         ]
-        hands = _moved(np.concatenate(parts, axis=1), scene.model_from_canonical)
+        hands = moved_hands(np.concatenate(parts, axis=1), scene.model_from_canonical)
         return motion_clip(request, torch.from_numpy(hands), torch.from_numpy(thing), self.synthetic)
 
     def _nearest(self, asked: np.ndarray, request: Request, rank: int) -> np.ndarray:
         """(2, frame, 99) of the nearest window; of the next nearest clip for each further motion of a request."""
+        if self.drawn:
+            row, hands = self._any(request)
+            return hands[:, np.minimum(np.arange(len(asked)) + max(len(row) - len(asked), 0) // 2, len(row) - 1)]
         found = []
         for row, hands in self.clips[_hands(request.active_hands)]:
             starts = np.arange(0, max(len(row) - len(asked), 0) + 1, STRIDE)
@@ -104,6 +110,10 @@ class NearestWindow:
             found.append((apart.min(), frames[apart.argmin()], hands))
         _, frames, hands = sorted(found, key=lambda one: one[0])[rank % len(found)]
         return hands[:, frames]
+
+    def _any(self, request: Request) -> tuple[np.ndarray, np.ndarray]:
+        clips = self.clips[_hands(request.active_hands)]
+        return clips[request.seed % len(clips)]
 
 
 @dataclass(frozen=True)
@@ -134,7 +144,7 @@ class MeanPose:
         thing = request.trajectories.object[: request.n_frames]
         scene = Scene.of(request.object, thing, BASIS)
         hands = np.repeat(self.hands[:, None], len(thing), axis=1)
-        moved = torch.from_numpy(_moved(hands, scene.model_from_canonical))
+        moved = torch.from_numpy(moved_hands(hands, scene.model_from_canonical))
         return motion_clip(request, moved, torch.from_numpy(thing), self.synthetic)
 
 
@@ -144,3 +154,6 @@ def _hands(active_hands: np.ndarray) -> tuple[bool, bool]:
 
 NEAREST_WINDOW = Family("nearest-window", "nearest training window by object and its motion", NearestWindow.load)
 OBJECT_MEAN_POSE = Family("mean-pose-at-object", "mean pose in the object's frame", MeanPose.load)
+RANDOM_WINDOW = Family(
+    "random-window", "random training window", lambda sources: NearestWindow.load(sources, drawn=True)
+)

@@ -129,6 +129,13 @@ class Denoiser(nn.Module):
         """(B, F, D) bool: numbers of hands and parts that are there, in frames that are."""
         raise NotImplementedError
 
+    def told_channels(self, windows: Windows) -> Tensor:
+        """(B, F, contact_size) bool: values of a contact map that are there, or joints of hands that take part."""
+        if self.config.features.between == "map":
+            return contact_channels(windows)
+        hands = windows.hands.bool().repeat_interleave(self.config.features.told_size, 1)
+        return hands[:, None] & windows.frames[..., None]
+
     def forward(self, x: Tensor, steps: Tensor, windows: Windows, drop: Tensor | None = None) -> Tensor:
         """Clean numbers (B, F, D) of noised ones at timesteps (B,); drop: (B,) bool, told no contact map."""
         known = self.prepare(windows)
@@ -167,7 +174,7 @@ class Denoiser(nn.Module):
         if known:
             assert windows.contact_m is not None
             normalised = (windows.contact_m - self.contact_mean) / self.contact_scale
-            contact = self.contact_in(normalised * contact_channels(windows))
+            contact = self.contact_in(normalised * self.told_channels(windows))
         if self.is_joint:
             return self.object_in(torch.cat((seen, contact), -1))
         latent = self.object_in(seen)
@@ -201,24 +208,23 @@ class Denoiser(nn.Module):
 
 
 class ContactModel(Denoiser):
-    """Makes contact maps (B, F, 2N): of the left hand, then of the right (Sec. 3.2)."""
+    """Makes contact maps (B, F, 2N), or joints: of the left hand, then of the right (Sec. 3.2)."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__(config, config.features.contact_size, with_contact=False)
 
     def channel_mask(self, windows: Windows) -> Tensor:
-        return contact_channels(windows)
+        return self.told_channels(windows)
 
 
 class MotionModel(Denoiser):
-    """Makes keypoints and ways to the object (B, F, 12 J) for contact maps (Sec. 3.3)."""
+    """Makes positions and what goes with them (B, F, motion_size) for contact maps, or joints (Sec. 3.3)."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__(config, config.features.motion_size, with_contact=True)
 
     def channel_mask(self, windows: Windows) -> Tensor:
-        own = windows.hands.repeat_interleave(3 * self.config.features.keypoints, 1).repeat(1, 2)
-        return own[:, None].bool() & windows.frames[..., None]
+        return self.config.features.of_hands(windows.hands.bool())[:, None] & windows.frames[..., None]
 
 
 def contact_channels(windows: Windows) -> Tensor:

@@ -3,7 +3,7 @@
 Each motion is drawn from its own seed, whatever else is asked for with it.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -12,9 +12,11 @@ import torch
 from torch import Tensor
 
 from hoidata.errors import BadInput
+from hoidata.objects.model import articulate
+from hoidata.sensors.part_bps import distance_map
 from models.bimart.guidance import Guide, Map, combined, metre_step, released_step
 from models.bimart.network import ContactModel, Denoiser, MotionModel, Prepared, Windows
-from models.bimart.scene import Anchor, Scene, split_motion
+from models.bimart.scene import Anchor, FeatureConfig, Scene, split_motion
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
 from models.common.checkpoints import Checkpoint
 from models.common.sampling import SamplerConfig, sample
@@ -29,7 +31,7 @@ class SamplingConfig:
     rule: of that guidance. with_map: motions are told contact maps. guide: contact-map guidance, in the last
     ``guide_share`` of the steps. overlapping: windows of a path share their frames at every step; else they are made
     apart and put side by side. contact_anchor: of G for the contact model, otherwise than it learnt (released:
-    "before").
+    "before"). hold_m: joints of the first network that come so near to the object stay there, on its part (OMOMO).
     """
 
     sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig("ddim", 10, 0.0))
@@ -39,6 +41,7 @@ class SamplingConfig:
     guide_share: float = 1 / 3
     overlapping: bool = True
     contact_anchor: Anchor | None = None
+    hold_m: float = 0.0
 
 
 OURS = SamplingConfig()
@@ -60,36 +63,42 @@ class Path:
 
 @dataclass(frozen=True)
 class Made:
-    """Canonical frame, metres. contact_m: (frame, 2 x places) wanted distances. keypoints_m, to_object_m: (side, frame,
-    keypoint, 3). active: (side, frame) near the object.
+    """Canonical frame, metres. contact_m: (frame, 2 x places) wanted distances, or joints. keypoints_m: (side, frame,
+    point, 3), or joints; rest: (side, frame, number) ways from them to the object, or rotations. active: (side, frame)
+    near the object.
     """
 
     contact_m: np.ndarray
     keypoints_m: np.ndarray
-    to_object_m: np.ndarray
+    rest: np.ndarray
     active: np.ndarray
+
+    @property
+    def to_object_m(self) -> np.ndarray:
+        """(side, frame, keypoint, 3) ways from keypoints to the object."""
+        return self.rest.reshape(self.keypoints_m.shape)
 
 
 @dataclass(frozen=True)
 class BimArt:
-    """Both trained networks, ready to answer."""
+    """Both trained networks, ready to answer. contact: None where motions are told no map."""
 
-    contact: ContactModel
+    contact: ContactModel | None
     motion: MotionModel
     config: SamplingConfig
     device: torch.device
 
     @classmethod
-    def of(cls, contact: Checkpoint, motion: Checkpoint, config: SamplingConfig, device: torch.device) -> "BimArt":
+    def of(
+        cls, contact: Checkpoint | None, motion: Checkpoint, config: SamplingConfig, device: torch.device
+    ) -> "BimArt":
         """Raises BadInput where the two networks do not see alike."""
-        first, second = contact.network, motion.network
-        assert isinstance(first, ContactModel)
+        first, second = None if contact is None else contact.network, motion.network
+        assert isinstance(first, ContactModel | None)
         assert isinstance(second, MotionModel)
-        seen = [replace(own.config.features, state="none", anchor="first", window=0) for own in (first, second)]
-        if seen[0] != seen[1]:
-            raise BadInput(
-                "bimart-motion", f"features of its contact model, {seen[0]}", f"{seen[1]}", "train both alike"
-            )
+        own, wanted = (_seen(one.config.features) for one in (second, first or second))
+        if own != wanted:
+            raise BadInput("bimart-motion", f"features of its contact model, {wanted}", f"{own}", "train both alike")
         return cls(first, second, config, device)
 
     @torch.no_grad()
@@ -99,8 +108,8 @@ class BimArt:
         drawn = self._maps(paths, generators)  # even where maps are given: a motion's noise comes after a map's
         contact = drawn if contact_m is None else contact_m.to(drawn)
         motion = self.motion.decode(self._walk(self.motion, paths, generators, contact))
-        rows = zip(map(self._hands, paths), contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
-        return [_made(*own) for own in rows]
+        rows = zip(paths, contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
+        return [self._made(*own) for own in rows]
 
     @torch.no_grad()
     def maps(self, paths: Sequence[Path]) -> np.ndarray:
@@ -108,16 +117,23 @@ class BimArt:
         return self._maps(paths, [torch.Generator().manual_seed(path.seed) for path in paths]).cpu().numpy()
 
     def _maps(self, paths: Sequence[Path], generators: list[torch.Generator]) -> Tensor:
+        features = self.motion.config.features
+        if self.contact is None:
+            return torch.zeros(len(paths), len(paths[0].scene), features.contact_size, device=self.device)
         drawn = self.contact.decode(self._walk(self.contact, paths, generators, None))
-        most = self.contact.config.features.most_m or None
-        return drawn.clamp(0, most) * self._known(paths)
+        if features.between == "map":
+            return drawn.clamp(0, features.most_m or None) * self._known(paths)
+        rows = zip(paths, drawn.cpu().numpy(), strict=True)
+        held = [held_joints(joints, path.scene, self.config.hold_m) for path, joints in rows]
+        return torch.from_numpy(np.stack(held)).to(drawn) * self._known(paths)
 
     def _known(self, paths: Sequence[Path]) -> Tensor:
-        """(B, frame, 2N) bool: values of maps that are there."""
-        frames = len(paths[0].scene)
-        own = np.stack(
-            [np.concatenate([path.scene.there & bool(hand) for hand in self._hands(path)]) for path in paths]
-        )
+        """(B, frame, contact_size) bool: values of maps that are there, or joints of hands that take part."""
+        frames, features = len(paths[0].scene), self.motion.config.features
+        nothing = np.ones(features.told_size, bool)
+        there = [path.scene.there if features.between == "map" else nothing for path in paths]
+        rows = zip(paths, there, strict=True)
+        own = np.stack([np.concatenate([here & bool(hand) for hand in self._hands(path)]) for path, here in rows])
         return torch.from_numpy(own).to(self.device)[:, None].expand(-1, frames, -1)
 
     def _hands(self, path: Path) -> np.ndarray:
@@ -138,7 +154,8 @@ class BimArt:
         if contact_m is None:
             denoise = _plain(network, known, layout)
         else:
-            denoise = self._guided(network, known, layout, self._map(paths, contact_m))
+            wanted = None if self.config.guide == "off" else self._map(paths, contact_m)
+            denoise = self._guided(network, known, layout, wanted)
         return sample(denoise, noise, self.config.sampler, generators)
 
     def _windows(self, network: Denoiser, paths: Sequence[Path], layout: Layout, contact_m: Tensor | None) -> Windows:
@@ -155,7 +172,7 @@ class BimArt:
         return Map(places, contact_m, known & (contact_m < 0.99 * most) if most else known)
 
     def _guided(
-        self, network: Denoiser, known: Prepared, layout: Layout, wanted: Map
+        self, network: Denoiser, known: Prepared, layout: Layout, wanted: Map | None
     ) -> Callable[[Tensor, Tensor], Tensor]:
         """The motion model told of its map, pulled to it, and away from what it does untold."""
         config, calls, both = self.config, 0, known.twice()
@@ -171,7 +188,7 @@ class BimArt:
             else:
                 found = network.denoise(torch.cat((cut, cut)), torch.cat((own, own)), both, both.conditional)
                 clean, untold = (layout.joined(part) for part in found.chunk(2))
-            if config.guide != "off" and calls > config.sampler.steps * (1 - config.guide_share):
+            if wanted is not None and calls > config.sampler.steps * (1 - config.guide_share):
                 clean = self._pulled(clean, wanted)
             return clean if untold is None else combined(clean, untold, config.sampler.guidance, config.rule)
 
@@ -179,7 +196,7 @@ class BimArt:
 
     def _pulled(self, clean: Tensor, wanted: Map) -> Tensor:
         """(B, frame, D) with its positions moved by a step of contact-map guidance; the ways to the object stay."""
-        network, half = self.motion, clean.shape[-1] // 2
+        network, half = self.motion, 6 * self.motion.config.features.points
         scale = (network.scale[:half] / network.config.signal_scale).reshape(2, -1, 3)
         keypoints = network.decode(clean)[..., :half].unflatten(-1, (2, -1, 3))
         if self.config.guide == "released":
@@ -188,6 +205,40 @@ class BimArt:
             step = metre_step(keypoints, wanted) / scale
         return torch.cat((clean[..., :half] + step.flatten(2), clean[..., half:]), -1)
 
+    def _made(self, path: Path, contact_m: np.ndarray, motion: np.ndarray) -> Made:
+        features = self.motion.config.features
+        keypoints, rest = split_motion(motion, features)
+        if features.hands == "keypoints":
+            near = np.linalg.norm(rest.reshape(keypoints.shape), axis=-1).min(axis=-1) < IDLE_M
+        else:
+            near = np.stack([distance_map(path.scene.place_m, own).min(axis=1) < IDLE_M for own in keypoints])
+        return Made(contact_m, keypoints, rest, near & self._hands(path)[:, None])
+
+
+def _seen(features: FeatureConfig) -> FeatureConfig:
+    """What both networks of a pair must agree in."""
+    return replace(features, state="none", anchor="first", window=0, hands="keypoints")
+
+
+def held_joints(joints_m: np.ndarray, scene: Scene, within_m: float) -> np.ndarray:
+    """(frame, 2 x 21 x 3) joints that, once within so many metres of the object, stay at that place of its part.
+
+    OMOMO's contact constraint (Li et al. 2023, Sec. 3.3): frozen where a joint first comes near a vertex, to the end.
+    """
+    if not within_m:
+        return joints_m
+    model, joints = scene.bps.model, joints_m.reshape(len(joints_m), -1, 3).astype(np.float64)
+    rest, apart = [], []
+    for part, own in scene.bps.vertices.items():
+        rest.append(np.broadcast_to(model.object_from_part(part, scene.hinge_rad).inverse() @ joints, joints.shape))
+        apart.append(own.tree.query(rest[-1])[0])
+    near = np.min(apart, axis=0) < within_m
+    first, every = near.argmax(axis=0), np.arange(joints.shape[1])
+    part = np.array([own[first, every] for own in apart]).argmin(axis=0)
+    held = articulate(np.stack(rest)[part, first, every], part, model.hinge, scene.hinge_rad)
+    stays = near.any(axis=0) & (np.arange(len(joints))[:, None] >= first)
+    return np.where(stays[..., None], held, joints).reshape(joints_m.shape).astype(joints_m.dtype)
+
 
 def _plain(network: Denoiser, known: Prepared, layout: Layout) -> Callable[[Tensor, Tensor], Tensor]:
     def denoise(x: Tensor, steps: Tensor) -> Tensor:
@@ -195,9 +246,3 @@ def _plain(network: Denoiser, known: Prepared, layout: Layout) -> Callable[[Tens
         return layout.joined(network.denoise(layout.cut(x), own, known, known.conditional))
 
     return denoise
-
-
-def _made(hands: np.ndarray, contact_m: np.ndarray, motion: np.ndarray) -> Made:
-    own: Mapping[str, np.ndarray] = split_motion(motion)
-    near = np.linalg.norm(own["to_object_m"], axis=-1).min(axis=-1) < IDLE_M
-    return Made(contact_m, own["keypoints_m"], own["to_object_m"], near & hands[:, None])

@@ -18,7 +18,7 @@ from hoidata.clips.clip import Clip
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
-from hoidata.metrics.asked import write_asked
+from hoidata.metrics.asked import AskedDistances, write_asked, write_asked_distances
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
@@ -31,18 +31,23 @@ LEFT_OUT = "left_out.json"
 
 @dataclass(frozen=True)
 class PredictionConfig:
-    """samples: motions for every test clip. seed: of all that is drawn."""
+    """samples: motions for every test clip. seed: of all that is drawn. clips: evenly spread test clips; 0: all."""
 
     samples: int = 8
     seed: int = 0
+    clips: int = 0
+
+
+# (point,) bool, the sampled points to be touched; or how far hands are to be; or None where nothing was asked.
+AskedMap = np.ndarray | AskedDistances | None
 
 
 @runtime_checkable
 class AsksContact(Protocol):
     """A family ready to answer that decides where the object is to be touched, and can say so."""
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[np.ndarray]]:
-        """As ``Sampler.sample``, and (point,) bool of each motion: the sampled points it was asked to touch."""
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[Sequence[Clip | LeftOut], Sequence[AskedMap]]:
+        """As ``Sampler.sample``, and of each motion the map it was made for, which :data:`AskedMap` describes."""
         ...
 
 
@@ -60,7 +65,7 @@ def sample_family(
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
     Requests the family has no answer to stand in ``out/left_out.json``, where there are any. A family that is
-    :class:`AsksContact` also gets ``out/asked.npz`` (``hoidata.metrics.asked``).
+    :class:`AsksContact` also gets ``out/asked.npz`` or ``out/asked-distances.npz`` (``hoidata.metrics.asked``).
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
     params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th motion for a clip is named
     ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a model takes the first frames.
@@ -70,6 +75,7 @@ def sample_family(
     reason = _why_not(family, root, checkpoints)
     annotated = None if reason else load_annotated(root, hands)
     test = [] if annotated is None else list(HoiDataset(annotated, "test", crop="start"))
+    test = test[:: -(-len(test) // config.clips)] if config.clips and test else test
     if annotated is None or not test:
         with atomic_folder(out) as partial:
             write_empty(partial, reason or "no test clips")
@@ -77,15 +83,14 @@ def sample_family(
     sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
-        left_out, asked = list[LeftOut](), dict[str, np.ndarray]()
+        left_out, asked = list[LeftOut](), dict[str, np.ndarray | AskedDistances]()
         motions = _made(_motions(family.load(sources), test, config, asked), left_out)
         first = next(motions, None)
         if first is None:
             write_empty(partial, f"no motion of {len(left_out)}: {left_out[0].reason}")
             return {"clips": 0}
         counts = write_store(partial / "clips", chain([first], motions), info)
-        if asked:
-            write_asked(partial, asked)
+        _write_asked(partial, asked)
         _write(partial / "diagnostics.json", family.diagnose(sources))
         if left_out:
             _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
@@ -119,6 +124,15 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
     ]
 
 
+def _write_asked(folder: Path, asked: Mapping[str, np.ndarray | AskedDistances]) -> None:
+    """The maps motions were made for, each kind in its file; none where there are none."""
+    distances = {name: own for name, own in asked.items() if isinstance(own, AskedDistances)}
+    if touched := {name: own for name, own in asked.items() if isinstance(own, np.ndarray)}:
+        write_asked(folder, touched)
+    if distances:
+        write_asked_distances(folder, distances)
+
+
 def _write(path: Path, values: Any) -> None:
     write_whole(path, json.dumps(values, indent=2, sort_keys=True) + "\n")
 
@@ -133,7 +147,10 @@ def _made(answers: Iterator[Clip | LeftOut], left_out: list[LeftOut]) -> Iterato
 
 
 def _motions(
-    sampler: Sampler, test: Sequence[ClipSample], config: PredictionConfig, asked: dict[str, np.ndarray]
+    sampler: Sampler,
+    test: Sequence[ClipSample],
+    config: PredictionConfig,
+    asked: dict[str, np.ndarray | AskedDistances],
 ) -> Iterator[Clip | LeftOut]:
     """The answers in order; ``asked`` is filled with the contact map of each, where the family has them."""
     starts = range(0, len(test), CLIPS_AT_ONCE)
@@ -142,7 +159,7 @@ def _motions(
         requests = [request for sample in chosen for request in requests_for(sample, config)]
         if isinstance(sampler, AsksContact):
             answers, maps = sampler.sample_asked(requests)
-            asked |= {answer.clip_id: contact_map for answer, contact_map in zip(answers, maps, strict=True)}
+            asked |= {answer.clip_id: own for answer, own in zip(answers, maps, strict=True) if own is not None}
         else:
             answers = sampler.sample(requests)
         yield from answers

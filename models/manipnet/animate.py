@@ -15,12 +15,13 @@ from hoidata.hands.tracks import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, Motion
+from models.manipnet.examples import between
 from models.manipnet.rollout import Predictor, Task, roll_out
 from models.manipnet.trajectory_files import UNITS, Body, TrajectoryFile
 
 NEAR_M = 0.12  # from the middle of the palm to the object: a hand that never comes nearer handles nothing
 PALM_M = 0.08  # from the wrist to the middle of the palm
-SEAM_S = 0.5  # over so long a time fingers are led to where the recording goes on
+SEAM_S = 0.5  # over so long a time fingers are led from and to where the recording goes on
 UNSEEN_M = 1.0
 FACING = np.array([0.8, 0.0, -0.6])  # canonical: where a hand that holds something looks to
 LOOKS_AWAY, LOOKS_TO = 0.2, 0.6  # mean cosines between that and the way to the object
@@ -159,38 +160,40 @@ def clip_control(clip: Clip) -> Control:
 
 
 def new_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, frames: slice,
-                recorded: np.ndarray | None) -> np.ndarray:  # fmt: skip
+                recorded: np.ndarray | None, seam_s: float = SEAM_S) -> np.ndarray:  # fmt: skip
     """Finger rotations (frame, joint - 1, 3, 3) of some frames of ``control``, which are a step apart.
 
-    recorded: (all frames, joint - 1, 3, 3). Only the poses just before and after the frames are taken from it: the
-    first is gone on from, to the last it is led in the last half second. Without one before: the neutral pose.
+    recorded: (all frames, joint - 1, 3, 3). Only the poses just before and after the frames are taken from it: what the
+    network makes is led over ``seam_s`` from the first and to the last. Without one before: from the neutral pose on.
     """
     n_frames = len(control.thing.time_s)
     first, stop, _ = frames.indices(n_frames)
-    before = first > 0 and recorded is not None
-    start = recorded[first - 1] if before and recorded is not None else hand.rest_rotmats
-    after = stop < n_frames and recorded is not None
-    time_s = control.thing.time_s[first - before : stop + after]
-    (made,) = roll_out(predictor, [Task(hand, side, control, time_s, start)])
-    if after and recorded is not None:
-        made = led_to(made, recorded[stop], round(SEAM_S / predictor.settings.step_s))
-    return made[int(before) : len(made) - int(after)]
+    before = recorded[first - 1] if first > 0 and recorded is not None else None
+    after = recorded[stop] if stop < n_frames and recorded is not None else None
+    given = int(before is not None)
+    start = hand.rest_rotmats if before is None else before
+    (made,) = roll_out(predictor, [Task(hand, side, control, control.thing.time_s[first - given : stop], start)])
+    return led(made[given:], before, after, round(seam_s / predictor.settings.step_s))
 
 
-def led_to(made: np.ndarray, last: np.ndarray, frames: int) -> np.ndarray:
-    """Poses (frame, joint, 3, 3) turned so that the last one is ``last``: all the way there, less and less before."""
-    frames = min(frames, len(made) - 1)
-    share = np.clip((np.arange(len(made)) - (len(made) - 1 - frames)) / max(frames, 1), 0, 1)
-    share = share * share * (3 - 2 * share)
-    way = rotmat_to_rotvec(made[-1].swapaxes(-1, -2) @ last)
-    return made @ rotvec_to_rotmat(share[:, None, None] * way)
+def led(made: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, seam: int) -> np.ndarray:
+    """Poses (frame, joint, 3, 3) led from the pose before them and to the one after, each over ``seam`` frames.
+
+    Near a pose that is known they are between it (both: turned evenly from the one to the other) and what was made.
+    """
+    first, last = (after if before is None else before), (before if after is None else after)
+    if first is None or last is None:
+        return made
+    away = np.arange(1, len(made) + 1)
+    ends = [end for end, pose in ((away, before), (away[::-1], after)) if pose is not None]
+    share = np.clip(np.minimum.reduce(ends) / max(seam, 1), 0, 1)
+    return between(interpolated(first, last, len(made)), made, share * share * (3 - 2 * share))
 
 
 def interpolated(before: np.ndarray, after: np.ndarray, count: int) -> np.ndarray:
     """(count, joint, 3, 3) poses evenly between two, neither of them among these."""
-    way = rotmat_to_rotvec(before.swapaxes(-1, -2) @ after)
-    share = np.arange(1, count + 1) / (count + 1)
-    return before @ rotvec_to_rotmat(share[:, None, None] * way)
+    ends = np.broadcast_to(before, (count, *before.shape)), np.broadcast_to(after, (count, *after.shape))
+    return between(*ends, np.arange(1, count + 1) / (count + 1))
 
 
 def recorded_fingers(track: HandTrack) -> np.ndarray:

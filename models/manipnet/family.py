@@ -29,7 +29,7 @@ NO_TRAJECTORIES = "it adds fingers to the trajectories of wrists and object, and
 class SamplingConfig:
     """rule: of post-processing, "off" for what the network says."""
 
-    rule: Rule = "released"
+    rule: Rule = "ours"
 
 
 @dataclass(frozen=True)

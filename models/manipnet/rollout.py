@@ -7,7 +7,7 @@ joints placed by forward kinematics: bones keep their length, which the release'
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -27,10 +27,20 @@ from models.manipnet.features import (
 )
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.network import ManipNet
-from models.manipnet.targets import Nearest, Targets, paper_targets, released_targets
+from models.manipnet.targets import DEEPEST_M, Nearest, Rule, Targets, our_targets, paper_targets, released_targets
 
-Rule = Literal["off", "paper", "released"]
-OVERLAP_SHARE, OVERLAP_WEIGHT = 0.3, 0.3  # the demo's second pass: a joint moves by this share of a capsule's depth
+
+class Out(NamedTuple):
+    """Passes that move joints by a share of what their capsule is deeper than allowed, and their weight."""
+
+    passes: int
+    allowed_m: float
+    share: float
+    weight: float
+
+
+OUT = {"paper": Out(0, 0.0, 0.0, 0.0), "released": Out(1, 0.0, 0.3, 0.3), "ours": Out(2, DEEPEST_M, 1.0, 1.0)}
+_RULES = {"paper": paper_targets, "released": released_targets}
 
 
 @dataclass(frozen=True)
@@ -38,7 +48,7 @@ class Predictor:
     """A trained network and how it is run. rule: of post-processing."""
 
     network: ManipNet
-    rule: Rule = "released"
+    rule: Rule = "ours"
 
     @property
     def settings(self) -> FeatureSettings:
@@ -77,12 +87,16 @@ def situation(control: Control, side: Side, hand: TrackedHand, time_s: float, se
 
 @dataclass
 class Follower:
-    """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) as they are now, from the start pose on."""
+    """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) that the network goes on from, the start pose first.
+
+    answer: (1, joint - 1, 3, 3) the post-processed ones.
+    """
 
     predictor: Predictor
     hand: TrackedHand
     surface: SurfaceIndex
     finger_rotmats: np.ndarray
+    answer: np.ndarray = field(init=False)
     limits: Limits = field(init=False)
     state: HandState = field(init=False)
 
@@ -99,47 +113,61 @@ class Follower:
         return np.concatenate([pose_features(self.hand, self.state)[0], now.trajectory, sensed.flat()[0]])
 
     def advance(self, output: np.ndarray, then: Situation) -> None:
-        """Take the pose of an output (214,) for the next frame, post-processed."""
-        fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
+        """Take the pose of an output (214,) for the next frame, post-processed.
+
+        With our rule the network goes on from its own pose: a corrected one is none that it learnt from, and the next
+        is the worse for it.
+        """
+        rule, fingers = self.predictor.rule, self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
         self._take(self.limits.within(fingers))
-        if self.predictor.rule != "off":
-            self._correct(output, then)
+        if rule != "off":
+            state = self._corrected(output, then)
+            self.answer = self.hand.finger_rotmats(state.joint_rotmats)
+            if rule != "ours":
+                self.finger_rotmats, self.state = self.answer, state
 
     def _take(self, finger_rotmats: np.ndarray) -> None:
-        self.finger_rotmats = finger_rotmats
+        self.finger_rotmats = self.answer = finger_rotmats
         self.state = self.hand.state(finger_rotmats)
 
-    def _correct(self, output: np.ndarray, then: Situation) -> None:
-        hand, settings = self.hand, self.predictor.settings
+    def _corrected(self, output: np.ndarray, then: Situation) -> HandState:
+        hand, settings, points = self.hand, self.predictor.settings, self.state.point_m[0]
         radius = hand.point_radius_m if settings.less_radius else np.zeros(hand.n_points)
-        predicted, points = np.clip(output[-hand.n_points :], 0, 1), self.state.point_m[0]
-        rule = paper_targets if self.predictor.rule == "paper" else released_targets
-        targets = rule(points, predicted, radius, settings.range_m, self._nearest(points, then))
-        moved = np.zeros(hand.n_points)
-        moved[target_points(hand)] = 1
-        self._reach(targets.point_m, targets.weight * moved)
-        if self.predictor.rule == "released":
-            apart = self._out_of_capsules(then)
-            self._reach(apart.point_m, apart.weight * moved)
+        predicted = np.clip(output[-hand.n_points :], 0, 1)
+        given = (points, predicted, radius, settings.range_m, self._nearest(points, then))
+        if self.predictor.rule == "ours":
+            cover = np.r_[hand.point_radius_m[: hand.n_joints], hand.point_radius_m[hand.tip_joint]]
+            state = self._reached(self.state, our_targets(*given, cover))
+        else:
+            state = self._reached(self.state, _RULES[self.predictor.rule](*given))
+        out = OUT[self.predictor.rule]
+        for _ in range(out.passes):
+            state = self._reached(state, self._out_of_capsules(state, then, out))
+        return state
 
-    def _reach(self, target_m: np.ndarray, weight: np.ndarray) -> None:
-        if weight.any():
-            self._take(reach(self.hand, self.limits, self.state, target_m, weight))
+    def _reached(self, state: HandState, targets: Targets) -> HandState:
+        """The hand turned towards its targets."""
+        weight = np.zeros(self.hand.n_points)
+        moved = target_points(self.hand)
+        weight[moved] = targets.weight[moved]
+        if not weight.any():
+            return state
+        return self.hand.state(reach(self.hand, self.limits, state, targets.point_m, weight))
 
-    def _out_of_capsules(self, then: Situation) -> Targets:
-        """The second pass: joints whose capsule overlaps the object, moved out by a share of its depth."""
-        hand, points = self.hand, self.state.point_m[0]
-        middle = (self.state.capsule_start_m[0] + self.state.capsule_end_m[0]) / 2
+    def _out_of_capsules(self, state: HandState, then: Situation, out: Out) -> Targets:
+        """A further pass: joints whose capsule is too deep in the object, moved out by a share of what is too much."""
+        hand = self.hand
+        middle = (state.capsule_start_m[0] + state.capsule_end_m[0]) / 2
         found = self._nearest(middle, then)
-        depth = np.maximum(hand.capsules.radius_m - found.distance_m, 0) * (hand.capsules.joint > 0)
-        target, weight = points.copy(), np.zeros(len(points))
+        depth = np.maximum(hand.capsules.radius_m - found.distance_m - out.allowed_m, 0) * (hand.capsules.joint > 0)
+        target, weight = state.point_m[0].copy(), np.zeros(hand.n_points)
         for capsule in np.flatnonzero(depth):
             # A capsule hangs between its joint and the one after it: the latter moves it.
             after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
             tip = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
             moved = np.concatenate([after, tip])
-            target[moved] += OVERLAP_SHARE * depth[capsule] * found.normal[capsule]
-            weight[moved] = OVERLAP_WEIGHT
+            target[moved] += out.share * depth[capsule] * found.normal[capsule]
+            weight[moved] = out.weight
         return Targets(target, weight)
 
     def _nearest(self, points_m: np.ndarray, then: Situation) -> Nearest:
@@ -172,11 +200,11 @@ def roll_out(predictor: Predictor, tasks: Sequence[Task]) -> list[np.ndarray]:
         for task in tasks
     ]
     followers = [Follower(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
-    made = [[follower.finger_rotmats[0]] for follower in followers]
+    made = [[follower.answer[0]] for follower in followers]
     for frame in range(1, max(map(len, given), default=0)):
         running = [number for number, frames in enumerate(given) if frame < len(frames)]
         rows = np.stack([followers[number].inputs(given[number][frame - 1]) for number in running])
         for number, output in zip(running, predictor(rows), strict=True):
             followers[number].advance(output, given[number][frame])
-            made[number].append(followers[number].finger_rotmats[0])
+            made[number].append(followers[number].answer[0])
     return [np.stack(poses) for poses in made]

@@ -87,7 +87,7 @@ class Stream:
         return self.first_s + number / (1 / self.predictor.settings.step_s)  # as the times of clips round
 
     def _poses(self) -> dict[Side, np.ndarray]:
-        return {side: self.followers[side].finger_rotmats[0] for side in self.hands}
+        return {side: self.followers[side].answer[0] for side in self.hands}
 
     def _situations(self, time_s: float) -> dict[Side, Situation]:
         settings = self.predictor.settings

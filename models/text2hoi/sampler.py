@@ -4,9 +4,9 @@ Everything a motion is drawn from comes from its request's seed, so it is the sa
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from torch import Tensor
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
+from hoidata.refinement import HoldSettings, hold_hands
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
@@ -33,15 +34,23 @@ AT_ONCE = 256
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """sampler: of the diffusion network. field_resolution: of the distance grids the refiner sees."""
+    """sampler: of the diffusion network. refined_by: what corrects its hands, the refiner network or a hold
+    (``hoidata.refinement.holding``); "preset": a hold where the diffusion network gives hands in the object's frame, as
+    `ours` does. field_resolution: of the distance grids the refiner sees.
+    """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     field_resolution: int = 48
+    refined_by: Literal["preset", "network", "hold"] = "preset"
+    hold: HoldSettings = field(default_factory=HoldSettings)
 
 
 @dataclass(frozen=True)
 class Text2HoiMotion:
-    """Features in the model frame: hands (2, F, 99) before and after the refiner, object (F, 10); contact_map (N,)."""
+    """Features in the model frame: hands (2, F, 99) before and after the refiner, object (F, 10); contact_map (N,).
+
+    What a hold changes stands in the clips alone.
+    """
 
     coarse: Tensor
     refined: Tensor
@@ -57,6 +66,7 @@ class Text2Hoi:
     hands: Hands
     config: SamplingConfig
     device: torch.device
+    pair: HandPair
 
     @classmethod
     def load(
@@ -71,12 +81,20 @@ class Text2Hoi:
         trained = {
             network.name: load_checkpoint(Path(checkpoints) / network.name, network, device) for network in NETWORKS
         }
-        return cls(trained, Hands(hands).to(device), config or SamplingConfig(), device)
+        return cls(trained, Hands(hands).to(device), config or SamplingConfig(), device, hands)
 
     @property
     def facts(self) -> dict[str, Any]:
         """What the diffusion network was trained on."""
         return self.trained["diffusion"].facts
+
+    @property
+    def refined_by(self) -> Literal["network", "hold"]:
+        """What corrects the hands of the diffusion network."""
+        if self.config.refined_by != "preset":
+            return self.config.refined_by
+        code = motion_generator(self.trained["diffusion"]).network.code.config
+        return "hold" if code.hand_frame == "object" else "network"
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         """Refined motions."""
@@ -91,22 +109,27 @@ class Text2Hoi:
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:
         """Motions as clips, after refinement or before it."""
-        return [
+        found = [
             motion_clip(request, motion.refined if refined else motion.coarse, motion.object, self.facts["synthetic"])
             for request, motion in zip(requests, motions, strict=True)
         ]
+        return [self._held(clip) for clip in found] if refined and self.refined_by == "hold" else found
+
+    def _held(self, clip: Clip) -> Clip:
+        return replace(clip, hands=hold_hands(self.pair, clip, self.config.hold))
 
     @torch.no_grad()
     def motions(
         self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
     ) -> list[Text2HoiMotion]:
-        """Every stage of one motion per request; without refinement ``refined`` is ``coarse``.
+        """Every network's part in one motion per request; where the refiner has none ``refined`` is ``coarse``.
 
         contact_maps: (2, N) by hand, or (N,) for either, 0 or 1, per request: in the place of what would be drawn.
         """
         made: list[Text2HoiMotion] = []
         models = {request.object.name: request.object for request in requests}.values()
-        surface = Surface.of(self.hands, models, self.config.field_resolution, self.device) if refined else None
+        seen = refined and self.refined_by == "network"
+        surface = Surface.of(self.hands, models, self.config.field_resolution, self.device) if seen else None
         for start in range(0, len(requests), AT_ONCE):
             part = slice(start, start + AT_ONCE)
             made += self._batch_motions(requests[part], surface, None if contact_maps is None else contact_maps[part])

@@ -13,7 +13,8 @@ from pipelines.commands.project import PROFILE, profile_line
 
 FILES = ("params.yaml", "prefect.toml", ".dvcignore", ".gitattributes", ".gitignore", ".dvc/config", ".dvc/.gitignore")
 ADDED_TO = (".gitignore", ".gitattributes")  # a repository may have its own
-PATTERNS = ("manifests/embedded/*.json", "manifests/study/*.json", "dvc.yaml", "models/*/dvc.yaml")
+GRAPHS = ("dvc.yaml", "pipelines/dvc.yaml", "models/*/dvc.yaml")
+PATTERNS = ("manifests/embedded/*.json", "manifests/study/*.json", *GRAPHS)
 # In a clone the stages run the code that lies there, in a project of `init` that of the installation.
 IN_CLONE, INSTALLED = "python -m pipelines.stages", "python -m hoidata stage"
 

@@ -69,12 +69,21 @@ def spdx_of(licence: str, name: str) -> str:
 
 
 def licences_of(info: dict[str, Any]) -> tuple[ArrayLicence, ...]:
-    """The licence of every kind of array of a store. info: its ``meta/info.json``."""
-    licence, name = str(info["licence"]), str(info["dataset"])
-    of_data = spdx_of(licence, name), licence, bool(info["may_be_shared"])
+    """The licence of every kind of array of a store. info: its ``meta/info.json``, with exceptions."""
+    name, exceptions = str(info["dataset"]), info.get("licences", {})
+    if unknown := sorted(exceptions.keys() - {kind.name for kind in KINDS}):
+        expected = f"some of {', '.join(kind.name for kind in KINDS)}"
+        raise BadInput(f"licences of {name}", expected, ", ".join(unknown), "correct facts.toml and convert again")
     own_hand = info["hand_model"]["digest"] == load_embedded_hands().digest
     of_hand = ("CC0-1.0", "CC0-1.0: hoidata's embedded hand", True) if own_hand else ("LicenseRef-MANO", MANO, False)
-    return tuple(ArrayLicence(kind, *(of_hand if kind is SKIN else of_data)) for kind in KINDS)
+
+    def of(kind: Kind) -> tuple[str, str, bool]:
+        facts = exceptions.get(kind.name, info)
+        licence = str(facts["licence"])
+        spdx = spdx_of(licence, f"{name}-{kind.name}" if kind.name in exceptions else name)
+        return spdx, licence, bool(facts["may_be_shared"])
+
+    return tuple(ArrayLicence(kind, *(of_hand if kind is SKIN else of(kind))) for kind in KINDS)
 
 
 def check_may_be_passed_on(where: str, info: dict[str, Any], kinds: tuple[Kind, ...], for_own_use: bool) -> None:

@@ -80,7 +80,7 @@ class SourceTree:
         path = self._root / KNOWN_IMPORTS
         if path.parent.is_dir() and not self._used.keys() <= self._known.keys():
             with suppress(OSError):
-                write_whole(path, json.dumps(self._known | self._used))
+                write_whole(path, json.dumps({"scanner": _scanner(), "imports": self._known | self._used}))
 
     def modules_below(self, package: str) -> list[str]:
         """All modules of a package of the project, sorted; none where there is no such folder."""
@@ -153,7 +153,8 @@ class SourceTree:
 
     @cached_property
     def _entry_points(self) -> list[EntryPoint]:
-        return [point for group in ENTRY_POINT_GROUPS for point in entry_points(group=group)]
+        points = entry_points()
+        return [point for group in ENTRY_POINT_GROUPS for point in points.select(group=group)]
 
     def _distribution(self, name: str) -> dict[str, str]:
         """Name and version of the package of others that a module belongs to."""
@@ -201,14 +202,19 @@ def _data_files(folder: Path) -> Iterator[Path]:
 
 
 def _read_imports(path: Path) -> dict[str, list[Statement]]:
+    """What was kept, by the digest of the file that imports it; nothing of what other code than this kept."""
     try:
         values = json.loads(path.read_bytes())
+        known = values["imports"] if values["scanner"] == _scanner() else {}
         return {
-            digest: [(base, int(level), list(names)) for base, level, names in found]
-            for digest, found in values.items()
+            digest: [(base, int(level), list(names)) for base, level, names in found] for digest, found in known.items()
         }
-    except (OSError, ValueError, TypeError, AttributeError):
+    except (OSError, ValueError, TypeError, AttributeError, KeyError):
         return {}
+
+
+def _scanner() -> str:
+    return sha256_file(__file__)
 
 
 def _imports(tree: ast.AST) -> Iterator[Statement]:

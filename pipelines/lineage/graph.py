@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from hoidata.errors import BadInput
-from pipelines.params import read_file
+from pipelines.params import load_yaml, read_file
 
 # What ``written_graph`` knows of a stage in dvc.yaml; DVC is asked where there is anything else.
 _KNOWN = {
@@ -79,20 +79,20 @@ def written_graph(root: Path) -> dict[str, Stage]:
     """What ``read_graph`` gives, in a tenth of the time: of what this project's dvc.yaml use, and else from DVC."""
     params = read_file(root / "params.yaml")
     try:
-        stages = [stage for file in ("dvc.yaml", *_family_files(root)) for stage in _written(root, file, params)]
+        stages = [stage for file in _graph_files(root) for stage in _written(root, file, params)]
     except (yaml.YAMLError, BadInput, ValueError, TypeError, AttributeError, KeyError, OSError):
         return read_graph(root)
     return {stage.name: stage for stage in stages}
 
 
-def _family_files(root: Path) -> list[str]:
-    return sorted(path.relative_to(root).as_posix() for path in root.glob("models/*/dvc.yaml"))
+def _graph_files(root: Path) -> list[str]:
+    found = (root / "dvc.yaml", *sorted(root.glob("models/*/dvc.yaml")), *root.glob("pipelines/dvc.yaml"))
+    return [path.relative_to(root).as_posix() for path in found]
 
 
 def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
     """The stages of one dvc.yaml, matrix resolved. Raises ValueError for what is not understood here."""
-    with open(root / file, "rb") as stream:
-        stages = yaml.load(stream, getattr(yaml, "CSafeLoader", yaml.SafeLoader))["stages"]
+    stages = load_yaml((root / file).read_bytes())["stages"]
     prefix = "" if file == "dvc.yaml" else f"{file}:"
     for name, body in stages.items():
         if unknown := body.keys() - _KNOWN:

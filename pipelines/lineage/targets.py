@@ -110,7 +110,7 @@ def _where_recorded(root: Path, path: Path, stage: str) -> str | None:
     """Where DVC noted these bytes as made by ``stage``, in words; "" for nowhere, None where it noted nothing."""
     if not lock_files(root):
         return None
-    locks, history = read_locks(root), History(root)
+    locks, history = read_locks(root, stage), History(root)
     digests = {dvc_digest(path), dvc_digest(path.parent) if len(list(path.parent.iterdir())) <= 4 else ""}
 
     def knows(of: dict[str, Locked]) -> bool:

@@ -14,7 +14,7 @@ from pipelines.lineage.history import History
 from pipelines.lineage.locks import dvc_digest, read_locks
 from pipelines.lineage.raw import RawList, raw_list
 from pipelines.lineage.targets import Target, find_target
-from pipelines.params import chosen_params, read_params
+from pipelines.params import chosen_params, load_yaml, read_params
 
 Kind = Literal["checkpoint", "motion", "stage", "param", "code", "data", "manifest", "raw"]
 # From worst to best. recorded: read from the header alone, there is no project here to compare it with.
@@ -127,6 +127,7 @@ class _Comparison:
     target: Target
     shown: set[str] = field(default_factory=set)
     digests: dict[str, str | None] = field(default_factory=dict)
+    code_files: dict[str, dict[str, str]] = field(default_factory=dict)
 
     @cached_property
     def stages(self) -> dict[str, Any]:
@@ -177,8 +178,11 @@ class _Comparison:
         return self.history.commits_of(changed)
 
     def code_of(self, name: str) -> dict[str, str]:
-        files = self.stages_today.get(name, _NO_STAGE).code
-        return {path: digest for file in files for path, digest in self.code_today.get(file, {}).items()}
+        if name not in self.code_files:
+            files = self.stages_today.get(name, _NO_STAGE).code
+            today = (self.code_today.get(file, {}).items() for file in files)
+            self.code_files[name] = {path: digest for items in today for path, digest in items}
+        return self.code_files[name]
 
     def stage(self, name: str) -> Node:
         if name in self.shown:
@@ -224,7 +228,7 @@ class _Comparison:
         import yaml
 
         try:
-            values = yaml.load(text, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+            values = load_yaml(text)
             if "profile" in self.params:
                 values["profile"] = self.params["profile"]
             return look_up(chosen_params(values), key)

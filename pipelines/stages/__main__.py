@@ -25,6 +25,9 @@ STAGES = (
     "sample",
     "evaluate",
     "controls",
+    "table_networks",
+    "table_rows",
+    "tables",
     "report",
 )
 

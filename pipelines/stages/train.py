@@ -57,24 +57,33 @@ def run(paths: StagePaths) -> None:
 
 def train(paths: StagePaths, out: Path) -> None:
     """One process of the training of ``paths.model`` into ``out``."""
+    params = load_settings(TrainParams, "train").of(paths.model)
+    code = Path("code", "train", f"{paths.model}.json")
+    train_into(out, paths, params, paths.checkpoint, paths.training, code)
+
+
+def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], made: Path, progress: Path, code: Path) -> None:
+    """Train ``paths.model`` by its settings. made: the output by which its stage is known; progress: of a killed one.
+
+    code: the file with the digests of what runs.
+    """
     from models.common.device import chosen_device
     from models.common.repeatable import make_repeatable
     from models.common.team import Team
     from models.common.training import train_network
 
-    network, settings = load_network(paths.model), load_settings(TrainParams, "train")
-    stage = producers(read_graph(Path()))[paths.checkpoint.as_posix()].name
-    code = Path("code", "train", f"{network.name}.json")
+    network = load_network(paths.model)
+    stage = producers(read_graph(Path()))[made.as_posix()].name
     make_repeatable(threads=1)  # stages run side by side; more processes train one network together
     train_network(
         network,
         paths.data,
         out,
-        settings.of(network.name),
+        params,
         load_hands(paths.profile),
         needed={load_network(name): paths.checkpoints / name for name in network.needs},
         provenance=lambda facts: build_provenance(Path(), stage, facts),
         device=Team.joined().device(chosen_device(read_params(Path()).get("device", "auto"))),
-        progress=paths.training,
+        progress=progress,
         code=sha256_file(code) if code.is_file() else "",
     )

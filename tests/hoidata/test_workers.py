@@ -3,8 +3,12 @@
 import multiprocessing
 import os
 import signal
+import threading
+import time
+from functools import partial
 from pathlib import Path
 
+import psutil
 import pytest
 
 from hoidata.errors import BadInput
@@ -29,6 +33,10 @@ def deadly_once(path: Path) -> str:
     return path.name
 
 
+def squared_beside(_ballast: bytes, item: int) -> int:
+    return item * item
+
+
 def broken(item: int) -> int:
     return 1 // (item - 3)
 
@@ -47,6 +55,26 @@ def test_an_item_that_kills_every_process_is_given_up_and_all_others_are_done():
 def test_processes_that_die_once_each_cost_nothing(tmp_path):
     paths = [tmp_path / str(number) for number in range(3)]
     assert dict(in_workers(deadly_once, paths, 2)) == {path: path.name for path in paths}
+
+
+@pytest.mark.slow
+def test_a_process_that_dies_before_it_read_what_it_is_for_costs_nothing():
+    """More than a pipe holds, which the parent would go on writing to nobody."""
+
+    def kill_the_first() -> None:
+        while not (found := psutil.Process().children()) or "spawn_main" not in " ".join(found[-1].cmdline()):
+            time.sleep(0.001)
+        found[-1].kill()
+
+    signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits for a process that is dead"))
+    killer = threading.Thread(target=kill_the_first)
+    killer.start()
+    signal.alarm(60)
+    try:
+        assert dict(in_workers(partial(squared_beside, bytes(1 << 20)), range(4), 2)) == {0: 0, 1: 1, 2: 4, 3: 9}
+    finally:
+        signal.alarm(0)
+        killer.join()
 
 
 @pytest.mark.slow

@@ -118,9 +118,10 @@ def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Che
     assert objective.validation(objective.network.eval()).device == DEVICE
 
 
-def sampled(stored: dict[str, Checkpoint], config: SamplerConfig, requests: list[Request]) -> None:
-    hands = Hands(load_embedded_hands())
-    made = Text2Hoi(on_device(stored), hands, SamplingConfig(config, 16), DEVICE).motions(requests)
+def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: list[Request]) -> None:
+    pair = load_embedded_hands()
+    config = SamplingConfig(sampler, 16, "network")
+    made = Text2Hoi(on_device(stored), Hands(pair), config, DEVICE, pair).motions(requests)
     assert len(made) == len(requests)
     assert made[0].refined.shape == (2, requests[0].n_frames, 99)
 

@@ -169,6 +169,25 @@ def test_pressed_hands_go_1_cm_against_the_surface_they_touch(sources, annotated
         assert off_the_box(after).min() < off_the_box(before).min() - 0.003  # the second clip's lies over an edge
 
 
+@pytest.mark.parametrize("name", ["pressed-deep", "hands-shifted"])
+def test_hands_moved_by_3_cm_keep_to_the_object(sources, annotated, test, name):
+    for sample in test:
+        side, recorded = acting(sample), annotated.clip(sample.clip_id)
+        (made,) = motions(sources, name, sample, 1)
+        shift = in_object(made, side) - in_object(recorded, side)
+        np.testing.assert_allclose(shift, np.broadcast_to(shift[0, 0], shift.shape), atol=1e-5)
+        assert np.linalg.norm(shift[0, 0]) == pytest.approx(0.03, abs=1e-5)
+
+
+def test_hands_held_still_are_those_of_the_first_contact_and_the_object_goes_on(sources, annotated, test):
+    for sample in test:
+        side, recorded = acting(sample), annotated.clip(sample.clip_id)
+        (made,) = motions(sources, "hands-still", sample, 1)
+        first = int(annotated.distances(sample.clip_id, side).frame.min())
+        assert (made.hands[side].wrist_m == recorded.hands[side].wrist_m[first]).all()
+        np.testing.assert_array_equal(made.object.translation_m, recorded.object.translation_m)
+
+
 def test_noise_is_5_mm_at_a_joint_and_never_twice_the_same(sources, annotated, test):
     off = []
     for sample in test:

@@ -11,9 +11,9 @@ import yaml
 from typer.testing import CliRunner
 
 from hoidata.hands import load_embedded_hands
+from hoidata.metrics.asked_metrics import with_lists
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
-from hoidata.metrics.registry import METRICS
 from hoidata.store.store import open_store
 from models.common.predicting import sample_family
 from models.evaluator.encoders import load_evaluators
@@ -116,7 +116,7 @@ def test_motions_taken_for_their_reverse_are_counted_among_verbs_that_have_one()
 
 
 def test_promises_name_families_and_metrics_there_are():
-    known = {metric.name for metric in (*METRICS, *FEATURE_METRICS)}
+    known = {metric.name for metric in (*with_lists(["bimart"]), *FEATURE_METRICS)}
     known |= {f"{CONFUSED} {name}" for name in ("paper", "corrected")}
     assert {promise.metric for promise in PROMISES} <= known
     assert {name for promise in PROMISES for name in (promise.control, promise.beside)} <= set(family_names())
@@ -139,7 +139,7 @@ def test_the_command_lists_promises_and_fails_where_one_is_broken(tmp_path):
     assert f"1 hold, 1 do not, {len(PROMISES) - 2} were not measured" in done.output
 
 
-OF_MODELS = {"text2hoi", "other-prompt", "other-contact", "one-call"}
+OF_MODELS = {"bimart", "text2hoi", "other-prompt", "other-contact", "one-call"}
 
 
 @pytest.mark.long
@@ -155,7 +155,7 @@ def test_every_promise_that_needs_no_model_holds_on_a_small_part_of_the_study_co
     looked_at, rows = {promise.metric for promise in asked}, {}
     for name in sorted({name for promise in asked for name in (promise.control, promise.beside)}):
         sample_family(load_family(name), data, tmp_path, tmp_path / name, {"samples": 1}, hands)
-        metrics = tuple(metric for metric in METRICS if metric.name in looked_at)
+        metrics = tuple(metric for metric in with_lists(["bimart"]) if metric.name in looked_at)
         rows[name] = evaluate_store(tmp_path / name / "clips", data, hands, metrics=metrics, encoders=encoders)
     assert rows[TRUTH]["figures"]["accuracy_top1_corrected"] >= 0.85
     found = kept(rows, asked)  # what needs more clips than these, as a Frechet distance, is not measured

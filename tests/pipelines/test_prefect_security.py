@@ -25,6 +25,7 @@ from hoidata.errors import BadInput, MissingResource
 from pipelines.prefect_key import KEY_FILE, is_loopback, read_key, write_key
 from pipelines.prefect_names import key_for
 from pipelines.prefect_server import api_url, stop_running, wait_until_healthy
+from pipelines.side_by_side import CODE
 from tests.pipelines.prefect_up import hoidata_up, wait_until
 
 FOREIGN = "http://evil.example"
@@ -356,7 +357,7 @@ def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_
     assert not (up.project / "checkpoints").exists()
     assert not up.marker.exists()
     tasks = {run["name"] for run in json.loads(with_key(up, "POST", "/task_runs/filter", "{}").body)}
-    assert {"code", "convert@embedded-arctic", "annotate@embedded-arctic"} <= tasks
+    assert {CODE, "convert@embedded-arctic", "annotate@embedded-arctic"} <= tasks
     artifacts = {found["key"] for found in json.loads(with_key(up, "POST", "/artifacts/filter", "{}").body)}
     assert artifacts == {"stages", "results"}
 

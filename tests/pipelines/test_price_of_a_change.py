@@ -16,6 +16,7 @@ import yaml
 
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import read_params
+from pipelines.side_by_side import CODE
 
 PROJECT = Path(__file__).parents[2]
 ARCHITECTURE = PROJECT / "ARCHITECTURE.md"
@@ -178,7 +179,7 @@ def stale_stages() -> set[str]:
 
     write_code()
     with Repo() as repo:
-        return set(repo.status()) - {"code"}
+        return set(repo.status()) - {CODE}
 
 
 def what_follows(stages: set[str]) -> set[str]:

@@ -74,6 +74,13 @@ def test_what_cannot_be_laid_over_is_refused_in_whatever_profile_one_is(plain, p
         chosen_params({**plain, "profiles": profiles})
 
 
+@pytest.mark.parametrize("text", ["[" * 30000, "{a: " * 30000, "- " * 30000])
+def test_params_nested_beyond_reason_are_refused_and_end_no_process(tmp_path, text):
+    (tmp_path / "params.yaml").write_text(text)
+    with pytest.raises(BadInput, match="YAML text"):
+        read_file(tmp_path / "params.yaml")
+
+
 def test_a_stage_runs_again_when_a_setting_it_reads_is_laid_over_and_no_other_does(plain):
     """Every parameter of every stage of dvc.yaml, changed in the overlay alone, changes that stage's file in code/."""
     stages = read_graph(PROJECT).values()

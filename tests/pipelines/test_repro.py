@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from hoidata.errors import BadInput
 from hoidata.files.sealed import read_metadata
 from pipelines.cli import app
+from pipelines.side_by_side import CODE
 
 pytestmark = [pytest.mark.slow, pytest.mark.first]
 MODELS = ("contact", "length", "diffusion", "refiner")
@@ -106,7 +107,7 @@ def test_removing_the_raw_data_afterwards_neither_deletes_nor_retrains_anything(
     try:
         result = project_tools.run(built, "dvc", "repro")
         assert result.returncode == 0, result.stderr
-        assert stages_run(result.stdout) == ["code"]
+        assert stages_run(result.stdout) == [CODE]
     finally:
         shutil.move(built / "moved", raw)
 
@@ -135,7 +136,7 @@ def test_going_to_the_other_profile_and_back_runs_nothing_again(built, project_t
     (built / "params.yaml").write_text(params)
     assert other.returncode == 0, other.stderr
     assert (built / "checkpoints/own/grab/contact/empty.json").is_file()
-    assert stages_run(project_tools.run(built, "dvc", "repro").stdout) == ["code"]
+    assert stages_run(project_tools.run(built, "dvc", "repro").stdout) == [CODE]
 
 
 def test_a_dataset_that_becomes_present_runs_its_own_stages_only(built, project_tools):

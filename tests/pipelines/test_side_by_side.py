@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive
-from pipelines.side_by_side import RUN, Run, describe_run, log_of, reproduce_side_by_side, run_all, stale_stages
+from pipelines.side_by_side import CODE, RUN, Run, describe_run, log_of, reproduce_side_by_side, run_all, stale_stages
 
 PROJECT = Path(__file__).parents[2]
 pytestmark = [
@@ -52,7 +52,7 @@ def _in_a_folder_of_its_own(tmp_path, monkeypatch):
 
 
 def run_graph(upstream: dict[str, frozenset[str]], jobs: int, recorder: Recorder) -> Run:
-    run = Run(seconds={"code": 0.0})
+    run = Run(seconds={CODE: 0.0})
     with ThreadPoolExecutor(jobs) as pool:
         run_all(upstream, pool, jobs, recorder, run)
     return run
@@ -88,9 +88,20 @@ def test_what_follows_from_a_failure_is_left_and_everything_else_is_done(upstrea
     for name, needs in upstream.items():  # they stand in an order that suits
         if needs & lost:
             lost.add(name)
-    assert set(run.seconds) == set(upstream) - lost | {failing, "code"}
+    assert set(run.seconds) == set(upstream) - lost | {failing, CODE}
     assert list(run.failed) == [failing]
     assert failing in describe_run(run)
+
+
+START = """
+import signal
+with open("imported", "a") as stream:
+    stream.write("x")
+if __name__ == "__main__":
+    from pipelines.side_by_side import reproduce_side_by_side
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    reproduce_side_by_side([], 2)
+"""
 
 
 def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
@@ -100,7 +111,10 @@ def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
     body += "print('made', sys.argv[1])"
     (folder / "make.py").write_text(body)
     (folder / "code.txt").write_text("code")
-    stages = {"code": {"cmd": "cat code.txt > code", "always_changed": True, "outs": [{"code": {"cache": False}}]}}
+    code = {"cmd": "cat code.txt > code", "wdir": "..", "always_changed": True, "outs": [{"code": {"cache": False}}]}
+    (folder / "pipelines").mkdir()
+    (folder / "pipelines/dvc.yaml").write_text(yaml.safe_dump({"stages": {"code": code}}))
+    stages = {}
     for name, needs in GRAPH.items():
         (folder / f"{name}.src").write_text(name)
         deps = [f"{name}.src", *(f"{need}.out" for need in needs)]
@@ -116,19 +130,19 @@ def tiny_project(folder: Path, sleep: float = 0.0) -> Path:
 def test_a_project_comes_up_to_date_as_by_dvc_repro_and_a_second_run_has_nothing_to_do(tmp_path):
     tiny_project(tmp_path)
     run = reproduce_side_by_side([], jobs=2)
-    assert sorted(run.seconds) == sorted(["code", *GRAPH])
+    assert sorted(run.seconds) == sorted([CODE, *GRAPH])
     assert (tmp_path / "d.out").read_text() == "(d (b (a)) (c (a)))"
     assert "made d.out" in log_of("d").read_text()
     status = subprocess.run([sys.executable, "-m", "dvc", "repro"], capture_output=True, text=True)
     assert "Running stage 'd'" not in status.stdout
-    assert list(reproduce_side_by_side([], jobs=2).seconds) == ["code"]
+    assert list(reproduce_side_by_side([], jobs=2).seconds) == [CODE]
     with pytest.raises(BadInput, match="'x' not found"):
         reproduce_side_by_side(["x"], jobs=2)
     (tmp_path / "b.src").write_text("B")
     assert stale_stages([]) == {"b": frozenset(), "d": frozenset("b")}
     assert stale_stages(["c"]) == {}
-    assert sorted(reproduce_side_by_side(["d"], jobs=1).seconds) == ["b", "code", "d"]
-    assert sorted(reproduce_side_by_side(["b"], jobs=1, force=True).seconds) == ["b", "code"]
+    assert sorted(reproduce_side_by_side(["d"], jobs=1).seconds) == ["b", "d", CODE]
+    assert sorted(reproduce_side_by_side(["b"], jobs=1, force=True).seconds) == ["b", CODE]
     assert "made b.out" in log_of("b").read_text()
 
 
@@ -144,7 +158,7 @@ def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_
     assert (tmp_path / "e.out").read_text() == "(E)"
     assert "UnicodeDecodeError" in capfd.readouterr().err
     (tmp_path / "code.txt").unlink()
-    assert reproduce_side_by_side([], jobs=2).failed == {"code": 255}
+    assert reproduce_side_by_side([], jobs=2).failed == {CODE: 255}
     assert "code.txt" in capfd.readouterr().err
 
 
@@ -152,9 +166,8 @@ def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_
 @pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGINT])
 def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes(tmp_path, sent):
     tiny_project(tmp_path, sleep=20)
-    command = "from pipelines.side_by_side import reproduce_side_by_side as r; r([], 2)"
-    start = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler); {command}"
-    process = subprocess.Popen([sys.executable, "-c", start], cwd=tmp_path, env={"PYTHONPATH": str(PROJECT)})
+    (tmp_path / "start.py").write_text(START)
+    process = subprocess.Popen([sys.executable, "start.py"], cwd=tmp_path, env={"PYTHONPATH": str(PROJECT)})
     while not log_of("a").is_file() or "make.py" not in log_of("a").read_text():
         time.sleep(0.1)
     with pytest.raises(BadInput, match="at work on it"):
@@ -163,5 +176,6 @@ def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes
     assert process.wait(timeout=15) != 0
     with exclusive(RUN, wait_s=0):
         assert not (tmp_path / "a.out").exists()
+    assert (tmp_path / "imported").read_text() == "x", "a stage imports what the run was started with, as Prefect"
     (tmp_path / "make.py").write_text((tmp_path / "make.py").read_text().replace("time.sleep(20)", "None"))
     assert reproduce_side_by_side([], jobs=2).failed == {}

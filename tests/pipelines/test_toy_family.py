@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hoidata.files.sealed import read_metadata
+from pipelines.side_by_side import CODE
 
 pytestmark = pytest.mark.long
 FOLDER = Path(__file__).with_name("toy_family")
@@ -47,7 +48,7 @@ def test_a_family_of_one_folder_trains_samples_is_measured_and_shown(built: Path
 
     result = project_tools.run(project, "dvc", "repro", PYTHONPATH=str(project))
     assert result.returncode == 0, result.stdout[-3000:] + result.stderr[-3000:]
-    assert set(re.findall(r"Running stage '([^']+)'", result.stdout)) == {"code", "report@embedded", *OWN_STAGES}
+    assert set(re.findall(r"Running stage '([^']+)'", result.stdout)) == {CODE, "report@embedded", *OWN_STAGES}
 
     metadata = read_metadata(project / "checkpoints/embedded/grab/toy/model.safetensors")
     assert metadata["provenance"]["datasets"] == {"grab": 4}

@@ -12,6 +12,7 @@ from hoidata.datasets.arctic.files import parse_parts
 from hoidata.datasets.base import RawTree
 from hoidata.datasets.checks import table
 from hoidata.datasets.h2o.files import listed_segments
+from hoidata.datasets.hot3d.files import LARGEST_ROWS, POSE_COLUMNS, hand_poses, object_poses
 from hoidata.datasets.manipnet.adapter import _read_tips
 from hoidata.datasets.manipnet.bvh import ROOT_CHANNELS, parse_bvh, unpack_text
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
@@ -130,6 +131,16 @@ def listed(path: Path) -> Any:
     return listed_segments(RawTree(path.parent), "subject1/h1/0")
 
 
+def hand_lines() -> bytes:
+    line = b'{"timestamp_ns": 1, "hand_poses": {}}\n'
+    return line * (LARGEST_ROWS // len(line))
+
+
+def object_rows() -> bytes:
+    head = ",".join(POSE_COLUMNS).encode() + b"\n"
+    return head + b"1,1,0,0,0,1,0,0,0\n" * (LARGEST_ROWS // 18 - 10)
+
+
 def as_hand_reference(path: Path) -> Any:
     (path.parent / "hand").mkdir()
     path.rename(path.parent / "hand" / path.name)
@@ -158,5 +169,7 @@ ATTACKS: list[Attack] = [
     ("cells.csv", lambda: b"," * (30 * MB), read_trajectories),
     ("lines.txt", lambda: b"120\n" + b"0\n" * (8 * MB), read_trajectories),
     ("hand_reference.json", lambda: b"[" + b"{}," * (4 * MB) + b"{}]", as_hand_reference),
+    ("hands.jsonl", hand_lines, lambda path: hand_poses(path.read_bytes(), "h", "mano")),
+    ("objects.csv", object_rows, lambda path: object_poses(path.read_bytes(), "o")),
     ("header.safetensors", header_of_lists, read_metadata),
 ]  # fmt: skip

@@ -125,7 +125,7 @@ def test_targets_are_the_clips_hands_in_the_objects_frame(samples: list[ClipSamp
         scene = clip.scene
         np.testing.assert_allclose(clip.motion[:, :60], clip.keypoints_m[0].reshape(-1, 60))
         near = scene.bps.nearest_m(clip.keypoints_m[1].astype(np.float64), scene.hinge_rad)
-        np.testing.assert_allclose(clip.to_object_m[1], near - clip.keypoints_m[1], atol=1e-6)
+        np.testing.assert_allclose(clip.rest[1].reshape(near.shape), near - clip.keypoints_m[1], atol=1e-6)
         places = target.clean[0].reshape(16, 2, -1).numpy()
         skin = distance_map(scene.place_m[3:19], clip.keypoints_m[0, 3:19])
         assert (places[:, 0] <= np.minimum(skin, 0.2) + 1e-3).all()  # the skin has more points than the keypoints

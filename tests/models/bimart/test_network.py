@@ -1,6 +1,7 @@
 """Promises of BimArt's denoisers: sizes layer by layer, what is not there changes nothing, statistics, switches."""
 
 from dataclasses import fields, replace
+from typing import Literal, cast
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ import torch
 from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.learning import Moments
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Windows, contact_channels
-from models.bimart.scene import FeatureConfig, motion_rows, split_motion
+from models.bimart.scene import FeatureConfig, Recorded, Scene, split_motion
 from models.common.transformer import TransformerConfig
 
 FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window=8, state="local")
@@ -143,12 +144,15 @@ def test_moments_are_of_what_is_known_alone() -> None:
     assert (mean[2], spread[2]) == (0, 1)
 
 
-def test_motion_rows_are_positions_left_and_right_then_ways_left_and_right() -> None:
-    draws = np.random.default_rng(0)
-    keypoints, ways = draws.normal(size=(2, 2, 3, 4, 3))
-    rows = motion_rows(keypoints, ways)
-    wanted = [keypoints[0, 1].ravel(), keypoints[1, 1].ravel(), ways[0, 1].ravel(), ways[1, 1].ravel()]
+@pytest.mark.parametrize("hands", ["keypoints", "mano"])
+def test_a_motion_is_positions_left_and_right_then_the_rest_left_and_right(hands: Literal["keypoints", "mano"]) -> None:
+    draws, features = np.random.default_rng(0), FeatureConfig(keypoints=4, hands=hands)
+    points, rest = draws.normal(size=(2, 3, features.points, 3)), draws.normal(size=(2, 3, features.rest_size))
+    rows = Recorded(cast(Scene, None), rest, points, rest, rest, rest).motion
+    wanted = [points[0, 1].ravel(), points[1, 1].ravel(), rest[0, 1], rest[1, 1]]
     np.testing.assert_array_equal(rows[1], np.concatenate(wanted))
-    back = split_motion(rows)
-    np.testing.assert_array_equal(back["keypoints_m"], keypoints)
-    np.testing.assert_array_equal(back["to_object_m"], ways)
+    assert rows.shape == (3, features.motion_size)
+    for own, back in zip((points, rest), split_motion(rows, features), strict=True):
+        np.testing.assert_array_equal(back, own)
+    left = features.of_hands(torch.tensor([True, False])).numpy()
+    np.testing.assert_array_equal(rows[1][left], np.concatenate((wanted[0], wanted[2])))

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.guidance import Map, combined, discrepancy, metre_step, released_step
 from models.bimart.learning import LossConfig, window_starts
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
-from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig
+from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig, held_joints
 from models.bimart.scene import FeatureConfig, Recorded, Scene
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
 from models.common.sampling import SamplerConfig
@@ -213,3 +214,20 @@ def test_presets_differ_as_the_paper_and_its_code_do() -> None:
     assert PRESETS == {"ours": OURS, "paper": PAPER, "released": RELEASED}
     assert replace(RELEASED, rule="paper", contact_anchor=None) == PAPER
     assert SamplingConfig() == OURS
+
+
+def test_joints_that_come_near_stay_at_their_place_of_the_part_and_others_go_on() -> None:
+    own = scene(6)
+    model = own.bps.model
+    lid = np.flatnonzero(model.part == 1)[0]
+    on_lid = articulate(model.vertices_m[[lid]], np.ones(1, int), model.hinge, own.hinge_rad)[:, 0]
+    joints = np.full((6, 42, 3), 5.0) + np.arange(6)[:, None, None]
+    joints[2, 0] = on_lid[2] + (0, 0, 0.01)
+    joints[3, 1] = model.vertices_m[np.flatnonzero(model.part == 0)[-1]] + (0, 0, 0.02)
+    held = held_joints(joints.reshape(6, -1).astype(np.float32), own, 0.03).reshape(6, 42, 3)
+    np.testing.assert_allclose(held[:2], joints[:2], rtol=1e-6)
+    np.testing.assert_allclose(held[:, 2:], joints[:, 2:], rtol=1e-6)
+    apart = np.linalg.norm(held[2:, 0] - on_lid[2:], axis=1)  # as far from its place of the lid at every angle
+    np.testing.assert_allclose(apart, 0.01, atol=1e-5)
+    assert np.abs(held[2:, 0] - held[2, 0]).max() > 1e-3
+    np.testing.assert_allclose(held[3:, 1], np.broadcast_to(joints[3, 1], (3, 3)), atol=1e-6)

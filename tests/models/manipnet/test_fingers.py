@@ -118,7 +118,7 @@ def test_a_request_without_trajectories_is_left_out_with_the_reason(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", ["off", "paper", "released"])
+@pytest.mark.parametrize("rule", ["off", "paper", "released", "ours"])
 def test_a_stream_gives_the_bits_of_the_clip(fingers: Fingers, samples: list[ClipSample], rule) -> None:
     sample, predictor = samples[0], replace(fingers.predictor, rule=rule)
     control, hands = control_of(trajectories_of(sample), sample.object_model), hands_of(HANDS, sample.betas, None)

@@ -11,7 +11,7 @@ from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.animate import given_control, interpolated, led_to
+from models.manipnet.animate import given_control, interpolated, led
 from models.manipnet.trajectory_files import PARTS, parse_csv, parse_manipnet, read_trajectories
 from tests.builders.objects import box_model, notebook
 
@@ -122,13 +122,20 @@ def test_every_damaged_table_is_refused_and_the_good_ones_are_not() -> None:
             parse_csv(data, "a.csv")
 
 
-def test_a_gap_is_led_to_where_the_recording_goes_on() -> None:
+def test_a_gap_is_led_from_and_to_where_the_recording_goes_on() -> None:
     draws = np.random.default_rng(0)
     made = Rotation.from_rotvec(draws.normal(0, 0.3, (20 * 15, 3))).as_matrix().reshape(20, 15, 3, 3)
-    goal = Rotation.from_rotvec(draws.normal(0, 0.3, (15, 3))).as_matrix()
-    led = led_to(made, goal, 8)
-    np.testing.assert_allclose(led[-1], goal, atol=1e-9)
-    np.testing.assert_array_equal(led[:12], made[:12])
+    start, goal = Rotation.from_rotvec(draws.normal(0, 0.3, (30, 3))).as_matrix().reshape(2, 15, 3, 3)
+
+    def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+        return Rotation.from_matrix(np.swapaxes(one, -1, -2).reshape(-1, 3, 3) @ other.reshape(-1, 3, 3)).magnitude()
+
+    both = led(made, start, goal, 8)
+    np.testing.assert_allclose(both[7:13], made[7:13], atol=1e-9)
+    assert angles(both[0], start).max() < 0.15 * angles(made[0], start).max()
+    assert angles(both[-1], goal).max() < 0.15 * angles(made[-1], goal).max()
+    np.testing.assert_allclose(led(made, None, goal, 8)[:13], made[:13], atol=1e-9)
+    np.testing.assert_array_equal(led(made, None, None, 8), made)
     between = interpolated(made[0], goal, 3)
     angle = Rotation.from_matrix(made[0, 4].T @ goal[4]).magnitude()
     steps = [Rotation.from_matrix(made[0, 4].T @ pose[4]).magnitude() / angle for pose in between]

@@ -1,9 +1,13 @@
 """Which files the code behind a module is, on packages in a temporary folder."""
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipelines.lineage.closure import KNOWN_IMPORTS, Choice, SourceTree
 
@@ -46,6 +50,8 @@ OF_STAGE = {
     "hoidata/room/words.csv",
     "hoidata/room/assets/hand.npz",
 }
+MODULES = ("hoidata/stage.py", "hoidata/room/__init__.py", "hoidata/room/inside.py", "hoidata/room/beside.py")
+IMPORTS = ("", "import hoidata.typed", "from hoidata.room import unused", "from . import beside")
 ADAPTER = Choice(modules=("hoidata.datasets.grab.adapter",))
 SPLITS = Choice(package="hoidata.datasets.grab", files=("*.json",))
 
@@ -126,7 +132,7 @@ def test_a_package_that_registers_an_adapter_counts_with_its_files_and_version(r
     assert {"toy_hoi/adapter.py", "toy_hoi/words.py", "hoidata/room/beside.py"} <= set(found)
 
 
-@pytest.mark.parametrize("damage", ["", "[]", '{"x": 1}', '{"x": [[1, 2]]}'])
+@pytest.mark.parametrize("damage", ["", "[]", '{"x": 1}', '{"scanner": "another", "imports": %s}'])
 def test_kept_imports_change_no_answer_and_damaged_ones_are_parsed_again(root, damage):
     (root / ".hoidata").mkdir()
     for _ in range(2):
@@ -136,5 +142,22 @@ def test_kept_imports_change_no_answer_and_damaged_ones_are_parsed_again(root, d
     assert (root / KNOWN_IMPORTS).is_file()
     (root / "hoidata/room/beside.py").write_text("import hoidata.typed")
     assert "hoidata/typed.py" in SourceTree(root).closure(["hoidata.stage"], {})
-    (root / KNOWN_IMPORTS).write_text(damage)
+    nothing = {digest: [] for digest in SourceTree(root).closure(["hoidata.stage"], {}).values()}
+    (root / KNOWN_IMPORTS).write_text(damage.replace("%s", json.dumps(nothing)))
     assert "hoidata/typed.py" in SourceTree(root).closure(["hoidata.stage"], {})
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.lists(st.tuples(st.sampled_from(MODULES), st.sampled_from(IMPORTS)), min_size=1, max_size=6))
+def test_kept_imports_give_the_digests_of_a_fresh_look_whatever_was_edited(edits):
+    with TemporaryDirectory() as folder:
+        root = Path(folder)
+        write(root, {".hoidata/x": "", **FILES})
+        for name, text in edits:
+            write(root, {name: text})
+            tree = SourceTree(root)
+            with_kept = tree.closure(["hoidata.stage"], {})
+            tree.keep_imports()
+            (root / KNOWN_IMPORTS).rename(root / "kept")
+            assert with_kept == SourceTree(root).closure(["hoidata.stage"], {})
+            (root / "kept").rename(root / KNOWN_IMPORTS)

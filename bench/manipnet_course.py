@@ -1,0 +1,223 @@
+"""Do the fingers of ManipNet's rollouts stay on course, and how well do they fill gaps?
+
+``python -m bench manipnet-course`` with HOIDATA_MANIPNET, after ``python -m bench manipnet``, whose networks it takes
+(or trains, where there is none). Rollouts of half a minute from three starts, each of a recording that its network
+never saw, and their way to each other as a picture in .hoidata/manipnet. Gaps of 0.5 to 4 s in what did not train, beside
+ways that need no network: the first held-out round of each recording (two tenths, one after the other) chooses a way
+for each length, the second is reported.
+"""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from bench.harness import show
+from bench.manipnet import KEPT, RATE_HZ, SETTINGS, Job, Trial, seen_trial, trained_network, unseen_trials
+from bench.manipnet_recordings import NAMES, ROUND, TENTHS, TEST, VALIDATION, HandRecording, read_hands
+from hoidata.clips.clip import SIDES, Side
+from hoidata.files import write_whole
+from hoidata.geometry.intervals import runs
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.hands.tracked_hand import TrackedHand
+from models.manipnet.animate import interpolated, led
+from models.manipnet.lookups import joint_errors_m
+from models.manipnet.rollout import Predictor, Task, roll_out
+
+COURSE_S = 30
+GAPS_S = (0.5, 1.0, 2.0, 4.0)
+SEAMS_S = (0.25, 0.5, 1.0)
+STARTS = ("neutral pose", "true pose", "fist")
+FIST_RAD = 1.2
+
+
+def main() -> None:
+    root = os.environ.get("HOIDATA_MANIPNET")
+    if not root:
+        print("HOIDATA_MANIPNET is not set: this needs the real recordings")
+        return
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    torch.use_deterministic_algorithms(True)
+    recordings = [read_hands(Path(root), name) for name in NAMES]
+    size = os.environ.get("HOIDATA_BENCH_SIZE", "small")
+    show_gaps(recordings, Predictor(trained_network(Job(seen_trial(recordings), "ours", 0), size)))
+    show_courses(unseen_trials(recordings), recordings, size)
+
+
+def fist(hand: TrackedHand) -> np.ndarray:
+    """(joint - 1, 3, 3) the neutral pose with every hinge bent."""
+    bend = np.minimum(FIST_RAD, hand.limit_rad[1:, 1])
+    return hand.rest_rotmats @ rotvec_to_rotmat(hand.hinge_axis[1:] * bend[:, None])
+
+
+class Course(NamedTuple):
+    """errors_mm: (start, frame) of both hands, from the recorded ones; apart_mm: (frame,) the starts from each other.
+
+    broken: frames in which a number is none, a bone longer, or a joint beyond its limits.
+    """
+
+    errors_mm: np.ndarray
+    apart_mm: np.ndarray
+    broken: int
+
+
+def course(trial: Trial, recording: HandRecording, size: str) -> Course:
+    """Half a minute of a recording left out (or its longest usable interval), from each start."""
+    predictor = Predictor(trained_network(Job(trial, "ours", 0), size))
+    first, stop = max(runs(recording.usable), key=lambda run: run[1] - run[0])
+    frames = slice(first, min(stop, first + COURSE_S * RATE_HZ))
+    tasks = []
+    for side in SIDES:
+        hand = recording.hands[side]
+        for start in (hand.rest_rotmats, recording.fingers[side][first], fist(hand)):
+            tasks.append(Task(hand, side, recording.control, recording.time_s[frames], start))
+    made = roll_out(predictor, tasks)
+    errors, apart, broken = np.zeros((len(STARTS), len(made[0]))), np.zeros(len(made[0])), 0
+    for row, side in enumerate(SIDES):
+        hand, own = recording.hands[side], made[len(STARTS) * row : len(STARTS) * (row + 1)]
+        true = recording.fingers[side][frames]
+        errors += 500 * np.stack([joint_errors_m(hand, one, true).mean(axis=1) for one in own])
+        pairs = [(own[0], own[1]), (own[0], own[2]), (own[1], own[2])]
+        apart += 500 * np.mean([joint_errors_m(hand, *pair).mean(axis=1) for pair in pairs], axis=0)
+        broken += sum(_broken(predictor, hand, one[1:]) for one in own)
+    return Course(errors, apart, broken)
+
+
+def _broken(predictor: Predictor, hand: TrackedHand, fingers: np.ndarray) -> int:
+    """Frames (frame, joint - 1, 3, 3) that no hand can have."""
+    joints = hand.state(fingers).joint_m
+    bones = np.linalg.norm(joints[:, 1:] - joints[:, hand.parents[1:]], axis=-1)
+    stretched = np.abs(bones - np.linalg.norm(hand.offset_m[1:], axis=-1)).max(axis=1) > 1e-6
+    beyond = np.abs(predictor.limits(hand).within(fingers) - fingers).max(axis=(1, 2, 3)) > 1e-6
+    return int((stretched | beyond | ~np.isfinite(fingers).all(axis=(1, 2, 3))).sum())
+
+
+def show_courses(trials: Sequence[Trial], recordings: Sequence[HandRecording], size: str) -> None:
+    """A row per recording, and the picture."""
+    found = [course(trial, one, size) for trial, one in zip(trials, recordings, strict=True)]
+    rows = []
+    for recording, one in zip(recordings, found, strict=True):
+        quarter = one.errors_mm.shape[1] // 4
+        first, last = one.errors_mm[0, :quarter].mean(), one.errors_mm[0, -quarter:].mean()
+        shares = [f"{one.apart_mm[round(s * RATE_HZ)]:.2f}" for s in (0, 0.25, 1, 2)]
+        length = f"{one.errors_mm.shape[1] / RATE_HZ:.1f}"
+        rows.append([recording.name, length, f"{first:.1f}", f"{last:.1f}", f"{last / first:.2f}", *shares, one.broken])
+    columns = ["unseen", "s", "first quarter mm", "last quarter mm", "ratio", "apart at 0 s mm", ".25 s", "1 s", "2 s"]
+    show("Rollouts from neutral pose, true pose and fist", [*columns, "broken frames"], rows)
+    shortest = min(len(one.apart_mm) for one in found)
+    curves = {"from each other": np.mean([one.apart_mm[:shortest] for one in found], axis=0)}
+    errors = np.mean([one.errors_mm[:, :shortest] for one in found], axis=0)
+    curves |= {f"from the recorded hand, {start}": own for start, own in zip(STARTS, errors, strict=True)}
+    write_whole(KEPT / "course.svg", picture(curves))
+    print(f"picture: {KEPT / 'course.svg'}")
+
+
+def picture(curves: Mapping[str, np.ndarray], width: int = 720, height: int = 300) -> str:
+    """SVG of curves (frame,) in mm over the first four seconds and after it, a tenth as wide."""
+    top, colours = max(float(one.max()) for one in curves.values()), ("#000", "#2a6fb0", "#2f8f4e", "#c2562d")
+    shown = 4 * RATE_HZ
+    lines = []
+    for (name, one), colour, row in zip(curves.items(), colours, range(len(curves)), strict=True):
+        points = " ".join(
+            f"{40 + (width - 60) * frame / shown:.1f},{height - 30 - (height - 50) * value / top:.1f}"
+            for frame, value in enumerate(one[: shown + 1])
+        )
+        lines.append(f'<polyline fill="none" stroke="{colour}" stroke-width="1.5" points="{points}"/>')
+        lines.append(f'<text x="{width - 330}" y="{20 + 16 * row}" fill="{colour}">{name}</text>')
+    marks = "".join(
+        f'<text x="{40 + (width - 60) * s / 4:.0f}" y="{height - 10}">{s} s</text>' for s in range(5)
+    ) + "".join(
+        f'<text x="4" y="{height - 26 - (height - 50) * mm / top:.0f}">{mm}</text>' for mm in range(0, int(top) + 1, 10)
+    )
+    size = f'width="{width}" height="{height}" font-family="sans-serif" font-size="12"'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>\n{marks}\n' + "\n".join(lines) + "\n</svg>\n"
+
+
+class Gap(NamedTuple):
+    """Frames of a hand that are taken away."""
+
+    recording: HandRecording
+    side: Side
+    frames: slice
+
+
+Filling = Callable[[Gap], np.ndarray]
+
+
+def gaps(recording: HandRecording, seconds: float, turn: int) -> list[Gap]:
+    """Gaps of a length in one held-out round (validation and test tenths), object lifted in most of it."""
+    tenth = np.arange(recording.n_frames) * TENTHS // recording.n_frames
+    held = np.isin(tenth % ROUND, (*VALIDATION, *TEST)) & (tenth // ROUND == turn)
+    length, found = round(seconds * RATE_HZ), []
+    for first, stop in runs(held & recording.usable):
+        for start in range(first + 1, stop - length, max(length // 2, RATE_HZ // 2)):
+            frames = slice(start, start + length)
+            if recording.lifted[frames].mean() > 0.5:
+                found += [Gap(recording, side, frames) for side in SIDES]
+    return found
+
+
+def ways(predictor: Predictor) -> dict[str, Filling]:
+    """What may stand in a gap, by name."""
+
+    def ends(gap: Gap) -> tuple[np.ndarray, np.ndarray, int]:
+        fingers, frames = gap.recording.fingers[gap.side], gap.frames
+        return fingers[frames.start - 1], fingers[frames.stop], frames.stop - frames.start
+
+    made: dict[tuple[str, Side, int, int], np.ndarray] = {}
+
+    def network(gap: Gap) -> np.ndarray:
+        key = (gap.recording.name, gap.side, gap.frames.start, gap.frames.stop)
+        if key not in made:
+            own, time_s = gap.recording, gap.recording.time_s[gap.frames.start - 1 : gap.frames.stop]
+            made[key] = roll_out(predictor, [Task(own.hands[gap.side], gap.side, own.control, time_s, ends(gap)[0])])[
+                0
+            ][1:]
+        return made[key]
+
+    def led_over(seam_s: float) -> Filling:
+        return lambda gap: led(network(gap), *ends(gap)[:2], round(seam_s / SETTINGS.step_s))
+
+    return {
+        "frozen fingers": lambda gap: np.tile(ends(gap)[0], (ends(gap)[2], 1, 1, 1)),
+        "interpolated": lambda gap: interpolated(*ends(gap)),
+        "network": network,
+    } | {f"network, led over {seam:g} s": led_over(seam) for seam in SEAMS_S}
+
+
+def show_gaps(recordings: Sequence[HandRecording], predictor: Predictor) -> None:
+    rows = []
+    for seconds in GAPS_S:
+        chosen = {name: _filled(gaps_of(recordings, seconds, 0), way) for name, way in ways(predictor).items()}
+        told = {name: _filled(gaps_of(recordings, seconds, 1), way) for name, way in ways(predictor).items()}
+        best = min(chosen, key=lambda name: chosen[name][0])
+        count = len(gaps_of(recordings, seconds, 1))
+        for name in told:
+            words = [f"{value:.2f}" for value in (chosen[name][0], *told[name])]
+            rows.append([f"{seconds:g} s, {count} gaps", name + " (chosen)" * (name == best), *words])
+    columns = ["gap", "way", "joints mm, choosing round", "joints mm", "seam steps mm, 95 %", "own 99 % step mm"]
+    show("Gaps in held-out intervals of the real recordings", columns, rows)
+
+
+def gaps_of(recordings: Sequence[HandRecording], seconds: float, turn: int) -> list[Gap]:
+    return [gap for one in recordings for gap in gaps(one, seconds, turn)]
+
+
+def _filled(found: Sequence[Gap], way: Filling) -> tuple[float, float, float]:
+    """Mean joint error, the step at seams that 95 % stay below, and the 99th percentile of recorded steps, mm."""
+    errors, seams, own = [], [], []
+    for recording, side, frames in found:
+        hand, true = recording.hands[side], recording.fingers[side]
+        made = way(Gap(recording, side, frames))
+        errors.append(joint_errors_m(hand, made, true[frames]).mean(axis=1))
+        edges = np.stack([true[frames.start - 1], made[-1]]), np.stack([made[0], true[frames.stop]])
+        seams.append(joint_errors_m(hand, *edges).mean(axis=1))
+        around = true[max(frames.start - 4 * RATE_HZ, 0) : frames.stop + 4 * RATE_HZ]
+        own.append(np.percentile(joint_errors_m(hand, around[1:], around[:-1]).mean(axis=1), 99))
+    if not found:
+        return np.nan, np.nan, np.nan
+    seam_m = np.percentile(np.concatenate(seams), 95)
+    return 1000 * float(np.concatenate(errors).mean()), 1000 * float(seam_m), 1000 * float(np.mean(own))

@@ -1,0 +1,1 @@
+"""HOT3D: adapter and facts."""

@@ -1,0 +1,205 @@
+"""Generated hands that hold what they touch: still on the part while they hold it, on its surface, out of it, and able
+to carry it.
+
+A hand is looked at in the frame of the part it touches most, where a hand that holds on is one pose. That pose, and
+corrections of the frames around it, are found by ``hold_solver``; where the hands that come out cannot carry an object
+that is in the air, fingers are drawn in from farther away.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.geometry.intervals import Interval, runs
+from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.model import HandPair
+from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
+from hoidata.physics.mano_capsules import hand_capsules
+from hoidata.physics.scene import Scene, object_scene
+from hoidata.physics.standard_units import StandardUnits
+from hoidata.refinement.hold_solver import SolverSettings, corrected
+from hoidata.refinement.kernels import N_UNKNOWNS
+from hoidata.refinement.object_field import ObjectField
+from hoidata.refinement.skin import HandPose, Skin
+
+_ALONG = 9  # places along a capsule's axis at which it is looked at
+
+
+@dataclass(frozen=True)
+class HoldSettings:
+    """near_m: a hand touches whose skin is nearer. still_m_s, carried_m_s: a touching hand slower than this on the part
+    holds it, where the part is at rest, and where it moves by more than moving_m_s. least: frames of a hold. gap:
+    frames between two holds that belong to one. blend: in which a hand comes to its hold, and leaves it. reach_m,
+    keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from the generated one:
+    the first of each, then the next where the hands cannot carry the object in some of air_frames frames in which it is
+    in the air. solver: the other wishes.
+    """
+
+    near_m: float = 0.006
+    still_m_s: float = 0.02
+    carried_m_s: float = 0.3
+    moving_m_s: float = 0.02
+    least: int = 6
+    gap: int = 12
+    blend: int = 8
+    reach_m: tuple[float, ...] = (0.003, 0.012, 0.03)
+    keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02)
+    air_frames: int = 4
+    solver: SolverSettings = field(default_factory=SolverSettings)
+
+
+def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
+    """The hands of a clip, still, touching and outside while they hold; one that never does stays as it was.
+
+    A frame in which a hand is not valid is not changed. Without known gravity nothing is asked to be carried.
+    """
+    starts: dict[Side, _Start] = {}
+    for side in SIDES:
+        if (start := _start(pair, side, clip, settings)) is not None:
+            starts[side] = start
+    load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
+    for reach, keypoint in zip(settings.reach_m, settings.keypoint_m, strict=True) if starts else ():
+        tracks, wishes = dict(clip.hands), replace(settings.solver, reach_m=reach, keypoint_m=keypoint)
+        for side, start in starts.items():
+            opposite: Side = "right" if side == "left" else "left"
+            other = hand_capsules(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
+            tracks[side] = start.solved(other, wishes)
+        share = load.carried([hand_capsules(tracks[side].take(load.frames), pair[side]) for side in starts])
+        if share > most:
+            best, most = tracks, share
+        if share == 1:
+            break
+    return best
+
+
+@dataclass(frozen=True)
+class _Load:
+    """An object in the air, and some frames in which hands have to carry it; no frames where it never is."""
+
+    clip: Clip
+    scene: Scene | None
+    frames: np.ndarray
+
+    @classmethod
+    def of(cls, clip: Clip, count: int) -> "_Load":
+        if clip.gravity is None or clip.n_frames < 3:
+            return cls(clip, None, np.zeros(0, int))
+        scene = object_scene(clip)
+        air = np.flatnonzero(scene.lifted)
+        return cls(clip, scene, air[((np.arange(count) + 0.5) * len(air) / count).astype(int)] if len(air) else air)
+
+    def carried(self, hands: Sequence[Capsules]) -> float:
+        """Share of the frames in which friction at the contacts can give the object's motion; hands in those frames."""
+        if self.scene is None or not len(self.frames):
+            return 1.0
+        capsules, physics = joined(list(hands)), StandardUnits()
+        along = np.linspace(0, 1, _ALONG)[:, None]
+        axis = (capsules.end_m - capsules.start_m)[:, :, None]
+        places = (capsules.start_m[:, :, None] + along * axis).reshape(len(self.frames), -1, 3)
+        found = ObjectField(self.clip.object).distances(places, self.frames)
+        shape = (*capsules.start_m.shape[:2], _ALONG)
+        distance, slope, place = (array.reshape(*shape, -1) for array in (*found, places))
+        deepest = distance.argmin(axis=2, keepdims=True)
+        distance, slope, place = (np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, place))
+        frame, capsule = np.nonzero(distance[..., 0] < capsules.radius_m)
+        depth, normal = (capsules.radius_m - distance[..., 0])[frame, capsule], slope[frame, capsule]
+        point = (place - distance * slope)[frame, capsule]
+        number = self.frames[frame]
+        contacts = CapsuleContacts(number, capsule, np.zeros_like(number), depth, point, normal, point, normal)
+        return float((physics.residuals(self.scene, contacts)[self.frames] < physics.limit).mean())
+
+
+@dataclass(frozen=True)
+class _Start:
+    """One hand in the frame of the part it holds, at rest in its holds."""
+
+    track: HandTrack
+    skin: Skin
+    pose: HandPose
+    holds: list[Interval]
+    part_from_world: RigidTransform
+    field: ObjectField
+
+    def solved(self, other: Capsules | None, settings: SolverSettings) -> HandTrack:
+        """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
+        turn = self.part_from_world
+        if other is not None:
+            other = Capsules(turn @ other.start_m, turn @ other.end_m, other.radius_m)
+        pose = corrected(self.skin, self.field, self.pose, self.holds, self.track.valid, other, settings)
+        track, valid = self.track, self.track.valid[:, None]
+        made = pose.seen_from(self.part_from_world.inverse()).track(track.betas[0], track.valid, track.template_m)
+        kept = {name: getattr(track, name) for name in ("wrist_m", "global_orient", "hand_pose")}
+        return replace(track, **{name: np.where(valid, getattr(made, name), own) for name, own in kept.items()})
+
+
+def _start(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Start | None:
+    """None for a hand that holds nothing."""
+    track, thing = clip.hands[side], clip.object
+    if not track.valid.any():
+        return None
+    skin = Skin(pair[side], np.asarray(track.betas, np.float64)[0], track.template_m)
+    world = HandPose.of(track)
+    points_m = skin.vertices_m(skin.chain(world))
+    distance, _ = ObjectField(thing).distances(points_m)
+    touching = (distance < settings.near_m) & track.valid[:, None]
+    part = ObjectField(thing).nearest_part(points_m) if thing.model.is_articulated else np.zeros_like(distance, int)
+    chosen = int((touching & (part == 1)).sum() > (touching & (part == 0)).sum())
+    object_from_part = thing.model.object_from_part(chosen, thing.hinge_rad)
+    world_from_part = thing.world_from_object @ object_from_part
+    holds = _holds(points_m, (touching & (part == chosen)).any(axis=1), world_from_part, track.valid, settings)
+    if not holds:
+        return None
+    pose = _at_rest(world.seen_from(world_from_part.inverse()), holds, settings.blend)
+    return _Start(track, skin, pose, holds, world_from_part.inverse(), ObjectField(_in_part(thing, object_from_part)))
+
+
+def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrack:
+    """The object's motion as the part sees it."""
+    back = object_from_part.inverse()
+    rotation, place = (
+        np.broadcast_to(array, (thing.n_frames, *array.shape[back.rotation.ndim - 2 :]))
+        for array in (back.rotation, back.translation)
+    )
+    return replace(thing, rotvec=rotmat_to_rotvec(rotation), translation_m=place)
+
+
+def _holds(
+    points_m: np.ndarray, touching: np.ndarray, world_from_part: RigidTransform, valid: np.ndarray, own: HoldSettings
+) -> list[Interval]:
+    """Intervals in which a hand, vertices (frame, vertex, 3) world, touches (frame,) a part and hardly moves on it."""
+    some = world_from_part.inverse() @ points_m[:, ::20]
+    speed = np.linalg.norm(np.diff(some, axis=0), axis=-1).mean(axis=1) * FPS
+    carried = world_from_part[1:] @ some[:-1] - world_from_part[:-1] @ some[:-1]
+    moving = np.linalg.norm(carried, axis=-1).mean(axis=1) * FPS > own.moving_m_s
+    slow = speed < np.where(moving, own.carried_m_s, own.still_m_s)
+    held = touching & (np.append(slow, False) | np.append(False, slow))
+    for start, stop in runs(~held):
+        if start > 0 and stop < len(held) and stop - start <= own.gap and valid[start:stop].all():
+            held[start:stop] = True
+    return [found for found in runs(held) if found.stop - found.start >= own.least]
+
+
+def _at_rest(pose: HandPose, holds: Sequence[Interval], blend: int) -> HandPose:
+    """The mean pose of each hold in all its frames; the way to it is shared out over frames before and after."""
+    step, n_frames = np.zeros((len(pose.wrist_m), N_UNKNOWNS)), len(pose.wrist_m)
+    for number, (start, stop) in enumerate(holds):
+        own = HandPose(*(array[start:stop] for array in pose))
+        mean = HandPose(*(np.repeat(array[len(array) // 2][None], len(array), 0) for array in own))
+        for _ in range(2):
+            mean = mean.moved(np.repeat(mean.step_to(own).mean(axis=0)[None], stop - start, 0))
+        step[start:stop] = ways = own.step_to(mean)
+        # Two holds share the frames between them.
+        before = min(blend, (start - holds[number - 1].stop) // 2 if number else start)
+        after = min(blend, (holds[number + 1].start - stop) // 2 if number + 1 < len(holds) else n_frames - stop)
+        step[start - before : start] = _ramp(before)[:, None] * ways[0]
+        step[stop : stop + after] = _ramp(after)[::-1, None] * ways[-1]
+    return pose.moved(step)
+
+
+def _ramp(count: int) -> np.ndarray:
+    """(count,) from near 0 to near 1, level at both ends."""
+    u = np.arange(1, count + 1) / (count + 1)
+    return u * u * (3 - 2 * u)

@@ -1,0 +1,102 @@
+"""Stage tables: BimArt's Tables 1 and 3 from the rows of all runs, and Table 6 from recorded clips, as Markdown."""
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from hoidata.files import write_whole
+from hoidata.files.written import Facts, read_json
+from models.bimart_tables.rows import VARIANTS
+from pipelines.stages.base import EMPTY, StagePaths, empty_reason, load_hands
+
+RIVALS = ("nearest-window", "random-window", "mean-pose-at-object")
+TABLES: Mapping[str, Sequence[str]] = {
+    "Table 1: baselines": ("ground-truth", "cams-b", "mdm-b", "omomo-b", "bimart", *RIVALS),
+    "Table 3: representations": ("unscaled", "whole", "mano", "stateless", "map"),
+    "Table 3: contact": ("no-map", "map", "map-guided", "bimart"),
+    "Controls": (
+        *("ground-truth", "hands-still", "hands-shifted", "pressed-deep", "bimart", "other-path", "other-object"),
+        "zero-map",
+    ),
+}
+# Column, then the figures in it: as released / corrected.
+COLUMNS = {
+    "Mul, cm": ("bimart_mul_cm",),
+    "Accel, cm/frame2 / m/s2": ("bimart_accel_paper", "bimart_accel_corrected"),
+    "Pen 1 cm, %": ("bimart_pen_1cm_paper", "bimart_pen_1cm_corrected"),
+    "Pen 5 mm, %": ("bimart_pen_5mm_paper", "bimart_pen_5mm_corrected"),
+    "Con, %": ("bimart_con_paper", "bimart_con_corrected"),
+    "Art, %": ("bimart_art_paper", "bimart_art_corrected"),
+    "CM, cm": ("bimart_cm_paper", "bimart_cm_corrected"),
+    "contact F1": ("contact_f1",),
+    "joints, best sample, mm": ("joint_error_mm",),
+}
+NOTE = (
+    "Figures as BimArt's release has them / corrected (hoidata/metrics/README.md); contact F1 and joints see where "
+    "hands are. Of several seeds the mean, in brackets the standard deviation."
+)
+
+
+def run(paths: StagePaths) -> None:
+    """Write the tables; of a dataset without clips the reason alone."""
+    if reason := empty_reason(paths.clips):
+        write_whole(paths.tables, f"{reason}\n")
+        return
+    found = read_rows(paths)
+    lines = [f"# BimArt's tables on {paths.profile}/{paths.dataset}", "", NOTE]
+    for title, names in TABLES.items():
+        if rows := [_row(found[name]) for name in names if name in found]:
+            lines += ["", f"## {title}", "", *_table(("row", "seeds", "motions", *COLUMNS), rows)]
+    lines += ["", "## Table 6: error of contact maps seen by basis points, cm", "", *_mapping(paths)]
+    write_whole(paths.tables, "\n".join(lines) + "\n")
+    print(f"{paths}: {len(found)} rows, {paths.tables}")
+
+
+def read_rows(paths: StagePaths) -> dict[str, list[Facts]]:
+    """What was measured of each row, by its name, seed by seed."""
+    known = [name for variant in VARIANTS.values() for name in variant.rows]
+    files = sorted(paths.table_rows.glob("*/*.json"))
+    rows = [(file.stem, read_json(file)) for file in files if file.name != EMPTY]
+    return {name: own for name in known if (own := [row for stem, row in rows if stem == name])}
+
+
+def _row(seeds: list[Facts]) -> list[str]:
+    """Title, how many seeds and motions, and the cells of a row."""
+    measured = [seed for seed in seeds if "figures" in seed]
+    if not measured:
+        return [seeds[0]["title"], "0", seeds[0]["empty"], *["-"] * len(COLUMNS)]
+    cells = [
+        " / ".join(_cell(seed["figures"].get(name) for seed in measured) for name in own) for own in COLUMNS.values()
+    ]
+    return [seeds[0]["title"], str(len(measured)), str(sum(seed["motions"] for seed in measured)), *cells]
+
+
+def _cell(values: Iterable[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    if not known:
+        return "-"
+    spread = f" ({np.std(known, ddof=1):.2g})" if len(known) > 1 else ""
+    return f"{np.mean(known):.3g}{spread}"
+
+
+def _mapping(paths: StagePaths) -> list[str]:
+    from hoidata.batches.dataset import HoiDataset
+    from hoidata.store.annotated import load_annotated
+    from models.bimart_tables.mapping import VARIANTS as SEEN
+    from models.bimart_tables.mapping import WHERE, mapping_errors_cm
+
+    hands = load_hands(paths.profile)
+    found = mapping_errors_cm(list(HoiDataset(load_annotated(paths.data, hands), "test", crop="start")), hands)
+    if not found:
+        return ["No test clips."]
+    found["mean"] = {kind: np.nanmean([own[kind] for own in found.values()], axis=0).tolist() for kind in SEEN}
+    columns = [f"{where}: {kind}" for where in WHERE for kind in SEEN]
+    rows = [
+        [name, *(f"{own[kind][place]:.3f}" for place in range(len(WHERE)) for kind in SEEN)]
+        for name, own in found.items()
+    ]
+    return _table(("object", *columns), rows)
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(own)} |" for own in (columns, ["---"] * len(columns), *rows)]

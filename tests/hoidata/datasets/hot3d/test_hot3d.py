@@ -1,0 +1,295 @@
+"""HOT3D's adapter on recordings of a known truth: intervals, what the makers checked, UmeTrack's hands, licences."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hoidata.annotation.sentences import four_sentences
+from hoidata.clips.clip import SIDES, Clip
+from hoidata.clips.validation import check_clip
+from hoidata.conversion.convert import convert_dataset
+from hoidata.dataset_folders import BUILT_IN, facts_beside
+from hoidata.datasets import Quarantined, RawTree, SequenceKey
+from hoidata.datasets.hot3d.adapter import Hot3dAdapter
+from hoidata.datasets.hot3d.words import NOUNS, object_words
+from hoidata.errors import BadInput
+from hoidata.hands import track_joints
+from hoidata.store.store import open_store
+from pipelines.exports.describe import dataset_card
+from pipelines.exports.licences import licences_of
+from tests.builders import hot3d
+from tests.builders.formulas import chain, rest_points
+from tests.builders.hot3d import ARIA, HANDS, KEYBOARD, MUG, N_FRAMES, QUEST, UMETRACK
+from tests.builders.spoilt import replaced
+
+MASK = f"{ARIA}/masks/mask_qa_pass.csv"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return hot3d.write_two(tmp_path / "raw")
+
+
+def load(root: Path, name: str = ARIA, **settings) -> list[Clip | Quarantined]:
+    return Hot3dAdapter(**settings).load(RawTree(root), hot3d.key_of(name), HANDS)
+
+
+def only_clip(root: Path, name: str = ARIA, **settings) -> Clip:
+    (clip,) = load(root, name, **settings)
+    assert isinstance(clip, Clip)
+    return check_clip(clip)
+
+
+def edit_rows(root: Path, change: Callable[[int, list[str]], list[str] | None], uid: str = MUG) -> None:
+    """Change the cells of an object's rows, or drop them; frames count from 0."""
+    path = root / ARIA / "dynamic_objects.csv"
+    head, *lines = path.read_text().splitlines()
+    frame_of = {str(time): frame for frame, times in enumerate(hot3d.times("Aria")) for time in times}
+    cells = [line.split(",") for line in lines]
+    kept = [change(frame_of[row[1]], row) if row[0] == uid else row for row in cells]
+    path.write_text("\n".join([head, *(",".join(row) for row in kept if row)]))
+
+
+def away(row: list[str]) -> list[str]:
+    return [*row[:2], "7.0", *row[3:]]
+
+
+@pytest.mark.parametrize(("name", "headset", "seed"), [(ARIA, "Aria", 0), (QUEST, "Quest3", 1)])
+def test_a_recording_comes_back_to_its_truth(root: Path, name: str, headset: str, seed: int) -> None:
+    """Joints and object of every frame, within 0.1 mm of what was planted, whatever world the headset has."""
+    clip, truth = only_clip(root, name), hot3d.truth(headset, "mano", seed)
+    for side in SIDES:
+        numbers, turn, place = truth.hands[side]
+        rest = rest_points(HANDS[side], numbers["betas"])
+        bends = HANDS[side].mean_pose + np.array(numbers["pose"]) @ HANDS[side].components[:15]
+        planted = [chain(rest, turn[frame].as_rotvec(), bends, place[frame]) for frame in range(N_FRAMES)]
+        assert np.abs(track_joints(clip.hands[side], HANDS[side])[:, :16] - planted).max() < 1e-4
+    box = hot3d.box(hot3d.HALF_BOX_M)
+    planted = [turn.apply(box) + place for turn, place in zip(truth.turn, truth.place, strict=True)]
+    order = [int(np.linalg.norm(clip.object.model.vertices_m - corner, axis=1).argmin()) for corner in box]
+    assert np.abs((clip.object.world_from_object @ clip.object.model.vertices_m)[:, order] - planted).max() < 1e-4
+
+
+def test_a_clip_has_words_of_its_object_and_no_verb(root: Path) -> None:
+    clip = only_clip(root)
+    assert clip.clip_id == f"hot3d/{ARIA}/00000-00035-mug_white"
+    assert (clip.verb, clip.object_words, clip.subject) == (None, "white mug", "P0001")
+    assert four_sentences(clip.verb, clip.object_words, "both")[0] == "Move a white mug with both hands."
+    assert [track.model.name for track in clip.other_objects] == ["keyboard"]
+    assert [str(key) for key in Hot3dAdapter().sequences(root)] == [f"hot3d/{ARIA}", f"hot3d/{QUEST}"]
+
+
+def test_every_object_of_the_makers_has_words() -> None:
+    assert object_words("coffee_pot") == "coffee pot"
+    assert all(words == object_words(name) and not any(map(str.isdigit, words)) for name, words in NOUNS.items())
+
+
+def test_a_clip_names_the_files_it_was_made_from(root: Path) -> None:
+    own = [f"{ARIA}/{name}" for name in ("dynamic_objects.csv", hot3d.MANO_FILE, "metadata.json")]
+    shared = ["assets/instance.json", *(f"assets/{uid}.glb" for uid in (MUG, KEYBOARD))]
+    assert [source.path for source in only_clip(root).sources] == sorted([*own, *shared, MASK])
+
+
+def test_an_interval_begins_and_ends_with_the_touch_and_a_margin_widens_it(root: Path) -> None:
+    edit_rows(root, lambda frame, row: row if 2 <= frame < 34 else away(row))
+    assert only_clip(root).source_frames.tolist() == list(range(2, 34))
+    assert only_clip(root, margin_frames=1).source_frames.tolist() == list(range(1, 35))
+    assert only_clip(root, margin_frames=99).n_frames == N_FRAMES
+
+
+def test_a_gap_of_ten_frames_without_touch_is_part_of_it_and_one_of_eleven_is_not(root: Path) -> None:
+    edit_rows(root, lambda frame, row: away(row) if 12 <= frame < 22 else row)
+    assert only_clip(root).n_frames == N_FRAMES
+    edit_rows(root, lambda frame, row: away(row) if 12 <= frame < 23 else row)
+    clips = load(root, shortest_frames=12)
+    assert [clip.source_frames[[0, -1]].tolist() for clip in clips if isinstance(clip, Clip)] == [[0, 11], [23, 35]]
+
+
+def test_long_intervals_are_divided_evenly(root: Path) -> None:
+    clips = load(root, longest_frames=15)
+    assert [clip.n_frames for clip in clips if isinstance(clip, Clip)] == [12, 12, 12]
+
+
+def test_frames_that_the_makers_refused_are_left_out_and_counted(root: Path) -> None:
+    (root / MASK).write_text(hot3d.mask_table(hot3d.truth("Aria", "mano", 0), "Aria", {2: "1201-2", 3: "214-1"}))
+    failed, short, clip = load(root)
+    assert isinstance(clip, Clip)
+    assert clip.source_frames.tolist() == list(range(4, N_FRAMES))
+    assert isinstance(failed, Quarantined)
+    assert (failed.source_key, failed.got) == (f"hot3d/{ARIA}/failed", "1 others, 2 frames, the first frame 2")
+    assert isinstance(short, Quarantined)
+    assert short.source_key == f"hot3d/{ARIA}/mug_white/short"
+    (root / MASK).unlink()
+    assert only_clip(root).n_frames == N_FRAMES
+
+
+def test_frames_without_the_object_and_times_that_are_missing_end_an_interval(root: Path) -> None:
+    edit_rows(root, lambda frame, row: None if frame == 33 else row)
+    assert [clip.n_frames for clip in load(root) if isinstance(clip, Clip)] == [33]
+    hands = root / ARIA / hot3d.MANO_FILE
+    lines = hands.read_text().splitlines(keepends=True)
+    hands.write_text("".join([*lines[:62], *lines[66:]]))
+    edit_rows(root, lambda frame, row: None if frame in (31, 32) else row)
+    edit_rows(root, lambda frame, row: None if frame in (31, 32) else row, KEYBOARD)
+    assert [clip.n_frames for clip in load(root) if isinstance(clip, Clip)] == [31]
+
+
+def test_another_object_is_beside_a_clip_only_where_it_is_known_throughout(root: Path) -> None:
+    edit_rows(root, lambda frame, row: None if frame == 9 else row, KEYBOARD)
+    assert only_clip(root).other_objects == ()
+
+
+def test_an_object_that_is_touched_and_does_not_move_gives_no_clip(root: Path) -> None:
+    still = (root / ARIA / "dynamic_objects.csv").read_text().splitlines()[1].split(",")[2:]
+    edit_rows(root, lambda frame, row: [*row[:2], *still])
+    hands = [json.loads(line) for line in (root / ARIA / hot3d.MANO_FILE).read_text().splitlines()]
+    held = [json.dumps({**line, "hand_poses": hands[0]["hand_poses"]}) for line in hands]
+    (root / ARIA / hot3d.MANO_FILE).write_text("\n".join(held))
+    (item,) = load(root)
+    assert isinstance(item, Quarantined)
+    assert (item.source_key, item.expected) == (f"hot3d/{ARIA}/mug_white/still", "an object that moves 2 cm")
+
+
+PACKED = SequenceKey("hot3d", "clips", "train_quest3/clip-001849")
+
+
+def load_packed(root: Path, **settings) -> list[Clip | Quarantined]:
+    return Hot3dAdapter(**settings).load(RawTree(root), PACKED, HANDS)
+
+
+def test_a_clip_of_hot3d_clips_says_what_its_recording_does(root: Path, tmp_path: Path) -> None:
+    """The same truth packed into a tar: the same motion, under the name and person of the recording."""
+    hot3d.write_clip(tmp_path / "clips", "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1))
+    assert Hot3dAdapter().sequences(tmp_path / "clips") == [PACKED]
+    (clip,) = load_packed(tmp_path / "clips")
+    assert isinstance(clip, Clip)
+    whole = only_clip(root, QUEST)
+    assert check_clip(clip).clip_id == f"hot3d/{QUEST}/clip-001849/00000-00035-mug_white"
+    assert (clip.sequence, clip.subject, clip.object_words) == (QUEST, "P0002", "white mug")
+    assert np.flatnonzero(~clip.hands["left"].valid).tolist() == [5]
+    for side in SIDES:
+        own = [track_joints(item.hands[side], HANDS[side])[clip.hands[side].valid] for item in (clip, whole)]
+        assert np.abs(own[0] - own[1]).max() < 1e-5
+    np.testing.assert_allclose(clip.object.translation_m, whole.object.translation_m, atol=1e-6)
+    np.testing.assert_allclose(clip.object.rotvec, whole.object.rotvec, atol=1e-5)
+    np.testing.assert_array_equal(clip.source_from_world, whole.source_from_world)
+    assert [source.path for source in clip.sources] == [
+        "clip_definitions.json",
+        "object_models_eval/obj_000009.glb",
+        "train_quest3/clip-001849.tar",
+    ]
+
+
+@pytest.mark.slow
+def test_a_clip_of_hot3d_clips_without_manos_numbers_gets_fitted_hands(tmp_path: Path) -> None:
+    hot3d.write_clip(tmp_path, "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1), without="mano")
+    assert all(item.hands_from == "keypoints" for item in load_packed(tmp_path) if isinstance(item, Clip))
+    assert load_packed(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("path", "change", "message"),
+    [
+        (f"{PACKED.name}.tar", lambda data: data[:300], "a whole .tar archive"),
+        (f"{PACKED.name}.tar", lambda data: b"", "a whole .tar archive"),
+        (f"{PACKED.name}.tar", lambda data: data[:0] + bytes(10240), "of test clips they are withheld"),
+        (f"{PACKED.name}.tar", replaced(b'"wrist_xform": [', b'"wrist_xform": {'), "JSON text"),
+        (f"{PACKED.name}.tar", replaced(b'"thetas": [', b'"thetaz": ['), "the entry 'thetas'"),
+        (f"{PACKED.name}.tar", replaced(b'"object_name": "mug', b'"object_name": "MUG'), "lower-case words"),
+        (f"{PACKED.name}.tar", replaced(b'{"9": [', b'{"x": ['), "a number, and one object"),
+        (f"{PACKED.name}.tar", replaced(b'{"mano": ', b'{"nano": '), "the entry 'mano'"),
+        ("clip_definitions.json", lambda data: b"{}", "the entry '1849'"),
+        ("clip_definitions.json", replaced(b"P0002_", b"../02_"), "a recording such as"),
+        ("clip_definitions.json", replaced(b"Quest3", b"Quest4"), "Aria or Quest3"),
+        ("object_models_eval/obj_000009.glb", lambda data: b"", "a readable mesh"),
+    ],
+)
+def test_a_spoilt_clip_of_hot3d_clips_is_named(tmp_path: Path, packed_root: Path, path, change, message) -> None:
+    root = shutil.copytree(packed_root, tmp_path / "clips")
+    (root / path).write_bytes(change((root / path).read_bytes()))
+    with pytest.raises(BadInput, match=message) as caught:
+        load_packed(root)
+    assert path in caught.value.where
+
+
+@pytest.fixture(scope="module")
+def packed_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("packed")
+    hot3d.write_clip(root, "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1))
+    return root
+
+
+@pytest.fixture(scope="module")
+def umetrack_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("umetrack")
+    hot3d.write_assets(root)
+    hot3d.write_recording(root, UMETRACK, "Aria", "umetrack", 2, MUG)
+    return root
+
+
+def test_a_recording_with_umetracks_hands_alone_gets_hands_fitted_to_their_joints(umetrack_root: Path) -> None:
+    """The person's hand is the embedded one, so that the planted joints can be met."""
+    clip, truth = only_clip(umetrack_root, UMETRACK), hot3d.truth("Aria", "umetrack", 2)
+    assert clip.hands_from == "keypoints"
+    assert clip.fit_error_m is not None
+    assert clip.fit_error_m < 5e-4
+    for side in SIDES:
+        _, turn, place = truth.hands[side]
+        planted = np.stack(
+            [turn[i].apply(hot3d.umetrack_joints(side, hot3d.ANGLES)) + place[i] for i in range(N_FRAMES)]
+        )
+        off = np.linalg.norm(track_joints(clip.hands[side], HANDS[side]) - planted, axis=2)
+        assert np.nanmax(off) < 2e-3
+        assert np.isnan(off).sum(axis=1).tolist() == [1] * N_FRAMES
+    assert f"{UMETRACK}/umetrack_hand_user_profile.json" in [source.path for source in clip.sources]
+
+
+@pytest.mark.slow
+def test_fitted_hands_that_miss_the_joints_are_left_out_with_the_distance(umetrack_root: Path) -> None:
+    (item,) = load(umetrack_root, UMETRACK, most_fit_error_mm=0)
+    assert isinstance(item, Quarantined)
+    assert item.where == f"{UMETRACK}/{hot3d.UMETRACK_FILE}"
+    assert "by 0 mm or less" in item.expected
+    assert item.got.endswith(" mm")
+
+
+@pytest.mark.slow
+def test_mano_wins_where_a_recording_has_both_unless_umetrack_is_asked_for(root: Path, umetrack_root: Path) -> None:
+    with pytest.raises(BadInput, match="poses of a hand, got none"):
+        load(root, hands="umetrack")
+    (root / ARIA / hot3d.UMETRACK_FILE).write_text((umetrack_root / UMETRACK / hot3d.UMETRACK_FILE).read_text())
+    assert only_clip(root).hands_from == "parameters"
+    asked = Hot3dAdapter(hands="umetrack")
+    assert (asked.needs_mano, asked.hand_convention.shape) == (False, "fitted")
+    assert only_clip(umetrack_root, UMETRACK, hands="umetrack").hands_from == "keypoints"
+
+
+def test_each_kind_of_array_has_the_licence_of_its_files(root: Path, tmp_path: Path) -> None:
+    convert_dataset(Hot3dAdapter(), root, HANDS, tmp_path / "clips", progress=False)
+    store = open_store(tmp_path / "clips")
+    rows = {row.kind.name: row for row in licences_of(store.info)}
+    assert {name: row.spdx for name, row in rows.items() if name in ("hands", "object motion", "words")} == {
+        "hands": "LicenseRef-hot3d-hands",
+        "object motion": "LicenseRef-hot3d-object-motion",
+        "words": "LicenseRef-hot3d",
+    }
+    assert [name for name, row in rows.items() if row.may_be_shared and name != "hand surface"] == ["object motion"]
+    assert "CC BY-NC-SA" in rows["hands"].licence
+    card = dataset_card(store.folder, store, "the store", True)
+    assert "- LicenseRef-hot3d-object-meshes: CC BY-SA, changed so that no object or model may be sold" in card
+    with pytest.raises(BadInput, match=r"licences of hot3d: expected some of hands, .*got feet"):
+        licences_of(store.info | {"licences": {"feet": {"licence": "x", "may_be_shared": True}}})
+    generated = convert_dataset(Hot3dAdapter(), root, HANDS, tmp_path / "made", progress=False, synthetic=True)
+    assert generated.clips == 2
+    assert all(row.may_be_shared for row in licences_of(open_store(tmp_path / "made").info))
+
+
+def test_licences_of_arrays_that_say_too_little_are_refused(tmp_path: Path) -> None:
+    facts = (BUILT_IN / "hot3d/facts.toml").read_text()
+    (tmp_path / "facts.toml").write_text(facts.replace("may_be_shared = true", 'may_be_shared = "yes"'))
+    with pytest.raises(BadInput, match=r"licences.object motion: expected a licence and may_be_shared"):
+        facts_beside(str(tmp_path / "adapter.py"))

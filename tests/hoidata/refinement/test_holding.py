@@ -1,0 +1,161 @@
+"""Generated hands that slide, sink in and let a box hang in the air come out holding it; recorded ones stay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import surface_index
+from hoidata.physics.realism import VARIANTS, score
+from hoidata.physics.scene import clip_scene
+from hoidata.refinement import HoldSettings, hold_hands
+from hoidata.refinement.hold_solver import spline_shares
+from tests.builders.clips import DOWN, clip_of
+from tests.builders.objects import box_model, two_parts
+
+PAIR = load_embedded_hands()
+FRAMES = 44
+BOX = box_model((0.06, 0.30, 0.06))
+HELD, LIFT = slice(12, 36), np.interp(np.arange(FRAMES), [0, 14, 30, FRAMES], [0, 0, 0.2, 0.2])
+
+
+def flat(side: Side) -> HandTrack:
+    """A hand at the origin, one frame, mean pose."""
+    pose, nothing = PAIR[side].mean_pose.astype(np.float32)[None], np.zeros((1, 3), np.float32)
+    return HandTrack(nothing, nothing, pose, np.zeros((1, 10), np.float32), np.ones(1, bool))
+
+
+def pressed(side: Side, top_m: np.ndarray, inside_m: float, wobble_m: float, turn: np.ndarray) -> HandTrack:
+    """A hand whose lowest skin lies inside_m below the top of an object, which sways under it by wobble_m.
+
+    top_m: (frame, 3) middle of the top, world. turn: (frame, 3, 3) of the object. It comes from 10 cm above and goes.
+    """
+    own, frames = flat(side), np.arange(len(top_m))
+    skin = track_vertices(own, PAIR[side])[0].astype(np.float64)
+    away = np.interp(frames, [0, 10, 37, FRAMES], [0.1, 0, 0, 0.1])
+    sway = wobble_m * np.sin(frames[:, None] / 3.0) * [1.0, 1.0, 0]
+    local = np.array([*-skin.mean(axis=0)[:2], -skin[:, 2].min() - inside_m]) + sway
+    local[:, 2] += away
+    wrist = top_m + (turn @ local[..., None])[..., 0]
+    return HandTrack(
+        wrist.astype(np.float32),
+        rotmat_to_rotvec(turn).astype(np.float32),
+        np.repeat(own.hand_pose, len(frames), 0),
+        own.betas,
+        np.ones(len(frames), bool),
+    )
+
+
+@pytest.fixture(scope="module")
+def pushed() -> tuple[Clip, dict[Side, HandTrack]]:
+    """Two hands 12 mm inside the top of a box that rises and turns, swaying by 4 mm on it; and what becomes of them."""
+    turn = rotvec_to_rotmat(np.linspace(0, 1, FRAMES)[:, None] * [0, 0, 0.5])
+    place = np.stack((0 * LIFT, 0 * LIFT, LIFT), 1)
+    thing = ObjectTrack(BOX, rotmat_to_rotvec(turn).astype(np.float32), place.astype(np.float32))
+    hands = {}
+    for side, y in zip(SIDES, (-0.08, 0.08), strict=True):
+        top = place + (turn @ np.array([0, y, 0.03]))
+        hands[side] = pressed(side, top, 0.012, 0.004, turn)
+    clip = clip_of("toy/s1/a", thing, hands)
+    return clip, hold_hands(PAIR, clip)
+
+
+def in_object(clip: Clip, side: Side, track: HandTrack) -> np.ndarray:
+    return clip.object.world_from_object.inverse() @ track_vertices(track, PAIR[side]).astype(np.float64)
+
+
+def depth_mm(model: ObjectModel, points_m: np.ndarray) -> np.ndarray:
+    return 1000 * surface_index(model).depth_m(points_m, None).max(axis=1)
+
+
+def test_a_hand_that_swayed_inside_what_it_held_is_still_on_its_surface(pushed):
+    clip, made = pushed
+    for side in SIDES:
+        before, after = in_object(clip, side, clip.hands[side]), in_object(clip, side, made[side])
+        slid = [np.linalg.norm(np.diff(skin[HELD], axis=0), axis=-1).max() for skin in (before, after)]
+        assert slid[0] > 0.001
+        assert slid[1] < 1e-6
+        assert depth_mm(BOX, before)[HELD].min() > 7
+        assert 0.5 < depth_mm(BOX, after)[HELD].max() < 3.5
+        assert depth_mm(BOX, after).max() < 5  # nor on its way to the hold, and away from it
+        assert np.linalg.norm(after - before, axis=-1).mean() < 0.02
+
+
+def test_far_from_its_hold_a_hand_is_left_as_it_was(pushed):
+    clip, made = pushed
+    for side in SIDES:
+        moved = np.linalg.norm(made[side].wrist_m - clip.hands[side].wrist_m, axis=1)
+        assert max(moved[0], moved[-1]) < 0.005
+        acceleration = [np.abs(np.diff(track.wrist_m, 2, axis=0)).max() for track in (clip.hands[side], made[side])]
+        assert acceleration[1] < acceleration[0] + 0.005
+
+
+def test_hands_that_touch_nothing_and_frames_without_a_hand_keep_their_numbers(pushed):
+    clip, _ = pushed
+    away = {side: replace(track, wrist_m=track.wrist_m + np.float32(1)) for side, track in clip.hands.items()}
+    left_alone = hold_hands(PAIR, replace(clip, hands=away))
+    for side in SIDES:
+        for name in ("wrist_m", "global_orient", "hand_pose"):
+            assert np.array_equal(getattr(left_alone[side], name), getattr(away[side], name))
+    valid = np.arange(FRAMES) < 30
+    gone = replace(clip, hands={side: replace(track, valid=valid) for side, track in clip.hands.items()})
+    for side, track in hold_hands(PAIR, gone).items():
+        assert np.array_equal(track.hand_pose[30:], clip.hands[side].hand_pose[30:])
+        assert not np.array_equal(track.hand_pose[12:30], clip.hands[side].hand_pose[12:30])
+
+
+def test_a_hand_on_a_lid_stays_still_on_the_lid_while_it_opens():
+    base, lid = (box_model((0.4, 0.4, 0.01), middle_m=(x, 0, 0)) for x in (-0.2, 0.2))
+    model = two_parts(base, lid, (0, 1, 0))
+    angle = np.interp(np.arange(FRAMES), [0, 14, 34, FRAMES], [0, 0, -0.8, -0.8])
+    still = np.zeros((FRAMES, 3), np.float32)
+    thing = ObjectTrack(model, still, still, angle.astype(np.float32))
+    world_from_lid = model.object_from_part(1, angle)
+    top = (world_from_lid @ np.tile([0.2, 0, 0.005], (FRAMES, 1, 1)))[:, 0]
+    hands: dict[Side, HandTrack] = {
+        "left": pressed("left", top + 1.0, 0.0, 0.0, np.tile(np.eye(3), (FRAMES, 1, 1))),
+        "right": pressed("right", top, 0.006, 0.003, world_from_lid.rotation),
+    }
+    made = hold_hands(PAIR, clip_of("toy/s1/b", thing, hands))["right"]
+    on_lid = world_from_lid.inverse() @ track_vertices(made, PAIR.right).astype(np.float64)
+    assert np.linalg.norm(np.diff(on_lid[14:33], axis=0), axis=-1).max() < 1e-6
+    on_base = track_vertices(made, PAIR.right)[HELD]
+    assert np.linalg.norm(np.diff(on_base, axis=0), axis=-1).max() > 0.001
+
+
+def test_where_the_object_would_fall_hands_are_drawn_to_it_from_farther_away():
+    """Two palms 4 mm off both sides of a box in the air."""
+    place, shares = np.stack((0 * LIFT, 0 * LIFT, LIFT), 1), []
+    still = np.zeros((FRAMES, 3), np.float32)
+    thing, hands = ObjectTrack(box_model((0.1, 0.1, 0.1)), still, place.astype(np.float32)), {}
+    for side, sign in zip(SIDES, (-1, 1), strict=True):
+        turn = np.tile(rotvec_to_rotmat(np.array([-sign * np.pi / 2, 0, 0])), (FRAMES, 1, 1))
+        hands[side] = pressed(side, place + np.array([0, sign * 0.05, 0]), -0.004, 0.0, turn)
+    clip = clip_of("toy/s1/c", thing, hands)
+    for reach in ((0.0005,), (0.0005, 0.03)):
+        made = hold_hands(PAIR, clip, HoldSettings(reach_m=reach, keypoint_m=(0.006, 0.02)[: len(reach)]))
+        shares.append(score(clip_scene(replace(clip, hands=made), PAIR, -0.05), VARIANTS["SI"]).share)
+    assert shares[0] < 0.2
+    assert shares[1] > 0.6
+
+
+def test_without_gravity_and_told_twice_the_answer_is_the_same(pushed):
+    clip, made = pushed
+    again, floating = hold_hands(PAIR, clip), hold_hands(PAIR, replace(clip, gravity=None))
+    for side in SIDES:
+        assert again[side].wrist_m.tobytes() == made[side].wrist_m.tobytes()
+        assert np.isfinite(floating[side].hand_pose).all()
+    assert (clip.gravity == DOWN).all()
+
+
+def test_a_hold_has_one_control_point_and_shares_add_up_to_one():
+    holds = [(12, 36)]
+    shares = spline_shares(FRAMES, holds, 5)  # pyright: ignore[reportArgumentType]
+    assert shares.sum(axis=1) == pytest.approx(1)
+    assert shares[12:36].max(axis=1) == pytest.approx(1)
+    assert len(set(shares[12:36].argmax(axis=1))) == 1
+    assert (shares[:6].max(axis=1) < 0.9).all()
