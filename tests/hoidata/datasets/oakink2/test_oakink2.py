@@ -138,6 +138,7 @@ def test_parts_whose_meshes_share_no_frame_rest_as_they_first_lie(tmp_path):
     assert clip.object.hinge_rad[-1] == pytest.approx(1.5, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_frames_off_the_hinge_or_untracked_divide_a_clip_and_parts_mostly_off_it_stay_two_objects(tmp_path):
     made = recording(LAPTOP, 4, 161)
     lid, poses = made.parts[LID]
@@ -223,6 +224,7 @@ def test_a_json_file_of_another_form_is_refused(read, data, says):
     assert caught.value.where.startswith("x.json")
 
 
+@pytest.mark.slow
 def test_its_words_make_sentences():
     for verb in _VERBS.values():
         assert verb.split()[0] in four_sentences(verb, "alcohol burner", "right")[0].lower()
