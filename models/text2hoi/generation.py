@@ -124,6 +124,7 @@ class Generator:
             "synthetic": bool(self.model.facts["synthetic"]),
             "contact_threshold_m": self.model.facts["contact_threshold_m"],
             "checkpoints": self.checkpoints,
+            "refined_by": self.model.refined_by,
         }
         # One by one: the last bits of a matrix product depend on how many rows it has.
         motions = [_started_at_origin(self.model.motions([request])[0]) for request in requests]

@@ -142,6 +142,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ("object", clip.object_words),
         ("seed", str(evidence["seed"])),
         ("trained on", clips),
+        ("refined by", {"hold": "a hold against the object", "network": "the refiner network"}[evidence["refined_by"]]),
         ("checkpoints", f"{checkpoints} (sha256: {digests})"),
         *[("never seen", note) for note in evidence["unseen"]],
     ]

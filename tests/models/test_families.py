@@ -14,6 +14,7 @@ from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.asked import read_asked
+from hoidata.refinement import hold_hands
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.common.family import Sources, motion_clip
@@ -21,6 +22,7 @@ from models.common.predicting import AsksContact, PredictionConfig, requests_for
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
 from models.text2hoi.family import other_prompts
+from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
 from models.text2hoi.thresholds import best_threshold, mean_f1
 from tests.models.toy import FAST
@@ -150,6 +152,26 @@ def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources
     plain = load_family("text2hoi-coarse").load(sources).sample([request])[0]
     unrefined = model.clips([request], model.motions([request], refined=False), refined=False)[0]
     np.testing.assert_array_equal(joints_of(plain), joints_of(unrefined))
+
+
+def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_the_objects_frame(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
+    usual = load_family("text2hoi").load(sources)
+    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold"}}
+    model = load_family("text2hoi").load(replace(sources, settings=told))
+    assert isinstance(model, Text2Hoi)
+    assert isinstance(usual, Text2Hoi)
+    assert (usual.refined_by, model.refined_by) == ("network", "hold")
+    (motion,) = model.motions([request])
+    assert torch.equal(motion.refined, motion.coarse)
+    (before,), (held,) = (model.clips([request], [motion], refined=kind) for kind in (False, True))
+    for side, track in hold_hands(HANDS, before).items():
+        np.testing.assert_array_equal(held.hands[side].hand_pose, track.hand_pose)
+    in_object = MotionCode(MotionCodeConfig(4, hand_frame="object"))
+    monkeypatch.setattr(usual.trained["diffusion"].network, "code", in_object)
+    assert usual.refined_by == "hold"
 
 
 def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(
