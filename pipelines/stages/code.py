@@ -149,10 +149,20 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     stage, _, of = name.partition("/")
     section = params.get(stage) or {}
     if stage == "train":
-        return section.get("seed"), *[(section.get(section.get(kind)) or {}).get(of) for kind in ("preset", "size")]
+        return section.get("seed"), *_trained(section, of)
+    if stage == "table_networks":
+        return [_trained(params["train"], network) for network in IN_TABLES]
+    tables = params.get("tables") or {}
+    if stage in ("table_rows", "tables"):  # the latter reads what the former wrote
+        return (params.get("sample"), tables.get("samples"), tables.get("clips")) if stage == "table_rows" else None
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
     return (section, params.get("sample"), params.get("evaluate")) if stage == "controls" else section
+
+
+def _trained(section: dict[str, Any], network: str) -> list[Any]:
+    """A network's settings by preset and by size."""
+    return [(section.get(section.get(kind)) or {}).get(network) for kind in ("preset", "size")]
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:

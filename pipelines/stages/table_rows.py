@@ -64,10 +64,10 @@ def _measured(
     metrics = tuple(one for one in METRICS if one.name in BESIDE) + tuple(
         one for one in BIMART_METRICS if one.topic == "BimArt"
     )
-    hands, networks_at = load_hands(paths.profile), paths.table_network.parent
+    hands = load_hands(paths.profile)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "motions"
-        counts = sample_family(family, paths.data, networks_at, out, sampled, hands, settings=own)
+        counts = sample_family(family, paths.data, paths.table_networks, out, sampled, hands, settings=own)
         if not counts["clips"]:
             return {"title": row.title, "empty": empty_reason(out)}
         found = evaluate_store(out / "clips", paths.data, hands, metrics=metrics, jobs=jobs())
