@@ -21,7 +21,7 @@ from models.manipnet.trajectory_files import UNITS, Body, TrajectoryFile
 
 NEAR_M = 0.12  # from the middle of the palm to the object: a hand that never comes nearer handles nothing
 PALM_M = 0.08  # from the wrist to the middle of the palm
-SEAM_S = 0.5  # over so long a time fingers are led from and to where the recording goes on
+SEAM_S = 1.0  # over so long a time fingers are led from and to where the recording goes on
 UNSEEN_M = 1.0
 FACING = np.array([0.8, 0.0, -0.6])  # canonical: where a hand that holds something looks to
 LOOKS_AWAY, LOOKS_TO = 0.2, 0.6  # mean cosines between that and the way to the object

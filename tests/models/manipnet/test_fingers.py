@@ -6,12 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import load_checkpoint
@@ -19,13 +23,15 @@ from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.manipnet.animate import new_fingers
+from models.manipnet.examples import sized
 from models.manipnet.family import Fingers
+from models.manipnet.features import pose_features
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.lookups import as_right
-from models.manipnet.network import ManipNet
-from models.manipnet.rollout import Task, roll_out
+from models.manipnet.network import ManipNet, NetworkConfig
+from models.manipnet.rollout import Follower, Predictor, Situation, Task, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
-from models.manipnet.targets import Nearest, paper_targets, released_targets
+from models.manipnet.targets import Nearest, our_targets, paper_targets, released_targets
 from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.training import MANIPNET
 
@@ -239,6 +245,28 @@ def test_targets_are_those_of_algorithm_1_and_of_the_demo() -> None:
     demo = released_targets(points, predicted, radius, range_m, found)
     np.testing.assert_allclose(demo.point_m[:2, 2], [0.008, 0.35 * 0.011 + 0.65 * 0.02])
     np.testing.assert_allclose(demo.weight, [0.8, 0.5, 0.0])
+    # Ours: out to where the finger gives way, in to what is said less 5 mm, and nothing is drawn off.
+    ours = our_targets(points, predicted, radius, range_m, found, cover_m=radius)
+    np.testing.assert_allclose(ours.point_m[:, 2], [0.0, 0.006, 0.02], atol=1e-12)
+    np.testing.assert_allclose(ours.weight, [1.0, 1.0, 0.0])
+    off = our_targets(points, np.full(3, 0.7), radius, range_m, found, cover_m=radius)
+    np.testing.assert_allclose(off.point_m[:, 2], [0.0, 0.02, 0.02], atol=1e-12)
+
+
+def test_our_rule_brings_fingers_out_of_the_object_and_the_network_goes_on_from_its_own_pose() -> None:
+    hand, mesh = right_hand(), trimesh.creation.box((0.03, 0.06, 0.03))
+    model = ObjectModel("box", np.array(mesh.vertices), np.array(mesh.faces), np.zeros(8, np.uint8))
+    network, surface = ManipNet(sized(NetworkConfig(encoder=8), hand)).eval(), surface_index(model)
+    state = hand.state(hand.rest_rotmats[None])
+    output = np.concatenate([pose_features(hand, state)[0], np.zeros(hand.n_points)])
+    placed = RigidTransform(np.eye(3)[None], -state.tip_m[:, 1])  # the box lies about the tip of the middle finger
+    deep = {}
+    for rule in ("off", "ours"):
+        one = Follower(Predictor(network, rule), hand, surface, hand.rest_rotmats)
+        one.advance(output, Situation(np.zeros(336), placed, None))
+        np.testing.assert_allclose(one.finger_rotmats[0], hand.rest_rotmats, atol=1e-6)
+        deep[rule] = -surface.nearest(placed @ hand.state(one.answer).tip_m, None).distance_m.min()
+    assert deep["off"] > deep["ours"] + 0.004
 
 
 def test_frames_of_a_clip_are_made_from_the_poses_beside_them_alone(
