@@ -2,9 +2,9 @@
 
 ``python -m bench manipnet-course`` with HOIDATA_MANIPNET, after ``python -m bench manipnet``, whose networks it takes
 (or trains, where there is none). Rollouts of half a minute from three starts, each of a recording that its network
-never saw, and their way to each other as a picture in .hoidata/manipnet. Gaps of 0.5 to 4 s in what did not train, beside
-ways that need no network: the first held-out round of each recording (two tenths, one after the other) chooses a way
-for each length, the second is reported.
+never saw, and their way to each other as a picture in .hoidata/manipnet. Gaps of 0.5 to 4 s in what did not train,
+beside ways that need no network: the first held-out round of each recording (two tenths, one after the other) chooses
+a way for each length, the second is reported (HOIDATA_BENCH_GAPS: how many of each length).
 """
 
 import os
@@ -29,6 +29,7 @@ from models.manipnet.rollout import Predictor, Task, roll_out
 
 COURSE_S = 30
 GAPS_S = (0.5, 1.0, 2.0, 4.0)
+MOST_GAPS = int(os.environ.get("HOIDATA_BENCH_GAPS", "40"))
 SEAMS_S = (0.25, 0.5, 1.0)
 STARTS = ("neutral pose", "true pose", "fist")
 FIST_RAD = 1.2
@@ -189,10 +190,10 @@ def ways(predictor: Predictor) -> dict[str, Filling]:
 
 
 def show_gaps(recordings: Sequence[HandRecording], predictor: Predictor) -> None:
-    rows = []
+    rows, filling = [], ways(predictor)
     for seconds in GAPS_S:
-        chosen = {name: _filled(gaps_of(recordings, seconds, 0), way) for name, way in ways(predictor).items()}
-        told = {name: _filled(gaps_of(recordings, seconds, 1), way) for name, way in ways(predictor).items()}
+        chosen = {name: _filled(gaps_of(recordings, seconds, 0), way) for name, way in filling.items()}
+        told = {name: _filled(gaps_of(recordings, seconds, 1), way) for name, way in filling.items()}
         best = min(chosen, key=lambda name: chosen[name][0])
         count = len(gaps_of(recordings, seconds, 1))
         for name in told:
@@ -203,7 +204,9 @@ def show_gaps(recordings: Sequence[HandRecording], predictor: Predictor) -> None
 
 
 def gaps_of(recordings: Sequence[HandRecording], seconds: float, turn: int) -> list[Gap]:
-    return [gap for one in recordings for gap in gaps(one, seconds, turn)]
+    """At most ``MOST_GAPS`` of all recordings, evenly chosen."""
+    found = [gap for one in recordings for gap in gaps(one, seconds, turn)]
+    return [found[number] for number in np.linspace(0, len(found) - 1, min(MOST_GAPS, len(found))).astype(int)]
 
 
 def _filled(found: Sequence[Gap], way: Filling) -> tuple[float, float, float]:

@@ -4,6 +4,7 @@ import gzip
 import io
 import json
 import pickle
+import pickletools
 import struct
 import tarfile
 import zipfile
@@ -81,7 +82,9 @@ def torch_pickles() -> list[bytes]:
     """As TACO's hand files: tensors of two frames; one as saved on a GPU, one a slice, one a parameter."""
     small = {"00000": {"hand_pose": _tensor(np.arange(4.0)), "hand_trans": _tensor(np.zeros(3, np.float32))}}
     turned = {"hand_shape": _tensor(np.arange(6.0).reshape(2, 3).T)}
+    own = [_Call(_from_bytes(), usual_storage(np.arange(count, dtype="f4"))) for count in (3, 300)]
     return [
+        pickle.dumps([_Call(_rebuild(), storage, 0, (3,), (1,), False, OrderedDict()) for storage in own], 4),
         pickle.dumps(small, 4),
         pickle.dumps(turned, 3),
         pickle.dumps([_tensor(np.arange(8), location="cuda:0"), OrderedDict(a=1)], 3),
@@ -97,12 +100,30 @@ class _Call:
         return self.function, self.arguments
 
 
-def _tensor(array: np.ndarray, location: str = "cpu") -> _Call:
+def _rebuild() -> object:
     from torch._utils import _rebuild_tensor_v2
 
+    return _rebuild_tensor_v2
+
+
+def _from_bytes() -> object:
+    from torch.storage import _load_from_bytes
+
+    return _load_from_bytes
+
+
+def usual_storage(elements: np.ndarray) -> bytes:
+    """What torch itself writes for a storage of float32."""
+    import torch
+
+    opcodes = pickletools.genops(pickle.dumps(torch.from_numpy(elements), 4))
+    return next(argument for opcode, argument, _ in opcodes if opcode.name == "BINBYTES")
+
+
+def _tensor(array: np.ndarray, location: str = "cpu") -> _Call:
     elements = np.ascontiguousarray(array) if array.flags.c_contiguous else array.T
     strides = tuple(step // array.itemsize for step in array.strides)
-    return _Call(_rebuild_tensor_v2, _storage(elements, location), 0, array.shape, strides, False, OrderedDict())
+    return _Call(_rebuild(), _storage(elements, location), 0, array.shape, strides, False, OrderedDict())
 
 
 def _parameter(array: np.ndarray) -> _Call:
@@ -112,9 +133,7 @@ def _parameter(array: np.ndarray) -> _Call:
 
 
 def _storage(elements: np.ndarray, location: str) -> _Call:
-    from torch.storage import _load_from_bytes
-
-    return _Call(_load_from_bytes, storage_bytes(elements, location))
+    return _Call(_from_bytes(), storage_bytes(elements, location))
 
 
 def storage_bytes(elements: np.ndarray, location: str = "cpu") -> bytes:
@@ -126,6 +145,26 @@ def storage_bytes(elements: np.ndarray, location: str = "cpu") -> bytes:
     first = (0x1950A86A20F9469CFC6C, 1001, {"protocol_version": 1001, "little_endian": True})
     pickles = b"".join(pickle.dumps(value, 2) for value in first) + head + pickle.dumps(["7"], 2)
     return pickles + struct.pack("<q", elements.size) + elements.tobytes()
+
+
+def oakink2_annotations() -> list[bytes]:
+    """Two frames of a hand and a part, and the same with faults."""
+    hand = {"pose_coeffs": np.eye(4, dtype="f4")[[0] * 16][None], "tsl": np.zeros((1, 3)), "betas": np.zeros((1, 10))}
+    both = {f"{side}__{name}": array for side in ("lh", "rh") for name, array in hand.items()}
+    whole = {
+        "mocap_frame_id_list": [0, 1, 4], "obj_list": ["a", "b"], "obj_transf": {"a": {0: np.eye(4), 4: np.eye(4)}},
+        "raw_mano": {0: both, 4: {f"lh__{name}": array for name, array in hand.items()}},
+    }  # fmt: skip
+    faults = (
+        *({"mocap_frame_id_list": frames} for frames in (["0"], [], [4, 1], [0, 1000])),
+        *({"obj_list": ids} for ids in ([1], "a", ["../x"])),
+        *(
+            {"obj_transf": {"a": poses}}
+            for poses in ([], {0: np.eye(3)}, {0: np.zeros((4, 4))}, {0: "words"}, {1: 0}, {0: np.eye(4) * 1e300})
+        ),
+        *({"raw_mano": hands} for hands in ([], {}, {0: {**both, "lh__pose_coeffs": np.zeros((1, 16, 4))}})),
+    )
+    return [pickle.dumps({**whole, **fault}, 4) for fault in ({}, *faults)]
 
 
 def npy_files() -> list[bytes]:
@@ -335,7 +374,7 @@ def hot3d_tars() -> list[bytes]:
         {"000000.objects.json": {}, "000001.objects.json": {}},
     )
     found = [_tar({**whole, **change}) for change in changes]
-    return [*found, found[0][:700], b"", _tar({f"{number:06d}.objects.json": {} for number in range(2002)})]
+    return [*found, found[0][:700], b""]
 
 
 def _tar(members: dict[str, object]) -> bytes:

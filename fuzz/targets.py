@@ -35,6 +35,7 @@ from hoidata.datasets.hot3d import files as hot3d_files
 from hoidata.datasets.hot3d import packed, umetrack
 from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.datasets.manipnet import bvh
+from hoidata.datasets.oakink2 import files as oakink2_files
 from hoidata.errors import BadInput
 from hoidata.files import (
     array_pieces,
@@ -125,6 +126,7 @@ def all_targets() -> dict[str, Target]:
         _trajectories(),
         _hoi4d(),
         _hot3d(),
+        _oakink2(),
         _object_paths(),
         _json_files(),
         _settings(),
@@ -451,6 +453,39 @@ def _hoi4d() -> list[Target]:
             ),
         ),
     ]
+
+
+def _oakink2() -> list[Target]:
+    entry = {"primitive": "stir", "interaction_mode": "bh_main", "obj_list": ["a"], "obj_list_lh": None}
+    entry |= {"obj_list_rh": ["b"]}
+    keys = ("((1595, 2340), None)", "(None, (3, 9))", "((1, 2), (3, 4))", "(None, None)", "((2, 1), 1)", "x", "((" * 30)
+    programs = [{key: entry} for key in keys]
+    programs += [{keys[0]: {**entry, "interaction_mode": "foot"}}, {keys[0]: {**entry, "obj_list": "a"}}]
+    others = [{"a": {"obj_id": "a", "obj_name": "mug"}}, {"a": {"obj_name": 1}}, {"a": ["b"], "b": ["c"]}, {"a": ["a"]}]
+    texts = (
+        *(oakink2_files.read_program, oakink2_files._segment, oakink2_files._ranges, oakink2_files._range),
+        *(oakink2_files.read_names, oakink2_files.read_roots, oakink2_files._topmost, oakink2_files._json),
+        oakink2_files.Segment,
+    )
+    return [
+        Target(
+            "oakink2-annotation",
+            seeds.oakink2_annotations,
+            lambda data: oakink2_files.read_annotation(data, "a.pkl"),
+            functions_of(oakink2_files, [item.__name__ for item in texts]),
+            (*OPCODES, *GLOBALS),
+            PICKLE,
+        ),
+        _json_target("oakink2-json", [*programs, *others, [1]], _oakink2_json, texts),
+    ]
+
+
+def _oakink2_json(data: bytes) -> None:
+    """As each of the three kinds of file."""
+    for parse in (oakink2_files.read_program, oakink2_files.read_names, oakink2_files.read_roots):
+        with contextlib.suppress(BadInput):
+            found = parse(data, "a.json")
+            _ = [(own.span, own.hand, own.name) for own in found] if isinstance(found, list) else found
 
 
 def _object_paths() -> list[Target]:

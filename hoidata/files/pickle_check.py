@@ -14,7 +14,8 @@ from typing import Any
 REFUSED_OPCODES = frozenset(
     {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"} | {"DUP", "LONG4"}
 )
-_MOST_OPCODES = 1_000_000  # a second; numbers lie within few opcodes, a tensor takes about 50
+_MOST_OPCODES = 1_000_000  # three seconds; numbers lie within few opcodes, a tensor takes about 50
+_BYTES_PER_OPCODE = 8  # of large files: one of 4,000 frames of 16 tensors each has 13 bytes per opcode
 _PUT_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET_OPCODES = {"GET", "BINGET", "LONG_BINGET"}
 _TUPLES = {"TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_TUPLE"}
@@ -28,10 +29,10 @@ def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES) -> None:
 
     Raises UnpicklingError, or what pickletools raises on something that is no pickle.
     """
-    walk = _Walk()
+    walk, most = _Walk(), max(_MOST_OPCODES, len(data) // _BYTES_PER_OPCODE)
     for number, (opcode, argument, _) in enumerate(pickletools.genops(data)):
-        if number >= _MOST_OPCODES:
-            raise pickle.UnpicklingError(f"it has more than {_MOST_OPCODES} opcodes")
+        if number >= most:
+            raise pickle.UnpicklingError(f"it has more than {most} opcodes")
         if opcode.name in refused:
             raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
         if opcode.name in _PUT_OPCODES and isinstance(argument, int) and argument > len(data):

@@ -1,16 +1,18 @@
-"""Read plain pickles that hold torch tensors (TACO's hand files) without executing anything.
+"""Read plain pickles that hold torch tensors (TACO's hand files, OakInk2's annotations) without executing anything.
 
 ``pickle.dump`` of a tensor writes a call of ``torch.storage._load_from_bytes`` on the bytes of ``torch.save`` in its
 legacy format: five pickles (magic number, protocol, system, the storage as a persistent id, keys), the number of
 elements and the elements. torch itself would open those bytes with an unrestricted unpickler; here the outer pickle is
 read by rules of ours, the bytes by torch's ``weights_only`` loading, once it is known that they name nothing but a
-storage and claim no more than there is. Tensors come back as NumPy arrays.
+storage and claim no more than there is. Tensors come back as NumPy arrays. The very bytes that torch writes for a small
+storage are known by their form and read at once: a recording of OakInk2 has a hundred thousand of them.
 """
 
 import io
 import math
 import pickle
 import pickletools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from hoidata.errors import BadInput
 from hoidata.files.npy_header import is_length
 from hoidata.files.pickle_check import REFUSED_OPCODES
 from hoidata.files.restricted_pickle import (
+    ARRAYS,
     Allow,
     Budget,
     CheckedArray,
@@ -45,14 +48,24 @@ STORAGE_NAMES = frozenset(
     for module in ("torch", "torch.cuda")
     for kind in ("Double", "Float", "Half", "Long", "Int", "Short", "Char", "Byte", "Bool")
 )
+# A storage as torch writes it on a little-endian machine: its kind, key, length as an opcode, key, length, elements.
+_USUAL_STORAGE = re.compile(
+    b"\x80\x02\x8a\nl\xfc\x9cF\xf9 j\xa8P\x19.\x80\x02M\xe9\x03.\x80\x02}q\x00"
+    rb"\(X\x10\0\0\0protocol_versionq\x01M\xe9\x03X\r\0\0\0little_endianq\x02\x88X\n\0\0\0type_sizesq\x03}q\x04"
+    rb"\(X\x05\0\0\0shortq\x05K\x02X\x03\0\0\0intq\x06K\x04X\x04\0\0\0longq\x07K\x04uu\."
+    rb"\x80\x02\(X\x07\0\0\0storageq\0ctorch\n(Float|Double)Storage\nq\x01X(?P<length>.)\0\0\0(?P<key>\d{1,20})q\x02"
+    rb"X\x03\0\0\0cpuq\x03(?:K(.)|M(..))Ntq\x04Q\.\x80\x02\]q\0X(?P=length)\0\0\0(?P=key)q\x01a\."
+    rb"(.{8})",
+    re.DOTALL,
+)
 
 
-def load_torch_pickle(source: str | Path | bytes, where: str | Path) -> Any:
+def load_torch_pickle(source: str | Path | bytes, where: str | Path, arrays: bool = False) -> Any:
     """The object in a plain pickle of torch tensors, each tensor as an own ``numpy.ndarray`` on the CPU.
 
     source: the file's path or its bytes; ``where`` names it in errors. Tensors of any device, parameters and ordered
-    dictionaries are read, inside dicts, lists and tuples. Raises BadInput for anything else: other globals, other
-    storage types, tensors that reach outside their storage, files over 256 MiB.
+    dictionaries are read, inside dicts, lists and tuples; ``arrays``: NumPy's arrays too. Raises BadInput for anything
+    else: other globals, other storage types, tensors that reach outside their storage, files over 256 MiB.
     """
     try:
         stream = io.BytesIO(source) if isinstance(source, bytes) else open(source, "rb")  # noqa: SIM115
@@ -60,7 +73,8 @@ def load_torch_pickle(source: str | Path | bytes, where: str | Path) -> Any:
         raise BadInput(where, "a pickle of tensors", f"{type(error).__name__}: {error.strerror}") from None
     with stream:
         data = read_at_most(stream, MAX_FILE_BYTES + 1)
-    return restricted_load(data, tensor_globals(len(data)), where=where, max_bytes=MAX_FILE_BYTES)
+    allow = {**tensor_globals(len(data)), **(ARRAYS if arrays else {})}
+    return restricted_load(data, allow, where=where, max_bytes=MAX_FILE_BYTES)
 
 
 def tensor_globals(n_bytes: int) -> Allow:
@@ -128,6 +142,9 @@ def _load_from_bytes(budget: Budget, data: Any) -> _Storage:
     if not isinstance(data, bytes):
         raise pickle.UnpicklingError(f"a {type(data).__name__} in the place of a storage")
     budget.spend(len(data))  # a pickle can ask for the same bytes many times
+    usual = _usual_elements(data)
+    if usual is not None:
+        return _Storage(usual)
     _check_storage(data)
     import torch
 
@@ -135,6 +152,20 @@ def _load_from_bytes(budget: Budget, data: Any) -> _Storage:
     if not isinstance(storage, torch.TypedStorage):
         raise pickle.UnpicklingError(f"a {type(storage).__name__} in the place of a storage")
     return _Storage(torch.empty(0, dtype=storage.dtype).set_(storage._untyped_storage).numpy())
+
+
+def _usual_elements(data: bytes) -> np.ndarray | None:
+    """(element,) of a storage in the very bytes torch writes; None for anything else, which may still be one."""
+    found = _USUAL_STORAGE.match(data)
+    if found is None or found["length"][0] != len(found["key"]):
+        return None
+    kind, short, long, number = found[1], found[4], found[5], found[6]
+    elements = data[found.end() :]
+    count = int.from_bytes(short or long, "little")
+    dtype = np.dtype("<f4" if kind == b"Float" else "<f8")
+    if int.from_bytes(number, "little") != count or len(elements) != count * dtype.itemsize:
+        return None
+    return np.frombuffer(elements, dtype)
 
 
 def _check_storage(data: bytes) -> None:

@@ -16,6 +16,7 @@ from hoidata.geometry.intervals import Interval, runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import HandPair
+from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.mano_capsules import hand_capsules
 from hoidata.physics.scene import Scene, object_scene
@@ -54,7 +55,7 @@ class HoldSettings:
 def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
     """The hands of a clip, still, touching and outside while they hold; one that never does stays as it was.
 
-    A frame in which a hand is not valid is not changed. Without known gravity nothing is asked to be carried.
+    A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
     """
     starts: dict[Side, _Start] = {}
     for side in SIDES:
@@ -85,7 +86,7 @@ class _Load:
 
     @classmethod
     def of(cls, clip: Clip, count: int) -> "_Load":
-        if clip.gravity is None or clip.n_frames < 3:
+        if clip.gravity is None or clip.n_frames < 3 or not surface_index(clip.object.model).is_solid:
             return cls(clip, None, np.zeros(0, int))
         scene = object_scene(clip)
         air = np.flatnonzero(scene.lifted)

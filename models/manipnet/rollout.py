@@ -27,19 +27,24 @@ from models.manipnet.features import (
 )
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.network import ManipNet
-from models.manipnet.targets import DEEPEST_M, Nearest, Rule, Targets, our_targets, paper_targets, released_targets
+from models.manipnet.targets import Nearest, Rule, Targets, our_targets, paper_targets, released_targets
 
 
 class Out(NamedTuple):
-    """Passes that move joints by a share of what their capsule is deeper than allowed, and their weight."""
+    """Passes that move joints by a share of what their capsule is deeper than allowed, and the weight of that.
+
+    joints: those that are too deep themselves come out too.
+    """
 
     passes: int
-    allowed_m: float
-    share: float
-    weight: float
+    allowed_m: float = 0.0
+    share: float = 0.3
+    weight: float = 0.3
+    joints: bool = False
 
 
-OUT = {"paper": Out(0, 0.0, 0.0, 0.0), "released": Out(1, 0.0, 0.3, 0.3), "ours": Out(2, DEEPEST_M, 1.0, 1.0)}
+# Ours: a capsule is held by its joint, so that the one after it goes twice as far as its middle is to go.
+OUT = {"paper": Out(0), "released": Out(1), "ours": Out(4, 0.006, 2.0, 1.0, True)}
 _RULES = {"paper": paper_targets, "released": released_targets}
 
 
@@ -98,10 +103,13 @@ class Follower:
     finger_rotmats: np.ndarray
     answer: np.ndarray = field(init=False)
     limits: Limits = field(init=False)
+    cover_m: np.ndarray = field(init=False)
     state: HandState = field(init=False)
 
     def __post_init__(self) -> None:
         self.limits = self.predictor.limits(self.hand)
+        radius = self.hand.point_radius_m
+        self.cover_m = np.r_[radius[: self.hand.n_joints], radius[self.hand.tip_joint]]
         self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
 
     def inputs(self, now: Situation) -> np.ndarray:
@@ -136,13 +144,12 @@ class Follower:
         predicted = np.clip(output[-hand.n_points :], 0, 1)
         given = (points, predicted, radius, settings.range_m, self._nearest(points, then))
         if self.predictor.rule == "ours":
-            cover = np.r_[hand.point_radius_m[: hand.n_joints], hand.point_radius_m[hand.tip_joint]]
-            state = self._reached(self.state, our_targets(*given, cover))
+            state = self._reached(self.state, our_targets(*given, self.cover_m))
         else:
             state = self._reached(self.state, _RULES[self.predictor.rule](*given))
         out = OUT[self.predictor.rule]
         for _ in range(out.passes):
-            state = self._reached(state, self._out_of_capsules(state, then, out))
+            state = self._reached(state, self._out_of_object(state, then, out))
         return state
 
     def _reached(self, state: HandState, targets: Targets) -> HandState:
@@ -154,13 +161,18 @@ class Follower:
             return state
         return self.hand.state(reach(self.hand, self.limits, state, targets.point_m, weight))
 
-    def _out_of_capsules(self, state: HandState, then: Situation, out: Out) -> Targets:
-        """A further pass: joints whose capsule is too deep in the object, moved out by a share of what is too much."""
+    def _out_of_object(self, state: HandState, then: Situation, out: Out) -> Targets:
+        """A further pass: what of the hand is too deep in the object moves out by a share of what is too much."""
         hand = self.hand
+        target, weight = state.point_m[0].copy(), np.zeros(hand.n_points)
+        if out.joints:
+            found = self._nearest(target, then)
+            depth = np.maximum(self.cover_m - found.distance_m - out.allowed_m, 0)
+            target += depth[:, None] * found.normal
+            weight[depth > 0] = out.weight
         middle = (state.capsule_start_m[0] + state.capsule_end_m[0]) / 2
         found = self._nearest(middle, then)
         depth = np.maximum(hand.capsules.radius_m - found.distance_m - out.allowed_m, 0) * (hand.capsules.joint > 0)
-        target, weight = state.point_m[0].copy(), np.zeros(hand.n_points)
         for capsule in np.flatnonzero(depth):
             # A capsule hangs between its joint and the one after it: the latter moves it.
             after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
-START_S = 180
+START_S = 600  # a busy machine takes its time
 STOP_S = 60
 
 

@@ -6,7 +6,6 @@ have 30 frames per second, of which every second one is made (``twice.py``).
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import product
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
@@ -18,6 +17,7 @@ from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gravity import TrackedObject, estimate_gravity
+from hoidata.datasets.hinge import box_corners, fit_hinge, hinged_model
 from hoidata.datasets.hoi4d.files import (
     PartPose,
     ShortPose,
@@ -28,7 +28,7 @@ from hoidata.datasets.hoi4d.files import (
     hinge_joint,
     object_poses,
 )
-from hoidata.datasets.hoi4d.hinge import aligned_from_whole, fit_hinge, matched
+from hoidata.datasets.hoi4d.parts import aligned_from_whole, matched
 from hoidata.datasets.hoi4d.twice import twice_frames, twice_hand, twice_rotvecs, twice_values
 from hoidata.datasets.hoi4d.words import CATEGORIES, EVENTS, TASKS, Category
 from hoidata.datasets.known_meshes import raw_mesh
@@ -230,18 +230,12 @@ class Hoi4dAdapter(Described):
         chosen, ratio = matched(where, extents_m, names, np.array([np.ptp(own, axis=0) for own in aligned]))
         seen = [boxes[box] @ turn for box, turn in zip(chosen, whole_from, strict=True)]
         assert model.hinge is not None
-        fit = fit_hinge(seen[0], seen[1], model.hinge, (_corners(corners[0]), _corners(corners[1])))
-        off = (fit.residual_m > self.most_off_mm / 1000) | (fit.residual_rad > np.deg2rad(self.most_off_deg))
-        frames = np.flatnonzero(tracked)
+        fit = fit_hinge(seen[0], seen[1], model.hinge, (box_corners(corners[0]), box_corners(corners[1])))
+        frames, off = np.flatnonzero(tracked), fit.off(self.most_off_mm, self.most_off_deg)
         tracked[frames[off]] = False
-        left_out = []
-        if off.any():
-            expected = f"both parts within {self.most_off_mm} mm and {self.most_off_deg} degrees of one hinge"
-            worst = f"up to {1000 * fit.residual_m.max():.1f} mm and {np.rad2deg(fit.residual_rad.max()):.1f} degrees"
-            got = f"{worst} in {int(off.sum())} frames, the first {frames[off][0]}"
-            left_out.append(Quarantined(f"{key}/hinge", where, expected, got, "nothing to do, or raise most_off_mm"))
-        mm, degrees = (np.percentile(values, 95) for values in (1000 * fit.residual_m, np.rad2deg(fit.residual_rad)))
-        note = f"hinge: {mm:.2f} mm and {degrees:.2f} degrees off in 95 % of frames; {_box_note(ratio, aligned)}"
+        limits = (self.most_off_mm, self.most_off_deg)
+        left_out = [fit.left_out(f"{key}/hinge", where, frames, *limits)] if off.any() else []
+        note = f"{fit.note}; {_box_note(ratio, aligned)}"
         return _placed(model, fit.world_from_object, fit.hinge_rad, frames, tracked, note, left_out)
 
 
@@ -296,20 +290,10 @@ def _hinged_model(raw: RawTree, category: Category, number: str) -> tuple[Object
     paths = [f"{folder}/objs/{name}-align.obj" for name in names]
     own = [raw_mesh(raw, path).vertices for path in paths]
     turns = [aligned_from_whole(*item) for item in zip(paths, own, [mesh.vertices for mesh in meshes], strict=True)]
-    counts = [len(mesh.vertices) for mesh in meshes]
-    model = ObjectModel(
-        f"{category.folder.lower()}_{number}",
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([meshes[0].faces, meshes[1].faces + counts[0]]),
-        np.repeat(np.array([0, 1], np.uint8), counts),
-        Hinge(joint.axis, joint.origin_m),
-    )
+    faces = [mesh.faces for mesh in meshes]
+    vertices, hinge = [mesh.vertices for mesh in meshes], Hinge(joint.axis, joint.origin_m)
+    model = hinged_model(f"{category.folder.lower()}_{number}", vertices, faces, hinge)
     return model, names, turns
-
-
-def _corners(points_m: np.ndarray) -> np.ndarray:
-    """(8, 3) of the box around points."""
-    return np.array(list(product(*np.stack([points_m.min(axis=0), points_m.max(axis=0)]).T)))
 
 
 def _box_note(ratio: np.ndarray, aligned_m: list[np.ndarray]) -> str:

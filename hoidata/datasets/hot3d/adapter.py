@@ -93,8 +93,9 @@ class _Found(NamedTuple):
 class Hot3dAdapter(Described):
     """Raw root: ``P<participant>_<recording>/`` with hands, objects and metadata, and ``assets/`` with GLB meshes.
 
-    Or HOT3D-Clips: ``train_aria/clip-*.tar``, ``clip_definitions.json`` and ``object_models_eval/``; a clip's sequence
-    is the recording it is from. Have one of the two: the clips are cut from the recordings.
+    Or HOT3D-Clips: ``train_aria/clip-*.tar``, ``clip_definitions.json`` and ``object_models_eval/``; a clip is a
+    sequence of its own, its subject the participant. Have one of the two: the clips are cut from the recordings, and
+    several are from one, so that they are best split by subject.
     hands: "mano", and UmeTrack where a recording has no MANO file; or "umetrack" throughout, which needs no MANO files.
     margin_frames: frames kept before and after each interval. shortest_frames: shorter intervals give no clip;
     longest_frames: longer ones are divided evenly. most_fit_error_mm: clips whose fitted hands miss UmeTrack's joints
@@ -139,10 +140,10 @@ class Hot3dAdapter(Described):
         source_from_world = np.eye(4)
         source_from_world[:3, :3] = WORLD_FROM[source.headset].T
         whole = Clip(
-            clip_id=f"{self.name}/{source.place}",
+            clip_id=str(key),
             dataset=self.name,
-            subject=source.recording.partition("_")[0],
-            sequence=source.recording,
+            subject=source.subject,
+            sequence=key.name,
             hands=recording.hands.tracks,
             object=recording.things[0].track,
             source_frames=np.arange(len(recording.times_ns), dtype=np.int32),

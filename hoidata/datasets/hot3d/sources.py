@@ -39,13 +39,13 @@ PARTS = (
 
 
 class Source(NamedTuple):
-    """What the files of one sequence say. place: of the whole, below the dataset; recording: the makers' name of it.
+    """What the files of one sequence say. place: below the raw root. subject: the participant.
 
     placed: by object; models: name and mesh of each. profile: UmeTrack's, where its hands are used.
     """
 
     place: str
-    recording: str
+    subject: str
     headset: str
     poses: dict[Side, Poses]
     profile: umetrack.Profile | None
@@ -83,13 +83,13 @@ def _folder(raw: RawTree, key: SequenceKey, wanted: HandFormat) -> Source:
     if raw.has(path):
         failed_ns = files.failed_times(*read(path, LARGEST_ROWS))
     models = {uid: (names[uid], f"{ASSETS}/{uid}.glb") for uid in placed}
-    return Source(key.name, key.name, headset, poses, profile, placed, models, failed_ns)
+    return Source(key.name, key.subject, headset, poses, profile, placed, models, failed_ns)
 
 
 def _packed(raw: RawTree, key: SequenceKey, wanted: HandFormat) -> Source:
     """One of HOT3D-Clips, whose recording stands in a table of all."""
-    path, name = f"{key.name}.tar", key.name.partition("/")[2]
-    recording, headset = packed.definition(raw.read(DEFINITIONS, LARGEST_JSON), DEFINITIONS, int(name[5:]))
+    path, number = f"{key.name}.tar", int(key.name.rpartition("-")[2])
+    recording, headset = packed.definition(raw.read(DEFINITIONS, LARGEST_JSON), DEFINITIONS, number)
     found = packed.read_packed(raw.read(path), path)
     kinds: list[HandFormat] = [kind for kind in _formats(wanted) if found.hands[kind]]
     if not kinds:
@@ -104,9 +104,10 @@ def _packed(raw: RawTree, key: SequenceKey, wanted: HandFormat) -> Source:
         for side, own in poses.items():
             poses[side] = own._replace(numbers={**own.numbers, "betas": np.repeat(betas, len(own.time_ns), axis=0)})
     folder = next((folder for folder in MODEL_FOLDERS if raw.names(folder, ".glb")), MODEL_FOLDERS[0])
-    models = {number: (name, f"{folder}/obj_{int(number):06d}.glb") for number, name in found.names.items()}
-    place = f"{recording}/{name}"
-    return Source(place, recording, headset, poses, profile, found.objects, models, np.zeros(0, np.int64))
+    models = {thing: (name, f"{folder}/obj_{int(thing):06d}.glb") for thing, name in found.names.items()}
+    return Source(
+        path, recording.partition("_")[0], headset, poses, profile, found.objects, models, np.zeros(0, np.int64)
+    )
 
 
 def _formats(wanted: HandFormat) -> tuple[HandFormat, ...]:

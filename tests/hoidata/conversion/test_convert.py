@@ -212,7 +212,7 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
     adapter = get_adapter(name)
     assert isinstance(adapter, Adapter)
     assert adapter.name == name
-    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic", "taco", "hoi4d", "hot3d"))
+    assert adapter.needs_mano == (name in ("h2o", "grab", "arctic", "taco", "hoi4d", "hot3d", "oakink2"))
     assert adapter.licence
     assert adapter.where_to_register
     assert adapter.frame.note
@@ -225,8 +225,8 @@ def test_a_registered_adapter_declares_its_facts(name, tmp_path):
 
 
 def test_an_unknown_adapter_is_answered_with_the_known_ones():
-    assert adapter_names()[:7] == ["arctic", "grab", "h2o", "hoi4d", "hot3d", "manipnet", "taco"]
-    with pytest.raises(MissingResource, match="arctic, grab, h2o, hoi4d, hot3d, manipnet, taco"):
+    assert adapter_names()[:8] == ["arctic", "grab", "h2o", "hoi4d", "hot3d", "manipnet", "oakink2", "taco"]
+    with pytest.raises(MissingResource, match="arctic, grab, h2o, hoi4d, hot3d, manipnet, oakink2, taco"):
         get_adapter("tacos")
 
 

@@ -17,9 +17,10 @@ from tests.hoidata.datasets.h2o.test_contract import TestH2O as OfH2O
 from tests.hoidata.datasets.hoi4d.test_contract import TestHoi4d as Hoi4d
 from tests.hoidata.datasets.hot3d.test_contract import TestHot3d as Hot3d
 from tests.hoidata.datasets.manipnet.test_contract import TestManipNet as ManipNet
+from tests.hoidata.datasets.oakink2.test_contract import TestOakink2 as Oakink2
 from tests.hoidata.datasets.taco.test_contract import TestTaco as Taco
 
-CONTRACTS: tuple[type[AdapterContract], ...] = (OfH2O, Grab, Arctic, ManipNet, Taco, Hoi4d, Hot3d)
+CONTRACTS: tuple[type[AdapterContract], ...] = (OfH2O, Grab, Arctic, ManipNet, Taco, Hoi4d, Hot3d, Oakink2)
 ROOM = Path(hoidata.datasets.__file__).parent
 
 

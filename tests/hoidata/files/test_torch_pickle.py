@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from hoidata.errors import BadInput
-from hoidata.files import load_torch_pickle
+from hoidata.files import load_torch_pickle, torch_pickle
 
 
 def hand_file():
@@ -72,6 +72,31 @@ def test_every_number_type_and_protocol_is_read_as_torch_has_it(kind, protocol):
     tensor = torch.tensor([[0, 1, 2], [3, 4, 5]]).to(getattr(torch, kind))
     loaded = load_torch_pickle(pickle.dumps([tensor], protocol), "x.pkl")
     np.testing.assert_array_equal(loaded[0], tensor.numpy(), strict=True)
+
+
+def test_small_storages_are_read_at_once_as_torch_itself_reads_them(monkeypatch):
+    """One byte changed in a storage's own bytes: known no more, and read or refused by torch's rules as ever."""
+    data = pickle.dumps([torch.randn(2, 3), torch.randn(300, dtype=torch.float64), torch.zeros(0)])
+    blobs = [blob for blob, _ in _blobs(data)]
+    assert all(torch_pickle._usual_elements(blob) is not None for blob in blobs)
+    quick = load_torch_pickle(data, "x.pkl")
+    for place in range(len(blobs[0]) - 24):
+        changed = bytearray(blobs[0])
+        changed[place] ^= 1
+        found = torch_pickle._usual_elements(bytes(changed))
+        assert found is None or found.tobytes() == blobs[0][-24:]
+    for spoilt in (blobs[0] + b"\0", blobs[0][:-1]):
+        assert torch_pickle._usual_elements(spoilt) is None
+    monkeypatch.setattr(torch_pickle, "_usual_elements", lambda _: None)
+    for one, other in zip(quick, load_torch_pickle(data, "x.pkl"), strict=True):
+        np.testing.assert_array_equal(one, other, strict=True)
+
+
+def test_a_pickle_of_tensors_may_hold_arrays_where_a_format_has_them():
+    data = pickle.dumps({"pose": {7: np.eye(4)}, "hand": torch.ones(2)})
+    np.testing.assert_array_equal(load_torch_pickle(data, "x.pkl", arrays=True)["pose"][7], np.eye(4))
+    with pytest.raises(BadInput, match="not allowed"):
+        load_torch_pickle(data, "x.pkl")
 
 
 @pytest.mark.parametrize("module", [b"ctorch\n", b"ctorch.cuda\n"], ids=["torch", "torch.cuda up to 1.9"])

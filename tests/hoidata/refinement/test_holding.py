@@ -143,8 +143,11 @@ def test_where_the_object_would_fall_hands_are_drawn_to_it_from_farther_away():
     assert shares[1] > 0.6
 
 
-def test_without_gravity_and_told_twice_the_answer_is_the_same(pushed):
+def test_told_twice_the_answer_is_the_same_and_what_has_no_weight_needs_no_carrying(pushed):
     clip, made = pushed
+    corners, sheet = BOX.vertices_m * [1, 1, 0], clip.object
+    paper = replace(clip, object=replace(sheet, model=replace(BOX, name="sheet", vertices_m=corners)))
+    assert all(np.isfinite(track.wrist_m).all() for track in hold_hands(PAIR, paper).values())
     again, floating = hold_hands(PAIR, clip), hold_hands(PAIR, replace(clip, gravity=None))
     for side in SIDES:
         assert again[side].wrist_m.tobytes() == made[side].wrist_m.tobytes()

@@ -185,7 +185,7 @@ def test_a_split_that_several_datasets_have_is_from_the_same_source():
 
 def test_a_dataset_says_its_own_split_and_params_override_it():
     usual = {"h2o": "text2hoi", "grab": "text2hoi", "arctic": "text2hoi", "manipnet": "rounds"} | dict.fromkeys(
-        ("taco", "hoi4d", "hot3d"), "drawn"
+        ("taco", "hoi4d", "hot3d", "oakink2"), "drawn"
     )
     assert {name: choose(name, None).name for name in built_in_names()} == usual
     assert choose("grab", "official").name == "official"

@@ -12,9 +12,10 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.validation import check_clip
 from hoidata.datasets import RawTree
+from hoidata.datasets.hinge import fit_hinge
 from hoidata.datasets.hoi4d.adapter import Hoi4dAdapter
 from hoidata.datasets.hoi4d.files import action_events, frame_numbers, hinge_joint
-from hoidata.datasets.hoi4d.hinge import fit_hinge, matched
+from hoidata.datasets.hoi4d.parts import matched
 from hoidata.datasets.hoi4d.twice import twice_rotvecs, twice_values
 from hoidata.datasets.hoi4d.words import EVENTS
 from hoidata.errors import BadInput

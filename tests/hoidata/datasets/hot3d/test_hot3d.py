@@ -11,6 +11,7 @@ import pytest
 from hoidata.annotation.sentences import four_sentences
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
+from hoidata.conformance.check import check_adapter
 from hoidata.conversion.convert import convert_dataset
 from hoidata.dataset_folders import BUILT_IN, facts_beside
 from hoidata.datasets import Quarantined, RawTree, SequenceKey
@@ -162,14 +163,14 @@ def load_packed(root: Path, **settings) -> list[Clip | Quarantined]:
 
 
 def test_a_clip_of_hot3d_clips_says_what_its_recording_does(root: Path, tmp_path: Path) -> None:
-    """The same truth packed into a tar: the same motion, under the name and person of the recording."""
+    """The same truth packed into a tar: the same motion, of the participant of the recording."""
     hot3d.write_clip(tmp_path / "clips", "Quest3", 1849, QUEST, hot3d.truth("Quest3", "mano", 1))
     assert Hot3dAdapter().sequences(tmp_path / "clips") == [PACKED]
     (clip,) = load_packed(tmp_path / "clips")
     assert isinstance(clip, Clip)
     whole = only_clip(root, QUEST)
-    assert check_clip(clip).clip_id == f"hot3d/{QUEST}/clip-001849/00000-00035-mug_white"
-    assert (clip.sequence, clip.subject, clip.object_words) == (QUEST, "P0002", "white mug")
+    assert check_clip(clip).clip_id == f"{PACKED}/00000-00035-mug_white"
+    assert (clip.sequence, clip.subject, clip.object_words) == (PACKED.name, "P0002", "white mug")
     assert np.flatnonzero(~clip.hands["left"].valid).tolist() == [5]
     for side in SIDES:
         own = [track_joints(item.hands[side], HANDS[side])[clip.hands[side].valid] for item in (clip, whole)]
@@ -182,6 +183,15 @@ def test_a_clip_of_hot3d_clips_says_what_its_recording_does(root: Path, tmp_path
         "object_models_eval/obj_000009.glb",
         "train_quest3/clip-001849.tar",
     ]
+
+
+@pytest.mark.slow
+def test_clips_of_hot3d_clips_keep_every_rule_of_the_conformance_check(packed_root: Path) -> None:
+    hot3d.write_clip(packed_root, "Quest3", 1850, QUEST, hot3d.truth("Quest3", "mano", 3))
+    table = {str(number): {"sequence_id": QUEST, "device": "Quest3"} for number in (1849, 1850)}
+    (packed_root / "clip_definitions.json").write_text(json.dumps(table))
+    findings = check_adapter(Hot3dAdapter(), packed_root, HANDS, worker=False)
+    assert [item for item in findings if item.outcome == "fail"] == []
 
 
 @pytest.mark.slow
@@ -231,6 +241,7 @@ def umetrack_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_a_recording_with_umetracks_hands_alone_gets_hands_fitted_to_their_joints(umetrack_root: Path) -> None:
     """The person's hand is the embedded one, so that the planted joints can be met."""
     clip, truth = only_clip(umetrack_root, UMETRACK), hot3d.truth("Aria", "umetrack", 2)
@@ -252,7 +263,7 @@ def test_a_recording_with_umetracks_hands_alone_gets_hands_fitted_to_their_joint
 def test_fitted_hands_that_miss_the_joints_are_left_out_with_the_distance(umetrack_root: Path) -> None:
     (item,) = load(umetrack_root, UMETRACK, most_fit_error_mm=0)
     assert isinstance(item, Quarantined)
-    assert item.where == f"{UMETRACK}/{hot3d.UMETRACK_FILE}"
+    assert item.where == UMETRACK
     assert "by 0 mm or less" in item.expected
     assert item.got.endswith(" mm")
 

@@ -1,0 +1,1 @@
+"""OakInk2 (Zhan et al. 2024)."""
