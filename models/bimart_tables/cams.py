@@ -128,7 +128,9 @@ class CamsNetwork(nn.Module):
         made = self.decode(told, mean + noise * (log_variance / 2).exp())
         touches = target[..., :1]
         wrong = ((made[..., 1:] - target[..., 1:]).square() * touches).sum() / touches.sum().clamp_min(1)
-        flag = functional.binary_cross_entropy_with_logits(made[..., 0], target[..., 0])
+        here = touches.any(dim=2).expand_as(target[..., 0]).float()  # a hand of which a stage says that it touches
+        flag = functional.binary_cross_entropy_with_logits(made[..., 0], target[..., 0], here, reduction="sum")
+        flag = flag / here.sum().clamp_min(1)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1).mean()
         total = wrong + weights.flag * flag + weights.divergence * divergence
         return {"total": total, "places": wrong, "flags": flag, "divergence": divergence}
