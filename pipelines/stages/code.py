@@ -162,7 +162,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
 
 def _trained(section: dict[str, Any], network: str) -> list[Any]:
     """A network's settings by preset and by size."""
-    return [(section.get(section.get(kind)) or {}).get(network) for kind in ("preset", "size")]
+    return [(section.get(str(section.get(kind))) or {}).get(network) for kind in ("preset", "size")]
 
 
 def _chosen_by_dataset(tree: SourceTree, name: str) -> dict[str, list[Choice]]:
