@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from hoidata.clips.clip import SIDES, HandTrack
-from hoidata.dataset_folders import dataset_facts
+from hoidata.dataset_folders import built_in_names, dataset_facts
 from hoidata.datasets.registry import get_adapter
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracks import track_vertices
@@ -86,10 +86,10 @@ def draw_conventions(figure: Figure, data: Path) -> None:
     """What zero angles, the translation and up mean in each source, drawn on the same right hand."""
     model = HANDS["right"]
     wrist = model.wrist_offset_m(np.zeros((1, 10)))[0]
-    for number, name in enumerate(("h2o", "grab", "arctic", "manipnet", "taco", "hoi4d")):
+    for number, name in enumerate(built_in_names()):
         adapter, facts = get_adapter(name), dataset_facts(name)
         convention, frame = adapter.hand_convention, adapter.frame
-        axes = figure.add_subplot(2, 3, number + 1, projection="3d")
+        axes = figure.add_subplot(2, 4, number + 1, projection="3d")
         pose = model.mean_pose if convention.fingers == "mean-relative" else np.zeros(45)
         vertices = posed(pose)
         mesh(axes, vertices, model.faces, SAND, 0.9)
@@ -218,7 +218,7 @@ def _label(name: str) -> str:
 
 DRAWINGS: dict[str, tuple[Callable[[Figure, Path], None], tuple[float, float]]] = {
     "clip": (draw_clip, (12, 3.2)),
-    "conventions": (draw_conventions, (9, 8.5)),
+    "conventions": (draw_conventions, (12, 8.5)),
     "contact": (draw_contact, (10, 4.2)),
     "hand-type": (draw_hand_type, (8, 3.2)),
     "splits": (draw_splits, (11, 4.4)),
