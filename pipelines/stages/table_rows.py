@@ -31,8 +31,8 @@ class TableSettings:
 
     datasets: tuple[str, ...] = ()
     runs: tuple[str, ...] = ()
-    samples: int = 10
-    clips: int = 16
+    samples: int = 1
+    clips: int = 0
 
 
 def run(paths: StagePaths) -> None:

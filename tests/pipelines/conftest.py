@@ -81,14 +81,15 @@ def make_narrow(folder: Path, datasets: list[str], families: list[str]) -> None:
     params = yaml.safe_load((folder / "params.yaml").read_text())
     write_params(folder, {**params, "datasets": datasets, "families": families})
     for path in folder.glob("models/*/dvc.yaml"):
-        graph = yaml.safe_load(path.read_text())
-        matrices = [stage["matrix"] for stage in graph["stages"].values() if "family" in stage["matrix"]]
-        for matrix in matrices:
-            matrix["family"] = [name for name in matrix["family"] if name in families]
-        if matrices and not any(matrix["family"] for matrix in matrices):
-            path.unlink()
+        stages = yaml.safe_load(path.read_text())["stages"]
+        for stage in stages.values():
+            if "family" in stage["matrix"]:
+                stage["matrix"]["family"] = [name for name in stage["matrix"]["family"] if name in families]
+        kept = {name: stage for name, stage in stages.items() if stage["matrix"].get("family") != []}
+        if kept:
+            path.write_text(yaml.safe_dump({"vars": ["../../params.yaml"], "stages": kept}, sort_keys=False))
         else:
-            path.write_text(yaml.safe_dump(graph, sort_keys=False))
+            path.unlink()
 
 
 def set_present(folder: Path, present: set[str]) -> None:

@@ -125,6 +125,7 @@ def test_a_failing_conversion_leaves_the_clips_in_place(built, project_tools):
     finally:
         code.write_text(text)
         shutil.move(built / "moved", built / ".hoidata/raw/embedded/grab")
+        assert project_tools.run(built, "dvc", "repro", CODE).returncode == 0
 
 
 @pytest.mark.long
