@@ -16,7 +16,7 @@ from hoidata.metrics.feature_metrics import FEATURE_METRICS
 TRUTH = "ground-truth"
 NOTHING = 1e-4
 # Verbs that are each other backwards.
-REVERSES = (("open", "close"), ("lift", "place"), ("put in", "take out"))
+REVERSES = (("open", "close"), ("lift", "place"), ("put in", "take out"), ("screw", "unscrew"))
 CONFUSED = "taken for its reverse by"
 Must = Literal["fall", "rise", "stay", "be equal", "be zero"]
 

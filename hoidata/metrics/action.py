@@ -29,6 +29,7 @@ NUMBERS = {
     "tilt_deg": "greatest angle between the object's first upright direction and the upright",
     "end_tilt_deg": "the same in the last frame",
     "turn_deg": "turns about the upright, either way, added up; of steps smoothed over 5 frames, so that none is noise",
+    "end_turn_deg": "by how much it has turned about the upright in the last frame, counter-clockwise from above",
     "path_m": "length of the middle's path",
     "reversals_per_s": "how often the middle turns back: 2 mm or more in 0.1 s, and as much the other way",
     "hinge_net_deg": "hinge angle of the last frame less that of the first; 0 for a rigid object",
@@ -96,6 +97,7 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
         "tilt_deg": float(tilt.max()),
         "end_tilt_deg": float(tilt[-1]),
         "turn_deg": float(turn),
+        "end_turn_deg": float(np.degrees(steps.sum())),
     }
 
 

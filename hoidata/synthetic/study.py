@@ -14,12 +14,14 @@ from hoidata.synthetic.pools import search_pool
 from hoidata.synthetic.sequences import Person, make_person
 from hoidata.synthetic.soundness import measure
 from hoidata.synthetic.study_objects import STUDY_OBJECTS, Region, StudyObject
-from hoidata.synthetic.study_plan import HANDOVER, VERBS, StudyEntry, StudySize, choices, shares, study_plan
+from hoidata.synthetic.study_plan import HANDOVER, SCREWING, VERBS, StudyEntry, StudySize, choices, shares, study_plan
 from hoidata.synthetic.study_sequences import Scenario, draw_hold, make_study_sequence, mirrored_grip
 from hoidata.synthetic.truth import TruthSequence
 
 # How often every grasp is tried for one clip, and how many there may be.
 _TRIES, _MOST_GRASPS = 3, 8
+# A verb that was added later comes after the others, whose clips stay as they are.
+_VERB_STREAMS = (*sorted(VERBS.keys() - set(SCREWING)), *SCREWING)
 _STREAM, _PERSON_STREAM, _POOL_STREAM = 5_000_000, 5_000_001, 5_000_002
 _GRASPS, _ROUNDS = 3, 60
 _HANDS_APART_M = 0.004
@@ -112,7 +114,7 @@ def _sound_clip(task: ClipTask, entry: StudyEntry, pair: HandPair) -> TruthSeque
     """Draw until the whole clip is sound, with one grasp after the other; where a hand finds none at the region of the
     plan, at the next one. Raises HoidataError where no region has any."""
     thing, dataset = STUDY_OBJECTS[task.dataset][entry.thing], task.dataset
-    stream = [task.seed, DATASET_IDS[dataset], _STREAM, entry.thing, sorted(VERBS).index(entry.verb)]
+    stream = [task.seed, DATASET_IDS[dataset], _STREAM, entry.thing, _VERB_STREAMS.index(entry.verb)]
     rng = np.random.default_rng([*stream, _number(entry.subject), entry.number])
     person = task.people[entry.subject]
     ways = choices(thing, entry.verb, entry.hand)

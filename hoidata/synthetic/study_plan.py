@@ -40,6 +40,10 @@ def _there_and_back(*middle: Key, swing: Swing | None = None) -> Motion:
     return Motion((Key(0), Key(0.08), *middle, Key(0.96), Key(1)), swing)
 
 
+def _turned(degrees: float) -> Motion:
+    return Motion((Key(0), Key(0.15), Key(0.85, turn=(0, 0, degrees)), Key(1, turn=(0, 0, degrees))))
+
+
 def _moving_lid(start: float, stop: float) -> tuple[Motion, Motion]:
     """On the table, and held up between two hands."""
     up = (0.0, 0.0, 0.09)
@@ -63,7 +67,7 @@ VERBS = {
     ),
     "push": StudyVerb("push", 42, Motion((Key(0), Key(0.15), Key(0.85, (0, 0.16, 0)), Key(1, (0, 0.16, 0)))),
                       heading_deg=50),
-    "turn": StudyVerb("turn", 44, Motion((Key(0), Key(0.15), Key(0.85, turn=(0, 0, 70)), Key(1, turn=(0, 0, 70))))),
+    "turn": StudyVerb("turn", 44, _turned(70)),
     "pass": StudyVerb(
         "pass", 54,
         Motion((Key(0), Key(0.1), Key(0.42, (0, 0.1, 0.17)), Key(0.62, (0, 0.18, 0.17)), Key(0.93, (0, 0.25, 0)),
@@ -95,19 +99,23 @@ VERBS = {
     ),
     "open": StudyVerb("open", 54, *_moving_lid(0, 1)),
     "close": StudyVerb("close", 50, *_moving_lid(1, 0)),
+    "screw": StudyVerb("screw", 44, _turned(-70)),
+    "unscrew": StudyVerb("unscrew", 44, _turned(70)),
 }  # fmt: skip
 HANDOVER = "hand over"
+# Which way these turn is part of the verb, for left hands too; and each is the other one backwards.
+SCREWING = ("screw", "unscrew")
 
 # Each object's verbs; every hand does them all, and two hands also hand over what has no lid and room for both.
 _VERBS_OF = {
     "mug": "lift place push pass pour drink",
-    "waterbottle": "lift turn pass pour drink shake",
-    "teapot": "lift place push turn pour inspect",
+    "waterbottle": "unscrew screw pass pour drink shake",
+    "teapot": "unscrew place push screw pour inspect",
     "wineglass": "lift place pass pour drink inspect",
     "fryingpan": "lift place push pour shake inspect",
-    "cylinderlarge": "lift push turn pass shake inspect",
-    "cubelarge": "place push turn pass shake inspect",
-    "flashlight": "place turn pass drink shake inspect",
+    "cylinderlarge": "lift unscrew screw pass shake inspect",
+    "cubelarge": "place push screw unscrew shake inspect",
+    "flashlight": "place screw pass unscrew shake inspect",
     "box": "open close lift push inspect",
     "ketchup": "open close lift shake place",
     "mixer": "open close lift push place",

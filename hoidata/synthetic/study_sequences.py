@@ -27,7 +27,7 @@ from hoidata.synthetic.sequences import (
 )
 from hoidata.synthetic.soundness import vertex_distances_m
 from hoidata.synthetic.study_objects import ANGLES, Region, StudyObject
-from hoidata.synthetic.study_plan import HANDOVER, VERBS
+from hoidata.synthetic.study_plan import HANDOVER, SCREWING, VERBS
 from hoidata.synthetic.truth import TruthSequence
 
 PACE = Pace(approach=14, close=7, open=6, retreat=12)
@@ -114,6 +114,8 @@ def _object_motion(scenario: Scenario, times: np.ndarray, start: float, hold: fl
     size, turn_size = rng.uniform(0.85, 1.15, 2)
     if scenario.verb == "turn":
         turn_size *= rng.choice((-1.0, 1.0))
+    elif scenario.verb in SCREWING and scenario.left:
+        turn_size = -turn_size
     path = follow_path(motion, _hurried(times, start, hold, rng), start, hold, False, float(size), float(turn_size))
     heading = np.deg2rad(rng.uniform(-verb.heading_deg, verb.heading_deg))
     path = path._replace(shift_m=path.shift_m @ rotvec_to_rotmat(np.array([0.0, 0.0, heading])).T)

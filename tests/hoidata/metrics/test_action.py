@@ -50,9 +50,10 @@ def test_tilt_is_away_from_the_upright_and_turn_about_it():
     assert (poured["tilt_deg"], poured["end_tilt_deg"]) == pytest.approx((90, 0), abs=1e-3)
     assert poured["turn_deg"] == pytest.approx(0, abs=1e-3)
     screwed = numbers_of(track(rotvec=np.linspace(0, 3 * np.pi, 60)[:, None] * [0, 0, 1]))
-    assert screwed["turn_deg"] == pytest.approx(540, abs=0.1)
+    assert (screwed["turn_deg"], screwed["end_turn_deg"]) == pytest.approx((540, 540), abs=0.1)
     looked_at = numbers_of(track(rotvec=there_and_back(60, (0, 0, np.pi / 3))))
-    assert looked_at["turn_deg"] == pytest.approx(120, abs=6)
+    assert (looked_at["turn_deg"], looked_at["end_turn_deg"]) == pytest.approx((120, 0), abs=6)
+    assert numbers_of(track(rotvec=np.linspace(0, -1, 30)[:, None] * [0, 0, 1]))["end_turn_deg"] < -50
     noise = np.random.default_rng(0).normal(0, np.radians(0.3), (60, 1))
     assert numbers_of(track(rotvec=noise * [0, 0, 1]))["turn_deg"] < 12
     assert screwed["tilt_deg"] == pytest.approx(0, abs=0.05)
@@ -98,7 +99,8 @@ def test_numbers_are_the_same_in_another_world_and_without_gravity_only_what_nee
     assert one["tilt_deg"] > 1
     unknown = action_numbers(clip.object, None, np.zeros((2, 20), bool))
     assert {name for name, value in unknown.items() if np.isnan(value)} == {
-        "rise_m", "end_rise_m", "sideways_m", "end_sideways_m", "tilt_deg", "end_tilt_deg", "turn_deg"
+        "rise_m", "end_rise_m", "sideways_m", "end_sideways_m", "tilt_deg", "end_tilt_deg", "turn_deg",
+        "end_turn_deg",
     }  # fmt: skip
 
 

@@ -108,6 +108,14 @@ def test_paths_start_and_end_on_the_table_and_stay_calm(verb):
         assert np.linalg.norm(np.diff(path.shift_m, axis=0), axis=1).max() * 120 < 2.2
 
 
+@pytest.mark.parametrize(("verb", "reverse"), [("screw", "unscrew"), ("open", "close")])
+def test_what_a_verb_does_is_its_reverse_backwards_from_where_that_ends(verb, reverse):
+    paths = [follow_path(VERBS[name].motion, np.linspace(0, 60, 121), 10, 40, False, 1, 1) for name in (verb, reverse)]
+    for one, other in zip(*paths, strict=True):
+        np.testing.assert_allclose(one[::-1] - one[-1], other - other[0], atol=0.02)
+        assert np.array_equal(one, other) == (np.ptp(one) == 0)
+
+
 def test_every_verb_has_limits_for_what_its_object_does():
     limits = tomllib.loads((Path(hoidata.metrics.__file__).parent / "actions.toml").read_text())
     assert set(limits) == set(VERBS)
