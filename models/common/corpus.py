@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
+from hoidata.batches.mirror import Mirror
 from hoidata.batches.sight import Sight
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
@@ -30,6 +31,7 @@ class Wanted:
     """What of every batch is asked for. frames, entries: of each clip and in all, for losses of geometry (``Sight``).
 
     parts: those of ``of`` equal parts of a batch that this process computes. balance: clips drawn evenly, or verbs.
+    mirror: every other clip in a mirror, where that can be (``Mirror``).
     """
 
     frames: int = 0
@@ -37,6 +39,7 @@ class Wanted:
     parts: Sequence[int] = (0,)
     of: int = 1
     balance: Balance = "none"
+    mirror: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,18 +108,24 @@ def batches(
     """
     lengths = [min(dataset.whole(clip_id).length, dataset.max_frames) for clip_id in dataset.ids]
     weights = _verb_weights(dataset) if wanted.balance == "verb" else None
+    mirror = Mirror.of(map(dataset.whole, dataset.ids)) if wanted.mirror else None
     for step, (epoch, rows) in enumerate(_plan(lengths, size, seed, weights), 1):
         if step > start:
             dataset.set_epoch(epoch)
             parts = {part: rows[part :: wanted.of] or rows[:1] for part in wanted.parts}
             yield [
-                (part, _collated([dataset[row] for row in own], wanted, seed, step, part))
+                (part, _collated([dataset[row] for row in own], wanted, (seed, step, part), mirror))
                 for part, own in parts.items()
             ]
 
 
-def _collated(samples: list[ClipSample], wanted: Wanted, seed: int, step: int, part: int) -> ClipBatch:
-    random = np.random.default_rng([seed, step, part])
+def _collated(
+    samples: list[ClipSample], wanted: Wanted, drawn_from: tuple[int, int, int], mirror: Mirror | None
+) -> ClipBatch:
+    if mirror is not None:
+        turned = np.random.default_rng([*drawn_from, 1]).random(len(samples)) < 0.5
+        samples = [(turn and mirror.mirrored(one)) or one for one, turn in zip(samples, turned, strict=True)]
+    random = np.random.default_rng(drawn_from)
     lengths = [sample.length for sample in samples]
     sight = Sight.drawn(lengths, wanted.frames, wanted.entries, random) if wanted.frames else None
     return collate(samples, sight)

@@ -45,6 +45,7 @@ class TrainingConfig:
     schedule: "constant", or "cosine" to zero after ``warmup`` steps. ema_decay: of the running average of the weights
     that is kept (0: the weights themselves). keep_best: keep the step with the lowest validation loss, not the last.
     patience: stop after so many validations without a lower loss (0: never). balance: draw clips evenly, or verbs.
+    mirror: every other clip is seen in a mirror, where the other hand is known to do the same (``batches.mirror``).
     precision: of Transformers and point networks, where the time is; all else stays float32. parts: of a batch, whose
     gradients (and statistics of batch norms) are averaged; they take turns, or are shared by ``train.processes``.
     save_every: steps after which all is written down that a killed training needs to go on.
@@ -62,6 +63,7 @@ class TrainingConfig:
     patience: int = 0
     validate_every: int = 500
     balance: Balance = "none"
+    mirror: bool = False
     precision: Precision = "float32"
     parts: int = 1
     save_every: int = 500
@@ -176,7 +178,8 @@ def fit(
         compute_in_bfloat16(network)
     if progress:
         progress.load(state)
-    wanted = Wanted(objective.frames, objective.entries, team.own_parts(config.parts), config.parts, config.balance)
+    shared = team.own_parts(config.parts), config.parts
+    wanted = Wanted(objective.frames, objective.entries, *shared, config.balance, config.mirror)
     stream = batches(corpus.train, config.batch, seed, wanted, state.step)
     remaining = range(state.step + 1, config.steps + 1)
     for step in track(remaining, description=type(network).__name__, transient=True, disable=not team.writes):
