@@ -17,7 +17,7 @@ from models.evaluator.inputs import corrected_input, drawn_frames, paper_input
 
 @dataclass(frozen=True)
 class Examples:
-    """Clips of one part of a split. steps: per clip (step, 178); joints: per clip (frame, 42, 3) and (frame, 42).
+    """Clips of one part of a split. steps: per clip (step, 179); joints: per clip (frame, 42, 3) and (frame, 42).
 
     text (clip, 4, 512): features of the sentences. verbs, objects, hands: in words, per clip.
     """

@@ -9,7 +9,8 @@ from functools import lru_cache
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Side
-from hoidata.clips.features import object_features, upright
+from hoidata.clips.features import OBJECT_ROTATION_6D, object_features, upright
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec
 from hoidata.metrics.pair import Motion
 from hoidata.metrics.paths import FRAMES, JOINTS, joints_and_presence
 from hoidata.objects.surface_index import surface_index
@@ -17,7 +18,7 @@ from hoidata.objects.surface_index import surface_index
 EVERY = 3
 FAR_M = 0.10
 PAPER_SIZE = JOINTS * 3
-OBJECT = slice(PAPER_SIZE, PAPER_SIZE + 10)  # position 3, 6D 6, hinge 1
+OBJECT = slice(PAPER_SIZE, PAPER_SIZE + 11)  # position 3, 6D 6, hinge 1, turn about the upright since the first frame 1
 CORRECTED_SIZE = OBJECT.stop + JOINTS
 MOTIONS_KEPT = 128
 
@@ -41,9 +42,11 @@ def paper_input(joints: np.ndarray, present: np.ndarray, frames: np.ndarray) -> 
 
 @lru_cache(maxsize=MOTIONS_KEPT)
 def corrected_input(motion: Motion, sides: tuple[Side, ...]) -> np.ndarray:
-    """(step, 178) float32: joints and object in the clip frame at 10 per second, and how near each joint is.
+    """(step, 179) float32: joints and object in the clip frame at 10 per second, and how near each joint is.
 
-    Clip frame: upright, the object's first position at zero. Kept for the last motions: two networks ask for it.
+    Clip frame: upright, the object's first position at zero; which way a clip faces means nothing. Hence the turn as a
+    number of its own, radians: of two rotations that may face any way, a network does not learn whether a lid is
+    screwed on or off. Kept for the last motions: two networks ask for it.
     """
     joints, present = joints_and_presence(motion, sides)
     frames = np.arange(len(joints))[::EVERY]
@@ -52,7 +55,14 @@ def corrected_input(motion: Motion, sides: tuple[Side, ...]) -> np.ndarray:
     objects = object_features(clip.object.take(frames), turn, origin)
     placed = np.where(seen[..., None], joints[frames] - turn @ origin, 0.0)
     near = np.where(seen, np.concatenate([_distances_m(motion, side, frames) for side in SIDES], axis=1), FAR_M)
-    return np.concatenate((placed.reshape(len(frames), -1), objects, near), axis=1).astype(np.float32)
+    facing = turn_rad(rot6d_to_rotmat(objects[:, OBJECT_ROTATION_6D]))[:, None]
+    return np.concatenate((placed.reshape(len(frames), -1), objects, facing, near), axis=1).astype(np.float32)
+
+
+def turn_rad(rotation: np.ndarray) -> np.ndarray:
+    """(step,) by how much rotations (step, 3, 3) have turned about z since the first, whole turns counted."""
+    steps = rotmat_to_rotvec(rotation[1:] @ rotation[:-1].swapaxes(1, 2))[:, 2]
+    return np.concatenate(([0.0], np.cumsum(steps)))
 
 
 def _distances_m(motion: Motion, side: Side, frames: np.ndarray) -> np.ndarray:

@@ -54,7 +54,7 @@ class PlanarTrunk(nn.Module):
 
 
 class RecurrentTrunk(nn.Module):
-    """(B, T, 178) steps and their numbers (B,) to (B, F) features, read from both ends; padding counts nothing."""
+    """(B, T, 179) steps and their numbers (B,) to (B, F) features, read from both ends; padding counts nothing."""
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
@@ -101,7 +101,7 @@ class MotionEncoder(nn.Module):
 
 
 def turned(motion: Tensor, angle: Tensor) -> Tensor:
-    """Motions (B, T, 178) turned about gravity by (B,) angles; hinge and distances are what they were."""
+    """Motions (B, T, 179) turned about gravity by (B,) angles; hinge, turn and distances are what they were."""
     cos, sin, zero = angle.cos(), angle.sin(), torch.zeros_like(angle)
     rows = (torch.stack(row, -1) for row in ((cos, -sin, zero), (sin, cos, zero), (zero, zero, zero + 1)))
     turn = torch.stack(list(rows), -2)[:, None]
@@ -112,7 +112,7 @@ def turned(motion: Tensor, angle: Tensor) -> Tensor:
 
 
 def _scale() -> Tensor:
-    """(178,) brings every number near one: metres of joints and object, and the distance that still counts."""
+    """(179,) brings every number near one: metres of joints and object, and the distance that still counts."""
     scale = np.ones(CORRECTED_SIZE, np.float32)
     scale[: OBJECT.start + 3] = 1 / FAR_M
     scale[OBJECT.stop :] = 1 / FAR_M
