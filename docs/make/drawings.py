@@ -1,5 +1,6 @@
 """The drawings of docs/concepts, made from the data of `make demo`: python docs/make/drawings.py PROJECT."""
 
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from matplotlib.patches import Patch
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from hoidata.clips.clip import SIDES, HandTrack
-from hoidata.dataset_folders import built_in_names, dataset_facts
+from hoidata.dataset_folders import built_in_names, dataset_facts, dataset_title
 from hoidata.datasets.registry import get_adapter
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracks import track_vertices
@@ -22,7 +23,7 @@ from hoidata.surface.store import open_surface
 from pipelines.lineage.graph import written_graph
 
 IMAGES = Path(__file__).parents[1] / "images"
-BLUE, SAND, GREY, RED = "#7a9fc6", "#e6b087", "#d6d4cc", "#c4571b"
+BLUE, SAND, GREY, RED, GREEN = "#7a9fc6", "#e6b087", "#d6d4cc", "#c4571b", "#7f9c6c"
 COLOURS = {"left": BLUE, "right": SAND}
 CLIP = "grab/s10/mug_drink_1"
 TOUCH = matplotlib.colors.LinearSegmentedColormap.from_list("touch", ["#d6d4cc", "#f29e40", "#c71f24"])
@@ -155,6 +156,45 @@ def draw_hand_type(figure: Figure, data: Path) -> None:
     axes.legend(frameon=False)
 
 
+def draw_words(figure: Figure, data: Path) -> None:
+    """How alike the features of sentences are: the four of one clip, and those of other verbs, objects and hands."""
+    annotated = load_annotated(data / "grab", HANDS)
+    prompts: dict[tuple, str] = {}
+    for clip_id in annotated.ids("test"):
+        sentences = annotated.sentences(clip_id)
+        prompts.setdefault(tuple(sentences), clip_id)
+    chosen = list(prompts.values())[:5]
+    features = np.concatenate([annotated.text_embedding(clip_id) for clip_id in chosen]).astype(np.float64)
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    axes: Axes = figure.add_subplot()
+    image = axes.imshow(features @ features.T, cmap="YlOrBr", vmin=0, vmax=1)
+    axes.set_yticks(range(len(features)), [s for clip_id in chosen for s in annotated.sentences(clip_id)], fontsize=7)
+    axes.set_xticks([])
+    for edge in range(4, len(features), 4):
+        axes.axhline(edge - 0.5, color="white", linewidth=1.5)
+        axes.axvline(edge - 0.5, color="white", linewidth=1.5)
+    figure.colorbar(image, ax=axes, shrink=0.7, label="cosine of their features")
+
+
+def draw_quality(figure: Figure, data: Path) -> None:
+    """Every measure of every clip, as a share of the limit above which it is reported."""
+    axes: Axes = figure.add_subplot()
+    folders = {name: data / name / "quality" for name in ("h2o", "grab", "arctic")}
+    limits = json.loads((folders["h2o"] / "info.json").read_text())["thresholds"]["limits"]
+    clips = {name: pd.read_parquet(folder / "clips.parquet") for name, folder in folders.items()}
+    names = [name for name in reversed(limits) if name in clips["h2o"]]
+    for offset, (dataset, colour) in zip((0.22, 0, -0.22), zip(clips, (BLUE, SAND, GREEN), strict=True), strict=True):
+        for row, name in enumerate(names):
+            shares = clips[dataset][name].dropna().abs() / limits[name]["warn"]
+            axes.plot(shares, np.full(len(shares), row + offset), "o", color=colour, alpha=0.5, markersize=4)
+        axes.plot([], [], "o", color=colour, label=dataset_title(dataset))
+    axes.axvline(1, color=RED, linewidth=1.5, label="reported above")
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    axes.set_xlim(-0.03, 1.15)
+    axes.set_xlabel("measure, as a share of its limit `warn`")
+    axes.legend(frameon=False, fontsize=8, loc="center", bbox_to_anchor=(0.78, 0.22))
+
+
 def draw_splits(figure: Figure, data: Path) -> None:
     """Subjects by objects, coloured by the part their clips are in, for two named splits of one corpus."""
     annotated = load_annotated(data / "grab", HANDS)
@@ -221,18 +261,21 @@ DRAWINGS: dict[str, tuple[Callable[[Figure, Path], None], tuple[float, float]]] 
     "conventions": (draw_conventions, (12, 8.5)),
     "contact": (draw_contact, (10, 4.2)),
     "hand-type": (draw_hand_type, (8, 3.2)),
+    "words": (draw_words, (9, 5)),
+    "quality": (draw_quality, (9, 4.6)),
     "splits": (draw_splits, (11, 4.4)),
     "lineage": (draw_lineage, (9, 6)),
 }
+
+
+FLAT = ("hand-type", "words", "quality", "splits", "lineage")  # the others have a view in space
 
 
 def main(project: Path, names: list[str]) -> None:
     """Draw all, or the named ones, into docs/images."""
     for name, (draw, inches) in DRAWINGS.items():
         if not names or name in names:
-            figure = Figure(
-                figsize=inches, layout="constrained" if name in ("hand-type", "splits", "lineage") else None
-            )
+            figure = Figure(figsize=inches, layout="constrained" if name in FLAT else None)
             draw(figure, project / "data/embedded")
             figure.savefig(IMAGES / f"{name}.png", dpi=90, bbox_inches="tight", metadata={"Software": None})
             print(IMAGES / f"{name}.png")
