@@ -26,6 +26,7 @@ from pipelines.warm import WarmProcess
 
 CODE = "pipelines/dvc.yaml:code"
 RUN = Path(".hoidata/repro")
+RWLOCK = Path(".dvc/tmp/rwlock")
 LOGS = Path(".hoidata/logs")
 DURATIONS = Path(".hoidata/durations.json")
 # What every run of a single stage would import anew, about a second each time.
@@ -57,6 +58,7 @@ def reproduce_side_by_side(
     """
     # Left in the opposite order: running stages are stopped before the threads that wait for them are.
     with exclusive(RUN, wait_s=0), ThreadPoolExecutor(jobs) as pool, _Children(max(1, _cores() // jobs)) as children:
+        forget_broken_lock()
         run_stage = wrap(children.run) if wrap else children.run
         start, run = time.monotonic(), Run()
         if _timed(CODE, run_stage, run):
@@ -69,6 +71,30 @@ def reproduce_side_by_side(
             write_whole(DURATIONS, json.dumps({**read_durations(), **run.seconds}, indent=1, sort_keys=True))
         run.wall = time.monotonic() - start
         return run
+
+
+def forget_broken_lock() -> None:
+    """Remove DVC's file of who reads and writes what, where a process that was killed has left half of it.
+
+    It is kept for processes that run; a broken one keeps every later run from starting.
+    """
+    if not _is_broken(RWLOCK):
+        return
+    from dvc.lock import make_lock
+
+    # Under DVC's own guard: whoever writes it at this moment has it.
+    with make_lock(f"{RWLOCK}.lock", tmp_dir=str(RWLOCK.parent)):
+        if _is_broken(RWLOCK):
+            RWLOCK.unlink()
+
+
+def _is_broken(path: Path) -> bool:
+    try:
+        return not isinstance(json.loads(path.read_bytes()), dict)
+    except FileNotFoundError:
+        return False
+    except ValueError:
+        return True
 
 
 def stale_stages(targets: list[str], forced: set[str] | None = None) -> dict[str, frozenset[str]]:

@@ -47,13 +47,13 @@ TINY_SAMPLE = {"samples": 2, "text2hoi": {"sampler": {"steps": 2}, "field_resolu
 
 
 def copy_project(folder: Path) -> Path:
-    """The project's code and settings in ``folder``, as a repository of its own, without any data."""
+    """The project's code and settings in ``folder``, as a repository of its own; no data, nothing DVC knows of it."""
     for part in PARTS:
         source, target = PROJECT / part, folder / part
         target.parent.mkdir(parents=True, exist_ok=True)
         if source.is_dir():
             # Compiled code comes along: numba takes it where the source's time of change is the same.
-            shutil.copytree(source, target, ignore=shutil.ignore_patterns("*.tmp.*", "*.pyc.*"))
+            shutil.copytree(source, target, ignore=shutil.ignore_patterns("*.tmp.*", "*.pyc.*", "dvc.lock"))
         else:
             shutil.copy(source, target)
     subprocess.run(["git", "init", "--quiet", str(folder)], check=True)

@@ -15,7 +15,18 @@ from hypothesis import strategies as st
 
 from hoidata.errors import BadInput
 from hoidata.files.atomic import exclusive
-from pipelines.side_by_side import CODE, RUN, Run, describe_run, log_of, reproduce_side_by_side, run_all, stale_stages
+from pipelines.side_by_side import (
+    CODE,
+    RUN,
+    RWLOCK,
+    Run,
+    describe_run,
+    forget_broken_lock,
+    log_of,
+    reproduce_side_by_side,
+    run_all,
+    stale_stages,
+)
 
 PROJECT = Path(__file__).parents[2]
 pytestmark = [
@@ -179,3 +190,22 @@ def test_a_run_that_is_stopped_takes_its_stages_along_and_the_next_one_completes
     assert (tmp_path / "imported").read_text() == "x", "a stage imports what the run was started with, as Prefect"
     (tmp_path / "make.py").write_text((tmp_path / "make.py").read_text().replace("time.sleep(20)", "None"))
     assert reproduce_side_by_side([], jobs=2).failed == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("left", ["", '{"write": {"a.out": {"pid": 1,', "[]"])
+def test_half_a_lock_that_a_killed_process_left_stops_no_later_run(tmp_path, monkeypatch, left):
+    monkeypatch.chdir(tmp_path)
+    tiny_project(tmp_path)
+    RWLOCK.parent.mkdir(parents=True, exist_ok=True)
+    RWLOCK.write_text(left)
+    assert reproduce_side_by_side([], jobs=2).failed == {}
+    assert (tmp_path / "a.out").exists()
+
+
+def test_a_lock_that_is_whole_is_left_to_those_who_hold_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    RWLOCK.parent.mkdir(parents=True)
+    RWLOCK.write_text('{"write": {}, "read": {"a": [{"pid": 1, "cmd": "dvc"}]}}')
+    forget_broken_lock()
+    assert '"pid": 1' in RWLOCK.read_text()

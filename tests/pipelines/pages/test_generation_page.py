@@ -1,5 +1,6 @@
 """What a generated motion is written as: arrays, an animated model, and a page that fetches nothing."""
 
+import contextlib
 import re
 import shutil
 import subprocess
@@ -134,8 +135,12 @@ def take_picture(chromium, page, out, part):
         "--disable-background-networking", "--disable-component-update", "--no-first-run", "--hide-scrollbars",
         "--window-size=900,700", "--virtual-time-budget=5000",
     ]  # fmt: skip
-    command = [chromium, *switches, f"--user-data-dir={out.with_suffix('.profile')}", f"--screenshot={out}"]
-    subprocess.run([*command, f"{page.as_uri()}#t={part}"], check=True, capture_output=True, timeout=120)
+    for attempt in range(3):  # on a machine with much to do a browser sometimes never begins
+        profile = out.with_suffix(f".profile{attempt}")
+        command = [chromium, *switches, f"--user-data-dir={profile}", f"--screenshot={out}"]
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            subprocess.run([*command, f"{page.as_uri()}#t={part}"], check=True, capture_output=True, timeout=120)
+            break
     from PIL import Image
 
     with Image.open(out) as image:
