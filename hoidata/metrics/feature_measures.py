@@ -231,7 +231,7 @@ def matched_sentences(comparison: Comparison, hard: bool) -> Groups:
     texts, objects = reference.text[first], reference.object[first]
     found = np.full((2, len(predicted)), np.nan)
     for row in range(len(predicted)):
-        others = np.flatnonzero((prompts != predicted.prompt[row]) & (~hard | (objects == predicted.object[row])))
+        others = np.flatnonzero((prompts != predicted.prompt[row]) & ((not hard) | (objects == predicted.object[row])))
         if len(others) >= GROUP or not hard:
             random = np.random.default_rng([SEED, int(predicted.sample[row]), int(predicted.clip[row])])
             others = random.permutation(others)[: GROUP - 1]
