@@ -84,6 +84,11 @@ def rot6d_to_rotmat(rot6d: Array) -> Array:
     return torch.stack((first, second, torch.linalg.cross(first, second, dim=-1)), -1)
 
 
+def turns_about(rotmat: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(frame - 1,) radians by which rotations (frame, 3, 3) turn about a unit axis (3,) from each frame to the next."""
+    return rotmat_to_rotvec(rotmat[1:] @ rotmat[:-1].swapaxes(1, 2)) @ axis
+
+
 def mirror_rotvec_x(rotvec: Array) -> Array:
     """The axis-angle ``(..., 3)`` seen in a mirror with normal x: ``diag(-1,1,1) R diag(-1,1,1)``."""
     if isinstance(rotvec, torch.Tensor):

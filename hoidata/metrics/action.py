@@ -17,7 +17,7 @@ import numpy as np
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
-from hoidata.geometry.rotations import rotmat_to_rotvec
+from hoidata.geometry.rotations import turns_about
 from hoidata.store.annotated import AnnotatedStore
 
 TABLE = Path(__file__).with_name("actions.toml")
@@ -87,7 +87,7 @@ def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | Non
     rotation = track.world_from_object.rotation
     since_first = rotation @ rotation[0].T
     tilt = np.degrees(np.arccos(np.clip((since_first @ up) @ up, -1, 1)))
-    steps = rotmat_to_rotvec(rotation[1:] @ rotation[:-1].swapaxes(1, 2)) @ up
+    steps = turns_about(rotation, up)
     turn = np.degrees(np.abs(np.convolve(steps, np.full(_SMOOTH, 1 / _SMOOTH), mode="full")).sum())
     return {
         "rise_m": float(rise.max()),

@@ -10,7 +10,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.features import OBJECT_ROTATION_6D, object_features, upright
-from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec
+from hoidata.geometry.rotations import rot6d_to_rotmat, turns_about
 from hoidata.metrics.pair import Motion
 from hoidata.metrics.paths import FRAMES, JOINTS, joints_and_presence
 from hoidata.objects.surface_index import surface_index
@@ -55,14 +55,9 @@ def corrected_input(motion: Motion, sides: tuple[Side, ...]) -> np.ndarray:
     objects = object_features(clip.object.take(frames), turn, origin)
     placed = np.where(seen[..., None], joints[frames] - turn @ origin, 0.0)
     near = np.where(seen, np.concatenate([_distances_m(motion, side, frames) for side in SIDES], axis=1), FAR_M)
-    facing = turn_rad(rot6d_to_rotmat(objects[:, OBJECT_ROTATION_6D]))[:, None]
+    steps = turns_about(rot6d_to_rotmat(objects[:, OBJECT_ROTATION_6D]), np.array((0.0, 0.0, 1.0)))
+    facing = np.concatenate(([0.0], np.cumsum(steps)))[:, None]  # whole turns counted
     return np.concatenate((placed.reshape(len(frames), -1), objects, facing, near), axis=1).astype(np.float32)
-
-
-def turn_rad(rotation: np.ndarray) -> np.ndarray:
-    """(step,) by how much rotations (step, 3, 3) have turned about z since the first, whole turns counted."""
-    steps = rotmat_to_rotvec(rotation[1:] @ rotation[:-1].swapaxes(1, 2))[:, 2]
-    return np.concatenate(([0.0], np.cumsum(steps)))
 
 
 def _distances_m(motion: Motion, side: Side, frames: np.ndarray) -> np.ndarray:
