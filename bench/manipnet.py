@@ -79,14 +79,21 @@ class Trial:
     rows: tuple[str, ...] = ()
 
 
-def main() -> None:
+def prepare_recordings() -> list[HandRecording]:
+    """The real recordings, and torch made repeatable; none, and a line that says why, where they are not here."""
     root = os.environ.get("HOIDATA_MANIPNET")
     if not root:
-        print("HOIDATA_MANIPNET is not set: the table needs the real recordings")
-        return
+        print("HOIDATA_MANIPNET is not set: this needs the real recordings")
+        return []
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
     torch.use_deterministic_algorithms(True)
-    recordings = [read_hands(Path(root), name) for name in NAMES]
+    return [read_hands(Path(root), name) for name in NAMES]
+
+
+def main() -> None:
+    recordings = prepare_recordings()
+    if not recordings:
+        return
     size, seeds = os.environ.get("HOIDATA_BENCH_SIZE", "small"), int(os.environ.get("HOIDATA_BENCH_SEEDS", "3"))
     wanted = os.environ.get("HOIDATA_BENCH_ROWS", ",".join(VARIANTS_OF_OURS)).split(",")
     trials = [seen_trial(recordings), *unseen_trials(recordings)]

@@ -9,15 +9,23 @@ a way for each length, the second is reported (HOIDATA_BENCH_GAPS: how many of e
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from bench.harness import show
-from bench.manipnet import KEPT, RATE_HZ, SETTINGS, Job, Trial, seen_trial, trained_network, unseen_trials
-from bench.manipnet_recordings import NAMES, ROUND, TENTHS, TEST, VALIDATION, HandRecording, read_hands
+from bench.manipnet import (
+    KEPT,
+    RATE_HZ,
+    SETTINGS,
+    Job,
+    Trial,
+    prepare_recordings,
+    seen_trial,
+    trained_network,
+    unseen_trials,
+)
+from bench.manipnet_recordings import ROUND, TENTHS, TEST, VALIDATION, HandRecording
 from hoidata.clips.clip import SIDES, Side
 from hoidata.files import write_whole
 from hoidata.geometry.intervals import runs
@@ -36,13 +44,9 @@ FIST_RAD = 1.2
 
 
 def main() -> None:
-    root = os.environ.get("HOIDATA_MANIPNET")
-    if not root:
-        print("HOIDATA_MANIPNET is not set: this needs the real recordings")
+    recordings = prepare_recordings()
+    if not recordings:
         return
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-    torch.use_deterministic_algorithms(True)
-    recordings = [read_hands(Path(root), name) for name in NAMES]
     size = os.environ.get("HOIDATA_BENCH_SIZE", "small")
     show_gaps(recordings, Predictor(trained_network(Job(seen_trial(recordings), "ours", 0), size)))
     show_courses(unseen_trials(recordings), recordings, size)
