@@ -117,7 +117,8 @@ def usual_storage(elements: np.ndarray) -> bytes:
     import torch
 
     opcodes = pickletools.genops(pickle.dumps(torch.from_numpy(elements), 4))
-    return next(argument for opcode, argument, _ in opcodes if opcode.name == "BINBYTES")
+    # It names the storage by its address: where addresses are short, the bytes of a small one are, too.
+    return next(argument for opcode, argument, _ in opcodes if opcode.name in ("BINBYTES", "SHORT_BINBYTES"))
 
 
 def _tensor(array: np.ndarray, location: str = "cpu") -> _Call:

@@ -130,13 +130,18 @@ def _shared_out(function: Function, items: Sequence[Any], jobs: int, lock: int) 
 
 @contextlib.contextmanager
 def one_thread() -> Iterator[None]:
-    """One torch thread, as in a worker: the number of threads can change the last bit of a fit."""
+    """One thread of torch and of BLAS, as in a worker: their number can change the last bit of a fit, and time.
+
+    Several threads of BLAS take five times as long as one on matrices as small as a hand's.
+    """
     import torch
+    from threadpoolctl import threadpool_limits
 
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        yield
+        with threadpool_limits(limits=1, user_api="blas"):
+            yield
     finally:
         torch.set_num_threads(before)
 

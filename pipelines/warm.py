@@ -30,8 +30,9 @@ PRELOADED = (
     "numpy", "scipy.spatial.transform", "scipy.optimize", "scipy.stats", "pandas", "pyarrow.parquet", "numba", "orjson",
     "torch", "safetensors.torch", "trimesh", "igl", "rich.progress", "yaml", "filelock", "threadpoolctl",
 )  # fmt: skip
-# Read as OpenMP's library is loaded. Threads that wait must sleep: spinning ones cost a busy machine ten times as much.
-ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0"}
+# Read as libraries are loaded. Threads of OpenMP that wait must sleep: spinning ones cost a busy machine ten times as
+# much. One thread of BLAS: its matrices are small here, two threads took five times as long and gave other last bits.
+ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1"}
 TAKEN = b"t"
 KILLED = 128 + signal.SIGKILL
 FORWARDED = (signal.SIGINT, signal.SIGTERM)

@@ -1,7 +1,9 @@
 """NPZ files: stored (not compressed, so one array can be read alone), equal arrays give equal bytes, no pickles."""
 
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
@@ -13,13 +15,31 @@ from hoidata.files.numpy_files import load_npz_arrays
 def write_npz(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
     """Write named arrays in the mapping's order, atomically. Object arrays are refused (ValueError).
 
-    NumPy stamps every member 1 January 1980, so the bytes depend on names and arrays alone.
+    The bytes depend on names and arrays alone; they are those of ``np.savez`` on Python 3.11.4 and later.
     """
     for name, array in arrays.items():
         if np.asarray(array).dtype.hasobject:
             raise ValueError(f"{path}: array {name!r} holds Python objects, which NPZ files here never do")
     with atomic_file(path) as partial, open(partial, "wb") as stream:
-        np.savez(stream, allow_pickle=False, **{name: np.asarray(a, order="C") for name, a in arrays.items()})
+        write_npz_to(stream, arrays)
+
+
+def write_npz_to(stream: IO[bytes], arrays: Mapping[str, np.ndarray]) -> None:
+    """The same into a stream that can seek. Raises ValueError on arrays of objects."""
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, array in arrays.items():
+            with archive.open(_Member(f"{name}.npy"), "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(array, order="C"), allow_pickle=False)
+
+
+class _Member(zipfile.ZipInfo):
+    """A member of 1 January 1980 that states its sizes in 64 bits alone; Python before 3.11.4 states them twice."""
+
+    def FileHeader(self, zip64: bool | None = None) -> bytes:  # noqa: N802 (zipfile's name)
+        """The header before the member's data: both sizes of 32 bits are all ones, which asks for version 4.5."""
+        self.create_version = self.extract_version = 45
+        header = super().FileHeader(zip64)
+        return header[:18] + b"\xff" * 8 + header[26:]
 
 
 def read_npz(path: str | Path) -> dict[str, np.ndarray]:

@@ -19,6 +19,7 @@ from hoidata.refinement.fitting import GeneratedHand, check_generated, pose_prio
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, Skin
+from hoidata.workers import one_thread
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,7 @@ class RefinementSettings:
     enough: float = 1e-4
 
 
+@one_thread()
 def refine_hands(
     pair: HandPair,
     keypoint_ids: np.ndarray,

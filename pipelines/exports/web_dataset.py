@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 
-import numpy as np
 import orjson
 
+from hoidata.files.arrays import write_npz_to
 from pipelines.exports.motion import ExportedClip
 
 CLIPS_PER_SHARD = 500
@@ -25,7 +25,7 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
 
 def _add(tar: tarfile.TarFile, key: str, item: ExportedClip) -> None:
     arrays = io.BytesIO()
-    np.savez(arrays, allow_pickle=False, **item.arrays())
+    write_npz_to(arrays, item.arrays())
     for suffix, content in (("npz", arrays.getvalue()), ("json", orjson.dumps(item.facts))):
         member = tarfile.TarInfo(f"{key}.{suffix}")  # dated 1970: equal clips, equal bytes
         member.size = len(content)

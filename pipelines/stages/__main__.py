@@ -46,8 +46,7 @@ def main() -> int:
     options = parser.parse_args()
     if (code := run_warm("pipelines.stages", sys.argv[1:])) is not None:
         return code
-    for name, value in ENVIRONMENT.items():
-        os.environ.setdefault(name, value)
+    os.environ.update(ENVIRONMENT)
     try:
         module = importlib.import_module(f"pipelines.stages.{options.stage}")
     except ModuleNotFoundError as error:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.errors import BadInput
 from hoidata.workers import WorkerLost, in_workers
@@ -42,6 +43,13 @@ def broken(item: int) -> int:
 
 
 @pytest.mark.slow
+def blas_threads(_: int) -> int:
+    import numpy as np
+
+    np.ones((2, 2)) @ np.ones((2, 2))
+    return max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
+
+
 def test_an_item_that_kills_every_process_is_given_up_and_all_others_are_done():
     found = dict(in_workers(deadly, range(6), 2, on_lost=lambda error: f"{error.item}: {error.cause}"))
     assert found == {0: 0, 1: 1, 2: 4, 3: "3: signal SIGSEGV", 4: 16, 5: 25}
@@ -86,6 +94,12 @@ def test_what_the_function_raises_names_the_item_and_ends_the_workers():
 
 def test_one_job_works_here():
     assert list(in_workers(squared, range(3), 1)) == [(0, 0), (1, 1), (2, 4)]
+
+
+def test_one_job_has_one_thread_of_blas_and_leaves_the_others_as_they_were():
+    with threadpool_limits(2, user_api="blas"):
+        assert list(in_workers(blas_threads, [0], 1)) == [(0, 1)]
+        assert blas_threads(0) == 2
 
 
 def test_a_lost_worker_is_a_bad_input_in_every_process():

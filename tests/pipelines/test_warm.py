@@ -1,5 +1,6 @@
 """A stage run by the warm process is the one it would be by itself: output, folder, environment, exit code, signals."""
 
+import json
 import os
 import signal
 import subprocess
@@ -101,6 +102,17 @@ def socket_of(process: Path, warm: dict[str, str]) -> bool:
         return "serve" in command and warm[SOCKET] in command and (process / "cwd").readlink() != Path.cwd()
     except OSError:
         return False
+
+
+def test_a_stage_has_one_thread_of_blas_whatever_the_user_set() -> None:
+    code = (
+        "import os; from pipelines.warm import ENVIRONMENT; os.environ.update(ENVIRONMENT)\n"
+        "import numpy, scipy.linalg; from threadpoolctl import threadpool_info\n"
+        "print([pool['num_threads'] for pool in threadpool_info() if pool['user_api'] == 'blas'])"
+    )
+    told = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    done = subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=True)
+    assert set(json.loads(done.stdout)) == {1}
 
 
 def test_without_a_warm_process_a_stage_runs_by_itself(monkeypatch, tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.clips.clip import SIDES, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
@@ -12,6 +13,7 @@ from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
+from hoidata.refinement.banded import solve_damped
 from hoidata.refinement.skin import HandPose
 from tests.builders.clips import still_object
 from tests.builders.objects import box_model
@@ -94,6 +96,18 @@ def test_hands_leave_the_object_and_keep_touching_it(scene):
     assert before.max() > 10
     assert after.max() < 3
     assert after[:, 12:].min() > -2  # within 2 mm of the surface in every frame in which they were in it
+
+
+def test_one_thread_of_blas_solves_whatever_the_user_set(scene, monkeypatch):
+    def watched(*arguments):
+        threads.append(max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+        return solve_damped(*arguments)
+
+    threads: list[int] = []
+    monkeypatch.setattr("hoidata.refinement.refining.solve_damped", watched)
+    with threadpool_limits(2, user_api="blas"):
+        refined(scene["generated"], scene["fitted"], steps=1)
+    assert set(threads) == {1}
 
 
 def test_hands_stay_what_was_generated_where_nothing_is_wrong(scene):
