@@ -25,7 +25,7 @@ class Examples:
     ids: list[str]
     steps: list[np.ndarray]
     joints: list[tuple[np.ndarray, np.ndarray]]
-    text: Tensor
+    text: np.ndarray
     verbs: list[str | None]
     objects: list[str]
     hands: list[str]
@@ -44,7 +44,7 @@ class Examples:
             ids,
             [corrected_input(item.motion, item.sides) for item in asked],
             [joints_and_presence(item.motion, item.sides) for item in asked],
-            torch.from_numpy(np.stack(text)) if text else torch.zeros(0, 4, 512),
+            np.stack(text) if text else np.zeros((0, 4, 512), np.float32),
             [verbs[clip_id] for clip_id in ids],
             annotated.store.sequences.loc[ids, "object_words"].tolist(),
             [annotated.hand_type(clip_id) for clip_id in ids],

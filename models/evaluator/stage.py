@@ -1,10 +1,12 @@
 """The evaluator of one dataset: every network trained, weighed on recorded clips, and written with what is known."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from safetensors.torch import load, save
 from torch import Tensor
 
 from hoidata.files import atomic_file
@@ -13,12 +15,13 @@ from hoidata.hands import HandPair
 from hoidata.metrics.encoded import UNKNOWN
 from hoidata.metrics.majority import majority_rows
 from hoidata.store.annotated import AnnotatedStore, load_annotated
+from hoidata.workers import in_workers
 from models.common.checkpoints import save_checkpoint
-from models.common.repeatable import own_draws
+from models.common.repeatable import make_repeatable, own_draws
 from models.evaluator.encoders import stored_network, weights_digest
 from models.evaluator.examples import Examples
 from models.evaluator.networks import EncoderConfig, MotionEncoder
-from models.evaluator.settings import EvaluatorSettings
+from models.evaluator.settings import EvaluatorSettings, NetworkName
 from models.evaluator.training import RECIPES, Classification, Pairing, Task, fit, held_out_loss, logits_of
 
 SPLITS = ("train", "validation", "test")
@@ -29,12 +32,29 @@ Figures = dict[str, Any]
 
 
 class Trained(NamedTuple):
-    """One training. chosen_by: on the held-out clips, higher is better."""
+    """One training. weights: as safetensors; chosen_by: on the held-out clips, higher is better."""
 
     seed: int
-    network: MotionEncoder
+    weights: bytes
     chosen_by: float
     figures: Figures
+
+
+@dataclass(frozen=True)
+class Training:
+    """Trains the network of a name from a seed, here or in a worker.
+
+    is_worker: the process is one of its own, whose settings may be fixed.
+    """
+
+    parts: dict[str, Examples]
+    settings: EvaluatorSettings
+    is_worker: bool
+
+    def __call__(self, item: tuple[NetworkName, int]) -> Trained:
+        if self.is_worker:
+            make_repeatable(threads=1)
+        return _trained(*item, self.parts, self.settings)
 
 
 def train_evaluators(
@@ -43,12 +63,14 @@ def train_evaluators(
     settings: EvaluatorSettings,
     hands: HandPair | None = None,
     *,
+    jobs: int = 1,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
 ) -> dict[str, Any] | str:
     """Write ``out/<network>/model.safetensors`` and ``out/info.json``; what stands there, or why nothing was written.
 
     annotated_root: clips, annotation, contact and splits of one dataset. provenance: from facts to what is stored. Each
-    network is trained once per seed on the training part and chosen on validation; test clips are only weighed.
+    network is trained once per seed on the training part and chosen on validation; test clips are only weighed. jobs:
+    trainings at once, in processes of their own; the bytes do not depend on it.
     """
     annotated = load_annotated(annotated_root, hands)
     parts = {split: Examples.of(annotated, split) for split in SPLITS}
@@ -61,16 +83,19 @@ def train_evaluators(
         "majority": majority_rows(*(_known(parts[split], settings.labels) for split in ("train", "test"))),
         "evaluators": {},
     }
+    wanted = [(name, seed) for name in settings.networks for seed in settings.seeds]
+    found = dict(in_workers(Training(parts, settings, jobs > 1), wanted, jobs))
     for name in settings.networks:
-        trainings = [_trained(name, seed, parts, settings) for seed in settings.seeds]
+        trainings = [found[name, seed] for seed in settings.seeds]
         kept = sorted(trainings, key=lambda one: (one.chosen_by, -one.seed))[len(trainings) // 2]
         by_seed = {str(one.seed): one.figures for one in trainings}
         facts = _facts(name, kept, parts, settings, annotated, info["labels"])
         stored = {"facts": facts, "results": kept.figures, "provenance": provenance(facts) if provenance else {}}
-        save_checkpoint(Path(out) / name, stored_network(name).name, kept.network, None, stored)
+        network = _network(name, kept, parts["train"], settings)
+        save_checkpoint(Path(out) / name, stored_network(name).name, network, None, stored)
         info["evaluators"][name] = {
-            "digest": weights_digest(kept.network),
-            "parameters": sum(weight.numel() for weight in kept.network.parameters()),
+            "digest": weights_digest(network),
+            "parameters": sum(weight.numel() for weight in network.parameters()),
             "seed": kept.seed,
             **kept.figures,
             "by_seed": by_seed,
@@ -89,7 +114,7 @@ def _why_not(train: Examples, settings: EvaluatorSettings) -> str | None:
     )
 
 
-def _trained(name: str, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings) -> Trained:
+def _trained(name: NetworkName, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings) -> Trained:
     train = parts["train"]
     held_out = parts["validation"] if len(parts["validation"]) else train
     with own_draws():
@@ -99,10 +124,17 @@ def _trained(name: str, seed: int, parts: dict[str, Examples], settings: Evaluat
     if isinstance(task, Classification):
         found = {split: _accuracies(network, task, examples) for split, examples in parts.items() if len(examples)}
         chosen_by = _accuracies(network, task, held_out)["top1"]
-        return Trained(seed, network, chosen_by, {"accuracy": found})
+        return Trained(seed, save(network.state_dict()), chosen_by, {"accuracy": found})
     losses = {split: held_out_loss(network, task, examples) for split, examples in parts.items() if len(examples)}
     rounded = {split: round(loss, DIGITS) for split, loss in losses.items()}
-    return Trained(seed, network, -held_out_loss(network, task, held_out), {"loss": rounded})
+    return Trained(seed, save(network.state_dict()), -held_out_loss(network, task, held_out), {"loss": rounded})
+
+
+def _network(name: NetworkName, trained: Trained, train: Examples, settings: EvaluatorSettings) -> MotionEncoder:
+    with own_draws():
+        network = MotionEncoder(config_of(name, train, settings.labels))
+    network.load_state_dict(load(trained.weights))
+    return network.eval()
 
 
 def config_of(name: str, train: Examples, label_kind: str) -> EncoderConfig:

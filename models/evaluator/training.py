@@ -95,7 +95,7 @@ class Pairing:
     """Which sentence belongs to which motion (InfoNCE both ways); clips of the same prompt are no negatives."""
 
     def targets(self, examples: Examples) -> tuple[Tensor, ...]:
-        return examples.text, examples.prompts()
+        return torch.from_numpy(examples.text), examples.prompts()
 
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None

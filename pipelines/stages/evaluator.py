@@ -5,7 +5,7 @@ from pathlib import Path
 from hoidata.files.atomic import atomic_folder
 from models.evaluator.settings import EvaluatorSettings
 from pipelines.lineage.graph import producers, read_graph
-from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, note_empty, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, note_empty, write_empty
 
 OFF = "off: params.yaml names no networks under evaluator"
 
@@ -30,6 +30,7 @@ def run(paths: StagePaths) -> None:
             part,
             settings,
             load_hands(paths.profile),
+            jobs=jobs(),
             provenance=lambda facts: build_provenance(Path(), stage, facts),
         )
         if isinstance(found, str):

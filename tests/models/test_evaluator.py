@@ -16,6 +16,7 @@ from hoidata.metrics.feature_metrics import FEATURE_METRICS
 from hoidata.metrics.pair import Motion
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from models.common.repeatable import make_repeatable
 from models.evaluator.encoders import MotionEvaluator, load_evaluators, weights_digest
 from models.evaluator.examples import Examples, padded
 from models.evaluator.inputs import CORRECTED_SIZE, OBJECT, corrected_input, drawn_frames
@@ -218,12 +219,13 @@ def test_the_stage_writes_what_the_networks_reach_on_recorded_clips(trained):
 
 @pytest.mark.slow
 def test_equal_trainings_give_equal_bytes_and_another_seed_other_weights(annotated_root, tmp_path):
-    def files(folder, seed):
-        settings = EvaluatorSettings(("corrected",), seeds=(seed,), most_steps=3)
-        train_evaluators(annotated_root, tmp_path / folder, settings)
-        return (tmp_path / folder / "corrected" / "model.safetensors").read_bytes()
+    def files(folder, seed, jobs=1):
+        settings = EvaluatorSettings(("corrected", "paper"), seeds=(seed, seed + 2), most_steps=3)
+        train_evaluators(annotated_root, tmp_path / folder, settings, jobs=jobs)
+        return [path.read_bytes() for path in sorted((tmp_path / folder).rglob("*.*"))]
 
-    assert files("one", 0) == files("again", 0) != files("other", 1)
+    make_repeatable(threads=1)
+    assert files("one", 0) == files("again", 0) == files("two at once", 0, jobs=2) != files("other", 1)
 
 
 def test_nothing_is_written_where_there_is_nothing_to_tell_apart(tmp_path, make_clip):
