@@ -24,25 +24,26 @@ NETWORKS: tuple[NetworkName, ...] = ("paper", "corrected", "text-motion")
 
 
 def main() -> None:
-    roots = filter(None, os.environ.get("HOIDATA_BENCH_ANNOTATED", "").split(":"))
-    rows = [_training_row(Path(root), name) for root in roots for name in NETWORKS]
-    show("Training, one seed", ["dataset", "network", "clips", "processor s", "clock s"], rows)
+    roots = [Path(root) for root in os.environ.get("HOIDATA_BENCH_ANNOTATED", "").split(":") if root]
+    rows = [_training_row(root, (name,), (0,), 1) for root in roots for name in NETWORKS]
+    rows += [_training_row(root, NETWORKS, (0, 1, 2), len(os.sched_getaffinity(0))) for root in roots]
+    show("Training", ["dataset", "networks", "seeds", "at once", "clips", "processor s", "clock s"], rows)
     heads = ["encoder", "features", "figures", "processor s", "clock s"]
     show(f"Figures of {CLIPS} clips x {REPETITIONS} motions", heads, [_figures_row(name) for name in SIZES])
 
 
-def _training_row(root: Path, name: NetworkName) -> list[str]:
-    start = time.process_time(), time.perf_counter()
+def _training_row(root: Path, names: tuple[NetworkName, ...], seeds: tuple[int, ...], jobs: int) -> list[str]:
+    start = _spent()
     with tempfile.TemporaryDirectory() as out:
-        found = train_evaluators(root, out, EvaluatorSettings((name,)))
+        found = train_evaluators(root, out, EvaluatorSettings(names, seeds=seeds), jobs=jobs)
     clips = found if isinstance(found, str) else str(found["clips"]["train"])
-    return [str(root), name, clips, *_since(start)]
+    return [str(root), ", ".join(names), str(len(seeds)), str(jobs), clips, *_since(start)]
 
 
 def _figures_row(name: str) -> list[str]:
     reference = random_set(name, CLIPS, 1, seed=0)
     predicted, train = random_set(name, CLIPS, REPETITIONS, seed=1), random_set(name, TRAIN, 1, seed=2)
-    start = time.process_time(), time.perf_counter()
+    start = _spent()
     feature_figures(predicted, reference, train)
     count = sum(metric.encoder == name for metric in FEATURE_METRICS)
     return [name, str(SIZES[name]), str(count), *_since(start)]
@@ -61,8 +62,14 @@ def random_set(name: str, clips: int, repetitions: int, seed: int) -> EncodedSet
     return replace(made, text=random.normal(size=made.features.shape)) if name == "text-motion" else made
 
 
-def _since(start: tuple[float, float]) -> tuple[str, str]:
-    return f"{time.process_time() - start[0]:.1f}", f"{time.perf_counter() - start[1]:.1f}"
+def _spent() -> tuple[float, float]:
+    """Seconds of processor time, of processes that have ended too, and by the clock."""
+    times = os.times()
+    return sum(times[:4]), time.perf_counter()
+
+
+def _since(start: tuple[float, float]) -> list[str]:
+    return [f"{now - before:.1f}" for now, before in zip(_spent(), start, strict=True)]
 
 
 if __name__ == "__main__":
