@@ -6,7 +6,7 @@ never depend on it. Workers need the same environment and the same files at the 
 
 import math
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 from hoidata.errors import BadInput, MissingResource
@@ -51,7 +51,7 @@ def on_cluster(
     A worker that dies costs its chunk, which others do again; a chunk that has ended several is done item by item.
     lost: gives the result of an item that does so alone.
     """
-    from distributed import KilledWorker, as_completed
+    from distributed import KilledWorker
 
     with _client(jobs) as client:
         workers = len(client.scheduler_info()["workers"]) or 1
@@ -63,22 +63,39 @@ def on_cluster(
             return client.submit(_work, function, chunk, os.getcwd(), answer, pure=False)
 
         running = {submitted(chunk): chunk for chunk in chunks}
-        completed = as_completed(running, loop=client.loop)
-        for future in completed:
-            chunk = running.pop(future)
-            if isinstance(future.exception(), KilledWorker):
-                if len(chunk) == 1:
-                    yield chunk[0], lost(chunk[0], "each of several workers it was given to ended")
+        while running:
+            for future in _done(client, running):
+                chunk = running.pop(future)
+                try:
+                    found = future.result()
+                except KilledWorker:  # also of a chunk that was done, whose result went with the worker that held it
+                    if len(chunk) == 1:
+                        yield chunk[0], lost(chunk[0], "each of several workers it was given to ended")
+                    else:
+                        running |= {submitted([item]): [item] for item in chunk}
                     continue
-                alone = {submitted([item]): [item] for item in chunk}
-                running |= alone
-                completed.update(alone)
-                continue
-            for item, (result, problem) in zip(chunk, future.result(), strict=True):
-                if problem is not None:
-                    raise problem
-                yield item, result
-            future.release()
+                for item, (result, problem) in zip(chunk, found, strict=True):
+                    if problem is not None:
+                        raise problem
+                    yield item, result
+                future.release()
+
+
+def _done(client: Any, running: Iterable[Any]) -> set[Any]:
+    """Those that have ended, once one has. Raises BadInput when there is no worker to wait for."""
+    from distributed import wait
+
+    while True:
+        try:
+            with client.as_current():
+                return wait(list(running), timeout=PATIENCE_S, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            if not client.scheduler_info()["workers"]:
+                got, remedy = (
+                    f"none for {PATIENCE_S} s",
+                    "start one (`dask worker ADDRESS --nthreads 1`) and run it again",
+                )
+                raise BadInput("workers", "a Dask cluster that has workers", got, remedy) from None
 
 
 def _client(jobs: int) -> Any:

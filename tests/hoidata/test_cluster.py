@@ -114,6 +114,17 @@ def test_what_the_function_raises_is_raised_here_and_results_come_in_order_when_
         list(in_workers(doubled, [1, -1, 2], 1))
 
 
+def test_a_cluster_without_a_worker_is_told_and_not_waited_for(monkeypatch):
+    monkeypatch.setattr(cluster, "PATIENCE_S", 1)
+    with distributed.LocalCluster(n_workers=0, dashboard_address=None) as empty:
+        cluster.choose_workers(empty.scheduler_address)
+        try:
+            with pytest.raises(BadInput, match="none for 1 s"):
+                list(in_workers(doubled, [1, 2], 1))
+        finally:
+            cluster.choose_workers("local")
+
+
 @only_in_chaos
 def test_a_cluster_started_for_the_work_ends_with_it(monkeypatch):
     cluster.choose_workers("dask")
