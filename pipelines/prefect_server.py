@@ -114,11 +114,12 @@ def server_environment(url: str, key: str) -> dict[str, str]:
 
 
 def deploy(environment: dict[str, str]) -> None:
-    """Make the work pool (again) and the deployments of this project's graph."""
+    """Make the work pool (again) and the deployments of this project's graph, and end runs of earlier servers."""
     template = ("--base-job-template", str(POOL_TEMPLATE))
     pool = _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite", *template)
     deployments = _prefect("--no-prompt", "deploy", "--all", "--prefect-file", str(write_deployments(Path())))
-    for command in (pool, deployments):
+    abandoned = [sys.executable, "-m", "pipelines.prefect_abandoned"]
+    for command in (abandoned, pool, deployments):
         code = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode
         if code:
             raise MissingResource(f"`{' '.join(command[2:])}` ended with exit code {code}; its output says why")
