@@ -80,9 +80,6 @@ PROMISES: tuple[Promise, ...] = (
     # Refinement brings hands to the surface wherever they are, so that contact alone does not see what a map asks for.
     *_promises("fall", "bimart-zero-map", "contact_f1", beside="bimart"),
     *_promises("rise", "bimart-zero-map", "bimart_cm_corrected", "joint_error_mm", beside="bimart"),
-    # Each of its motions has its own contact map, so they differ and do what is asked for; but they are less smooth.
-    *_promises("rise", "one-call", "jitter_m_s3", beside="text2hoi"),
-)
 
 
 def datasets_below(folder: Path) -> list[Path]:

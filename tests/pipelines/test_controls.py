@@ -139,7 +139,7 @@ def test_the_command_lists_promises_and_fails_where_one_is_broken(tmp_path):
     assert f"1 hold, 1 do not, {len(PROMISES) - 2} were not measured" in done.output
 
 
-OF_MODELS = {"bimart", "text2hoi", "other-prompt", "other-contact", "one-call"}
+OF_MODELS = {"bimart", "text2hoi", "other-prompt", "other-contact"}
 
 
 @pytest.mark.long

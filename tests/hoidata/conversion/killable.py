@@ -18,6 +18,7 @@ import numpy as np
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import HoidataError
+from hoidata.files import arrays as arrays_file
 from hoidata.hands import load_embedded_hands
 
 KILL_AT = "HOIDATA_TEST_KILL_AT"
@@ -88,7 +89,7 @@ def die_at(order: dict | None) -> dict[str, int]:
     calls = {"made": 0}
     if not order or order.get("only") not in (None, "worker" if IS_WORKER else "parent"):
         return calls
-    replace, savez = os.replace, np.savez
+    replace, write_arrays = os.replace, arrays_file.write_npz_to
 
     def is_the_one() -> bool:
         calls["made"] += 1
@@ -106,17 +107,17 @@ def die_at(order: dict | None) -> dict[str, int]:
         if now:
             die()
 
-    def dying_savez(stream, **arrays) -> None:
+    def dying_write(stream, arrays) -> None:
         if is_the_one():
             whole = io.BytesIO()
-            savez(whole, **arrays)
+            write_arrays(whole, arrays)
             stream.write(whole.getvalue()[: len(whole.getvalue()) // 2])
             stream.flush()
             die()
-        savez(stream, **arrays)
+        write_arrays(stream, arrays)
 
     if order["at"] == "write":
-        np.savez = dying_savez
+        arrays_file.write_npz_to = dying_write
     else:
         os.replace = dying_replace
     return calls
