@@ -88,7 +88,8 @@ def _done(client: Any, running: Iterable[Any]) -> set[Any]:
     while True:
         try:
             with client.as_current():
-                return wait(list(running), timeout=PATIENCE_S, return_when="FIRST_COMPLETED").done
+                ended: Any = wait(list(running), timeout=PATIENCE_S, return_when="FIRST_COMPLETED")
+                return ended.done
         except TimeoutError:
             if not client.scheduler_info()["workers"]:
                 got, remedy = (

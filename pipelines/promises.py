@@ -80,6 +80,7 @@ PROMISES: tuple[Promise, ...] = (
     # Refinement brings hands to the surface wherever they are, so that contact alone does not see what a map asks for.
     *_promises("fall", "bimart-zero-map", "contact_f1", beside="bimart"),
     *_promises("rise", "bimart-zero-map", "bimart_cm_corrected", "joint_error_mm", beside="bimart"),
+)
 
 
 def datasets_below(folder: Path) -> list[Path]:
