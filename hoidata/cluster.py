@@ -92,11 +92,8 @@ def _done(client: Any, running: Iterable[Any]) -> set[Any]:
                 return ended.done
         except TimeoutError:
             if not client.scheduler_info()["workers"]:
-                got, remedy = (
-                    f"none for {PATIENCE_S} s",
-                    "start one (`dask worker ADDRESS --nthreads 1`) and run it again",
-                )
-                raise BadInput("workers", "a Dask cluster that has workers", got, remedy) from None
+                remedy = "start one (`dask worker ADDRESS --nthreads 1`) and run it again"
+                raise BadInput("workers", "a Dask cluster with a worker", f"none for {PATIENCE_S} s", remedy) from None
 
 
 def _client(jobs: int) -> Any:

@@ -42,7 +42,6 @@ def broken(item: int) -> int:
     return 1 // (item - 3)
 
 
-@pytest.mark.slow
 def blas_threads(_: int) -> int:
     import numpy as np
 
@@ -50,6 +49,7 @@ def blas_threads(_: int) -> int:
     return max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas")
 
 
+@pytest.mark.slow
 def test_an_item_that_kills_every_process_is_given_up_and_all_others_are_done():
     found = dict(in_workers(deadly, range(6), 2, on_lost=lambda error: f"{error.item}: {error.cause}"))
     assert found == {0: 0, 1: 1, 2: 4, 3: "3: signal SIGSEGV", 4: 16, 5: 25}
