@@ -30,10 +30,10 @@ from hoidata.physics.capsules import CapsuleContacts
 from hoidata.physics.realism import LARGEST_PENETRATION_M, VARIANTS, contacts_in, score, smoothness_m_s2
 from models.common.training import TrainingConfig
 from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared, sized
-from models.manipnet.features import FeatureSettings
+from models.manipnet.features import FeatureSettings, output_distances, pose_features
 from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.rollout import Predictor, Rule, Task, roll_out
+from models.manipnet.rollout import Follower, Predictor, Rule, Task, roll_out, situation
 
 KEPT = Path(".hoidata/manipnet")
 SETTINGS = FeatureSettings(step_s=1 / RATE_HZ)
@@ -271,6 +271,8 @@ def controls(trial: Trial) -> dict[str, dict[str, float]]:
     hand = trial.train[0][0].hands["right"]
     inputs = [_control_inputs(one, side, frames) for one, frames in trial.train for side in SIDES]
     lookup, mean = Lookup.of(hand, SETTINGS, inputs, fingers), mean_rotmats(np.concatenate(fingers))
+    shares = np.concatenate([_shares(one, side, frames) for one, frames in trial.train for side in SIDES])
+    predictor = Predictor(prepared(NetworkConfig(encoder=8, features=SETTINGS), hand, examples_of(trial, False)))
 
     def both(pose: Callable[[Piece, Side], np.ndarray]) -> dict[str, float]:
         return measured(trial, [{side: pose(piece, side) for side in SIDES} for piece in trial.pieces])
@@ -285,6 +287,17 @@ def controls(trial: Trial) -> dict[str, dict[str, float]]:
 
         return pose
 
+    def post_processed(count: int) -> Callable[[Piece, Side], np.ndarray]:
+        """A lookup has distances to foretell as well: those of its frames."""
+
+        def pose(piece: Piece, side: Side) -> np.ndarray:
+            one, own = piece.recording, piece.recording.hands[side]
+            found = lookup.nearest(_control_inputs(one, side, piece.frames), count)
+            features = pose_features(own, own.state(looked_up(count)(piece, side)))
+            return _followed(predictor, piece, side, np.concatenate([features, shares[found].mean(axis=1)], axis=1))
+
+        return pose
+
     raw = [{side: piece.recording.fingers[side][piece.frames] for side in SIDES} for piece in trial.pieces]
     return {
         "raw data": measured(trial, raw),
@@ -294,7 +307,28 @@ def controls(trial: Trial) -> dict[str, dict[str, float]]:
         "frozen at the first scored frame": both(_frozen),
         "nearest training frame": both(looked_up(1)),
         f"mean of {NEAREST} nearest": both(looked_up(NEAREST)),
+        "nearest training frame, post-processed": both(post_processed(1)),
+        f"mean of {NEAREST} nearest, post-processed": both(post_processed(NEAREST)),
     }
+
+
+def _shares(recording: HandRecording, side: Side, frames: np.ndarray) -> np.ndarray:
+    """(frame, 22) recorded distances in the form of the network's output."""
+    hand, time_s = recording.hands[side], recording.time_s[frames]
+    placed = recording.control.thing.at(time_s).inverse() @ recording.control.wrists[side].at(time_s)
+    points = hand.state(recording.fingers[side][frames]).point_m
+    return output_distances(hand, recording.surface.nearest(placed @ points, None).distance_m, SETTINGS)
+
+
+def _followed(predictor: Predictor, piece: Piece, side: Side, outputs: np.ndarray) -> np.ndarray:
+    """(frame, joint - 1, 3, 3) what post-processing makes of outputs (frame, 214) that no network said."""
+    recording, frames, _ = piece
+    hand = recording.hands[side]
+    follower, made = Follower(predictor, hand, recording.surface, hand.rest_rotmats), [hand.rest_rotmats]
+    for time_s, output in zip(recording.time_s[frames][1:], outputs[1:], strict=True):
+        follower.advance(output, situation(recording.control, side, hand, time_s, SETTINGS))
+        made.append(follower.answer[0])
+    return np.stack(made)
 
 
 def _frozen(piece: Piece, side: Side) -> np.ndarray:

@@ -6,7 +6,9 @@ in without its key, which the hook takes from ``.prefect/``.
 """
 
 import os
+import sys
 from difflib import get_close_matches
+from pathlib import Path
 
 from prefect.plugins import SetupResult, register_hook
 
@@ -46,7 +48,13 @@ def wrap_lookup(client: type) -> None:
         if "/" in name:
             return await original(self, name)
         found = await _deployments_named(self, name)
-        return only_one(name, found, [] if found else await _all_names(self))
+        names = [] if found else await _all_names(self)
+        try:
+            return only_one(name, found, names)
+        except ValueError as error:
+            if Path(sys.argv[0]).name == "prefect":  # whoever types a name wants an answer, not a traceback
+                raise SystemExit(str(error)) from None
+            raise
 
     client.read_deployment_by_name = read_deployment_by_name
 

@@ -45,6 +45,8 @@ class Out(NamedTuple):
 
 # Ours: a capsule is held by its joint, so that the one after it goes twice as far as its middle is to go.
 OUT = {"paper": Out(0), "released": Out(1), "ours": Out(4, 0.006, 2.0, 1.0, True)}
+AT_OBJECT_M = 0.01  # a point of the network's this far from the finger's skin is kept out of the object
+ROUNDS = 2  # of ours: what a hand sees changes with its pose
 _RULES = {"paper": paper_targets, "released": released_targets}
 
 
@@ -94,7 +96,7 @@ def situation(control: Control, side: Side, hand: TrackedHand, time_s: float, se
 class Follower:
     """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) that the network goes on from, the start pose first.
 
-    answer: (1, joint - 1, 3, 3) the post-processed ones.
+    answer: (1, joint - 1, 3, 3) the post-processed ones; state and answered: the hand in both.
     """
 
     predictor: Predictor
@@ -105,12 +107,14 @@ class Follower:
     limits: Limits = field(init=False)
     cover_m: np.ndarray = field(init=False)
     state: HandState = field(init=False)
+    answered: HandState = field(init=False)
 
     def __post_init__(self) -> None:
         self.limits = self.predictor.limits(self.hand)
         radius = self.hand.point_radius_m
         self.cover_m = np.r_[radius[: self.hand.n_joints], radius[self.hand.tip_joint]]
         self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
+        self.answered = self.state
 
     def inputs(self, now: Situation) -> np.ndarray:
         """(2350,) what the network sees."""
@@ -129,10 +133,10 @@ class Follower:
         rule, fingers = self.predictor.rule, self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
         self._take(self.limits.within(fingers))
         if rule != "off":
-            state = self._corrected(output, then)
-            self.answer = self.hand.finger_rotmats(state.joint_rotmats)
+            self.answered = self._corrected(output, then)
+            self.answer = self.hand.finger_rotmats(self.answered.joint_rotmats)
             if rule != "ours":
-                self.finger_rotmats, self.state = self.answer, state
+                self.finger_rotmats, self.state = self.answer, self.answered
 
     def _take(self, finger_rotmats: np.ndarray) -> None:
         self.finger_rotmats = self.answer = finger_rotmats
@@ -142,11 +146,14 @@ class Follower:
         hand, settings, points = self.hand, self.predictor.settings, self.state.point_m[0]
         radius = hand.point_radius_m if settings.less_radius else np.zeros(hand.n_points)
         predicted = np.clip(output[-hand.n_points :], 0, 1)
-        given = (points, predicted, radius, settings.range_m, self._nearest(points, then))
+        found, given = self._nearest(points, then), (points, predicted, radius, settings.range_m)
         if self.predictor.rule == "ours":
-            state = self._reached(self.state, our_targets(*given, self.cover_m))
+            near, state = found.distance_m < self.cover_m + AT_OBJECT_M, self.answered
+            for _ in range(ROUNDS):
+                seen = self._nearest(state.point_m[0], then)
+                state = self._reached(state, our_targets(*given, near, self.cover_m, seen))
         else:
-            state = self._reached(self.state, _RULES[self.predictor.rule](*given))
+            state = self._reached(self.state, _RULES[self.predictor.rule](*given, found))
         out = OUT[self.predictor.rule]
         for _ in range(out.passes):
             state = self._reached(state, self._out_of_object(state, then, out))

@@ -14,8 +14,9 @@ ACTIVE_SHARE = 0.8  # of the range of predicted distances: the paper's 2.8 of 3.
 NEAR_M = 0.06  # the demo looks at no point farther away; nor do we, or a wrong distance pulls at a hand in the air
 # Ours, chosen on the validation tenths of the real recordings, whose touching points are 4 to 8 mm deep in 5 %.
 DEEPEST_M = 0.008  # a finger gives way by so much and no more
-PRESS_M = 0.005  # a finger said to touch is brought so much nearer
-TOUCH_SHARE, FADE_SHARE = 0.2, 0.3
+PRESS_M = 0.007  # and is brought so much nearer than it is said to be
+FADE_SHARE = 0.3  # of the range below the active share: the nearer it is said to be, the more it counts
+HOLD = 0.5  # weight of the network's own pose, where it says nothing of the object
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,25 @@ def released_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.n
 
 
 def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
-                found: Nearest, cover_m: np.ndarray) -> Targets:  # fmt: skip
-    """Fingers that are said to touch press, those too deep come out; none is drawn off the object.
+                near: np.ndarray, cover_m: np.ndarray, seen: Nearest) -> Targets:  # fmt: skip
+    """Fingers go where the network has them and press what it says is near; none enters the object or is drawn off it.
 
-    The rules above stop at the surface, where a contact carries nothing, and a distance that is a mean of many takes
-    off the object what touches it. Arguments as in ``paper_targets``; cover_m: (point,) how thick the finger is there.
+    The rules above stop at the surface, where a contact carries nothing; a distance that is a mean of many takes off
+    the object what touches it; and from a pose that is deep in a thin thing the nearest way out may be the far side.
+    So the surface is what the hand sees from the pose that it comes from: ``seen``, of its points there, and what lies
+    below the plane of the nearest place is inside. Arguments else as in ``paper_targets``. near: (point,) bool, the
+    network's points are at the object or in it. cover_m: (point,) how thick the finger is there.
     """
-    distance_m = predicted * range_m + radius_m - PRESS_M * (predicted < TOUCH_SHARE)
-    least = cover_m - DEEPEST_M
-    wanted = np.maximum(np.minimum(distance_m, found.distance_m), least)
-    sure = np.clip((ACTIVE_SHARE - predicted) / FADE_SHARE, 0, 1) * (found.distance_m < NEAR_M)
-    weight = np.where(found.distance_m < least, 1.0, sure)
-    return Targets(found.closest_m + wanted[..., None] * found.normal, weight)
+    wanted_m = predicted * range_m + radius_m - PRESS_M
+    least_m = cover_m - DEEPEST_M
+    height_m = ((points_m - seen.closest_m) * seen.normal).sum(axis=-1)
+    up_m = np.maximum(np.minimum(wanted_m, height_m), least_m) - height_m
+    is_seen = seen.distance_m < NEAR_M
+    sure = np.clip((ACTIVE_SHARE - predicted) / FADE_SHARE, 0, 1) * is_seen
+    enters = (height_m < least_m) & is_seen & near
+    share = np.where(enters, 1.0, sure)
+    target = points_m + (share * up_m)[..., None] * seen.normal
+    return Targets(target, np.where(enters, 1.0, np.maximum(sure, HOLD)))
 
 
 def _active(predicted: np.ndarray, found: Nearest) -> np.ndarray:

@@ -31,6 +31,16 @@ def test_a_bare_name_finds_its_deployment_and_the_form_with_a_slash_stays_prefec
         asyncio.run(Wrapped().read_deployment_by_name("anotate-artic"))
 
 
+def test_whoever_types_a_wrong_name_gets_an_answer_and_no_traceback(monkeypatch):
+    class Wrapped(Client):
+        pass
+
+    wrap_lookup(Wrapped)
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/prefect", "deployment", "run", "anotate-artic"])
+    with pytest.raises(SystemExit, match="did you mean annotate-arctic"):
+        asyncio.run(Wrapped().read_deployment_by_name("anotate-artic"))
+
+
 @pytest.mark.parametrize(("found", "message"), [([], "no deployment is named"), ([1, 2], "2 flows have")])
 def test_a_name_that_none_or_several_have_is_refused(found, message):
     with pytest.raises(ValueError, match=message):

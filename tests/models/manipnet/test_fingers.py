@@ -245,12 +245,24 @@ def test_targets_are_those_of_algorithm_1_and_of_the_demo() -> None:
     demo = released_targets(points, predicted, radius, range_m, found)
     np.testing.assert_allclose(demo.point_m[:2, 2], [0.008, 0.35 * 0.011 + 0.65 * 0.02])
     np.testing.assert_allclose(demo.weight, [0.8, 0.5, 0.0])
-    # Ours: out to where the finger gives way, in to what is said less 5 mm, and nothing is drawn off.
-    ours = our_targets(points, predicted, radius, range_m, found, cover_m=radius)
-    np.testing.assert_allclose(ours.point_m[:, 2], [0.0, 0.006, 0.02], atol=1e-12)
-    np.testing.assert_allclose(ours.weight, [1.0, 1.0, 0.0])
-    off = our_targets(points, np.full(3, 0.7), radius, range_m, found, cover_m=radius)
-    np.testing.assert_allclose(off.point_m[:, 2], [0.0, 0.02, 0.02], atol=1e-12)
+
+
+def test_targets_of_ours_press_what_is_near_and_stay_on_the_side_they_come_from() -> None:
+    # On the plane z = 0 with the object below it: 1 cm deep, 2 cm above it and said to be near, and said to be far.
+    points, seen = np.array([[0, 0, -0.01], [0, 0, 0.02], [0, 0, 0.02]]), np.array([[0, 0, 0.01]] * 3)
+    found = Nearest(seen[:, 2], seen * [1, 1, 0], np.tile([0.0, 0, 1], (3, 1)))
+    radius, predicted = np.full(3, 0.008), np.array([0.5, 0.1, 1.0])
+    given = (radius, 0.03, np.array([True, False, False]), radius)
+    ours = our_targets(points, predicted, *given, found)
+    # Out to where a finger gives way (8 mm), in to what is said (3 mm) and its radius less 7 mm; nothing is drawn off.
+    np.testing.assert_allclose(ours.point_m[:, 2], [0.0, 0.004, 0.02], atol=1e-12)
+    np.testing.assert_allclose(ours.weight, [1.0, 1.0, 0.5])
+    # A plate 4 mm thick: what lies beyond it comes back to the side that the finger was on, not to the nearer one.
+    beyond = our_targets(points - [0, 0, 0.02], predicted, *given, found)
+    assert beyond.point_m[0, 2] == pytest.approx(0.0)
+    # Nothing is known from farther away than 6 cm.
+    far = our_targets(points, predicted, *given, Nearest(seen[:, 2] + 0.06, found.closest_m, found.normal))
+    np.testing.assert_allclose(far.point_m, points)
 
 
 def test_our_rule_brings_fingers_out_of_the_object_and_the_network_goes_on_from_its_own_pose() -> None:
