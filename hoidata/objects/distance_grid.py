@@ -123,8 +123,10 @@ def lower_distances(tree, grid, places_m, most_m, distance_m):  # pragma: no cov
     for place in range(len(places_m)):
         x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
         most = min(most_m, distance_m[place])
+        if _square_to_box(box, 0, x, y, z) > most * most * _WIDER:
+            continue
         near, slack = _between(low_m, cell_m, value, x, y, z)
-        if abs(near) - slack > most or _square_to_box(box, 0, x, y, z) > most * most * _WIDER:
+        if abs(near) - slack > most:
             continue
         bound = min(most, abs(near) + slack) * _WIDER + _TINY_M
         found = np.sqrt(_least_square(triangle, box, link, x, y, z, bound * bound, 0.0, stack, squares))

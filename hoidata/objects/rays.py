@@ -23,6 +23,9 @@ def first_hits(tree, start_m, direction, reach_m, facing, way_m):  # pragma: no 
     start_m, direction: (ray, 3), directions of length 1. facing: (ray,) ENTERING meets only triangles whose outward
     normal points against the ray, LEAVING only those along it, EITHER all; a triangle seen edge on is never met.
     """
+    if len(tree[4]) <= FEW:  # looking at all takes less than asking which
+        _first_hits_of_few(tree, start_m, direction, reach_m, facing, way_m)
+        return
     stack, ways = np.empty(DEEPEST, np.int64), np.empty(DEEPEST)
     for ray in range(len(start_m)):
         best = min(reach_m[ray], way_m[ray])
@@ -31,6 +34,48 @@ def first_hits(tree, start_m, direction, reach_m, facing, way_m):  # pragma: no 
         found = _first_hit(tree, start_m[ray], direction[ray], best, facing[ray], stack, ways)
         if found >= 0:
             way_m[ray] = found
+
+
+@njit(cache=True, error_model="numpy")
+def _first_hits_of_few(tree, start_m, direction, reach_m, facing, way_m):  # pragma: no cover (compiled)
+    """The same where there is nothing to choose: numbers alone, for views of arrays cost more than the triangles."""
+    triangle, corner, vertices_m = tree[0], tree[4], tree[5]
+    places = np.empty((len(corner), 3, 3))
+    for number in range(len(corner)):
+        for point in range(3):
+            places[number, point] = vertices_m[corner[number, point]]
+    for ray in range(len(start_m)):
+        best = min(reach_m[ray], way_m[ray])
+        if _is_beyond(tree[1], start_m, direction, ray, best * _WIDER):
+            continue
+        start = (start_m[ray, 0], start_m[ray, 1], start_m[ray, 2])
+        way = (direction[ray, 0], direction[ray, 1], direction[ray, 2])
+        kx, ky, kz, shear_x, shear_y, speed = _axes(way)
+        for number in range(len(places)):
+            if _is_missed(triangle, number, start, way, facing[ray], best):
+                continue
+            az = places[number, 0, kz] - start[kz]
+            bz = places[number, 1, kz] - start[kz]
+            cz = places[number, 2, kz] - start[kz]
+            ax = places[number, 0, kx] - start[kx] - shear_x * az
+            bx = places[number, 1, kx] - start[kx] - shear_x * bz
+            cx = places[number, 2, kx] - start[kx] - shear_x * cz
+            ay = places[number, 0, ky] - start[ky] - shear_y * az
+            by = places[number, 1, ky] - start[ky] - shear_y * bz
+            cy = places[number, 2, ky] - start[ky] - shear_y * cz
+            found = _way_met(ax, ay, az, bx, by, bz, cx, cy, cz, facing[ray], speed)
+            if 0 <= found <= best:
+                best = way_m[ray] = found
+
+
+@njit(cache=True, inline="always")
+def _way_met(ax, ay, az, bx, by, bz, cx, cy, cz, facing, speed):  # pragma: no cover (compiled)
+    """Way along the ray, which runs along the third axis, to a triangle abc; -1 where it is missed."""
+    u, v, w = cx * by - cy * bx, ax * cy - ay * cx, bx * ay - by * ax
+    area = u + v + w
+    if min(u, v, w) < 0 < max(u, v, w) or area == 0 or area * facing > 0:
+        return -1.0
+    return (u * az + v * bz + w * cz) / area / speed
 
 
 @njit(cache=True, inline="always")
@@ -48,8 +93,6 @@ def _is_beyond(box, start_m, direction, ray, reach):  # pragma: no cover (compil
 def _first_hit(tree, start, way, reach, facing, stack, ways):  # pragma: no cover (compiled)
     """Way to the first triangle met within ``reach``; -1 where there is none. way: the ray's direction."""
     box, link, axes = tree[1], tree[2], _axes(way)
-    if len(tree[4]) <= FEW:  # looking at all takes less than asking which
-        return _hit_in_leaf(tree, 0, len(tree[4]), start, way, axes, facing, reach)
     over = (1 / way[0], 1 / way[1], 1 / way[2])
     best, hit, waiting = reach, -1.0, 1
     stack[0], ways[0] = 0, _way_to_box(box, 0, start, over)
@@ -98,11 +141,7 @@ def _hit_in_leaf(tree, first, last, start, way, axes, facing, best):  # pragma: 
         ax, ay, az = _sheared(vertices_m, corner[number, 0], start, kx, ky, kz, shear_x, shear_y)
         bx, by, bz = _sheared(vertices_m, corner[number, 1], start, kx, ky, kz, shear_x, shear_y)
         cx, cy, cz = _sheared(vertices_m, corner[number, 2], start, kx, ky, kz, shear_x, shear_y)
-        u, v, w = cx * by - cy * bx, ax * cy - ay * cx, bx * ay - by * ax
-        area = u + v + w
-        if min(u, v, w) < 0 < max(u, v, w) or area == 0 or area * facing > 0:
-            continue
-        far = (u * az + v * bz + w * cz) / area / speed
+        far = _way_met(ax, ay, az, bx, by, bz, cx, cy, cz, facing, speed)
         if 0 <= far <= best:
             best, hit = far, far
     return hit
