@@ -7,6 +7,7 @@ command, an environment or a folder of its own. And since the worker obeys whoev
 server may, as long as the worker lives.
 """
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -28,6 +29,7 @@ from pipelines.prefect_key import KEY_FILE, is_loopback, write_key
 
 START_TIMEOUT_S = 180
 STOP_TIMEOUT_S = 15
+PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 POOL = "local"
 POOL_TEMPLATE = Path(__file__).with_name("prefect_pool.json")
 
@@ -47,7 +49,8 @@ def _serve(url: str, environment: dict[str, str]) -> int:
     try:
         wait_until_healthy(url, running[0])
         deploy(environment)
-        running.append(subprocess.Popen(_prefect("worker", "start", "--pool", POOL), env=environment))
+        worker = _prefect("worker", "start", "--pool", POOL)
+        running.append(subprocess.Popen(worker, env=environment, preexec_fn=_end_with_parent))
         print(f"{_origin(url)} asks for a password: the text in {KEY_FILE}, new at every start")
         print("ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder", flush=True)
         while all(process.poll() is None for process in running):
@@ -56,6 +59,8 @@ def _serve(url: str, environment: dict[str, str]) -> int:
     except KeyboardInterrupt:
         return 0
     finally:
+        for sent in (signal.SIGTERM, signal.SIGINT):  # whoever asks again must not leave the worker behind
+            signal.signal(sent, signal.SIG_IGN)
         for process in reversed(running):
             _stop(process)
 
@@ -155,7 +160,17 @@ def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
     """The server; what it writes, its database above all, is for the owner alone."""
     address = urlsplit(url)
     where = ("--host", str(address.hostname), "--port", str(address.port))
-    return subprocess.Popen(_prefect("server", "start", *where, "--analytics-off"), env=environment, umask=0o077)
+    command = _prefect("server", "start", *where, "--analytics-off")
+    return subprocess.Popen(command, env=environment, umask=0o077, preexec_fn=_end_with_parent)
+
+
+def _end_with_parent() -> None:
+    """In a new process: have the kernel end it when ``hoidata up`` is killed, which can clear nothing away itself.
+
+    A worker that stayed would obey whoever listens at the address next. Linux alone knows how.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _prefect(*arguments: str) -> list[str]:

@@ -290,7 +290,8 @@ def test_of_two_runs_at_once_the_second_says_so_and_the_first_completes(built, t
 
 @only_in_chaos
 @every_turn
-def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built, project_tools, typed, turn):
+@pytest.mark.parametrize("killed", ["server", "hoidata up"])
+def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built, project_tools, typed, turn, killed):
     make_stale(built, "convert")
     with hoidata_up(built, project_tools) as up:
         started = project_tools.run(built, "prefect", "deployment", "run", "convert-grab", **up.settings)
@@ -301,10 +302,15 @@ def test_a_server_that_is_gone_costs_no_output_and_a_run_by_hand_completes(built
             lambda: log.is_file() and "Running stage" in log.read_text(errors="replace"), 120, up.process, up.log
         )
         time.sleep(moment(turn, 0, 2))
-        for child in psutil.Process(up.process.pid).children(recursive=True):
-            if "uvicorn" in " ".join(child.cmdline()) or "server" in " ".join(child.cmdline()):
+        children = psutil.Process(up.process.pid).children()
+        if killed == "server":
+            for child in (one for one in children if "server" in one.cmdline()):
                 child.kill()
+        else:
+            up.process.kill()
         time.sleep(2)
+    _, alive = psutil.wait_procs(children, 30)
+    assert not alive, "a worker obeys whoever listens at the address next"
     completes(typed, CONVERT)
 
 
