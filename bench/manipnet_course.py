@@ -4,11 +4,13 @@
 (or trains, where there is none). Rollouts of half a minute from three starts, each of a recording that its network
 never saw, and their way to each other as a picture in .hoidata/manipnet. Gaps of 0.5 to 4 s in what did not train,
 beside ways that need no network: the first held-out round of each recording (two tenths, one after the other) chooses
-a way for each length, the second is reported (HOIDATA_BENCH_GAPS: how many of each length).
+a way for each length, the second is reported (HOIDATA_BENCH_GAPS: how many of each length). The release's trajectories,
+which have no fingers, with six objects.
 """
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -27,13 +29,22 @@ from bench.manipnet import (
 )
 from bench.manipnet_recordings import ROUND, TENTHS, TEST, VALIDATION, HandRecording
 from hoidata.clips.clip import SIDES, Side
+from hoidata.datasets.manipnet.adapter import METRES_PER_UNIT
+from hoidata.datasets.manipnet.bvh import unpack_text
 from hoidata.files import write_whole
 from hoidata.geometry.intervals import runs
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands.tracked_hand import TrackedHand
-from models.manipnet.animate import interpolated, led
+from hoidata.objects.mesh import parse_obj
+from hoidata.objects.model import ObjectModel
+from hoidata.physics.capsules import Capsules, ObjectPoses, joined
+from hoidata.physics.realism import contacts_in
+from hoidata.physics.scene import Scene
+from models.manipnet.animate import given_control, interpolated, led
+from models.manipnet.control import Control
 from models.manipnet.lookups import joint_errors_m
 from models.manipnet.rollout import Predictor, Task, roll_out
+from models.manipnet.trajectory_files import parse_manipnet
 
 COURSE_S = 30
 GAPS_S = (0.5, 1.0, 2.0, 4.0)
@@ -41,6 +52,15 @@ MOST_GAPS = int(os.environ.get("HOIDATA_BENCH_GAPS", "40"))
 SEAMS_S = (0.25, 0.5, 1.0)
 STARTS = ("neutral pose", "true pose", "fist")
 FIST_RAD = 1.2
+DEMOS = ("demo1", "demo2")
+DEMO_OBJECTS = (
+    "Primitive/cyl_med",
+    "Primitive/cube_med",
+    "Primitive/sphere",
+    "Dining/cup1",
+    "Dining/mug1",
+    "Dining/teapot2",
+)
 
 
 def main() -> None:
@@ -48,7 +68,9 @@ def main() -> None:
     if not recordings:
         return
     size = os.environ.get("HOIDATA_BENCH_SIZE", "small")
-    show_gaps(recordings, Predictor(trained_network(Job(seen_trial(recordings), "ours", 0), size)))
+    predictor = Predictor(trained_network(Job(seen_trial(recordings), "ours", 0), size))
+    show_demos(recordings, predictor)
+    show_gaps(recordings, predictor)
     show_courses(unseen_trials(recordings), recordings, size)
 
 
@@ -139,6 +161,69 @@ def picture(curves: Mapping[str, np.ndarray], width: int = 720, height: int = 30
     )
     size = f'width="{width}" height="{height}" font-family="sans-serif" font-size="12"'
     return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>\n{marks}\n' + "\n".join(lines) + "\n</svg>\n"
+
+
+def show_demos(recordings: Sequence[HandRecording], predictor: Predictor) -> None:
+    """Both released trajectories with six objects: in how many lifted frames two or more capsules touch."""
+    root, hands = Path(os.environ["HOIDATA_MANIPNET"]), recordings[0].hands
+    rows = [_recorded_row(recordings)]
+    for demo in DEMOS:
+        path = f"trajectories/{demo}.txt.gz"
+        found = parse_manipnet(unpack_text((root / path).read_bytes(), path).encode(), path)
+        for place in DEMO_OBJECTS:
+            given = given_control(found, _mesh(root, place), hands)
+            time_s = np.arange(0.0, found.time_s[-1], 1 / RATE_HZ)
+            tasks = [Task(hands[side], side, given.control, time_s, hands[side].rest_rotmats) for side in given.active]
+            made = dict(zip(given.active, roll_out(predictor, tasks), strict=True))
+            scene = _scene(given.control, hands, made, time_s)
+            rows.append([demo, place.split("/")[1], *_touched(scene, scene.lifted)])
+    columns = ["trajectories", "object", "lifted frames", "two or more capsules touch, %", "none, %", "deepest mm"]
+    show("The release's trajectories", columns, rows)
+
+
+def _mesh(root: Path, place: str) -> ObjectModel:
+    path = f"objects/{place}.obj.gz"
+    mesh = parse_obj(unpack_text((root / path).read_bytes(), path), path)
+    return ObjectModel(place, mesh.vertices * METRES_PER_UNIT, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
+
+
+def _scene(
+    control: Control, hands: Mapping[Side, TrackedHand], fingers: Mapping[Side, np.ndarray], time_s: np.ndarray
+) -> Scene:
+    """The object and the capsules of these hands; the table is where the object stands lowest."""
+    capsules = []
+    for side, own in fingers.items():
+        state = hands[side].state(own).placed(control.wrists[side].at(time_s))
+        capsules.append(Capsules(state.capsule_start_m, state.capsule_end_m, hands[side].capsules.radius_m))
+    placed = control.thing.at(time_s)
+    poses = ObjectPoses(placed.rotation, placed.translation)
+    return Scene(control.model, poses, joined(capsules), RATE_HZ, np.array([0.0, -1.0, 0.0]))
+
+
+def _recorded_row(recordings: Sequence[HandRecording]) -> list[str]:
+    """The same of the five recordings with their own hands."""
+    found = []
+    for one in recordings:
+        whole = slice(0, one.n_frames)
+        found.append(_touching_counts(one.scene(one.states(one.fingers, whole), whole), one.lifted & one.usable))
+    counts = np.concatenate([count for count, _ in found])
+    return ["recorded", "its own", *_told(counts, max(deepest for _, deepest in found))]
+
+
+def _touched(scene: Scene, frames: np.ndarray) -> list[str]:
+    return _told(*_touching_counts(scene, frames))
+
+
+def _touching_counts(scene: Scene, frames: np.ndarray) -> tuple[np.ndarray, float]:
+    """(frame of these,) how many capsules overlap the object, and how deep the deepest is."""
+    contacts = contacts_in(scene, frames)
+    counts = np.bincount(contacts.frame, minlength=scene.n_frames)[frames]
+    return counts, float(contacts.depth_m.max(initial=0))
+
+
+def _told(counts: np.ndarray, deepest_m: float) -> list[str]:
+    shares = (100 * (counts >= 2).mean(), 100 * (counts == 0).mean())
+    return [f"{len(counts):,}", *(f"{share:.1f}" for share in shares), f"{1000 * deepest_m:.0f}"]
 
 
 class Gap(NamedTuple):

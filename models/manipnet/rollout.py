@@ -18,6 +18,7 @@ from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
 from models.manipnet.control import Control
+from models.manipnet.examples import between
 from models.manipnet.features import (
     FeatureSettings,
     joint_rotmats_of,
@@ -47,6 +48,7 @@ class Out(NamedTuple):
 OUT = {"paper": Out(0), "released": Out(1), "ours": Out(4, 0.006, 2.0, 1.0, True)}
 AT_OBJECT_M = 0.01  # a point of the network's this far from the finger's skin is kept out of the object
 ROUNDS = 2  # of ours: what a hand sees changes with its pose
+LEAD = 0.2  # of the way from the answer before to the network's pose: what points do not tell, a twist, is the network's
 _RULES = {"paper": paper_targets, "released": released_targets}
 
 
@@ -96,7 +98,7 @@ def situation(control: Control, side: Side, hand: TrackedHand, time_s: float, se
 class Follower:
     """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) that the network goes on from, the start pose first.
 
-    answer: (1, joint - 1, 3, 3) the post-processed ones; state and answered: the hand in both.
+    answer: (1, joint - 1, 3, 3) the post-processed ones.
     """
 
     predictor: Predictor
@@ -107,14 +109,12 @@ class Follower:
     limits: Limits = field(init=False)
     cover_m: np.ndarray = field(init=False)
     state: HandState = field(init=False)
-    answered: HandState = field(init=False)
 
     def __post_init__(self) -> None:
         self.limits = self.predictor.limits(self.hand)
         radius = self.hand.point_radius_m
         self.cover_m = np.r_[radius[: self.hand.n_joints], radius[self.hand.tip_joint]]
         self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
-        self.answered = self.state
 
     def inputs(self, now: Situation) -> np.ndarray:
         """(2350,) what the network sees."""
@@ -130,25 +130,28 @@ class Follower:
         With our rule the network goes on from its own pose: a corrected one is none that it learnt from, and the next
         is the worse for it.
         """
-        rule, fingers = self.predictor.rule, self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
+        rule, before = self.predictor.rule, self.answer
+        fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
         self._take(self.limits.within(fingers))
         if rule != "off":
-            self.answered = self._corrected(output, then)
-            self.answer = self.hand.finger_rotmats(self.answered.joint_rotmats)
+            state = self._corrected(output, then, before)
+            self.answer = self.hand.finger_rotmats(state.joint_rotmats)
             if rule != "ours":
-                self.finger_rotmats, self.state = self.answer, self.answered
+                self.finger_rotmats, self.state = self.answer, state
 
     def _take(self, finger_rotmats: np.ndarray) -> None:
         self.finger_rotmats = self.answer = finger_rotmats
         self.state = self.hand.state(finger_rotmats)
 
-    def _corrected(self, output: np.ndarray, then: Situation) -> HandState:
+    def _corrected(self, output: np.ndarray, then: Situation, before: np.ndarray) -> HandState:
+        """The hand that an output means, post-processed; before: the answer of the frame before."""
         hand, settings, points = self.hand, self.predictor.settings, self.state.point_m[0]
         radius = hand.point_radius_m if settings.less_radius else np.zeros(hand.n_points)
         predicted = np.clip(output[-hand.n_points :], 0, 1)
         found, given = self._nearest(points, then), (points, predicted, radius, settings.range_m)
         if self.predictor.rule == "ours":
-            near, state = found.distance_m < self.cover_m + AT_OBJECT_M, self.answered
+            near = found.distance_m < self.cover_m + AT_OBJECT_M
+            state = self.hand.state(between(before, self.finger_rotmats, np.full(1, LEAD)))
             for _ in range(ROUNDS):
                 seen = self._nearest(state.point_m[0], then)
                 state = self._reached(state, our_targets(*given, near, self.cover_m, seen))
