@@ -48,7 +48,7 @@ class Out(NamedTuple):
 OUT = {"paper": Out(0), "released": Out(1), "ours": Out(4, 0.006, 2.0, 1.0, True)}
 AT_OBJECT_M = 0.01  # a point of the network's this far from the finger's skin is kept out of the object
 ROUNDS = 2  # of ours: what a hand sees changes with its pose
-LEAD = 0.2  # of the way from the answer before to the network's pose: what points do not tell, a twist, is the network's
+LEAD = 0.2  # of the way from the answer before to the network's pose, whose twist points do not tell
 _RULES = {"paper": paper_targets, "released": released_targets}
 
 
