@@ -24,7 +24,7 @@ from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.manipnet.animate import new_fingers
-from models.manipnet.examples import between, sized
+from models.manipnet.examples import sized
 from models.manipnet.family import Fingers
 from models.manipnet.features import FeatureSettings, outputs, pose_features
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
@@ -282,27 +282,27 @@ def test_our_rule_brings_fingers_out_of_the_object_and_the_network_goes_on_from_
     assert deep["off"] > deep["ours"] + 0.004
 
 
-def test_a_finger_stays_on_the_side_of_a_plate_that_it_comes_from() -> None:
+def test_a_finger_in_a_plate_leaves_it_on_the_side_that_it_came_from() -> None:
     hand, mesh = right_hand(), trimesh.creation.box((0.05, 0.05, 0.01))
     model = ObjectModel("plate", np.array(mesh.vertices), np.array(mesh.faces), np.zeros(8, np.uint8))
-    bent = hand.rest_rotmats.copy()
-    bent[3:6] = bent[3:6] @ rotvec_to_rotmat(np.tile([0.0, 0.0, 0.4], (3, 1)))  # the middle finger
-    rest = hand.state(hand.rest_rotmats[None])
-    way = hand.state(bent[None]).tip_m[0, 1] - rest.tip_m[0, 1]
-    assert np.linalg.norm(way) > 0.03
-    # Across the tip's way, which ends beyond the plate's middle: the nearest way out leads to the far side.
-    turn = Rotation.align_vectors([way], [[0, 0, 1]])[0].as_matrix()
-    middle = rest.tip_m[0, 1] + 0.85 * way
-    placed = RigidTransform(turn.T[None], -(turn.T @ middle)[None])
-    network = ManipNet(sized(NetworkConfig(encoder=8), hand)).eval()
-    one = Follower(Predictor(network), hand, surface_index(model), hand.rest_rotmats)
-    for share in np.linspace(0.05, 0.9, 18):
-        state = hand.state(between(hand.rest_rotmats[None], bent[None], np.full(1, share)))
-        distance_m = one.surface.nearest(placed @ state.point_m, None).distance_m
-        one.advance(outputs(hand, state, distance_m, FeatureSettings())[0], Situation(np.zeros(336), placed, None))
-    sides = [(placed @ hand.state(pose).tip_m)[0, 1, 2] for pose in (one.finger_rotmats, one.answer)]
-    assert sides[0] > 0.002
-    assert sides[1] < -0.005
+
+    def bent(turn_rad: float) -> np.ndarray:
+        fingers = hand.rest_rotmats.copy()
+        fingers[3:6] = fingers[3:6] @ rotvec_to_rotmat(np.tile([0.0, 0.0, turn_rad], (3, 1)))  # the middle finger
+        return fingers
+
+    within, tips = hand.state(bent(0.3)[None]), [hand.state(bent(turn)[None]).tip_m[0, 1] for turn in (0.2, 0.4)]
+    turn = Rotation.align_vectors([tips[1] - tips[0]], [[0, 0, 1]])[0].as_matrix()
+    placed = RigidTransform(turn.T[None], -(turn.T @ within.tip_m[0, 1])[None])  # the tip is in its middle
+    predictor, surface = Predictor(ManipNet(sized(NetworkConfig(encoder=8), hand)).eval()), surface_index(model)
+    distance_m = surface.nearest(placed @ within.point_m, None).distance_m
+    output, heights = outputs(hand, within, distance_m, FeatureSettings())[0], []
+    for start in (0.2, 0.4):
+        one = Follower(predictor, hand, surface, bent(start))
+        one.advance(output, Situation(np.zeros(336), placed, None))
+        heights.append((placed @ hand.state(one.answer).tip_m)[0, 1, 2])
+    assert heights[0] < -0.004
+    assert heights[1] > 0.004
 
 
 def test_frames_of_a_clip_are_made_from_the_poses_beside_them_alone(
