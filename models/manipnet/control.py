@@ -50,6 +50,11 @@ class Control:
     model: ObjectModel
     hinge_rad: np.ndarray | None = None
 
+    @cached_property
+    def box_middle_m(self) -> np.ndarray:
+        """(3,) the middle of the object's bounding box, object frame, hinge at 0."""
+        return (self.model.vertices_m.min(axis=0) + self.model.vertices_m.max(axis=0)) / 2
+
     def hinge_at(self, time_s: np.ndarray) -> np.ndarray | None:
         """Angles at times of any shape, radians."""
         if self.hinge_rad is None:

@@ -14,7 +14,6 @@ from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import N_TIPS, HandState, TrackedHand
 from hoidata.objects.mesh import mass_properties
-from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import OURS, SensorSettings, sense
 from hoidata.sensors.settings import CELLS
@@ -107,7 +106,7 @@ def trajectory_features(
     wrist_from_world = now.inverse()
     away = np.linalg.norm(other.at(samples).translation - now.translation[:, None], axis=-1, keepdims=True)
     axes = canonical.T @ (now.rotation[:, None].swapaxes(-1, -2) @ wrist.rotation) @ canonical
-    middle = (thing @ object_place(control.model, settings)[None])[:, :, 0]
+    middle = (thing @ object_place(control, settings)[None])[:, :, 0]
     turning = _angular_velocity(control.thing, own, samples, now, settings)
     if settings.velocity_axes == "wrist":
         turning = np.linalg.det(canonical) * turning @ canonical  # a mirror turns axial vectors round
@@ -118,11 +117,11 @@ def trajectory_features(
     return (_smoothed(rows) if settings.smooth else rows).reshape(len(time_s), -1)
 
 
-def object_place(model: ObjectModel, settings: FeatureSettings) -> np.ndarray:
+def object_place(control: Control, settings: FeatureSettings) -> np.ndarray:
     """(3,) what stands for the object's position, object frame, hinge at 0: its box's centre, or its mass's."""
     if settings.object_place == "mass":
-        return mass_properties(model.vertices_m, model.faces).centre_m
-    return (model.vertices_m.min(axis=0) + model.vertices_m.max(axis=0)) / 2
+        return mass_properties(control.model.vertices_m, control.model.faces).centre_m
+    return control.box_middle_m
 
 
 def _angular_velocity(

@@ -159,7 +159,10 @@ class Follower:
             state = self._reached(self.state, _RULES[self.predictor.rule](*given, found))
         out = OUT[self.predictor.rule]
         for _ in range(out.passes):
-            state = self._reached(state, self._out_of_object(state, then, out))
+            targets = self._out_of_object(state, then, out)
+            if not targets.weight.any():
+                break
+            state = self._reached(state, targets)
         return state
 
     def _reached(self, state: HandState, targets: Targets) -> HandState:
@@ -174,21 +177,21 @@ class Follower:
     def _out_of_object(self, state: HandState, then: Situation, out: Out) -> Targets:
         """A further pass: what of the hand is too deep in the object moves out by a share of what is too much."""
         hand = self.hand
-        target, weight = state.point_m[0].copy(), np.zeros(hand.n_points)
-        if out.joints:
-            found = self._nearest(target, then)
-            depth = np.maximum(self.cover_m - found.distance_m - out.allowed_m, 0)
-            target += depth[:, None] * found.normal
-            weight[depth > 0] = out.weight
+        target, weight, n_points = state.point_m[0].copy(), np.zeros(hand.n_points), hand.n_points
         middle = (state.capsule_start_m[0] + state.capsule_end_m[0]) / 2
-        found = self._nearest(middle, then)
-        depth = np.maximum(hand.capsules.radius_m - found.distance_m - out.allowed_m, 0) * (hand.capsules.joint > 0)
+        found = self._nearest(np.concatenate([target, middle]), then)
+        if out.joints:
+            depth = np.maximum(self.cover_m - found.distance_m[:n_points] - out.allowed_m, 0)
+            target += depth[:, None] * found.normal[:n_points]
+            weight[depth > 0] = out.weight
+        depth = np.maximum(hand.capsules.radius_m - found.distance_m[n_points:] - out.allowed_m, 0)
+        depth *= hand.capsules.joint > 0
         for capsule in np.flatnonzero(depth):
             # A capsule hangs between its joint and the one after it: the latter moves it.
             after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
             tip = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
             moved = np.concatenate([after, tip])
-            target[moved] += out.share * depth[capsule] * found.normal[capsule]
+            target[moved] += out.share * depth[capsule] * found.normal[n_points + capsule]
             weight[moved] = out.weight
         return Targets(target, weight)
 
