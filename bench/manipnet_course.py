@@ -131,7 +131,9 @@ def show_courses(trials: Sequence[Trial], recordings: Sequence[HandRecording], s
         first, last = one.errors_mm[0, :quarter].mean(), one.errors_mm[0, -quarter:].mean()
         shares = [f"{one.apart_mm[round(s * RATE_HZ)]:.2f}" for s in (0, 0.25, 1, 2)]
         length = f"{one.errors_mm.shape[1] / RATE_HZ:.1f}"
-        rows.append([recording.name, length, f"{first:.1f}", f"{last:.1f}", f"{last / first:.2f}", *shares, str(one.broken)])
+        rows.append(
+            [recording.name, length, f"{first:.1f}", f"{last:.1f}", f"{last / first:.2f}", *shares, str(one.broken)]
+        )
     columns = ["unseen", "s", "first quarter mm", "last quarter mm", "ratio", "apart at 0 s mm", ".25 s", "1 s", "2 s"]
     show("Rollouts from neutral pose, true pose and fist", [*columns, "broken frames"], rows)
     shortest = min(len(one.apart_mm) for one in found)
