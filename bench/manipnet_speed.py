@@ -1,17 +1,23 @@
 """How fast fingers are made: both hands, sensors, network, post-processing, frame by frame on one core.
 
 ``python -m bench fingers``. Untrained networks at the paper's size and the small one (what they say makes no difference
-to the time), the embedded hand, a box of 12 and a sphere of 20,480 triangles. Shares of the processor time beside it.
+to the time), the embedded hand, a box of 12 and a sphere of 20,480 triangles, every joint to be moved: the worst there
+is. Shares of the processor time beside it. With HOIDATA_MANIPNET the real recordings, lifted frames, as well: there the
+recorded pose and distances stand for what the network says.
 """
 
+import os
 import time
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import torch
 import trimesh
 
 from bench.harness import show
+from bench.manipnet import SETTINGS
+from bench.manipnet_recordings import NAMES, HandRecording, read_hands
 from hoidata.clips.clip import SIDES
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
@@ -20,6 +26,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 from models.manipnet.examples import sized
+from models.manipnet.features import outputs
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Follower, Predictor, situation
 
@@ -40,6 +47,59 @@ def main() -> None:
             rows.append([f"{size}, {thing} of {len(mesh.faces)}", *_figures(model, width)])
     columns = ["network, object", "frames/s", "median ms", "p99 ms", *(f"{name} ms" for name in _PARTS)]
     show("Both hands, one core, processor time", columns, rows)
+    if root := os.environ.get("HOIDATA_MANIPNET"):
+        show_recordings(Path(root))
+
+
+def show_recordings(root: Path) -> None:
+    """Both hands of the real recordings, with their own objects."""
+    rows = []
+    for name in NAMES:
+        recording = read_hands(root, name)
+        for size, width in (("full", 512), ("small", 128)):
+            spent = _seconds_of(recording, width)
+            figures = [
+                f"{1 / spent.mean():.0f}",
+                f"{1000 * np.median(spent):.1f}",
+                f"{1000 * np.percentile(spent, 99):.1f}",
+            ]
+            rows.append([f"{size}, {name} of {len(recording.control.model.faces)}", *figures])
+    show(
+        "The real recordings, both hands, one core, processor time",
+        ["network, object", "frames/s", "median ms", "p99 ms"],
+        rows,
+    )
+
+
+def _seconds_of(recording: HandRecording, width: int) -> np.ndarray:
+    """(frame,) of frames from a lifted one on, less those to warm up."""
+    lifted = np.flatnonzero(recording.lifted & recording.usable)
+    frames = slice(lifted[len(lifted) // 3], lifted[len(lifted) // 3] + FRAMES)
+    hands, control, time_s = recording.hands, recording.control, recording.time_s[frames]
+    config = sized(NetworkConfig(encoder=width, features=SETTINGS), hands["right"])
+    predictor = Predictor(ManipNet(config).eval())
+    start = frames.start
+    followers = {
+        side: Follower(predictor, hands[side], recording.surface, recording.fingers[side][start]) for side in SIDES
+    }
+    said = {}
+    for side in SIDES:
+        state = hands[side].state(recording.fingers[side][frames])
+        placed = control.thing.at(time_s).inverse() @ control.wrists[side].at(time_s)
+        distance_m = recording.surface.nearest(placed @ state.point_m, None).distance_m
+        said[side] = outputs(hands[side], state, distance_m, SETTINGS)
+    spent = []
+    for frame in range(1, len(time_s)):
+        began = time.process_time()
+        now, then = (
+            {side: situation(control, side, hands[side], t, SETTINGS) for side in SIDES}
+            for t in time_s[frame - 1 : frame + 1]
+        )
+        predictor(np.stack([followers[side].inputs(now[side]) for side in SIDES]))
+        for side in SIDES:
+            followers[side].advance(said[side][frame], then[side])
+        spent.append(time.process_time() - began)
+    return np.array(spent[WARM_UP:])
 
 
 _PARTS = ("trajectories", "sensors", "network", "post-processing")
@@ -62,9 +122,9 @@ def _figures(model: ObjectModel, width: int) -> list[str]:
         marks.append(time.process_time())
         inputs = np.stack([followers[side].inputs(now[side]) for side in SIDES])
         marks.append(time.process_time())
-        outputs = predictor(inputs)
+        made = predictor(inputs)
         marks.append(time.process_time())
-        for side, output in zip(SIDES, outputs, strict=True):
+        for side, output in zip(SIDES, made, strict=True):
             output[-HANDS[side].n_points :] = 0.2  # every joint is to be moved
             followers[side].advance(output, then[side])
         marks.append(time.process_time())
