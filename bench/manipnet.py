@@ -265,12 +265,22 @@ def rolled(trial: Trial, model: ManipNet, rule: Rule) -> list[Fingers]:
     return [dict(zip(SIDES, made[2 * number : 2 * number + 2], strict=True)) for number in range(len(trial.pieces))]
 
 
+def mean_training_pose(trial: Trial) -> np.ndarray:
+    """(joint - 1, 3, 3) finger rotations of a right hand, the mean of both hands' training frames."""
+    return mean_rotmats(np.concatenate(_training_fingers(trial)))
+
+
+def _training_fingers(trial: Trial) -> list[np.ndarray]:
+    """By recording and hand (frame, joint - 1, 3, 3), as a right hand's."""
+    return [as_right(one.hands[side], one.fingers[side][frames]) for one, frames in trial.train for side in SIDES]
+
+
 def controls(trial: Trial) -> dict[str, dict[str, float]]:
     """Rows without a network."""
-    fingers = [as_right(one.hands[side], one.fingers[side][frames]) for one, frames in trial.train for side in SIDES]
+    fingers = _training_fingers(trial)
     hand = trial.train[0][0].hands["right"]
     inputs = [_control_inputs(one, side, frames) for one, frames in trial.train for side in SIDES]
-    lookup, mean = Lookup.of(hand, SETTINGS, inputs, fingers), mean_rotmats(np.concatenate(fingers))
+    lookup, mean = Lookup.of(hand, SETTINGS, inputs, fingers), mean_training_pose(trial)
     shares = np.concatenate([_shares(one, side, frames) for one, frames in trial.train for side in SIDES])
     predictor = Predictor(prepared(NetworkConfig(encoder=8, features=SETTINGS), hand, examples_of(trial, False)))
 

@@ -10,6 +10,7 @@ which have no fingers, with six objects.
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from bench.manipnet import (
     SETTINGS,
     Job,
     Trial,
+    mean_training_pose,
     prepare_recordings,
     seen_trial,
     trained_network,
@@ -42,7 +44,7 @@ from hoidata.physics.realism import contacts_in
 from hoidata.physics.scene import Scene
 from models.manipnet.animate import given_control, interpolated, led
 from models.manipnet.control import Control
-from models.manipnet.lookups import joint_errors_m
+from models.manipnet.lookups import as_right, joint_errors_m
 from models.manipnet.rollout import Predictor, Task, roll_out
 from models.manipnet.trajectory_files import parse_manipnet
 
@@ -51,6 +53,7 @@ GAPS_S = (0.5, 1.0, 2.0, 4.0)
 MOST_GAPS = int(os.environ.get("HOIDATA_BENCH_GAPS", "40"))
 SEAMS_S = (0.25, 0.5, 1.0)
 STARTS = ("neutral pose", "true pose", "fist")
+AGAIN = "true pose of the last quarter"
 FIST_RAD = 1.2
 DEMOS = ("demo1", "demo2")
 DEMO_OBJECTS = (
@@ -83,11 +86,15 @@ def fist(hand: TrackedHand) -> np.ndarray:
 class Course(NamedTuple):
     """errors_mm: (start, frame) of both hands, from the recorded ones; apart_mm: (frame,) the starts from each other.
 
-    broken: frames in which a number is none, a bone longer, or a joint beyond its limits.
+    again_mm: (frame of the last quarter,) of a rollout that begins there, from the recorded pose. mean_mm: (frame,) of
+    the mean training pose: how hard these frames are. broken: frames in which a number is none, a bone longer, or a
+    joint beyond its limits.
     """
 
     errors_mm: np.ndarray
     apart_mm: np.ndarray
+    again_mm: np.ndarray
+    mean_mm: np.ndarray
     broken: int
 
 
@@ -96,21 +103,39 @@ def course(trial: Trial, recording: HandRecording, size: str) -> Course:
     predictor = Predictor(trained_network(Job(trial, "ours", 0), size))
     first, stop = max(runs(recording.usable), key=lambda run: run[1] - run[0])
     frames = slice(first, min(stop, first + COURSE_S * RATE_HZ))
-    tasks = []
+    last = slice(frames.stop - (frames.stop - first) // 4, frames.stop)
+    tasks = {}
     for side in SIDES:
-        hand = recording.hands[side]
-        for start in (hand.rest_rotmats, recording.fingers[side][first], fist(hand)):
-            tasks.append(Task(hand, side, recording.control, recording.time_s[frames], start))
-    made = roll_out(predictor, tasks)
-    errors, apart, broken = np.zeros((len(STARTS), len(made[0]))), np.zeros(len(made[0])), 0
-    for row, side in enumerate(SIDES):
-        hand, own = recording.hands[side], made[len(STARTS) * row : len(STARTS) * (row + 1)]
-        true = recording.fingers[side][frames]
-        errors += 500 * np.stack([joint_errors_m(hand, one, true).mean(axis=1) for one in own])
-        pairs = [(own[0], own[1]), (own[0], own[2]), (own[1], own[2])]
-        apart += 500 * np.mean([joint_errors_m(hand, *pair).mean(axis=1) for pair in pairs], axis=0)
-        broken += sum(_broken(predictor, hand, one[1:]) for one in own)
-    return Course(errors, apart, broken)
+        hand, fingers = recording.hands[side], recording.fingers[side]
+        poses = (hand.rest_rotmats, fingers[first], fist(hand), fingers[last.start])
+        for name, pose in zip((*STARTS, AGAIN), poses, strict=True):
+            time_s = recording.time_s[last if name == AGAIN else frames]
+            tasks[side, name] = Task(hand, side, recording.control, time_s, pose)
+    made = dict(zip(tasks, roll_out(predictor, list(tasks.values())), strict=True))
+
+    def error_mm(name: str, frames: slice) -> np.ndarray:
+        return _apart_mm(recording, {side: (made[side, name], recording.fingers[side][frames]) for side in SIDES})
+
+    starts: list[dict[Side, tuple[np.ndarray, np.ndarray]]] = [
+        {side: (made[side, one], made[side, other]) for side in SIDES} for one, other in combinations(STARTS, 2)
+    ]
+    mean = mean_training_pose(trial)
+    held: dict[Side, tuple[np.ndarray, np.ndarray]] = {
+        side: (as_right(recording.hands[side], mean)[None], recording.fingers[side][frames]) for side in SIDES
+    }
+    return Course(
+        np.stack([error_mm(name, frames) for name in STARTS]),
+        np.mean([_apart_mm(recording, pair) for pair in starts], axis=0),
+        error_mm(AGAIN, last),
+        _apart_mm(recording, held),
+        sum(_broken(predictor, recording.hands[side], own[1:]) for (side, _), own in made.items()),
+    )
+
+
+def _apart_mm(recording: HandRecording, poses: Mapping[Side, tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """(frame,) mean distance of joints of two motions, over both hands."""
+    apart = [joint_errors_m(recording.hands[side], *pair).mean(axis=1) for side, pair in poses.items()]
+    return 1000 * np.mean(apart, axis=0)
 
 
 def _broken(predictor: Predictor, hand: TrackedHand, fingers: np.ndarray) -> int:
@@ -129,12 +154,20 @@ def show_courses(trials: Sequence[Trial], recordings: Sequence[HandRecording], s
     for recording, one in zip(recordings, found, strict=True):
         quarter = one.errors_mm.shape[1] // 4
         first, last = one.errors_mm[0, :quarter].mean(), one.errors_mm[0, -quarter:].mean()
-        shares = [f"{one.apart_mm[round(s * RATE_HZ)]:.2f}" for s in (0, 0.25, 1, 2)]
+        means = one.mean_mm[:quarter].mean(), one.mean_mm[-quarter:].mean()
+        figures = [first, last, last / first, one.again_mm.mean(), *means, means[1] / means[0]]
+        shares = [one.apart_mm[round(s * RATE_HZ)] for s in (0, 0.25, 1, 2)]
         length = f"{one.errors_mm.shape[1] / RATE_HZ:.1f}"
-        rows.append(
-            [recording.name, length, f"{first:.1f}", f"{last:.1f}", f"{last / first:.2f}", *shares, str(one.broken)]
-        )
-    columns = ["unseen", "s", "first quarter mm", "last quarter mm", "ratio", "apart at 0 s mm", ".25 s", "1 s", "2 s"]
+        rows.append([recording.name, length, *(f"{value:.2f}" for value in (*figures, *shares)), str(one.broken)])
+    columns = [
+        "unseen",
+        "s",
+        "first quarter mm",
+        "last quarter mm",
+        "ratio",
+        "last quarter, begun there from the truth",
+    ]
+    columns += ["mean pose first quarter", "last quarter", "ratio", "apart at 0 s mm", ".25 s", "1 s", "2 s"]
     show("Rollouts from neutral pose, true pose and fist", [*columns, "broken frames"], rows)
     shortest = min(len(one.apart_mm) for one in found)
     curves = {"from each other": np.mean([one.apart_mm[:shortest] for one in found], axis=0)}

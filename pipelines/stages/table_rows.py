@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hoidata.files.atomic import atomic_folder
+from hoidata.files.written import read_json
 from models.bimart_tables.rows import Row, variant_of
 from models.registry import load_family
 from pipelines.params import laid_over
@@ -58,7 +59,9 @@ def _measured(
     from models.common.repeatable import make_repeatable
 
     make_repeatable(threads=1)
-    family = replace(load_family(row.family), name=name, uses=networks, diagnose=lambda sources: {})
+    family = replace(load_family(row.family), name=name, uses=networks)
+    if row.settings:  # figures inside the networks are theirs, however they are sampled
+        family = replace(family, diagnose=lambda sources: {})
     sampled = {"samples": settings.samples, "seed": seed, "clips": settings.clips}
     own = {"bimart": laid_over(read_section("sample").get("bimart") or {}, row.settings)}
     metrics = tuple(one for one in METRICS if one.name in BESIDE) + tuple(
@@ -71,6 +74,7 @@ def _measured(
         if not counts["clips"]:
             return {"title": row.title, "empty": empty_reason(out)}
         found = evaluate_store(out / "clips", paths.data, hands, metrics=metrics, jobs=jobs())
+        inside = read_json(out / "diagnostics.json")
     print(f"{paths}: {name}: {counts['clips']} motions", flush=True)
     kept = ("motions", "figures", "intervals", "counts", "synthetic")
-    return {"title": row.title, **{key: found[key] for key in kept}}
+    return {"title": row.title, **{key: found[key] for key in kept}, "diagnostics": inside}

@@ -1,12 +1,14 @@
 """Stage tables: BimArt's Tables 1 and 3 from the rows of all runs, and Table 6 from recorded clips, as Markdown."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from hoidata.files import write_whole
 from hoidata.files.written import Facts, read_json
-from models.bimart_tables.rows import VARIANTS
+from models.bimart_tables.rows import VARIANTS, variant_of
+from pipelines.promises import Kept, Promise, kept
 from pipelines.stages.base import EMPTY, StagePaths, empty_reason, load_hands
 
 RIVALS = ("nearest-window", "random-window", "mean-pose-at-object")
@@ -47,6 +49,7 @@ def run(paths: StagePaths) -> None:
     for title, names in TABLES.items():
         if rows := [_row(found[name]) for name in names if name in found]:
             lines += ["", f"## {title}", "", *_table(("row", "seeds", "motions", *COLUMNS), rows)]
+    lines += controls_lines(paths) + maps_lines(found)
     lines += ["", "## Table 6: error of contact maps seen by basis points, cm", "", *_mapping(paths)]
     write_whole(paths.tables, "\n".join(lines) + "\n")
     print(f"{paths}: {len(found)} rows, {paths.tables}")
@@ -69,6 +72,38 @@ def _row(seeds: list[Facts]) -> list[str]:
         " / ".join(_cell(seed["figures"].get(name) for seed in measured) for name in own) for own in COLUMNS.values()
     ]
     return [seeds[0]["title"], str(len(measured)), str(sum(seed["motions"] for seed in measured)), *cells]
+
+
+def controls_lines(paths: StagePaths) -> list[str]:
+    """What every control must do beyond the 95 % interval over clips, and in how many runs it does."""
+    found: dict[Promise, list[Kept]] = {}
+    for folder in sorted(paths.table_rows.glob("*")):
+        for one in kept(_rows_by_family(folder)):
+            if one.holds is not None:
+                found.setdefault(one.promise, []).append(one)
+    rows = []
+    for promise, own in found.items():
+        values = _cell(one.reference for one in own), _cell(one.value for one in own)
+        holds = f"{sum(bool(one.holds) for one in own)} of {len(own)}"
+        must = f"{promise.must}, beside {promise.beside}"
+        rows.append([promise.control, promise.metric, must, *values, holds])
+    title = "## What controls must do beyond the 95 % interval over clips"
+    columns = ("control", "figure", "must", "beside", "control's", "runs in which it does")
+    return ["", title, "", *_table(columns, rows)] if rows else []
+
+
+def _rows_by_family(folder: Path) -> dict[str, Facts]:
+    """The rows of a run that are a family as it stands in the registry, by its name."""
+    rows = variant_of(folder.name)[0].rows.items()
+    paths = {row.family: folder / f"{name}.json" for name, row in rows if not row.settings}
+    return {family: read_json(path) for family, path in paths.items() if path.is_file()}
+
+
+def maps_lines(found: Mapping[str, list[Facts]]) -> list[str]:
+    """How far drawn contact maps lie from the recorded ones, beside the object's mean map of training."""
+    inside = [row["diagnostics"]["bimart-contact"] for row in found.get("bimart", []) if row.get("diagnostics")]
+    rows = [[name, _cell(one[name] for one in inside)] for name in sorted(inside[0])] if inside else []
+    return ["", "## Contact maps: error, mm", "", *_table(("of", "mm"), rows)] if rows else []
 
 
 def _cell(values: Iterable[float | None]) -> str:
