@@ -110,7 +110,7 @@ def _from_file(path: Path, wish: AnimateWish, profile: str, datasets: tuple[str,
         raise BadInput("--world-up", "x, y or z", wish.up, "name the axis of the file's world that points up")
     predictor, facts = chosen_network(wish, profile, datasets, hands)
     found = read_trajectories(path, wish.unit, wish.axes)
-    model, notes = _object(wish, profile, datasets, hands)
+    model, notes = _object(wish, wish.mesh.unit or found.mesh_unit, profile, datasets, hands)
     own = hands_of(hands, np.zeros((2, 10), np.float32), None)
     given = given_control(found, model, own)
     control = at_30_fps(given.control)
@@ -125,12 +125,12 @@ def _from_file(path: Path, wish: AnimateWish, profile: str, datasets: tuple[str,
 
 
 def _object(
-    wish: AnimateWish, profile: str, datasets: tuple[str, ...], hands: HandPair
+    wish: AnimateWish, unit: str, profile: str, datasets: tuple[str, ...], hands: HandPair
 ) -> tuple[ObjectModel, list[str]]:
     """A mesh file in its own axes, or an object of the dataset; and what is to be said of it."""
     if Path(wish.object).is_file():
         # Trajectories say how the mesh lies: it is not turned upright.
-        user = read_user_object(Path(wish.object), wish.mesh.unit, "z", wish.mesh.hinge)
+        user = read_user_object(Path(wish.object), unit, "z", wish.mesh.hinge)
         return user.model, list(user.notes)
     if not wish.object:
         raise BadInput("--object", "the mesh of the object (.obj, .ply, .stl, .glb)", "none", "name it")

@@ -15,7 +15,7 @@ from hoidata.errors import BadInput
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, checked_mesh, load_mesh
 from hoidata.objects.model import Hinge, ObjectModel
 
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}
+UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "dm": 0.1, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.005, 2.0
 HELD_M = (0.02, 1.0)  # sizes a hand is likely to be asked to hold, for guesses of a unit
 UP_AXES = {
@@ -38,7 +38,7 @@ class UserObject:
 def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") -> UserObject:
     """An object from an OBJ, PLY, STL or GLB file.
 
-    unit: "m", "cm", "mm" or "inch"; metres where not told. up: "z", "-y", ...; found where not told (GLB: y).
+    unit: "m", "cm", "mm", "dm" or "inch"; metres where not told. up: "z", "-y", ...; found where not told (GLB: y).
     hinge: "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's own unit and axes, for a mesh of two
     pieces of which the second in the file moves.
     Raises BadInput for a size that cannot be meant, naming the unit that may be, and for a hinge that does not fit.

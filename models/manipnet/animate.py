@@ -14,13 +14,15 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracks import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
+from hoidata.objects.user_mesh import UNITS_M
 from models.manipnet.control import Control, Motion
 from models.manipnet.examples import between
 from models.manipnet.rollout import Predictor, Task, roll_out
-from models.manipnet.trajectory_files import UNITS, Body, TrajectoryFile
+from models.manipnet.trajectory_files import Body, TrajectoryFile
 
 NEAR_M = 0.12  # from the middle of the palm to the object: a hand that never comes nearer handles nothing
 PALM_M = 0.08  # from the wrist to the middle of the palm
+SWALLOWED_M = 0.03  # so deep in an object no palm is
 SEAM_S = 1.0  # over so long a time fingers are led from and to where the recording goes on
 UNSEEN_M = 1.0
 FACING = np.array([0.8, 0.0, -0.6])  # canonical: where a hand that holds something looks to
@@ -58,6 +60,7 @@ def given_control(found: TrajectoryFile, model: ObjectModel, hands: Mapping[Side
     if not active:
         _refuse_far(found, control, hands, nearest)
     for side in active:
+        _check_outside(found, control, side, hands[side])
         _check_facing(found, control, side, hands[side])
     notes = [
         f"the {side} hand stays {metres:.2f} m away from the object and keeps its neutral pose"
@@ -86,9 +89,13 @@ def _palms(control: Control, side: Side, hand: TrackedHand, scale: float = 1.0) 
 
 
 def _nearest_m(control: Control, side: Side, hand: TrackedHand, scale: float = 1.0) -> float:
-    """How near the palm comes to the object's surface in any frame."""
-    palms = _palms(control, side, hand, scale)
-    return float(surface_index(control.model).distance_m(palms[:, None], control.hinge_rad).min())
+    """How near the palm comes to the object in any frame; negative inside."""
+    return float(_distances_m(control, _palms(control, side, hand, scale)).min())
+
+
+def _distances_m(control: Control, places_m: np.ndarray) -> np.ndarray:
+    """(frame,) signed distances of a place in each frame from the surface, negative inside."""
+    return surface_index(control.model).nearest(places_m[:, None], control.hinge_rad).distance_m[:, 0]
 
 
 def _refuse_far(
@@ -97,7 +104,7 @@ def _refuse_far(
     """Raise BadInput that says how near the hands come, and which unit of the positions would bring them to it."""
     likely = [
         name
-        for name, factor in UNITS.items()
+        for name, factor in UNITS_M.items()
         if factor != 1 and min(_nearest_m(control, side, hands[side], factor) for side in nearest) < NEAR_M
     ]
     got = ", ".join(f"the {side} one {metres:.3g} m" for side, metres in nearest.items())
@@ -105,10 +112,20 @@ def _refuse_far(
     raise BadInput(found.where, f"a palm that comes within {NEAR_M} m of the object", got, remedy)
 
 
+def _check_outside(found: TrajectoryFile, control: Control, side: Side, hand: TrackedHand) -> None:
+    """Raise BadInput where the object holds the palm of a hand most of the time: its mesh has another unit."""
+    distance_m = _distances_m(control, _palms(control, side, hand))
+    inside = (distance_m < -SWALLOWED_M).sum() / max((distance_m < NEAR_M).sum(), 1)
+    if inside > 0.5:
+        got = f"a {side} palm inside it in {100 * inside:.0f} % of the frames in which it is near"
+        remedy = "perhaps the mesh has another unit (--unit cm), or another origin than the trajectories mean"
+        raise BadInput(f"{found.where} with {control.model.name}", "an object beside the hands", got, remedy)
+
+
 def _check_facing(found: TrajectoryFile, control: Control, side: Side, hand: TrackedHand) -> None:
     """Raise BadInput where a hand at the object looks away from it, and would not with w last in its quaternions."""
     palms = _palms(control, side, hand)
-    near = surface_index(control.model).distance_m(palms[:, None], control.hinge_rad)[:, 0] < NEAR_M
+    near = _distances_m(control, palms) < NEAR_M
     centre = control.model.vertices_m.mean(axis=0)
     wrist, thing = control.wrists[side], control.thing
     toward = thing.position_m + thing.rotmats @ centre - wrist.position_m

@@ -33,7 +33,7 @@ PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 FASTEST_HZ, SLOWEST_HZ = 1000.0, 5.0
 LARGEST = 1e30  # of any number: squares of it are numbers still
 MOST_BYTES, MOST_FRAMES, LONGEST_LINE = 64 * 2**20, 200_000, 1 << 16
-UNITS = UNITS_M | {"dm": 0.1}
+MANIPNET_UNIT = "dm"  # of the release's trajectories and meshes
 _MIRROR_POSITION, _MIRROR_QUATERNION = np.array([-1.0, 1, 1]), np.array([1.0, 1, -1, -1])
 
 
@@ -49,7 +49,7 @@ class Body:
 class TrajectoryFile:
     """What a file says. axes: of the wrists. at_box: the object's position is the middle of its bounding box.
 
-    up: (3,) where the file's kind says so, else None.
+    up: (3,) where the file's kind says so, else None. mesh_unit: of the meshes that come with files of this kind.
     """
 
     where: str
@@ -60,20 +60,21 @@ class TrajectoryFile:
     axes: Axes = "model"
     at_box: bool = False
     up: tuple[float, float, float] | None = None
+    mesh_unit: str = ""
 
 
 def read_trajectories(path: Path, unit: str = "m", axes: Axes = "model") -> TrajectoryFile:
     """Read a file by its ending. Raises BadInput that names the line, column or array and what to do."""
-    if unit not in UNITS:
-        raise BadInput("--trajectory-unit", f"one of {', '.join(UNITS)}", unit, "name the unit of the positions")
+    if unit not in UNITS_M:
+        raise BadInput("--trajectory-unit", f"one of {', '.join(UNITS_M)}", unit, "name the unit of the positions")
     if not path.is_file():
         raise BadInput(path, "a file of trajectories (.csv, .npz, .txt)", "nothing there", "correct the path")
     if path.stat().st_size > MOST_BYTES:
         raise BadInput(path, f"at most {MOST_BYTES} bytes", f"{path.stat().st_size}", "cut it into pieces")
     if path.suffix.lower() == ".npz":
-        found = from_arrays(load_npz_arrays(path), str(path), UNITS[unit])
+        found = from_arrays(load_npz_arrays(path), str(path), UNITS_M[unit])
     elif path.suffix.lower() == ".csv":
-        found = parse_csv(path.read_bytes(), str(path), UNITS[unit])
+        found = parse_csv(path.read_bytes(), str(path), UNITS_M[unit])
     else:
         return parse_manipnet(path.read_bytes(), str(path))
     return replace(found, axes=axes)
@@ -141,8 +142,8 @@ def parse_manipnet(data: bytes, where: str) -> TrajectoryFile:
         own = table[:, 7 * number : 7 * number + 7]
         arrays[f"{body}_quaternion"] = own[:, [3, 0, 1, 2]] * _MIRROR_QUATERNION
         arrays[f"{body}_position"] = own[:, 4:] * _MIRROR_POSITION
-    found = from_arrays(arrays, where, UNITS["dm"])
-    return replace(found, axes="canonical", at_box=True, up=(0.0, 1.0, 0.0))
+    found = from_arrays(arrays, where, UNITS_M[MANIPNET_UNIT])
+    return replace(found, axes="canonical", at_box=True, up=(0.0, 1.0, 0.0), mesh_unit=MANIPNET_UNIT)
 
 
 def _numbers(rows: list[list[str]], count: int, where: str) -> np.ndarray:

@@ -28,7 +28,10 @@ def animate(
         typer.Option(help="Of wrists in .csv and .npz: the hand model's, or x to the fingers, y to the thumb."),
     ] = "model",
     world_up: Annotated[str, typer.Option(help="Axis of the world that points up: x, y or z; only shown.")] = "",
-    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm or inch; metres when left out.")] = "",
+    unit: Annotated[
+        str,
+        typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; when left out metres, dm beside a ManipNet .txt."),
+    ] = "",
     hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
     profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
 ) -> None:

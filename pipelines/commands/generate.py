@@ -32,7 +32,7 @@ def generate(
     sampler: Annotated[Literal["ddim", "ddpm", "dpm++"], typer.Option(help="How noise becomes motion.")] = "ddim",
     steps: Annotated[int, typer.Option(help="Denoiser calls.", min=1, max=1000)] = 20,
     scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 is none.")] = 1.0,
-    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm or inch; metres when left out.")] = "",
+    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; metres when left out.")] = "",
     up: Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")] = "",
     hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
     hand_by: Annotated[

@@ -27,7 +27,7 @@ def hands(
     seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
     hand: Annotated[Literal["left", "right", "both"], typer.Option(help="Which hands.")] = "both",
     length: Annotated[float | None, typer.Option(help="Seconds it is to last, instead of its own time.")] = None,
-    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm or inch; metres when left out.")] = "",
+    unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; metres when left out.")] = "",
     up: Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")] = "",
     hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
     hinge_range: Annotated[str, typer.Option(help="How far it opens, like 0:110 degrees; 0 is as drawn.")] = "",

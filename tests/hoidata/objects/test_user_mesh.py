@@ -56,7 +56,7 @@ def test_a_size_that_cannot_be_meant_names_the_likely_unit(tmp_path, scale, says
 def test_a_unit_that_is_told_is_used(tmp_path):
     found = read_user_object(saved(MUG, tmp_path / "mug.stl", 1000), unit="mm")
     assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
-    with pytest.raises(BadInput, match="m, cm, mm, inch"):
+    with pytest.raises(BadInput, match="m, cm, mm, dm, inch"):
         read_user_object(tmp_path / "mug.stl", unit="feet")
 
 

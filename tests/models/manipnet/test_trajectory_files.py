@@ -83,6 +83,7 @@ def test_manipnets_text_is_seen_in_the_mirror_in_metres_at_the_box_centre() -> N
     np.testing.assert_allclose(found.thing.position_m[0], [-0.1, 0.2, 0.3])
     np.testing.assert_allclose(found.wrists["left"].rotmats[0], flip @ turn.as_matrix() @ flip, atol=1e-12)
     assert (found.axes, found.at_box, found.up) == ("canonical", True, (0.0, 1.0, 0.0))
+    assert (found.mesh_unit, parse_csv(table().encode(), "mine.csv").mesh_unit) == ("dm", "")
     np.testing.assert_allclose(np.diff(found.time_s), 1 / 120)
 
 
@@ -111,6 +112,12 @@ def test_a_hinged_object_needs_angles_and_an_open_mesh_is_said_to_have_no_inside
     faces = sheet.faces[:6]
     noted = given(table(), type(sheet)("sheet", sheet.vertices_m, faces, sheet.part))
     assert any("no inside" in note for note in noted.notes)
+
+
+def test_an_object_that_swallows_the_hand_is_refused_and_a_palm_on_its_surface_is_not() -> None:
+    given(table(), box_model((0.06, 0.06, 0.12)))  # the palm a centimetre in it, as a crude mesh may have it
+    with pytest.raises(BadInput, match="palm inside it in 100 %.*--unit"):
+        given(table(), box_model((0.6, 0.6, 1.0)))
 
 
 def test_every_damaged_table_is_refused_and_the_good_ones_are_not() -> None:
