@@ -227,7 +227,7 @@ def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray) -> HandTr
 
 
 def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[float, float, float] | None,
-            words: str, synthetic: bool) -> Clip:  # fmt: skip
+            name: str, synthetic: bool) -> Clip:  # fmt: skip
     """A clip of trajectories at 30 fps with these fingers (frame, 15, 3, 3); other hands are not there."""
     n_frames = len(control.thing.time_s)
     tracks: dict[Side, HandTrack] = {}
@@ -241,15 +241,15 @@ def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[floa
     placed = (rotmat_to_rotvec(thing.rotmats).astype(np.float32), thing.position_m.astype(np.float32))
     hinge = None if control.hinge_rad is None else control.hinge_rad.astype(np.float32)
     return Clip(
-        clip_id=f"animated/{words}",
+        clip_id=f"animated/{name}",
         dataset="generated",
         subject="generated",
-        sequence=words,
+        sequence=name,
         hands=tracks,
         object=ObjectTrack(control.model, *placed, hinge),
         source_frames=np.arange(n_frames, dtype=np.int32),
         gravity=None if up is None else -np.asarray(up),
         verb=None,
-        object_words=words,
+        object_words=control.model.name.replace("_", " "),
         synthetic=synthetic,
     )
