@@ -14,11 +14,15 @@ Settings = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Row:
-    """One row. family: of the registry. settings: of BimArt's sampling, laid over ``sample.bimart``."""
+    """One row. family: of the registry. settings: of BimArt's sampling, laid over ``sample.bimart``.
+
+    most_samples: motions of a clip that are enough for it, where its figures are no best of many.
+    """
 
     family: str
     title: str
     settings: Settings = field(default_factory=dict)
+    most_samples: int | None = None
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,9 @@ VARIANTS: Mapping[str, Variant] = {
             "map": _plain("part-BPS; told contact maps"),
             "map-guided": Row("bimart", "and guided by them", {"refined": False}),
             "bimart": Row("bimart", "and refined: BimArt"),
-            "other-path": Row("bimart-other-path", "BimArt told another path"),
-            "other-object": Row("bimart-other-object", "BimArt told another object"),
-            "zero-map": Row("bimart-zero-map", "BimArt told a map of zeros"),
+            "other-path": Row("bimart-other-path", "BimArt told another path", most_samples=3),
+            "other-object": Row("bimart-other-object", "BimArt told another object", most_samples=3),
+            "zero-map": Row("bimart-zero-map", "BimArt told a map of zeros", most_samples=3),
         },
     ),
     "unscaled": Variant(_both(_features(basis={"variant": "unscaled"})), {"unscaled": _plain("unscaled BPS")}),

@@ -62,7 +62,8 @@ def _measured(
     family = replace(load_family(row.family), name=name, uses=networks)
     if row.settings:  # figures inside the networks are theirs, however they are sampled
         family = replace(family, diagnose=lambda sources: {})
-    sampled = {"samples": settings.samples, "seed": seed, "clips": settings.clips}
+    samples = min(settings.samples, row.most_samples or settings.samples)
+    sampled = {"samples": samples, "seed": seed, "clips": settings.clips}
     own = {"bimart": laid_over(read_section("sample").get("bimart") or {}, row.settings)}
     metrics = tuple(one for one in METRICS if one.name in BESIDE) + tuple(
         one for one in BIMART_METRICS if one.topic == "BimArt"

@@ -25,10 +25,10 @@ def rows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return PATHS.table_rows
 
 
-def write(path: Path, maps: dict[str, float] | None = None, **figures: float) -> None:
+def write(path: Path, maps: dict[str, float] | None = None, motions: int = 2, **figures: float) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     intervals = {name: {"clips": [value - 0.05, value + 0.05]} for name, value in figures.items()}
-    row = {"title": path.stem, "figures": figures, "intervals": intervals, "motions": 2}
+    row = {"title": path.stem, "figures": figures, "intervals": intervals, "motions": motions}
     inside = {"diagnostics": {"bimart-contact": maps} if maps else {}}
     path.write_text(json.dumps(row | inside))
 
@@ -44,6 +44,15 @@ def test_a_control_within_the_interval_of_its_row_is_counted_as_not_losing(rows:
         "bimart-zero-map", "contact_f1", "fall, beside bimart", "0.42 (0)", "0.355 (0.078)", "1 of 2",
     ]  # fmt: skip
     assert cells(lines, "hands-still")[2:] == ["fall, beside ground-truth", "1", "0.4", "1 of 1"]
+
+
+def test_the_best_of_few_motions_is_not_held_against_the_best_of_many(rows: Path) -> None:
+    for motions, told in ((2, True), (1, False)):
+        write(rows / "part-0" / "bimart.json", motions=2, joint_error_mm=60.0, contact_f1=0.42)
+        write(rows / "part-0" / "zero-map.json", motions=motions, joint_error_mm=90.0, contact_f1=0.3)
+        lines = [line for line in controls_lines(PATHS) if "bimart-zero-map" in line]
+        assert any("joint_error_mm" in line for line in lines) == told
+        assert any("contact_f1" in line for line in lines)
 
 
 def test_errors_of_maps_are_means_over_the_runs_that_drew_some(rows: Path) -> None:
