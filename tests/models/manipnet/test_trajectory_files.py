@@ -116,7 +116,7 @@ def test_a_hinged_object_needs_angles_and_an_open_mesh_is_said_to_have_no_inside
 
 def test_an_object_that_swallows_the_hand_is_refused_and_a_palm_on_its_surface_is_not() -> None:
     given(table(), box_model((0.06, 0.06, 0.12)))  # the palm a centimetre in it, as a crude mesh may have it
-    with pytest.raises(BadInput, match="palm inside it in 100 %.*--unit"):
+    with pytest.raises(BadInput, match=r"palm inside it in 100 %.*--unit"):
         given(table(), box_model((0.6, 0.6, 1.0)))
 
 
