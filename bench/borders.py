@@ -18,7 +18,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.object_paths import scripted_path
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import load_annotated
-from models.bimart.borders import border_figures, borders_of, made_apart
+from models.bimart.borders import border_figures, borders_of, made_apart, overlapping_borders_of
 from models.bimart.family import HandsForPaths
 from models.bimart.hands import MotionWish, hands_for
 from models.common.family import Sources
@@ -48,13 +48,21 @@ def main() -> None:
         together.append(hands_for(sampler, thing, wish)[0].clip)
         seconds.append(time.process_time() - start)
         apart.append(made_apart(sampler, thing, wish, window))
-    borders = borders_of(FRAMES, window)
+    ours, theirs = overlapping_borders_of(FRAMES, window), borders_of(FRAMES, window)
     rows = []
-    for name, clips in (("windows made together", together), ("windows made apart and joined", apart)):
+    for name, clips, borders in (
+        ("windows made together, every frame where one begins or ends", together, ours),
+        ("windows made together, where those made apart meet", together, theirs),
+        ("windows made apart and joined", apart, theirs),
+    ):
         acceleration, contact = border_figures(clips, pair, borders)
-        rows.append([name, f"{acceleration:.2f}x", f"{contact:.2f}x"])
+        rows.append([name, f"{len(borders)}", f"{acceleration:.2f}x", f"{contact:.2f}x"])
     title = f"{count} paths of {FRAMES} frames, windows of {window}; {sum(seconds) / count:.1f} s each"
-    show(title, ["at borders over elsewhere", "95th percentile of acceleration", "rate of contact changes"], rows)
+    show(
+        title,
+        ["at borders over elsewhere", "borders", "95th percentile of acceleration", "rate of contact changes"],
+        rows,
+    )
     twice = []
     for number in range(count)[1 : 1 + TIMED]:  # the first one compiles
         start = time.process_time()

@@ -27,6 +27,7 @@ FAMILIES = {
     "bimart": "models.bimart.family:BIMART",
     "bimart-unrefined": "models.bimart.family:UNREFINED",
     "nearest-window": "models.bimart.lookups:NEAREST_WINDOW",
+    "nearest-window-refined": "models.bimart.refined_lookup:NEAREST_REFINED",
     "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
     "random-window": "models.bimart.lookups:RANDOM_WINDOW",
     "cams-b": "models.bimart_tables.cams:CAMS_B",

@@ -24,6 +24,13 @@ def borders_of(frames: int, window: int) -> list[int]:
     return [start for start in starts if frames - start >= LEAST_FRAMES]
 
 
+def overlapping_borders_of(frames: int, window: int) -> list[int]:
+    """Frames in which a window begins or ends, where each lies half on the next, as motions are made."""
+    layout = layout_of(frames, window, overlapping=True)
+    edges = {edge for start in layout.starts for edge in (start, start + layout.length)}
+    return sorted(edges - {0, frames})
+
+
 def made_apart(sampler: HandsForPaths, thing: ObjectTrack, wish: MotionWish, window: int) -> Clip:
     """The control: each window a motion of its own, from a seed of its own."""
     edges = [0, *borders_of(thing.n_frames, window), thing.n_frames]

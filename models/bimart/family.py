@@ -24,7 +24,7 @@ from models.bimart.lookups import moved_hands, training_clips
 from models.bimart.motion_training import MOTION
 from models.bimart.sampler import BimArt, Made, Path, SamplingConfig
 from models.bimart.scene import Scene
-from models.common.checkpoints import load_checkpoint
+from models.common.checkpoints import FILE_NAME, load_checkpoint
 from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
 from models.common.features import proper_hands
 
@@ -60,7 +60,8 @@ class HandsForPaths:
         sampling = replace(config.sampling, with_map=config.sampling.with_map and change != "no map")
         motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
         folder = sources.checkpoints / CONTACT.name
-        contact = load_checkpoint(folder, CONTACT, sources.device) if sampling.with_map or folder.is_dir() else None
+        has_contact = sampling.with_map or (folder / FILE_NAME).is_file()
+        contact = load_checkpoint(folder, CONTACT, sources.device) if has_contact else None
         model = BimArt.of(contact, motion, sampling, sources.device)
         synthetic = bool(motion.facts["synthetic"])
         config = replace(config, refined=config.refined and refined)
@@ -70,7 +71,10 @@ class HandsForPaths:
         return self.sample_asked(requests)[0]
 
     def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[AskedDistances | None]]:
-        """Motions, and the contact map each was made for; None where it was made for none."""
+        """Motions, and the contact map each was made for; None where it was made for none.
+
+        Beside motions that were told zeros stands the map that they would have been told: zeros no hand can meet.
+        """
         found: dict[int, Made] = {}
         for rows in self._alike(requests):
             found |= zip(rows, self.made([requests[row] for row in rows]), strict=True)
@@ -95,8 +99,11 @@ class HandsForPaths:
     def made(self, requests: Sequence[Request]) -> list[Made]:
         """Maps, keypoints and ways to the object for requests of one length, canonical frame."""
         paths = [Path(self._scene(request), request.active_hands, request.seed) for request in requests]
-        maps = torch.zeros(len(paths), len(paths[0].scene), self.model.motion.config.features.contact_size)
-        return self.model.make(paths, maps if self.change == "zero map" else None)
+        if self.change != "zero map":
+            return self.model.make(paths)
+        drawn = self.model.maps(paths)
+        made = self.model.make(paths, torch.zeros(drawn.shape))
+        return [replace(one, contact_m=own) for one, own in zip(made, drawn, strict=True)]
 
     def _scene(self, request: Request) -> Scene:
         """The motion of a request, or what a control takes for it."""

@@ -20,6 +20,7 @@ from models.common.family import Family, LeftOut, Sources, motion_clip
 from models.common.features import proper_hands
 
 BASIS = BasisSettings(64, nearest="vertex", frame="base")
+NO_WINDOW = "no training window of these hands, or no motion of an object"
 WINDOW = 64
 STRIDE = 8
 KINDS = (slice(0, 6 * BASIS.count), slice(6 * BASIS.count, None))  # O, and G with the scale: they count alike
@@ -78,42 +79,44 @@ class NearestWindow:
         clips: dict[tuple[bool, bool], list[tuple[np.ndarray, np.ndarray]]] = {}
         for sample, scene, row in zip(samples, scenes, rows, strict=True):
             own = (row - every.mean(axis=0)) / spread, canonical_hands(sample.hands, scene.model_from_canonical)
-            clips.setdefault(_hands(sample.active_hands), []).append(own)
+            clips.setdefault(hands_of(sample), []).append(own)
         return cls(clips, every.mean(axis=0), spread, any(sample.synthetic for sample in samples), drawn)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self._answer(request) for request in requests]
 
     def _answer(self, request: Request) -> Clip | LeftOut:
-        if request.trajectories is None or _hands(request.active_hands) not in self.clips:
-            return LeftOut(request.motion_id, "no training window of these hands, or no motion of an object")
+        if request.trajectories is None or hands_of(request) not in self.clips:
+            return LeftOut(request.motion_id, NO_WINDOW)
         thing = request.trajectories.object[: request.n_frames]
         scene = Scene.of(request.object, thing, BASIS)
-        asked = (told(scene) - self.mean) / self.spread
-        parts = [
-            self._nearest(asked[start : start + WINDOW], request, rank=request.number)
-            for start in range(0, len(asked), WINDOW)
-        ]
+        clips = self.clips[hands_of(request)]
+        parts = [clips[number][1][:, frames] for number, frames in self.windows(request, scene)]
         hands = moved_hands(np.concatenate(parts, axis=1), scene.model_from_canonical)
         return motion_clip(request, torch.from_numpy(hands), torch.from_numpy(thing), self.synthetic)
 
-    def _nearest(self, asked: np.ndarray, request: Request, rank: int) -> np.ndarray:
-        """(2, frame, 99) of the nearest window; of the next nearest clip for each further motion of a request."""
-        if self.drawn:
-            row, hands = self._any(request)
-            return hands[:, np.minimum(np.arange(len(asked)) + max(len(row) - len(asked), 0) // 2, len(row) - 1)]
+    def windows(self, request: Request, scene: Scene) -> list[tuple[int, np.ndarray]]:
+        """For every window of a request the number of a clip among those of its hands, and frames (frame,) of it."""
+        asked = (told(scene) - self.mean) / self.spread
+        find = self._any if self.drawn else self._nearest
+        return [find(asked[start : start + WINDOW], request) for start in range(0, len(asked), WINDOW)]
+
+    def _nearest(self, asked: np.ndarray, request: Request) -> tuple[int, np.ndarray]:
+        """The nearest window; of the next nearest clip for each further motion of a request."""
         found = []
-        for row, hands in self.clips[_hands(request.active_hands)]:
+        for number, (row, _) in enumerate(self.clips[hands_of(request)]):
             starts = np.arange(0, max(len(row) - len(asked), 0) + 1, STRIDE)
             frames = np.minimum(starts[:, None] + np.arange(len(asked)), len(row) - 1)
             apart = ((row[frames] - asked) ** 2).sum(axis=-1).mean(axis=-1)
-            found.append((apart.min(), frames[apart.argmin()], hands))
-        _, frames, hands = sorted(found, key=lambda one: one[0])[rank % len(found)]
-        return hands[:, frames]
+            found.append((apart.min(), number, frames[apart.argmin()]))
+        _, number, frames = sorted(found, key=lambda one: one[:2])[request.number % len(found)]
+        return number, frames
 
-    def _any(self, request: Request) -> tuple[np.ndarray, np.ndarray]:
-        clips = self.clips[_hands(request.active_hands)]
-        return clips[request.seed % len(clips)]
+    def _any(self, asked: np.ndarray, request: Request) -> tuple[int, np.ndarray]:
+        clips = self.clips[hands_of(request)]
+        number = request.seed % len(clips)
+        length = len(clips[number][0])
+        return number, np.minimum(np.arange(len(asked)) + max(length - len(asked), 0) // 2, length - 1)
 
 
 @dataclass(frozen=True)
@@ -148,8 +151,9 @@ class MeanPose:
         return motion_clip(request, moved, torch.from_numpy(thing), self.synthetic)
 
 
-def _hands(active_hands: np.ndarray) -> tuple[bool, bool]:
-    return bool(active_hands[0]), bool(active_hands[1])
+def hands_of(one: Request | ClipSample) -> tuple[bool, bool]:
+    """Which hands take part."""
+    return bool(one.active_hands[0]), bool(one.active_hands[1])
 
 
 NEAREST_WINDOW = Family("nearest-window", "nearest training window by object and its motion", NearestWindow.load)

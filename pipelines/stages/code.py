@@ -34,7 +34,7 @@ SECTIONS_OF_DATASETS = {"convert": ("convert", "adapters"), "split": ("split",)}
 
 
 # Rows of BimArt's tables; those of its controls are in the modules of these.
-TABLE_FAMILIES = ("bimart", "nearest-window", "cams-b", "ground-truth", "hands-still")
+TABLE_FAMILIES = ("bimart", "nearest-window", "nearest-window-refined", "cams-b", "ground-truth", "hands-still")
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,9 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
     rows = (params.get("controls") or {}).get("families") or []
     found["controls"] = _start("controls", every | _families([family_module(family) for family in rows]))
     tables = [*map(family_module, TABLE_FAMILIES), *(module for one in IN_TABLES for module in network_modules(one))]
-    found |= {stage: _start(stage, every | _families(tables)) for stage in ("table_networks", "table_rows", "tables")}
+    found |= {stage: _start(stage, every | _families(tables)) for stage in ("table_rows", "tables")}
+    for network in IN_TABLES:
+        found[f"table_networks/{network}"] = _start("table_networks", every | _families(network_modules(network)))
     every |= _families([family_module(family) for family in params["families"]])
     return found | {stage: _start(stage, every) for stage in ("evaluator", "evaluate", "report")}
 
@@ -151,7 +153,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     if stage == "train":
         return section.get("seed"), *_trained(section, of)
     if stage == "table_networks":
-        return [_trained(params["train"], network) for network in IN_TABLES]
+        return _trained(params["train"], of)
     tables = params.get("tables") or {}
     if stage in ("table_rows", "tables"):  # the latter reads what the former wrote
         return (params.get("sample"), tables.get("samples"), tables.get("clips")) if stage == "table_rows" else None

@@ -3,21 +3,29 @@
 from pathlib import Path
 
 from hoidata.files.atomic import atomic_folder
-from models.bimart_tables.rows import variant_of
+from models.bimart_tables.variants import VARIANTS, variant_of
 from pipelines.params import laid_over
 from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
 from pipelines.stages.train import TrainParams, train_into
 
-CODE = Path("code/table_networks.json")
+CODE = Path("code/table_networks")
 
 
 def run(paths: StagePaths) -> None:
     """Train ``paths.model`` as the variant changes it; an empty output where the variant has no such network."""
-    variant, seed = variant_of(paths.family)
-    none = "" if paths.model in variant.networks else f"{paths.family} has no network {paths.model}"
+    name, seed = variant_of(paths.family)
+    networks = VARIANTS[name]
+    none = "" if paths.model in networks else f"{paths.family} has no network {paths.model}"
     if reason := none or empty_reason(paths.clips):
         write_empty(paths.table_network, reason)
         return
-    params = laid_over(load_settings(TrainParams, "train").of(paths.model), variant.networks[paths.model])
+    params = laid_over(load_settings(TrainParams, "train").of(paths.model), networks[paths.model])
     with atomic_folder(paths.table_network) as partial:
-        train_into(partial, paths, {**params, "seed": seed}, paths.table_network, paths.table_training, CODE)
+        train_into(
+            partial,
+            paths,
+            {**params, "seed": seed},
+            paths.table_network,
+            paths.table_training,
+            CODE / f"{paths.model}.json",
+        )

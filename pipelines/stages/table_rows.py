@@ -6,7 +6,8 @@ from pathlib import Path
 
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.written import read_json
-from models.bimart_tables.rows import Row, variant_of
+from models.bimart_tables.rows import ROWS, Row
+from models.bimart_tables.variants import VARIANTS, variant_of
 from models.registry import load_family
 from pipelines.params import laid_over
 from pipelines.stages.base import (
@@ -25,7 +26,7 @@ BESIDE = ("joint_error_mm", "contact_f1")  # figures that see where a hand is, b
 
 @dataclass(frozen=True)
 class TableSettings:
-    """datasets, runs: which; runs are variants and seeds of ``models/bimart_tables/rows.py``.
+    """datasets, runs: which; runs are variants and seeds of ``models/bimart_tables/variants.py``.
 
     samples: motions per clip. clips: evenly spread test clips; 0: all.
     """
@@ -39,13 +40,14 @@ class TableSettings:
 def run(paths: StagePaths) -> None:
     """A file of figures per row; of a dataset without clips the reason alone."""
     variant, seed = variant_of(paths.family)
+    networks = tuple(VARIANTS[variant])
     settings = load_settings(TableSettings, "tables")
     with atomic_folder(paths.table_rows) as partial:
         if reason := empty_reason(paths.clips):
             note_empty(partial, reason)
             return
-        for name, row in variant.rows.items():
-            write_json(partial / f"{name}.json", _measured(paths, name, row, tuple(variant.networks), seed, settings))
+        for name, row in ROWS[variant].items():
+            write_json(partial / f"{name}.json", _measured(paths, name, row, networks, seed, settings))
 
 
 def _measured(

@@ -7,11 +7,12 @@ import numpy as np
 
 from hoidata.files import write_whole
 from hoidata.files.written import Facts, read_json
-from models.bimart_tables.rows import VARIANTS, variant_of
+from models.bimart_tables.rows import ROWS
+from models.bimart_tables.variants import variant_of
 from pipelines.promises import Kept, Promise, kept
 from pipelines.stages.base import EMPTY, StagePaths, empty_reason, load_hands
 
-RIVALS = ("nearest-window", "random-window", "mean-pose-at-object")
+RIVALS = ("nearest-window", "nearest-window-refined", "nearest-windows", "random-window", "mean-pose-at-object")
 TABLES: Mapping[str, Sequence[str]] = {
     "Table 1: baselines": ("ground-truth", "cams-b", "mdm-b", "omomo-b", "bimart", *RIVALS),
     "Table 3: representations": ("unscaled", "whole", "mano", "stateless", "map"),
@@ -35,7 +36,8 @@ COLUMNS = {
 }
 NOTE = (
     "Figures as BimArt's release has them / corrected (hoidata/metrics/README.md); contact F1 and joints see where "
-    "hands are. Of several seeds the mean, in brackets the standard deviation."
+    "hands are. As released: of the first motion of each clip alone. Of several seeds the mean, in brackets the "
+    "standard deviation. Controls have three motions a clip, so that their best is a best of three."
 )
 
 
@@ -57,7 +59,7 @@ def run(paths: StagePaths) -> None:
 
 def read_rows(paths: StagePaths) -> dict[str, list[Facts]]:
     """What was measured of each row, by its name, seed by seed."""
-    known = [name for variant in VARIANTS.values() for name in variant.rows]
+    known = [name for rows in ROWS.values() for name in rows]
     files = sorted(paths.table_rows.glob("*/*.json"))
     rows = [(file.stem, read_json(file)) for file in files if file.name != EMPTY]
     return {name: own for name in known if (own := [row for stem, row in rows if stem == name])}
@@ -103,7 +105,7 @@ def _as_many_chances(promise: Promise, rows: Mapping[str, Facts]) -> bool:
 
 def _rows_by_family(folder: Path) -> dict[str, Facts]:
     """The rows of a run that are a family as it stands in the registry, by its name."""
-    rows = variant_of(folder.name)[0].rows.items()
+    rows = ROWS[variant_of(folder.name)[0]].items()
     paths = {row.family: folder / f"{name}.json" for name, row in rows if not row.settings}
     return {family: read_json(path) for family, path in paths.items() if path.is_file()}
 

@@ -5,7 +5,7 @@ import pytest
 
 from hoidata.clips.clip import Clip
 from hoidata.hands import load_embedded_hands
-from models.bimart.borders import border_figures
+from models.bimart.borders import border_figures, borders_of, overlapping_borders_of
 from tests.builders.clips import clip_of, flat_hand, still_object
 from tests.builders.objects import box_model
 
@@ -19,6 +19,12 @@ def hand_along(height_m: np.ndarray) -> Clip:
     wrist = np.zeros((FRAMES, 3)) + height_m[:, None] * [0, 0, 1]
     hands = {"left": flat_hand(wrist + away, np.zeros(FRAMES, bool)), "right": flat_hand(wrist)}
     return clip_of("toy/s1/a", still_object(box_model((0.3, 0.3, 0.02)), FRAMES), hands)
+
+
+def test_windows_that_overlap_have_borders_where_any_begins_or_ends() -> None:
+    assert borders_of(300, 64) == [64, 128, 192, 256]
+    assert overlapping_borders_of(300, 64) == [32, 64, 96, 128, 160, 192, 224, 236, 256, 288]
+    assert overlapping_borders_of(50, 64) == []
 
 
 def test_a_step_at_a_border_is_its_acceleration_over_that_elsewhere() -> None:

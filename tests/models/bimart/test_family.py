@@ -21,6 +21,7 @@ from models.bimart.learning import LossConfig, learn_statistics, targets_of, win
 from models.bimart.lookups import NEAREST_WINDOW, OBJECT_MEAN_POSE
 from models.bimart.motion_training import MOTION
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
+from models.bimart.refined_lookup import NEAREST_REFINED
 from models.bimart.sampler import BimArt
 from models.bimart.sampler import Path as ObjectPath
 from models.bimart.scene import FeatureConfig, Scene, recorded_clip
@@ -197,12 +198,16 @@ def test_lookups_place_training_hands_at_the_object(sources: Sources, annotated:
     asked = requests_for(sample, PredictionConfig(samples=1))
     found = NEAREST_WINDOW.load(sources).sample(asked)[0]
     mean = OBJECT_MEAN_POSE.load(sources).sample(asked)[0]
+    refined = NEAREST_REFINED.load(sources).sample(asked)[0]
     assert isinstance(found, Clip)
     assert isinstance(mean, Clip)
+    assert isinstance(refined, Clip)
     recorded = annotated.clip(sample.clip_id)
     for side in SIDES:  # a training clip is nearest to itself
         np.testing.assert_allclose(found.hands[side].wrist_m, recorded.hands[side].wrist_m, atol=1e-4)
         assert np.abs(mean.hands[side].wrist_m - recorded.hands[side].wrist_m).max() > 1e-3
+        # Refinement corrects depth and shaking of recorded hands; it does not take them elsewhere.
+        assert np.abs(refined.hands[side].wrist_m - recorded.hands[side].wrist_m).max() < 0.03
 
 
 @pytest.mark.slow
