@@ -3,17 +3,20 @@
 ``python -m bench manipnet`` with HOIDATA_MANIPNET: the data folder. HOIDATA_BENCH_SEEDS: how many trainings of each
 row of objects seen (3 if not given); HOIDATA_BENCH_MINUTES: no row is begun that would end later (120);
 HOIDATA_BENCH_ROWS: some rows alone, by name with commas; HOIDATA_BENCH_SIZE: small or full. What was computed is kept
-in .hoidata/manipnet (never committed: the data is CC BY-NC) and taken up again, so a run may be stopped at any time.
+in .hoidata/manipnet (never committed: the data is CC BY-NC) and taken up again while the code it came from is the same,
+so a run may be stopped at any time and two may share the rows.
 
 Objects seen: of five successive tenths of a recording three train, the last tests, 0.5 s around what is not trained on
-left out. Objects unseen: every recording left out in turn; the first test tenths of it are rolled out.
+left out. Objects unseen: every recording left out in turn; of five successive tenths the first and the last are rolled
+out.
 """
 
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,6 +39,12 @@ from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Follower, Predictor, Rule, Task, roll_out, situation
 
 KEPT = Path(".hoidata/manipnet")
+ROOT = Path(__file__).parents[1]
+# What training examples and networks come from, and what else figures come from.
+LEARNT_FROM = ("models/manipnet/examples.py", "models/manipnet/features.py", "models/manipnet/network.py",
+               "models/common/training.py", "bench/manipnet_recordings.py")  # fmt: skip
+MEASURED_BY = (*LEARNT_FROM, "models/manipnet/rollout.py", "models/manipnet/targets.py", "models/manipnet/lookups.py",
+               "models/manipnet/inverse_kinematics.py", "hoidata/physics", "bench/manipnet.py")  # fmt: skip
 SETTINGS = FeatureSettings(step_s=1 / RATE_HZ)
 SIZES = {
     "small": (NetworkConfig(encoder=128), TrainingConfig(3500, 128, 1e-3, 0.0, "cosine", 50)),
@@ -43,7 +52,7 @@ SIZES = {
 }
 VARIANTS_OF_OURS: dict[str, dict[str, Any]] = {
     "ours": {},
-    "trained as the paper": {"astray": False},
+    "from recorded poses alone": {"astray": False},
     "no sensors": {"without": ("sensors",)},
     "no ambient": {"without": ("ambient",)},
     "no distance": {"without": ("distance",)},
@@ -102,9 +111,9 @@ def main() -> None:
     jobs += [Job(trials[0], name, seed) for seed in range(1, seeds) for name in trials[0].rows if name in wanted]
     left_out = fill(tables, jobs, size, 60 * float(os.environ.get("HOIDATA_BENCH_MINUTES", "120")))
     for name, rows in tables.items():
-        show_rows(f"Objects {name}, {size} network", rows)
+        show_sums(f"Objects {name}, {size} network", rows)
     if all(trial.name in tables for trial in trials):
-        show_rows(f"Objects unseen, all, {size} network", pooled([tables[trial.name] for trial in trials[1:]]))
+        show_sums(f"Objects unseen, all, {size} network", pooled([tables[trial.name] for trial in trials[1:]]))
     if left_out:
         print(f"no time was left for {len(left_out)} trainings: " + ", ".join(job.key(size) for job in left_out))
 
@@ -124,7 +133,7 @@ Rows = dict[str, list[dict[str, float]]]
 
 
 def fill(tables: dict[str, Rows], jobs: Sequence[Job], size: str, budget_s: float) -> list[Job]:
-    """Train row after row into the tables, one dictionary of figures per seed; those that there was no time for."""
+    """Train row after row into the tables, one dictionary of sums per seed; those that there was no time for."""
     began, longest, left_out = time.monotonic(), 0.0, []
     for job in jobs:
         start = time.monotonic()
@@ -133,22 +142,22 @@ def fill(tables: dict[str, Rows], jobs: Sequence[Job], size: str, budget_s: floa
             continue
         if job.trial.name not in tables:
             tables[job.trial.name] = control_rows(job.trial)
-        for rule, figures in kept(job.key(size), lambda job=job: trained_row(job, size)).items():
+        for rule, sums in kept(job.key(size), lambda job=job: trained_row(job, size)).items():
             words = {"off": "", "ours": ", post-processed", "released": ", the demo's post-processing"}[rule]
-            tables[job.trial.name].setdefault(job.name + words, []).append(figures)
+            tables[job.trial.name].setdefault(job.name + words, []).append(sums)
         longest = max(longest, time.monotonic() - start)
     return left_out
 
 
 def pooled(tables: Sequence[Rows]) -> Rows:
-    """Means over trials of rows that all of them have, every hand frame counting the same."""
+    """Sums over trials of the rows that all of them have; shares and means are made of the sums."""
     names = [name for name in tables[0] if all(name in rows for rows in tables)]
-    weight = np.array([rows["raw data"][0]["frames"] for rows in tables])
-    found: Rows = {}
-    for name in names:
-        figures = {key: float(np.average([rows[name][0][key] for rows in tables], weights=weight)) for key in COLUMNS}
-        found[name] = [figures | {"frames": float(weight.sum())}]
-    return found
+    return {name: [added([rows[name][0] for rows in tables])] for name in names}
+
+
+def added(sums: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """The sums by name."""
+    return {name: sum(one[name] for one in sums) for name in sums[0]}
 
 
 def seen_trial(recordings: Sequence[HandRecording], kinds: tuple[int, ...] = TEST) -> Trial:
@@ -160,7 +169,7 @@ def seen_trial(recordings: Sequence[HandRecording], kinds: tuple[int, ...] = TES
 
 
 def unseen_trials(recordings: Sequence[HandRecording]) -> list[Trial]:
-    """Each recording left out in turn, all of its test and validation tenths rolled out."""
+    """Each recording left out in turn; of five successive tenths of it the first and the last are rolled out."""
     trials = []
     for out in recordings:
         train = tuple((one, one.usable) for one in recordings if one is not out)
@@ -183,7 +192,7 @@ def pieces(recording: HandRecording, kinds: tuple[int, ...]) -> list[Piece]:
 
 
 def control_rows(trial: Trial) -> Rows:
-    return {name: [figures] for name, figures in kept(f"{trial.name} controls", lambda: controls(trial)).items()}
+    return {name: [sums] for name, sums in kept(f"{trial.name} controls", lambda: controls(trial)).items()}
 
 
 def trained_row(job: Job, size: str) -> dict[str, dict[str, float]]:
@@ -199,7 +208,7 @@ def trained_network(job: Job, size: str) -> ManipNet:
     network, training = SIZES[size]
     astray = changes.pop("astray", True)
     config = replace(network, features=SETTINGS, **changes)
-    path = kept_path(f"{job.key(size)} network", ".pt")
+    path = kept_path(f"{job.key(size)} network", ".pt", LEARNT_FROM)
     hand = job.trial.train[0][0].hands["right"]
     if path.is_file():
         model = ManipNet(sized(config, hand))
@@ -209,7 +218,9 @@ def trained_network(job: Job, size: str) -> ManipNet:
     torch.manual_seed(job.seed)
     model = prepared(config, hand, examples)
     fit_examples(model, examples, training, job.seed)
-    torch.save(model.state_dict(), path)
+    whole = path.with_name(f"{path.name}.{os.getpid()}")
+    torch.save(model.state_dict(), whole)
+    whole.replace(path)
     return model
 
 
@@ -231,7 +242,7 @@ def examples_of(trial: Trial, astray: bool) -> list[Examples]:
 def _recorded_examples(recording: HandRecording, side: Side, astray: bool) -> Examples:
     key = (recording.name, side, astray)
     if key not in _EXAMPLES:
-        path = KEPT / f"examples-{recording.name}-{side}{'-astray' * astray}.npz"
+        path = kept_path(f"examples {recording.name} {side}{' astray' * astray}", ".npz", LEARNT_FROM)
         if not path.is_file():
             fingers, hand = recording.fingers[side], recording.hands[side]
             # Of frames that may train alone: no test pose is met, not even as a way to go wrong.
@@ -247,8 +258,9 @@ def _recorded_examples(recording: HandRecording, side: Side, astray: bool) -> Ex
                 SETTINGS,
                 other_poses(fingers, pool, NAMES.index(recording.name)) if astray else None,
             )
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez(path, **made._asdict())
+            whole = path.with_name(f"{os.getpid()}-{path.name}")
+            np.savez(whole, **made._asdict())
+            whole.replace(path)
         with np.load(path) as stored:
             _EXAMPLES[key] = Examples(**stored)
     return _EXAMPLES[key]
@@ -352,11 +364,12 @@ def _control_inputs(recording: HandRecording, side: Side, frames: np.ndarray | s
 
 
 def measured(trial: Trial, fingers: Sequence[Fingers], away_m: float = 0.0) -> dict[str, float]:
-    """Figures over all pieces: sums and counts of scored frames, then shares and means."""
-    sums: dict[str, float] = {}
-    for piece, made in zip(trial.pieces, fingers, strict=True):
-        for name, value in _piece_sums(piece, made, away_m).items():
-            sums[name] = sums.get(name, 0.0) + value
+    """Sums and counts of scored frames over all pieces."""
+    return added([_piece_sums(piece, made, away_m) for piece, made in zip(trial.pieces, fingers, strict=True)])
+
+
+def figures_of(sums: Mapping[str, float]) -> dict[str, float]:
+    """Shares and means of sums."""
     pairs = 2 * max(sums["touching"] + sums["touching_raw"], 1)
     return {
         "joint_mm": 1000 * sums["joint"] / sums["hand_frames"],
@@ -366,7 +379,7 @@ def measured(trial: Trial, fingers: Sequence[Fingers], away_m: float = 0.0) -> d
         "released": 100 * sums["as released"] / max(sums["sound"], 1),
         "deep": 100 * (1 - sums["sound"] / sums["frames"]),
         "penetration_cm": 100 * sums["depth"] / max(sums["overlaps"], 1),
-        "smooth_cm_s2": 100 * sums["acceleration"] / max(sums["hands"], 1),
+        "smooth_cm_s2": 100 * sums["acceleration"] / max(sums["accelerations"], 1),
         "capsule_f1": 200 * 2 * sums["touching_both"] / pairs,
         "frames": sums["frames"],
     }
@@ -384,7 +397,7 @@ def _piece_sums(piece: Piece, made: Fingers, away_m: float) -> dict[str, float]:
     depth = results["SI"].penetration_m[scored]
     contacts = contacts_in(scene, scored)
     touching, touching_raw = _touching(contacts), _touching_raw(piece)
-    motions = [recording.motion(state.taken(scored)) for state in states.values()]
+    accelerations = np.array([_acceleration(recording, state, scored) for state in states.values()])
     inside = contacts.depth_m[contacts.depth_m > 0]
     return {
         "joint": float(sum(error.mean(axis=1).sum() for error in errors)),
@@ -397,18 +410,26 @@ def _piece_sums(piece: Piece, made: Fingers, away_m: float) -> dict[str, float]:
         "touching": float(len(touching)),
         "touching_raw": float(len(touching_raw)),
         "touching_both": float(len(touching & touching_raw)),
-        "acceleration": float(sum(smoothness_m_s2(*motion, RATE_HZ) for motion in motions)),
-        "hands": float(len(motions)),
+        "acceleration": float(np.prod(accelerations, axis=1).sum()),
+        "accelerations": float(accelerations[:, 1].sum()),
     } | {name: float(result.passed.sum()) for name, result in results.items()}
 
 
-_RAW_TOUCHING: dict[tuple[str, int], set[tuple[int, int]]] = {}
+def _acceleration(recording: HandRecording, state: HandState, scored: np.ndarray) -> tuple[float, int]:
+    """Mean acceleration where three frames in a row are scored, and in how many places."""
+    joints_m, wrist_rotmats = recording.motion(state)
+    joints_m = np.where(scored[:, None, None], joints_m, np.nan)
+    places = int((scored[2:] & scored[1:-1] & scored[:-2]).sum())
+    return (smoothness_m_s2(joints_m, wrist_rotmats, RATE_HZ), places) if places else (0.0, 0)
+
+
+_RAW_TOUCHING: dict[tuple[str, int, int], set[tuple[int, int]]] = {}
 
 
 def _touching_raw(piece: Piece) -> set[tuple[int, int]]:
     """What touches in the recording; every row is held against it."""
     recording, frames, scored = piece
-    key = (recording.name, frames.start)
+    key = (recording.name, frames.start, frames.stop)
     if key not in _RAW_TOUCHING:
         raw = {side: recording.fingers[side][frames] for side in SIDES}
         _RAW_TOUCHING[key] = _touching(contacts_in(recording.scene(recording.states(raw, frames), frames), scored))
@@ -431,7 +452,7 @@ def _moved_away(recording: HandRecording, frames: slice, state: HandState, way_m
 
 
 def kept(key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
-    """What was computed under a key before with the same settings, else what is computed now."""
+    """What was computed under a key before with the same settings and code, else what is computed now."""
     path = kept_path(key, ".json")
     if not path.is_file():
         began, processor = time.perf_counter(), time.process_time()
@@ -441,10 +462,17 @@ def kept(key: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     return json.loads(path.read_text())
 
 
-def kept_path(key: str, ending: str) -> Path:
-    digest = sha256(f"{key} {SIZES} {SETTINGS}".encode()).hexdigest()[:12]
+def kept_path(key: str, ending: str, code: tuple[str, ...] = MEASURED_BY) -> Path:
+    """code: files and folders below the project's that what is kept depends on."""
+    digest = sha256(f"{key} {SIZES} {SETTINGS} {_code_digest(code)}".encode()).hexdigest()[:12]
     KEPT.mkdir(parents=True, exist_ok=True)
     return KEPT / f"{key.replace(' ', '-').replace(',', '')}-{digest}{ending}"
+
+
+@cache
+def _code_digest(places: tuple[str, ...]) -> str:
+    paths = [path for place in places for path in (sorted((ROOT / place).rglob("*.py")) or [ROOT / place])]
+    return sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
 
 
 COLUMNS = {
@@ -460,7 +488,8 @@ COLUMNS = {
 }
 
 
-def show_rows(title: str, rows: dict[str, list[dict[str, float]]]) -> None:
+def show_sums(title: str, sums: Rows) -> None:
+    rows = {name: [figures_of(one) for one in seeds] for name, seeds in sums.items()}
     frames = int(next(iter(rows.values()))[0]["frames"])
     lines = [[name, *(_cell([one[key] for one in figures]) for key in COLUMNS)] for name, figures in rows.items()]
     show(f"{title}, {frames} scored frames", ["row", *COLUMNS.values()], lines)
