@@ -65,7 +65,7 @@ VARIANTS_OF_OURS: dict[str, dict[str, Any]] = {
 }
 UNSEEN = ("ours", "no sensors", "no ambient", "no distance")
 NEAREST = 10
-AWAY_M = 0.02
+AWAY_M, OUT_OF_REACH_M = 0.02, 10.0
 LEAD_FRAMES = RATE_HZ // 2  # a rollout begins so long before the first frame that counts
 Fingers = dict[Side, np.ndarray]
 
@@ -324,6 +324,7 @@ def controls(trial: Trial) -> dict[str, dict[str, float]]:
     return {
         "raw data": measured(trial, raw),
         "raw hands 2 cm away": measured(trial, raw, AWAY_M),
+        "no hands: the floor": measured(trial, raw, OUT_OF_REACH_M),
         "neutral pose": both(held(hand.rest_rotmats)),
         "mean training pose": both(held(mean)),
         "frozen at the first scored frame": both(_frozen),
