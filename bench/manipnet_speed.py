@@ -2,13 +2,14 @@
 
 ``python -m bench fingers``. Untrained networks at the paper's size and the small one (what they say makes no difference
 to the time), the embedded hand, a box of 12 and a sphere of 20,480 triangles, every joint to be moved: the worst there
-is. Shares of the processor time beside it. With HOIDATA_MANIPNET the real recordings, lifted frames, as well: there the
-recorded pose and distances stand for what the network says.
+is. With HOIDATA_MANIPNET the real recordings, lifted frames, as well: there the recorded pose and distances stand for
+what the network says. Where the time goes stands beside it, and as a picture in .hoidata/manipnet.
 """
 
 import os
 import time
-from collections import defaultdict
+from collections.abc import Callable, Mapping
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +17,13 @@ import torch
 import trimesh
 
 from bench.harness import show
-from bench.manipnet import SETTINGS
+from bench.manipnet import KEPT, SETTINGS
 from bench.manipnet_recordings import NAMES, HandRecording, read_hands
-from hoidata.clips.clip import SIDES
+from hoidata.clips.clip import SIDES, Side
+from hoidata.files import write_whole
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
+from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
@@ -31,109 +34,116 @@ from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Follower, Predictor, situation
 
 FRAMES, WARM_UP = 240, 30
-HANDS = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
+SIZES = {"full": 512, "small": 128}
+PARTS = ("trajectories", "sensors", "network", "post-processing")
+HANDS: dict[Side, TrackedHand] = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    rows = []
-    for size, width in (("full", 512), ("small", 128)):
+    found = {}
+    for size, width in SIZES.items():
         for thing, mesh in (
             ("box", trimesh.creation.box((0.06, 0.06, 0.1))),
             ("sphere", trimesh.creation.icosphere(5)),
         ):
             vertices = np.asarray(mesh.vertices) * (0.04 if thing == "sphere" else 1.0)
             model = ObjectModel(thing, vertices, np.asarray(mesh.faces), np.zeros(len(vertices), np.uint8))
-            rows.append([f"{size}, {thing} of {len(mesh.faces)}", *_figures(model, width)])
-    columns = ["network, object", "frames/s", "median ms", "p99 ms", *(f"{name} ms" for name in _PARTS)]
-    show("Both hands, one core, processor time", columns, rows)
+            found[f"{size}, {thing} of {len(mesh.faces):,}, every joint moved"] = worst_ms(model, width)
     if root := os.environ.get("HOIDATA_MANIPNET"):
-        show_recordings(Path(root))
-
-
-def show_recordings(root: Path) -> None:
-    """Both hands of the real recordings, with their own objects."""
+        for recording in (read_hands(Path(root), name) for name in NAMES):
+            for size, width in SIZES.items():
+                label = f"{size}, {recording.name} of {len(recording.control.model.faces):,}"
+                found[label] = recorded_ms(recording, width)
     rows = []
-    for name in NAMES:
-        recording = read_hands(root, name)
-        for size, width in (("full", 512), ("small", 128)):
-            spent = _seconds_of(recording, width)
-            figures = [
-                f"{1 / spent.mean():.0f}",
-                f"{1000 * np.median(spent):.1f}",
-                f"{1000 * np.percentile(spent, 99):.1f}",
-            ]
-            rows.append([f"{size}, {name} of {len(recording.control.model.faces)}", *figures])
-    show(
-        "The real recordings, both hands, one core, processor time",
-        ["network, object", "frames/s", "median ms", "p99 ms"],
-        rows,
-    )
+    for label, spent in found.items():
+        whole = spent.sum(axis=1)
+        figures = [f"{1000 / whole.mean():.0f}", f"{np.median(whole):.1f}", f"{np.percentile(whole, 99):.1f}"]
+        rows.append([label, *figures, *(f"{part:.2f}" for part in np.median(spent, axis=0))])
+    columns = ["network, object", "frames/s", "median ms", "p99 ms", *(f"{name} ms" for name in PARTS)]
+    show("Both hands, one core, processor time", columns, rows)
+    write_whole(KEPT / "time.svg", picture({label: np.median(spent, axis=0) for label, spent in found.items()}))
+    print(f"picture: {KEPT / 'time.svg'}")
 
 
-def _seconds_of(recording: HandRecording, width: int) -> np.ndarray:
-    """(frame,) of frames from a lifted one on, less those to warm up."""
+def recorded_ms(recording: HandRecording, width: int) -> np.ndarray:
+    """(frame, part) of a recording's frames from a lifted one on; what it shows stands for what a network says."""
     lifted = np.flatnonzero(recording.lifted & recording.usable)
     frames = slice(lifted[len(lifted) // 3], lifted[len(lifted) // 3] + FRAMES)
     hands, control, time_s = recording.hands, recording.control, recording.time_s[frames]
-    config = sized(NetworkConfig(encoder=width, features=SETTINGS), hands["right"])
-    predictor = Predictor(ManipNet(config).eval())
-    start = frames.start
-    followers = {
-        side: Follower(predictor, hands[side], recording.surface, recording.fingers[side][start]) for side in SIDES
-    }
     said = {}
     for side in SIDES:
         state = hands[side].state(recording.fingers[side][frames])
         placed = control.thing.at(time_s).inverse() @ control.wrists[side].at(time_s)
         distance_m = recording.surface.nearest(placed @ state.point_m, None).distance_m
         said[side] = outputs(hands[side], state, distance_m, SETTINGS)
+    start: dict[Side, np.ndarray] = {side: recording.fingers[side][frames.start] for side in SIDES}
+    answers: list[dict[Side, np.ndarray]] = [
+        {side: said[side][frame] for side in SIDES} for frame in range(1, len(time_s))
+    ]
+    return _spent_ms(control, hands, width, start, time_s, lambda frame, made: answers[frame])
+
+
+def worst_ms(model: ObjectModel, width: int) -> np.ndarray:
+    """(frame, part) of hands whose every joint is said to be on the surface."""
+
+    def answers(frame: int, made: np.ndarray) -> dict[Side, np.ndarray]:
+        for side, output in zip(SIDES, made, strict=True):
+            output[-HANDS[side].n_points :] = 0.2
+        return dict(zip(SIDES, made, strict=True))
+
+    start: dict[Side, np.ndarray] = {side: hand.rest_rotmats for side, hand in HANDS.items()}
+    return _spent_ms(_control(model), HANDS, width, start, np.arange(FRAMES) / 60, answers)
+
+
+def _spent_ms(
+    control: Control,
+    hands: Mapping[Side, TrackedHand],
+    width: int,
+    start: Mapping[Side, np.ndarray],
+    time_s: np.ndarray,
+    answers: Callable[[int, np.ndarray], Mapping[Side, np.ndarray]],
+) -> np.ndarray:
+    """(frame, part) processor time, less the frames to warm up. answers: by frame what counts as said."""
+    config = sized(NetworkConfig(encoder=width, features=SETTINGS), hands["right"])
+    predictor = Predictor(ManipNet(config).eval())
+    surface = surface_index(control.model)
+    followers = {side: Follower(predictor, hands[side], surface, start[side]) for side in SIDES}
     spent = []
-    for frame in range(1, len(time_s)):
-        began = time.process_time()
-        now, then = (
-            {side: situation(control, side, hands[side], t, SETTINGS) for side in SIDES}
-            for t in time_s[frame - 1 : frame + 1]
-        )
-        predictor(np.stack([followers[side].inputs(now[side]) for side in SIDES]))
-        for side in SIDES:
-            followers[side].advance(said[side][frame], then[side])
-        spent.append(time.process_time() - began)
-    return np.array(spent[WARM_UP:])
-
-
-_PARTS = ("trajectories", "sensors", "network", "post-processing")
-
-
-def _figures(model: ObjectModel, width: int) -> list[str]:
-    control = _control(model)
-    predictor = Predictor(ManipNet(sized(NetworkConfig(encoder=width), HANDS["right"])).eval())
-    followers = {
-        side: Follower(predictor, hand, surface_index(model), hand.rest_rotmats) for side, hand in HANDS.items()
-    }
-    parts, whole = defaultdict(list), []
-    for number in range(FRAMES):
+    for frame, times in enumerate(pairwise(time_s)):
         marks = [time.process_time()]
-        at = number / 60
-        now, then = (
-            {side: situation(control, side, hand, t, predictor.settings) for side, hand in HANDS.items()}
-            for t in (at, at + 1 / 60)
-        )
+        now, then = ({side: situation(control, side, hands[side], t, SETTINGS) for side in SIDES} for t in times)
         marks.append(time.process_time())
         inputs = np.stack([followers[side].inputs(now[side]) for side in SIDES])
         marks.append(time.process_time())
         made = predictor(inputs)
         marks.append(time.process_time())
-        for side, output in zip(SIDES, made, strict=True):
-            output[-HANDS[side].n_points :] = 0.2  # every joint is to be moved
+        for side, output in answers(frame, made).items():
             followers[side].advance(output, then[side])
         marks.append(time.process_time())
-        whole.append(marks[-1] - marks[0])
-        for name, spent in zip(_PARTS, np.diff(marks), strict=True):
-            parts[name].append(spent)
-    kept = 1000 * np.array(whole[WARM_UP:])
-    shares = [f"{1000 * np.median(parts[name][WARM_UP:]):.2f}" for name in _PARTS]
-    return [f"{1000 / kept.mean():.0f}", f"{np.median(kept):.1f}", f"{np.percentile(kept, 99):.1f}", *shares]
+        spent.append(np.diff(marks))
+    return 1000 * np.array(spent[WARM_UP:])
+
+
+def picture(spent_ms: Mapping[str, np.ndarray], width: int = 760) -> str:
+    """SVG of a bar per row, as long as its frame takes, in the colours of its parts."""
+    colours, left, high = ("#9aa3ad", "#2a6fb0", "#2f8f4e", "#c2562d"), 330, 22
+    scale = (width - left - 60) / max(float(parts.sum()) for parts in spent_ms.values())
+    marks = [
+        f'<rect x="{left + 110 * number}" y="6" width="12" height="12" fill="{colour}"/>'
+        f'<text x="{left + 16 + 110 * number}" y="16">{name}</text>'
+        for number, (name, colour) in enumerate(zip(PARTS, colours, strict=True))
+    ]
+    for row, (label, parts) in enumerate(spent_ms.items()):
+        top, ends = 30 + high * row, left + scale * np.concatenate([[0.0], np.cumsum(parts)])
+        marks.append(f'<text x="{left - 8}" y="{top + 13}" text-anchor="end">{label}</text>')
+        marks += [
+            f'<rect x="{start:.1f}" y="{top}" width="{stop - start:.1f}" height="{high - 6}" fill="{colour}"/>'
+            for (start, stop), colour in zip(pairwise(ends), colours, strict=True)
+        ]
+        marks.append(f'<text x="{ends[-1] + 5:.1f}" y="{top + 13}">{parts.sum():.1f} ms</text>')
+    size = f'width="{width}" height="{40 + high * len(spent_ms)}" font-family="sans-serif" font-size="12"'
+    return f'<svg xmlns="http://www.w3.org/2000/svg" {size}>\n' + "\n".join(marks) + "\n</svg>\n"
 
 
 def _control(model: ObjectModel) -> Control:
