@@ -15,6 +15,7 @@ from bench import (
     evaluator,
     kernels,
     manipnet,
+    manipnet_across,
     manipnet_course,
     manipnet_speed,
     physics,
@@ -48,6 +49,7 @@ BENCHMARKS = {
     "borders": borders.main,
     "manipnet": manipnet.main,
     "manipnet-course": manipnet_course.main,
+    "manipnet-across": manipnet_across.main,
 }
 
 
