@@ -7,11 +7,16 @@ from typing import Any
 from models.bimart_tables.variants import Settings
 
 
+NO_MAP = {"with_map": False}
+# Motions of a clip for rows that are told from others by means, and for rows that only have to lose.
+ABLATED, CONTROL = 4, 2
+
+
 @dataclass(frozen=True)
 class Row:
     """One row. family: of the registry. settings: of BimArt's sampling, laid over ``sample.bimart``.
 
-    most_samples: motions of a clip that are enough for it, where its figures are no best of many.
+    most_samples: motions of a clip that are enough for it.
     """
 
     family: str
@@ -22,10 +27,9 @@ class Row:
 
 def _plain(title: str, **sampling: Any) -> Row:
     """As the networks made it: no guidance by contact maps, no refinement."""
-    return Row("bimart", title, {"sampling": {"guide": "off", **sampling}, "refined": False})
+    return Row("bimart", title, {"sampling": {"guide": "off", **sampling}, "refined": False}, ABLATED)
 
 
-NO_MAP = {"with_map": False}
 # A clip has one nearest window and one recording; the next nearest windows stand in for further samples.
 ROWS: Mapping[str, Mapping[str, Row]] = {
     "rivals": {
@@ -42,11 +46,11 @@ ROWS: Mapping[str, Mapping[str, Row]] = {
     "part": {
         "no-map": _plain("without contact maps", **NO_MAP),
         "map": _plain("part-BPS; told contact maps"),
-        "map-guided": Row("bimart", "and guided by them", {"refined": False}),
+        "map-guided": Row("bimart", "and guided by them", {"refined": False}, ABLATED),
         "bimart": Row("bimart", "and refined: BimArt"),
-        "other-path": Row("bimart-other-path", "BimArt told another path", most_samples=3),
-        "other-object": Row("bimart-other-object", "BimArt told another object", most_samples=3),
-        "zero-map": Row("bimart-zero-map", "BimArt told a map of zeros", most_samples=3),
+        "other-path": Row("bimart-other-path", "BimArt told another path", most_samples=CONTROL),
+        "other-object": Row("bimart-other-object", "BimArt told another object", most_samples=CONTROL),
+        "zero-map": Row("bimart-zero-map", "BimArt told a map of zeros", most_samples=CONTROL),
     },
     "unscaled": {"unscaled": _plain("unscaled BPS")},
     "whole": {"whole": _plain("part-agnostic BPS")},

@@ -37,7 +37,7 @@ COLUMNS = {
 NOTE = (
     "Figures as BimArt's release has them / corrected (hoidata/metrics/README.md); contact F1 and joints see where "
     "hands are. As released: of the first motion of each clip alone. Of several seeds the mean, in brackets the "
-    "standard deviation. Controls have three motions a clip, so that their best is a best of three."
+    "standard deviation. A best sample is the best of as many motions as a clip has: the more, the nearer."
 )
 
 
