@@ -6,7 +6,6 @@ from typing import Any
 
 from models.bimart_tables.variants import Settings
 
-
 NO_MAP = {"with_map": False}
 # Motions of a clip for rows that are told from others by means, and for rows that only have to lose.
 ABLATED, CONTROL = 4, 2
