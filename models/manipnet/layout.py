@@ -52,6 +52,7 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
         return [rows[name][number] for name in rows for number in np.flatnonzero(times)]
 
     samples = kept["trajectory"].reshape(-1, SAMPLE_NUMBERS)
+    long = np.flatnonzero(settings.samples_s > SHORT_FUTURE_S + 1e-9)
     signed = [kept["distance"], kept["normal"]]
     return {
         "ambient": [kept["ambient"]],
@@ -60,7 +61,7 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
         "distance": [kept["proximity"], *signed],
         "sensors": [kept["ambient"], kept["proximity"], *signed],
         "future": at(later),
-        "long-future": [*at(far), *samples[settings.samples_s > SHORT_FUTURE_S + 1e-9]],
+        "long-future": [*at(far), *(samples[number] for number in long)],
     }
 
 
