@@ -65,6 +65,22 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
     }
 
 
+def times_read_s(kept: np.ndarray, hand: TrackedHand, settings: FeatureSettings) -> tuple[float, float]:
+    """The earliest and the latest time, seconds from now, of which a network with these kept columns reads anything.
+
+    kept: (input,) as ``kept_columns`` gives. (A velocity also asks for one step before its sample.)
+    """
+    count = sizes(hand, settings)
+    parts = dict(zip(count, np.split(kept, np.cumsum(list(count.values()))[:-1]), strict=True))
+    samples = np.any(parts["trajectory"].reshape(-1, SAMPLE_NUMBERS), axis=1)
+    if settings.smooth and samples.any():  # every sample has something of the others
+        samples = np.ones_like(samples)
+    times = np.array(settings.sensors.times_s)
+    sensed = [np.any(parts[name].reshape(len(times), -1), axis=1) for name in ("proximity", "distance")]
+    read = np.concatenate([[0.0], settings.samples_s[samples], *(times[seen] for seen in sensed)])
+    return float(read.min()), float(read.max())
+
+
 def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:
     """(input,) and (output,): the least spread a number is scaled by, by what it is."""
     count = sizes(hand, settings)
