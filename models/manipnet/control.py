@@ -23,15 +23,23 @@ class Motion:
     position_m: np.ndarray
 
     def at(self, time_s: np.ndarray) -> RigidTransform:
-        """``world_from_body`` at times of any shape: turned by slerp, moved straight, held beyond the ends."""
+        """``world_from_body`` at times of any shape: turned by slerp, moved straight, held beyond the ends.
+
+        What it says of a time depends on the two frames beside it alone, to the last bit: a stream forgets the others.
+        """
         time = np.clip(time_s, self.time_s[0], self.time_s[-1])
-        place = np.interp(time, self.time_s, np.arange(len(self.time_s)))
-        frame = np.rint(place).astype(np.int64)
-        if (np.abs(place - frame) < _ON_FRAME).all():
-            return RigidTransform(self.rotmats[frame], self.position_m[frame])
-        turn = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
-        columns = [np.interp(place, np.arange(len(self.time_s)), column) for column in self.position_m.T]
-        return RigidTransform(turn, np.stack(columns, axis=-1))
+        before = np.searchsorted(self.time_s[1:-1], time, side="right")
+        after = np.minimum(before + 1, len(self.time_s) - 1)
+        since, until = time - self.time_s[before], self.time_s[after] - time
+        on_frame = np.minimum(since, until) <= _ON_FRAME * (since + until)
+        frame = np.where(since <= until, before, after)
+        turn, place = self.rotmats[frame], self.position_m[frame]
+        if not on_frame.all():
+            between = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
+            columns = [np.interp(time, self.time_s, column) for column in self.position_m.T]
+            turn = np.where(on_frame[..., None, None], turn, between)
+            place = np.where(on_frame[..., None], place, np.stack(columns, axis=-1))
+        return RigidTransform(turn, place)
 
     @cached_property
     def _slerp(self) -> Slerp:

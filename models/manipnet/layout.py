@@ -52,6 +52,7 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
         return [rows[name][number] for name in rows for number in np.flatnonzero(times)]
 
     samples = kept["trajectory"].reshape(-1, SAMPLE_NUMBERS)
+    long = np.flatnonzero(settings.samples_s > SHORT_FUTURE_S + 1e-9)
     signed = [kept["distance"], kept["normal"]]
     return {
         "ambient": [kept["ambient"]],
@@ -60,8 +61,24 @@ def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.n
         "distance": [kept["proximity"], *signed],
         "sensors": [kept["ambient"], kept["proximity"], *signed],
         "future": at(later),
-        "long-future": [*at(far), *samples[settings.samples_s > SHORT_FUTURE_S + 1e-9]],
+        "long-future": [*at(far), *(samples[number] for number in long)],
     }
+
+
+def times_read_s(kept: np.ndarray, hand: TrackedHand, settings: FeatureSettings) -> tuple[float, float]:
+    """The earliest and the latest time, seconds from now, of which a network with these kept columns reads anything.
+
+    kept: (input,) as ``kept_columns`` gives. (A velocity also asks for one step before its sample.)
+    """
+    count = sizes(hand, settings)
+    parts = dict(zip(count, np.split(kept, np.cumsum(list(count.values()))[:-1]), strict=True))
+    samples = np.any(parts["trajectory"].reshape(-1, SAMPLE_NUMBERS), axis=1)
+    if settings.smooth and samples.any():  # every sample has something of the others
+        samples = np.ones_like(samples)
+    times = np.array(settings.sensors.times_s)
+    sensed = [np.any(parts[name].reshape(len(times), -1), axis=1) for name in ("proximity", "distance")]
+    read = np.concatenate([[0.0], settings.samples_s[samples], *(times[seen] for seen in sensed)])
+    return float(read.min()), float(read.max())
 
 
 def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:

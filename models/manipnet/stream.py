@@ -1,4 +1,7 @@
-"""Fingers for trajectories that come frame by frame: the same numbers as for the whole clip, half a second later."""
+"""Fingers for trajectories that come frame by frame: the same numbers as for the whole clip, a look-ahead later.
+
+The look-ahead is what the network reads: half a second, 0.1 s for a short trajectory (``without=("long-future",)``).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +14,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, Motion
+from models.manipnet.layout import times_read_s
 from models.manipnet.rollout import Follower, Predictor, Situation, situation
 
 SPARE_S = 0.25  # kept beyond the oldest sample: the one before it tells a velocity
@@ -34,7 +38,7 @@ class Stream:
 
     hands: those to animate; both wrists are always tracked. models: the object of each. start: finger rotations
     (joint - 1, 3, 3) at the first frame. Frame k of the answer stands for k steps of the network after the first
-    frame, whatever the tracker's rate, and is told when what the network looks ahead to is there.
+    frame, whatever the tracker's rate, and is told when what the network reads of later times is there.
     """
 
     def __init__(
@@ -52,8 +56,10 @@ class Stream:
         self.frames: list[TrackedFrame] = []
         self.made = 0
         self.first_s = 0.0
-        settings = predictor.settings
-        self._ahead_s = max(settings.samples_s[-1], settings.sensors.times_s[-1], settings.step_s)
+        # What else is measured of other times meets zeros in the network: that it is not there yet changes no bit.
+        read = [times_read_s(predictor.network.kept.numpy(), hand, predictor.settings) for hand in hands.values()]
+        self._behind_s = -min(earliest for earliest, _ in read)
+        self._ahead_s = max(predictor.settings.step_s, *(latest for _, latest in read))
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
         """Poses that can be told now: by side (joint - 1, 3, 3). Often none, sometimes several."""
@@ -67,7 +73,7 @@ class Stream:
 
     def _told(self, known_s: float) -> list[dict[Side, np.ndarray]]:
         """Poses whose inputs, one step before, lie before ``known_s``."""
-        told, settings = [], self.predictor.settings
+        told = []
         if self.made == 0 and self.frames:
             told.append(self._poses())
             self.made = 1
@@ -80,7 +86,7 @@ class Stream:
                 self.followers[side].advance(output, then[side])
             told.append(self._poses())
             self.made += 1
-            self._forget(self._time_s(self.made - 1) - settings.past_s - SPARE_S)
+            self._forget(self._time_s(self.made - 1) - self._behind_s - SPARE_S)
         return told
 
     def _time_s(self, number: int) -> float:

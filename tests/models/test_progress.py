@@ -22,14 +22,16 @@ from models.common.family import Network, Setup
 from models.common.team import Team, run_team
 from models.common.training import train_network
 from models.registry import load_network
-from tests.models.toy import PARAMS
+from tests.models.toy import BUDGET, PARAMS
 
 STEPS, SAVED_EVERY = 8, 2
+# Beside the toy's, of which other tests train each.
+SETTINGS = PARAMS | {"manipnet": {"network": {"encoder": 8}, "training": BUDGET, "loss": {"rows": 4}}}
 
 
 def train(name: str, root: Path, out: Path, *, progress: Path | None = None, die_at: int = 0, **training) -> None:
     """A short training of one network with these settings beside the toy's; killed (-9) at the start of a step."""
-    params = {**PARAMS[name], "training": {**PARAMS[name]["training"], **training}}
+    params = {**SETTINGS[name], "training": {**SETTINGS[name]["training"], **training}}
     network = load_network(name)
     needed = {load_network(other): out.parent / "needed" / other for other in network.needs}
     network = mortal(network, die_at) if die_at else network
@@ -69,7 +71,7 @@ def out(trained: Path, tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
-@pytest.mark.parametrize("name", PARAMS)
+@pytest.mark.parametrize("name", SETTINGS)
 def test_a_training_killed_three_times_writes_the_bytes_of_an_undisturbed_one(
     annotated_root: Path, out: Path, name: str, capfd: pytest.CaptureFixture
 ) -> None:

@@ -22,6 +22,7 @@ from models.manipnet.features import (
     released_outputs,
     trajectory_features,
 )
+from models.manipnet.layout import kept_columns
 from tests.builders.objects import box_model
 from tests.builders.sensing import small_hand, turns
 
@@ -164,3 +165,18 @@ def test_the_released_layout_comes_back_and_turns_the_ambient_sensor_round_in_x(
     said = np.random.default_rng(0).normal(size=(2, len(outputs.scale)))
     np.testing.assert_allclose(outputs.back(outputs(said)), said)
     np.testing.assert_array_equal(outputs(said)[:, -hand.n_points :], said[:, -hand.n_points :])
+
+
+def test_what_is_switched_off_is_all_that_its_name_says():
+    hand, n_points, n_sensors = HANDS["mano"], HANDS["mano"].n_points, HANDS["mano"].n_sensors
+    off = {
+        "ambient": 1000,
+        "proximity": 6 * n_sensors,
+        "signed-distance": 9 * n_points,
+        "distance": 6 * n_sensors + 9 * n_points,
+        "sensors": 1000 + 6 * n_sensors + 9 * n_points,
+        "future": 5 * (n_sensors + n_points),
+        "long-future": 4 * (n_sensors + n_points) + 8 * 16,  # 0.15 to 0.5 s of the trajectory
+    }
+    for name, count in off.items():
+        assert (kept_columns(hand, SETTINGS, [name]) == 0).sum() == count, name
