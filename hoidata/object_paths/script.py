@@ -15,13 +15,14 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.object_paths.path import ObjectPath, PathStep, checked_path, frame_times, smooth
+from hoidata.object_paths.path import ObjectPath, PathStep, check_mean_rate, checked_path, frame_times, smooth
 from hoidata.objects.model import ObjectModel
 
 MOST_LETTERS, MOST_STEPS = 5000, 200
 REST_S = 0.5  # before the first step and after the last, in which hands come and go
 PACE = {"length": 0.2, "angle": math.radians(60)}  # mean speed of a step without a time: m/s, rad/s
 SHORTEST_S, HOLD_S, SHAKES, SHAKES_PER_S = 0.6, 1.0, 3, 2.0
+MOST_SHAKES_PER_S = 10.0  # 30 frames per second show no more
 LIFT_M, SHAKE_M, TILT_RAD, TURN_RAD, OPEN_RAD = 0.15, 0.03, math.radians(45), math.pi / 2, math.pi / 2
 UNITS: dict[str, tuple[str, float]] = {
     **{word: ("length", 1.0) for word in ("m", "metre", "metres", "meter", "meters")},
@@ -213,10 +214,15 @@ def _planned(step: Step, model: ObjectModel, state: _State, plan: _Plan, start: 
         count = step.count or SHAKES
         span = step.duration_s or count / SHAKES_PER_S
         way = DIRECTIONS[step.direction or "up"] * (SHAKE_M if step.amount is None else step.amount)
+        if count / span > MOST_SHAKES_PER_S:
+            remedy = f"give it {math.ceil(10 * count / MOST_SHAKES_PER_S) / 10:g} s or more"
+            raise BadInput(where, f"at most {MOST_SHAKES_PER_S:g} times a second", f"{count / span:.3g}", remedy)
         plan.shakes.append((start, span, count, way))
         return span
     span = step.duration_s or _easy_span(targets, state)
     for name, target in targets.items():
+        unit = "m/s" if name in "xyz" else "rad/s of the hinge" if name == "hinge" else "rad/s"
+        check_mean_rate(PathStep(step.words, start, start + span), np.array([target - state.value[name]]), unit)
         if plan.keys[name] and plan.keys[name][-1][0] > start + 1e-9:
             raise BadInput(where, "steps at once that move different things", "two that move the same", "write 'then'")
         plan.keys[name] += [(start, state.value[name]), (start + span, target)]

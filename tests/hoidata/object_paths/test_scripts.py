@@ -1,5 +1,7 @@
 """A short script becomes the motion it says."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -134,12 +136,28 @@ def test_velocity_and_acceleration_never_jump():
         ("turn up", "left or right"),
         ("tilt up", "left, right"),
         ("lift - cm", "15 cm"),
+        ("turn 360 deg in 0.03 s", "give 'turn 360 deg in 0.03 s' 1.0 s"),
+        ("lift 20 cm, shake 100 times in 1 s", "give it 10 s"),
+        ("open to 400 deg in 10 s", "0 to 120 deg"),
     ],
 )
 def test_what_cannot_be_gets_an_answer_that_says_what_to_do(script, words):
     with pytest.raises(BadInput) as error:
         made(script)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("script", ["lift 1 m in 0.1 s", "turn 720 deg in 0.5 s", "lift 45 cm in 0.3 s"])
+def test_a_step_that_is_too_fast_is_taken_in_the_time_the_answer_names(script):
+    with pytest.raises(BadInput) as error:
+        made(script)
+    seconds = re.search(r"' ([\d.]+) s or more", str(error.value)).group(1)
+    assert made(re.sub(r"in [\d.]+ s", f"in {seconds} s", script)).track.n_frames > float(seconds) * FPS
+
+
+def test_a_lid_opens_no_farther_than_180_degrees_where_nobody_says_more():
+    with pytest.raises(BadInput, match=r"-180 to 180 deg, got 400 deg.*--hinge-range"):
+        made("lift 50 cm, open to 400 deg in 10 s", limits_rad=None)
 
 
 def test_a_rigid_object_is_not_opened_but_may_be_lifted():
