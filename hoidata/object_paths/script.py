@@ -8,7 +8,7 @@ and how long it takes ("in 1.5 s"); without, at an easy pace.
 import difflib
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -94,7 +94,7 @@ def scripted_path(
     """
     plan, state = _Plan(), _State(dict.fromkeys(_CHANNELS, 0.0), limits_rad)
     now, steps = rest_s, [PathStep("at rest", 0.0, rest_s)]
-    for group in parse_script(script):
+    for group in parse_script(script, re.findall(r"[^\W\d_]+", model.name.lower())):
         spans = [_planned(step, model, state, plan, now) for step in group]
         steps += [PathStep(step.words, now, now + span) for step, span in zip(group, spans, strict=True)]
         now += max(spans)
@@ -110,13 +110,18 @@ def scripted_path(
     return checked_path(model, shift, rotmats, curve["hinge"], steps, limits_rad, standing)
 
 
-def parse_script(script: str) -> list[list[Step]]:
-    """Groups of steps; those of a group happen at once. Raises BadInput that names the step and what to write."""
+def parse_script(script: str, names: Sequence[str] = ()) -> list[list[Step]]:
+    """Groups of steps; those of a group happen at once. names: words for the object, which say nothing.
+
+    Raises BadInput that names the step and what to write.
+    """
     if len(script) > MOST_LETTERS:
         raise BadInput("script", f"at most {MOST_LETTERS} letters", f"{len(script)}", "leave steps out")
     text = re.sub(r"#[^\n]*", "", script).lower()
     pieces = [piece.strip() for piece in re.split(r"[,;\n]+(?!\d)|\bthen\b|\.(?!\d)", text)]
-    groups = [[_parsed(part.strip()) for part in re.split(r"\band\b|\bwhile\b", piece)] for piece in pieces if piece]
+    groups = [
+        [_parsed(part.strip(), names) for part in re.split(r"\band\b|\bwhile\b", piece)] for piece in pieces if piece
+    ]
     if not 1 <= sum(map(len, groups)) <= MOST_STEPS:
         raise BadInput("script", f"1 to {MOST_STEPS} steps", f"{sum(map(len, groups))}", f"write e.g. {EXAMPLE!r}")
     return groups
@@ -125,7 +130,7 @@ def parse_script(script: str) -> list[list[Step]]:
 EXAMPLE = "lift 15 cm, open to 70 deg in 1.5 s, hold, put down"
 
 
-def _parsed(words: str) -> Step:
+def _parsed(words: str, names: Sequence[str]) -> Step:
     tokens = re.findall(r"\d*\.?\d+(?:e[+-]?\d+)?|[^\W\d_]+|°|[^\w\s]", words.replace("degrees", "deg"))
     if not tokens:
         raise BadInput("script", "a verb", repr(words), f"begin with one of {', '.join(VERBS)}")
@@ -134,24 +139,25 @@ def _parsed(words: str) -> Step:
             f"script: {words[:40]!r}", "a step of at most 20 words", f"{len(tokens)}", "part steps by commas"
         )
     verb, rest = _verb(words, tokens)
-    return _with_details(Step(verb, words), rest)
+    return _with_details(Step(verb, words), rest, names)
 
 
 def _verb(words: str, tokens: list[str]) -> tuple[str, list[str]]:
-    if " ".join(tokens[:2]) in _TWO_WORDS:
-        return _TWO_WORDS[" ".join(tokens[:2])], tokens[2:]
+    for pair, verb in _TWO_WORDS.items():
+        first, second = pair.split()
+        if tokens[0] == first and second in tokens[1:]:  # "put the box down"
+            place = tokens.index(second, 1)
+            return verb, tokens[1:place] + tokens[place + 1 :]
     if tokens[0] in _SYNONYMS:
         return _SYNONYMS[tokens[0]], tokens[1:]
-    known = [*VERBS, *_SYNONYMS, *(pair.split()[0] for pair in _TWO_WORDS)]
-    raise BadInput(f"script: {words[:40]!r}", f"a verb: {', '.join(VERBS)}", tokens[0], _nearest(tokens[0], known))
+    whole = [pair for pair in _TWO_WORDS if pair.split()[0] == tokens[0]]
+    near = whole or difflib.get_close_matches(" ".join(tokens[:2]), _TWO_WORDS, 1, 0.75)
+    near = near or difflib.get_close_matches(tokens[0], _SYNONYMS, 1, 0.5)
+    remedy = f"did you mean {near[0]!r}?" if near else f"write e.g. {EXAMPLE!r}"
+    raise BadInput(f"script: {words[:40]!r}", f"a verb: {', '.join(VERBS)}", tokens[0], remedy)
 
 
-def _nearest(word: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(word, known, 1, 0.5)
-    return f"did you mean {near[0]!r}?" if near else f"write e.g. {EXAMPLE!r}"
-
-
-def _with_details(step: Step, tokens: list[str]) -> Step:
+def _with_details(step: Step, tokens: list[str], names: Sequence[str]) -> Step:
     """The step with its direction, amounts and time."""
     values: dict[str, object] = {}
     place, before = 0, ""
@@ -165,9 +171,9 @@ def _with_details(step: Step, tokens: list[str]) -> Step:
             place += 1
         elif word in DIRECTIONS and "direction" not in values:
             values["direction"] = word
-        elif word not in (*_FILLING, "to", "in", "for", "over", "within"):
-            known = [*DIRECTIONS, *UNITS, "to", "in", "for", *_SYNONYMS]
-            remedy = _nearest(word, known)
+        elif word not in (*_FILLING, "to", "in", "for", "over", "within", *names):
+            near = difflib.get_close_matches(word, [*DIRECTIONS, *UNITS], 1, 0.7)
+            remedy = f"did you mean {near[0]!r}?" if near else f"leave {word!r} out"
             raise BadInput(f"script: {step.words[:40]!r}", "a direction, an amount or a time", word, remedy)
         before, place = word, place + 1
     return Step(step.verb, step.words, **values)  # pyright: ignore[reportArgumentType]
@@ -367,7 +373,6 @@ _TWO_WORDS = {
     "put down": "put down",
     "set down": "put down",
     "lay down": "put down",
-    "put it": "put down",
     "pick up": "lift",
     "hold still": "hold",
 }
