@@ -9,19 +9,19 @@ import torch
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import BasisSettings
+from hoidata.settings import build_config
 from models.bimart.guidance import Map, combined, discrepancy, metre_step, released_step
 from models.bimart.learning import LossConfig, middle_start, window_starts
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
-from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig, held_joints
+from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig, WalkConfig, held_joints
 from models.bimart.scene import FeatureConfig, Recorded, Scene
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
-from models.common.sampling import SamplerConfig
 from models.common.transformer import TransformerConfig
 from tests.builders.objects import hinged_box
 
 FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window=8, state="local", most_m=0.2)
 TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)
-FAST = replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5))
+FAST = replace(OURS, sampler=WalkConfig("ddim", 2, 0.5))
 
 
 def path_features(frames: int, seed: int = 0, shift_m: float = 0.0) -> np.ndarray:
@@ -213,7 +213,7 @@ def asked_path(frames: int, seed: int, number: int = 0) -> Path:
 
 def test_a_motion_is_drawn_from_its_own_seed_in_any_company(model: BimArt) -> None:
     first, second = asked_path(12, 1), asked_path(12, 2, 1)
-    for config in (FAST, replace(FAST, sampler=SamplerConfig("ddpm", 3, 0.5))):
+    for config in (FAST, replace(FAST, sampler=WalkConfig("ddpm", 3, 0.5))):
         ready = replace(model, config=config)
         alone, again, other = (ready.make([path])[0] for path in (first, first, replace(first, seed=5)))
         together = ready.make([second, first])[1]
@@ -250,6 +250,14 @@ def test_presets_differ_as_the_paper_and_its_code_do() -> None:
     assert PRESETS == {"ours": OURS, "paper": PAPER, "released": RELEASED}
     assert replace(RELEASED, rule="paper", contact_anchor=None) == PAPER
     assert SamplingConfig() == OURS
+
+
+def test_settings_of_the_sampler_keep_what_they_do_not_tell() -> None:
+    told = build_config(SamplingConfig, {"sampler": {"steps": 20}}, "sample.bimart.sampling")
+    assert told == replace(OURS, sampler=replace(OURS.sampler, steps=20))
+    assert told.sampler.guidance == 0
+    guided = build_config(SamplingConfig, {"sampler": {"guidance": 0.5}}, "sample.bimart.sampling")
+    assert guided == replace(OURS, sampler=replace(OURS.sampler, guidance=0.5))
 
 
 def test_joints_that_come_near_stay_at_their_place_of_the_part_and_others_go_on() -> None:
