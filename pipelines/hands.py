@@ -1,5 +1,6 @@
 """Hands for a motion of an object that a person made up, or that a clip or a generated motion has, as files."""
 
+import difflib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -17,7 +18,7 @@ from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.object_paths import keyframed_path, read_keyframes, scripted_path
-from hoidata.object_paths.path import PathStep
+from hoidata.object_paths.path import MOST_S, PathStep, check_pace
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
@@ -27,13 +28,15 @@ from models.bimart.hands import MadeHands, MotionWish, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
-from pipelines.objects import MeshWish, stored_object
+from pipelines.objects import MeshWish
 from pipelines.pages.hands_page import write_hands
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
-MOST_FRAMES = 3600
+LEAST_S = 0.3
+MOST_FRAMES = round(MOST_S * FPS) + 1
 CLIPS_FOR_RANGE = 60  # of an object, whose hinge angles say how far it opens
+SCRIPT_FILES = (".txt", ".md", ".script")
 GENERATED = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
 
 
@@ -95,6 +98,7 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
 
 def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Asked:
     """The motion of the object that hands are asked for."""
+    _check_dataset(wish.model, profile, datasets)
     given = {name: value for name in ("script", "keyframes", "clip", "motion") if (value := getattr(wish, name))}
     if len(given) != 1:
         got = " and ".join(f"--{name}" for name in given) or "none"
@@ -109,8 +113,11 @@ def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands
     if wish.length_s is not None:
         asked = _lasting(asked, wish.length_s)
     if asked.thing.n_frames > MOST_FRAMES:
-        got = f"{asked.thing.n_frames / FPS:.0f} s"
-        raise BadInput("object's motion", f"at most {MOST_FRAMES / FPS:.0f} s", got, "make two of it")
+        got = f"{(asked.thing.n_frames - 1) / FPS:g} s"
+        raise BadInput("object's motion", f"at most {MOST_S:g} s", got, "make two of it, or tell a --length")
+    if wish.hinge_range and not asked.thing.model.is_articulated:
+        note = "the object is rigid, so --hinge-range is not looked at; --hinge tells where it turns"
+        asked = asked._replace(notes=[*asked.notes, note])
     return asked
 
 
@@ -118,6 +125,7 @@ def chosen_networks(
     model: str, profile: str, datasets: tuple[str, ...], hands: HandPair
 ) -> tuple[StagePaths, HandsForPaths]:
     """The networks of the dataset asked for, or of the first that has them. Raises MissingResource where none has."""
+    _check_dataset(model, profile, datasets)
     runs = [StagePaths(profile, name) for name in ((model,) if model else datasets)]
     trained = [paths for paths in runs if all(_is_trained(paths, name) for name in BIMART.uses)]
     if not trained:
@@ -133,6 +141,15 @@ def chosen_networks(
             raise BadInput(paths.checkpoints / name, f"hand {facts['hand']}", hands.name, remedy)
     sources = Sources(load_annotated(paths.data, hands), paths.checkpoints, hands, torch.device("cpu"))
     return paths, HandsForPaths.load(sources)
+
+
+def _check_dataset(name: str, profile: str, datasets: tuple[str, ...]) -> None:
+    """Raise BadInput that names the datasets there are, for one that is not among them; "" is none."""
+    paths = StagePaths(profile, name)
+    if name and name not in datasets and not paths.data.is_dir() and not paths.checkpoints.is_dir():
+        near = difflib.get_close_matches(name, datasets, 1, 0.5)
+        remedy = f"did you mean {near[0]!r}?" if near else "name one of them, or leave it out"
+        raise BadInput("--model", f"a dataset: {', '.join(datasets)}", name, remedy)
 
 
 def _is_trained(paths: StagePaths, name: str) -> bool:
@@ -182,16 +199,19 @@ def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Han
         if user.model.is_articulated and limits is None:
             notes.append("how far the hinge opens is not known; --hinge-range 0:110 has it checked")
         return _Thing(user.model, limits, None, notes)
-    names = (wish.model,) if wish.model else datasets
-    known = [paths for name in names if not empty_reason((paths := StagePaths(profile, name)).clips)]
-    for paths in known:
-        store = open_store(paths.clips, hands)
+    stores = _converted((wish.model,) if wish.model else datasets, profile, hands)
+    for store in stores:
         if wish.object in list(store.objects["object"]):
             return _recorded(store, wish.object, limits)
-    if not known:
-        raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb)", wish.object, "correct the path")
-    stored_object(wish.object, known[0].clips, hands)  # says which there are
-    raise AssertionError
+    names = sorted({name for store in stores for name in store.objects["object"]})
+    expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
+    raise BadInput("object", expected, wish.object, "correct the name or path" if names else "correct the path")
+
+
+def _converted(names: tuple[str, ...], profile: str, hands: HandPair) -> list[Store]:
+    """The stores of the datasets that are converted."""
+    folders = [StagePaths(profile, name).clips for name in names]
+    return [open_store(own, hands) for own in folders if not empty_reason(own) and (own / "meta").is_dir()]
 
 
 def _recorded(store: Store, name: str, limits: tuple[float, float] | None) -> _Thing:
@@ -227,11 +247,20 @@ def _of_path(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Ha
         keys = read_keyframes(wish.keyframes)
         path = keyframed_path(thing.model, keys, thing.limits_rad, wish.keyframes, thing.standing)
         return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", thing.notes)
-    text = wish.script
-    if "\n" not in text and len(text) < 250 and Path(text).is_file():
-        text = Path(text).read_text(encoding="utf-8", errors="replace")
+    text = _script_text(wish.script)
     path = scripted_path(thing.model, text, thing.limits_rad, standing=thing.standing)
     return Asked(path.track, own, path.steps, f"script: {' '.join(text.split())}", thing.notes)
+
+
+def _script_text(script: str) -> str:
+    """A script, or that of the file it names."""
+    if "\n" in script or len(script) >= 250:
+        return script
+    if Path(script).is_file():
+        return Path(script).read_text(encoding="utf-8", errors="replace")
+    if Path(script).suffix.lower() in SCRIPT_FILES or ("/" in script and " " not in script):
+        raise BadInput("--script", "steps, or a file of them", f"{script}, which is not there", "correct the path")
+    return script
 
 
 def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
@@ -300,12 +329,17 @@ def _check_track(thing: ObjectTrack, path: Path) -> None:
 
 
 def _lasting(asked: Asked, seconds: float) -> Asked:
-    """The same way in another time."""
-    thing, count = asked.thing, round(seconds * FPS) + 1
-    if not 8 <= count <= MOST_FRAMES:
-        raise BadInput("--length", f"0.3 to {MOST_FRAMES / FPS:.0f} s", f"{seconds:g} s", "ask for another length")
-    old, new = np.arange(thing.n_frames), np.linspace(0, thing.n_frames - 1, count)
+    """The same way in another time. Raises BadInput for a time that is none, or too short for it."""
+    thing = asked.thing
+    if not LEAST_S <= seconds <= MOST_S:
+        raise BadInput("--length", f"{LEAST_S:g} to {MOST_S:g} s", f"{seconds:g} s", "ask for another length")
+    if thing.n_frames < 2:
+        raise BadInput("--length", "a motion of two frames or more", "one frame", "leave it out")
+    count = round(seconds * FPS) + 1
     pace = (count - 1) / (thing.n_frames - 1)
+    if pace < 1:
+        check_pace(thing, pace, "--length")
+    old, new = np.arange(thing.n_frames), np.linspace(0, thing.n_frames - 1, count)
     turned = Slerp(old, Rotation.from_rotvec(thing.rotvec))(new).as_rotvec().astype(np.float32)
     place = CubicSpline(old, thing.translation_m)(new).astype(np.float32)
     hinge = None if thing.hinge_rad is None else CubicSpline(old, thing.hinge_rad)(new).astype(np.float32)

@@ -22,7 +22,8 @@ _SOLID = "inside the solid of a closed part"
 _CONTACT = "5 mm or nearer, none deeper than 1 cm"
 _FORCES = "residual below 0.01, friction 0.35, contact 2 mm"
 Measure = Callable[[Pair, int], np.ndarray]
-_INNER = "all but the first and last; known gravity"
+_THREE = f"{HANDS}, three recorded ones in a row"
+_INNER = f"{HANDS}, with a recorded one before and after; known gravity"
 
 
 def _shares(
@@ -49,11 +50,11 @@ BIMART_METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "BimArt", "bimart_accel_paper", "Accel, paper", "cm/frame2", "lower", bimart.accel_paper, "mean over motions",
-        f"{HANDS}, three in a row", f"{BIMART}, {_PAPER}", samples=1,
+        _THREE, f"{BIMART}, {_PAPER}", samples=1,
     ),
     Metric(
         "BimArt", "bimart_accel_corrected", "Accel, corrected", "m/s2", "nearer the truth", bimart.accel_corrected,
-        "mean over motions", f"{HANDS}, three in a row", f"{BIMART}, {_CORRECTED}",
+        "mean over motions", _THREE, f"{BIMART}, {_CORRECTED}",
     ),
     *_shares(
         "pen_1cm", "Pen 1 cm", "lower", (bimart.pen_1cm_paper, bimart.pen_1cm_corrected), HANDS,
@@ -106,12 +107,12 @@ BIMART_METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "CAMS", "cams_art_paper", "CAMS Art, paper", "", "higher", cams.art_paper, "mean over frames",
-        "frames in which the hinge turns by more than 1e-6 rad to the next", f"{CAMS}, {_PAPER}", samples=1,
+        f"{HANDS} and the hinge turns by more than 1e-6 rad to the next", f"{CAMS}, {_PAPER}", samples=1,
         thresholds="arm above 0.3 of the mean, contact 2 mm",
     ),
     Metric(
         "CAMS", "cams_art_corrected", "CAMS Art, corrected", "", "higher", cams.art_corrected, "mean over motions",
-        "frames in which the hinge turns by more than 0.001 rad to the next", f"{CAMS}, {_CORRECTED}",
+        _TURNS, f"{CAMS}, {_CORRECTED}",
         thresholds="arm above 0.3 of the mean, contact 2 mm, no deeper than 1 cm",
     ),
 )  # fmt: skip

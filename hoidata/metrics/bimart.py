@@ -38,15 +38,16 @@ _NEVER = 1 << 62  # positions from which a grid would pay: these surfaces are as
 
 
 def accel_paper(pair: Pair, every: int) -> np.ndarray:
-    """(hand and frame,) mean over 778 vertices of the length of the second difference, cm per frame^2."""
+    """(hand and frame,) mean over 778 vertices of the length of the second difference, cm per recorded frame^2."""
     del every  # a derivative needs every frame
-    return 100 * _second_differences_m(pair)
+    return 100 * _second_differences_m(pair)[0]
 
 
 def accel_corrected(pair: Pair, every: int) -> np.ndarray:
     """(hand and frame,) the same in m/s^2."""
     del every
-    return FPS**2 * _second_differences_m(pair)
+    length_m, step = _second_differences_m(pair)
+    return length_m * (FPS / step) ** 2
 
 
 def mul_cm(pairs: Sequence[Pair], every: int) -> np.ndarray:
@@ -75,13 +76,17 @@ def border_ratios(values: np.ndarray, borders: Sequence[int], reach: int = 1) ->
     return float(there / elsewhere) if elsewhere else np.nan
 
 
-def _second_differences_m(pair: Pair) -> np.ndarray:
-    each = []
+def _second_differences_m(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
+    """(hand and frame,) lengths over three recorded frames, metres, and how many frames these are apart."""
+    lengths, steps = [np.zeros(0)], [np.zeros(0)]
     for side in pair.sides:
-        seen = np.where(pair.valid(side)[:, None, None], _vertices_m(pair.predicted, side).astype(np.float64), np.nan)
-        second = np.linalg.norm(np.diff(seen, n=2, axis=0), axis=-1).mean(axis=-1)
-        each.append(second[np.isfinite(second)])
-    return np.concatenate([np.zeros(0), *each])
+        vertices = _vertices_m(pair.predicted, side).astype(np.float64)
+        triples = pair.triples()
+        triples = triples[pair.valid(side)[triples].all(axis=1)]
+        before, now, after = (vertices[frames] for frames in triples.T)
+        lengths.append(np.linalg.norm((after - now) - (now - before), axis=-1).mean(axis=-1))
+        steps.append(triples[:, 1] - triples[:, 0])
+    return np.concatenate(lengths), np.concatenate(steps)
 
 
 @lru_cache(maxsize=32)

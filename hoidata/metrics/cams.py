@@ -1,9 +1,10 @@
 """CAMS's three figures (Zheng et al. 2023) of one motion: ``paper`` as its code has them, ``corrected`` in SI units.
 
 Can contacts at the hands, on a table and in the hinge carry both parts' motion, and can both parts be turned against
-each other? A part is a set of points with masses, whose accelerations are second differences, so frames 1 to n - 2 are
-looked at. What its forces must add up to is their sum of m (a - g) and of its moments. A contact pushes within four
-edges of its friction cone; the hinge gives any force at 11 points of its axis, and the opposite one to the other part.
+each other? A part is a set of points with masses, whose accelerations are second differences of recorded frames. Only
+frames in which an acting hand is looked at count: in others no hand could carry anything. What a part's forces must add
+up to is their sum of m (a - g) and of its moments. A contact pushes within four edges of its friction cone; the hinge
+gives any force at 11 points of its axis, and the opposite one to the other part.
 
 ``paper``: a kilogram on every vertex, gravity 1 m per frame^2, contacts at the vertices nearest to hand vertices that
 are inside or within 2 mm, and a table under the lowest vertices wherever they are. Its cones and its choice of table
@@ -78,7 +79,7 @@ def pen_corrected(pair: Pair, every: int) -> np.ndarray:
 
 
 def con_paper(pair: Pair, every: int) -> np.ndarray:
-    """(frame from 1 to n - 2,) 1 where contacts carry both parts with the units of the release, else 0.
+    """(frame with a hand, between recorded ones,) 1 where contacts carry both parts as in the release, else 0.
 
     None without known gravity.
     """
@@ -86,23 +87,24 @@ def con_paper(pair: Pair, every: int) -> np.ndarray:
 
 
 def con_corrected(pair: Pair, every: int) -> np.ndarray:
-    """(frame from 1 to n - 2,) the same in SI units; none either for an object without an inside."""
+    """(frame with a hand, between recorded ones,) the same in SI units; none either for an object without an inside."""
     return _carried(pair, every, paper=False)
 
 
 def _carried(pair: Pair, every: int, paper: bool) -> np.ndarray:
     clip, down = pair.predicted.clip, pair.reference.clip.gravity
-    if down is None or pair.table_m is None or clip.n_frames < 3 or not (paper or _all_solid(clip.object.model)):
+    triples = pair.triples()
+    triples = triples[pair.looked_at()[triples[:, 1]]][::every]
+    if down is None or pair.table_m is None or not len(triples) or not (paper or _all_solid(clip.object.model)):
         return np.zeros(0)
-    scale = 1.0 if paper else FPS**2
     weight = down * (1.0 if paper else GRAVITY_M_S2)
     bodies = vertex_masses(clip.object) if paper else even_masses(clip.object)
     contacts = _contacts(pair, paper)
-    frames = range(1, clip.n_frames - 1)[::every]
     carried = []
-    for frame in frames:
+    for triple in triples:
+        frame, scale = int(triple[1]), 1.0 if paper else (FPS / (triple[1] - triple[0])) ** 2
         about = clip.object.translation_m[frame].astype(np.float64)
-        wanted = needed_wrenches(bodies, frame, scale, weight, about)
+        wanted = needed_wrenches(bodies, triple, scale, weight, about)
         own = [contacts[frame][part] for part in bodies]
         table = _table(pair, frame, down, None if paper else pair.table_m)
         hinge = _hinge_points(clip.object, frame)
@@ -140,12 +142,15 @@ def residual(
 
 
 def needed_wrenches(
-    bodies: dict[int, Masses], frame: int, scale: float, weight: np.ndarray, about_m: np.ndarray
+    bodies: dict[int, Masses], triple: np.ndarray, scale: float, weight: np.ndarray, about_m: np.ndarray
 ) -> np.ndarray:
-    """(part, 6) sums of m (a - g) and of their moments about a point, a = ``scale`` x second difference."""
+    """(part, 6) sums of m (a - g) and of their moments about a point, a = ``scale`` x second difference.
+
+    triple: (3,) the frame and its neighbours.
+    """
     wrenches = []
     for body in bodies.values():
-        before, now, after = body.place_m[frame - 1 : frame + 2]
+        before, now, after = body.place_m[triple]
         force = body.mass_kg[:, None] * (scale * (after - 2 * now + before) - weight)
         wrenches.append(np.concatenate([force.sum(axis=0), np.cross(now - about_m, force).sum(axis=0)]))
     return np.array(wrenches)
@@ -216,12 +221,12 @@ def _object_vertices_m(pair: Pair) -> np.ndarray:
 
 
 def art_paper(pair: Pair, every: int) -> np.ndarray:
-    """(frame in which the hinge turns at all,) 1 where both parts can be turned, in opposite senses, else 0."""
+    """(frame with a hand in which the hinge turns,) 1 where both parts can be turned, in opposite senses, else 0."""
     return _turned(pair, every, paper=True)
 
 
 def art_corrected(pair: Pair, every: int) -> np.ndarray:
-    """(frame in which the hinge turns by more than 0.001 rad,) the same with contacts of the exact surface."""
+    """(frame with a hand in which it turns by more than 0.001 rad,) the same with contacts of the exact surface."""
     return _turned(pair, every, paper=False)
 
 
@@ -231,7 +236,8 @@ def _turned(pair: Pair, every: int, paper: bool) -> np.ndarray:
     if hinge is None or track.hinge_rad is None or len(track.model.parts) < 2:
         return np.zeros(0)
     steps = np.abs(np.diff(track.hinge_rad.astype(np.float64)))
-    frames = np.flatnonzero(steps > (TURNED_PAPER_RAD if paper else TURNED_RAD))[::every]
+    turning = steps > (TURNED_PAPER_RAD if paper else TURNED_RAD)
+    frames = np.flatnonzero(turning & pair.looked_at()[:-1])[::every]
     contacts = _contacts(pair, paper) if len(frames) else {}
     turned = []
     for frame in frames:

@@ -71,14 +71,28 @@ class Pair:
     actions: Actions | None = None
     asked_distances: AskedDistances | None = None
 
+    @property
+    def _timed(self) -> Clip:
+        """The clip that says which frames are looked at."""
+        return (self.reference if self.aligned else self.predicted).clip
+
     def valid(self, side: Side) -> np.ndarray:
         """(frame,) bool: the frames of the prediction in which this hand is looked at: none that was made."""
-        clip = (self.reference if self.aligned else self.predicted).clip
-        return clip.hands[side].valid & clip.recorded
+        return self._timed.hands[side].valid & self._timed.recorded
 
     def frames(self, side: Side, every: int = 1) -> np.ndarray:
         """Every n-th of the frames in which this hand is looked at."""
         return np.flatnonzero(self.valid(side))[::every]
+
+    def looked_at(self) -> np.ndarray:
+        """(frame,) bool: the frames in which any acting hand is looked at."""
+        return np.any([self.valid(side) for side in self.sides], axis=0)
+
+    def triples(self) -> np.ndarray:
+        """(triple, 3) numbers of recorded frames that follow each other, as far apart before the middle as after it."""
+        recorded = np.flatnonzero(self._timed.recorded)
+        triples = np.stack((recorded[:-2], recorded[1:-1], recorded[2:]), axis=1)
+        return triples[np.ptp(np.diff(triples, axis=1), axis=1) == 0]
 
     @cached_property
     def scene(self) -> Scene | None:

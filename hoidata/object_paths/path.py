@@ -4,9 +4,11 @@ World: metres, z up, the table at height 0, x to the right and y away from the p
 on the table at hinge angle 0, the middle of its bounding box above the world's origin, and turns about that middle.
 """
 
-from collections.abc import Sequence
+import math
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import BPoly, PchipInterpolator
@@ -14,12 +16,19 @@ from scipy.spatial import ConvexHull, QhullError
 
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotation_angle, rotmat_to_rotvec
+from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.objects.model import ObjectModel, articulate
 
 MOST_S = 120.0
 MOST_SPEED_M_S, MOST_ACCELERATION_M_S2 = 2.5, 40.0  # a hand with something in it; both are rarely reached
 MOST_TURN_RAD_S, MOST_TURN_RAD_S2 = 12.0, 200.0
+LIMITS = {
+    "m/s": (MOST_SPEED_M_S, MOST_ACCELERATION_M_S2),
+    "rad/s": (MOST_TURN_RAD_S, MOST_TURN_RAD_S2),
+    "rad/s of the hinge": (MOST_TURN_RAD_S, MOST_TURN_RAD_S2),
+}
+LEAST_JERK = 15 / 8, 10 / math.sqrt(3)  # greatest speed x time / way, and acceleration x time^2 / way, stop to stop
+ANY_HINGE_RAD = (-math.pi, math.pi)  # where nobody says how far it opens
 TABLE_M = 0.003  # that an object may sink in: meshes do not stand on it exactly
 ANGLE_RAD = np.radians(0.5)  # that an angle may pass the stop by
 _CHUNK = 64
@@ -89,22 +98,23 @@ def checked_path(
     track = ObjectTrack(model, rotmat_to_rotvec(rotmats).astype(np.float32), translation, hinge)
     path = ObjectPath(track, tuple(steps), limits_rad)
     _check_angle(path, hinge_rad)
-    _check_speeds(path, shift_m, rotmats, hinge_rad)
+    _check_rates(path, shift_m, rotmats, hinge_rad)
     _check_table(path, translation.astype(np.float64), rotmats)
     return path
 
 
 def _step_at(path: ObjectPath, frame: int) -> str:
     """Which step the frame belongs to, and its time, in words."""
-    time_s = frame / FPS
-    inside = [step.words for step in path.steps if step.start_s - 1e-6 <= time_s <= step.end_s + 1e-6]
-    return f"{time_s:.2f} s" + (f" ({'; '.join(inside)})" if inside else "")
+    inside = [step.words for step in _steps_at(path, frame)]
+    return f"{frame / FPS:.2f} s" + (f" ({'; '.join(inside)})" if inside else "")
+
+
+def _steps_at(path: ObjectPath, frame: int) -> list[PathStep]:
+    return [step for step in path.steps if step.start_s - 1e-6 <= frame / FPS <= step.end_s + 1e-6]
 
 
 def _check_angle(path: ObjectPath, hinge_rad: np.ndarray) -> None:
-    if path.limits_rad is None:
-        return
-    low, high = path.limits_rad
+    low, high = path.limits_rad or ANY_HINGE_RAD
     beyond = np.maximum(hinge_rad - high, low - hinge_rad)
     frame = int(beyond.argmax())
     if beyond[frame] > ANGLE_RAD:
@@ -116,23 +126,79 @@ def _check_angle(path: ObjectPath, hinge_rad: np.ndarray) -> None:
         )
 
 
-def _check_speeds(path: ObjectPath, shift_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> None:
+def check_mean_rate(step: PathStep, way: np.ndarray, unit: str) -> None:
+    """Raise BadInput for a step that is too fast on the mean: frames do not see what happens between them.
+
+    way: (n,) metres, or a turn in radians, from its begin to its end.
+    """
+    size, span, (limit, most_change) = float(np.linalg.norm(way)), step.end_s - step.start_s, LIMITS[unit]
+    if size > limit * span:
+        enough = max(LEAST_JERK[0] * size / limit, math.sqrt(LEAST_JERK[1] * size / most_change))
+        got = f"{size / span:.3g} in {step.words!r}"
+        raise BadInput("object path", f"at most {limit:g} {unit}", got, _slower(step, enough / span))
+
+
+def _check_rates(path: ObjectPath, shift_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> None:
+    kinds = list(_rates(shift_m, rotmats, hinge_rad))
+    for kind in kinds:
+        frame = int(kind.size.argmax())
+        if kind.size[frame] > kind.limit:
+            inside = _steps_at(path, frame) or [PathStep("it", 0.0, (len(shift_m) - 1) / FPS)]
+            longest = max(inside, key=lambda step: step.end_s - step.start_s)
+            own = slice(math.floor(longest.start_s * FPS), math.ceil(longest.end_s * FPS) + 1)
+            remedy = _slower(longest, max(other.factor(own) for other in kinds))
+            raise BadInput("object path", kind.expected, f"{kind.size[frame]:.3g} at {_step_at(path, frame)}", remedy)
+
+
+def check_pace(track: ObjectTrack, pace: float, where: str) -> None:
+    """Raise BadInput where a motion that lasts ``pace`` times as long is faster than a hand."""
+    middle = (track.model.vertices_m.min(axis=0) + track.model.vertices_m.max(axis=0)) / 2
+    hinge = np.zeros(track.n_frames) if track.hinge_rad is None else track.hinge_rad.astype(np.float64)
+    pose = track.world_from_object
+    kinds = list(_rates((pose @ middle[None])[:, 0], pose.rotation, hinge))
+    for kind in kinds:
+        most = float(kind.size.max()) / pace**kind.order
+        if most > kind.limit:
+            seconds = (track.n_frames - 1) / FPS * max(other.factor(slice(None)) for other in kinds)
+            raise BadInput(where, kind.expected, f"{most:.3g}", f"ask for {_rounded_up(seconds):.1f} s or more")
+
+
+class _Rate(NamedTuple):
+    """size: (frame,) of the first or second derivative (order). limit: the most a hand does."""
+
+    unit: str
+    order: int
+    size: np.ndarray
+    limit: float
+
+    @property
+    def expected(self) -> str:
+        return f"at most {self.limit:g} {self.unit.replace('/s', '/s²') if self.order == 2 else self.unit}"
+
+    def factor(self, frames: slice) -> float:
+        """How many times as long these frames must last to keep within the limit."""
+        return (float(self.size[frames].max(initial=0.0)) / self.limit) ** (1 / self.order)
+
+
+def _rates(place_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> Iterator[_Rate]:
+    """Of every kind there is, where there are frames enough."""
     turns = rotmat_to_rotvec(rotmats[1:] @ rotmats[:-1].swapaxes(1, 2)) * FPS
-    speed = np.diff(shift_m, axis=0) * FPS
-    swing = np.diff(hinge_rad) * FPS
-    for rate, most, most_change, unit in (
-        (speed, MOST_SPEED_M_S, MOST_ACCELERATION_M_S2, "m/s"),
-        (turns, MOST_TURN_RAD_S, MOST_TURN_RAD_S2, "rad/s"),
-        (swing[:, None], MOST_TURN_RAD_S, MOST_TURN_RAD_S2, "rad/s of the hinge"),
-    ):
-        for order, values, limit in ((1, rate, most), (2, np.diff(rate, axis=0) * FPS, most_change)):
-            size = np.linalg.norm(values, axis=1)
-            if len(size) and size.max() > limit:
-                frame = int(size.argmax())
-                slower = (size[frame] / limit) ** (1 / order)
-                expected = f"at most {limit:g} {unit.replace('/s', '/s²') if order == 2 else unit}"
-                remedy = f"give it {slower:.1f} times as long or more, or check the units"
-                raise BadInput("object path", expected, f"{size[frame]:.3g} at {_step_at(path, frame)}", remedy)
+    each = np.diff(place_m, axis=0) * FPS, turns, np.diff(hinge_rad)[:, None] * FPS
+    for (unit, limits), rate in zip(LIMITS.items(), each, strict=True):
+        for order, values in ((1, rate), (2, np.diff(rate, axis=0) * FPS)):
+            if len(values):
+                yield _Rate(unit, order, np.linalg.norm(values, axis=1), limits[order - 1])
+
+
+def _slower(step: PathStep, factor: float) -> str:
+    """What to do about a step that is ``factor`` times too fast."""
+    seconds = _rounded_up((step.end_s - step.start_s) * factor)
+    return f"give {step.words!r} {seconds:.1f} s or more ({_rounded_up(factor):.1f} times as long), or check the units"
+
+
+def _rounded_up(value: float) -> float:
+    """To the next tenth above, so that it is enough."""
+    return (math.floor(10 * value) + 1) / 10
 
 
 def _check_table(path: ObjectPath, translation_m: np.ndarray, rotmats: np.ndarray) -> None:
@@ -163,8 +229,3 @@ def _hull(model: ObjectModel) -> tuple[np.ndarray, np.ndarray]:
         kept.append(own)
     rows = np.concatenate(kept)
     return model.vertices_m[rows], model.part[rows]
-
-
-def largest_turn(rotmats: np.ndarray) -> float:
-    """The largest turn between neighbours of (key, 3, 3), radians."""
-    return float(rotation_angle(rotmats[1:] @ rotmats[:-1].swapaxes(1, 2)).max(initial=0.0))

@@ -8,20 +8,21 @@ and how long it takes ("in 1.5 s"); without, at an easy pace.
 import difflib
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.object_paths.path import ObjectPath, PathStep, checked_path, frame_times, smooth
+from hoidata.object_paths.path import ObjectPath, PathStep, check_mean_rate, checked_path, frame_times, smooth
 from hoidata.objects.model import ObjectModel
 
 MOST_LETTERS, MOST_STEPS = 5000, 200
 REST_S = 0.5  # before the first step and after the last, in which hands come and go
 PACE = {"length": 0.2, "angle": math.radians(60)}  # mean speed of a step without a time: m/s, rad/s
 SHORTEST_S, HOLD_S, SHAKES, SHAKES_PER_S = 0.6, 1.0, 3, 2.0
+MOST_SHAKES_PER_S = 10.0  # 30 frames per second show no more
 LIFT_M, SHAKE_M, TILT_RAD, TURN_RAD, OPEN_RAD = 0.15, 0.03, math.radians(45), math.pi / 2, math.pi / 2
 UNITS: dict[str, tuple[str, float]] = {
     **{word: ("length", 1.0) for word in ("m", "metre", "metres", "meter", "meters")},
@@ -93,7 +94,7 @@ def scripted_path(
     """
     plan, state = _Plan(), _State(dict.fromkeys(_CHANNELS, 0.0), limits_rad)
     now, steps = rest_s, [PathStep("at rest", 0.0, rest_s)]
-    for group in parse_script(script):
+    for group in parse_script(script, re.findall(r"[^\W\d_]+", model.name.lower())):
         spans = [_planned(step, model, state, plan, now) for step in group]
         steps += [PathStep(step.words, now, now + span) for step, span in zip(group, spans, strict=True)]
         now += max(spans)
@@ -109,13 +110,18 @@ def scripted_path(
     return checked_path(model, shift, rotmats, curve["hinge"], steps, limits_rad, standing)
 
 
-def parse_script(script: str) -> list[list[Step]]:
-    """Groups of steps; those of a group happen at once. Raises BadInput that names the step and what to write."""
+def parse_script(script: str, names: Sequence[str] = ()) -> list[list[Step]]:
+    """Groups of steps; those of a group happen at once. names: words for the object, which say nothing.
+
+    Raises BadInput that names the step and what to write.
+    """
     if len(script) > MOST_LETTERS:
         raise BadInput("script", f"at most {MOST_LETTERS} letters", f"{len(script)}", "leave steps out")
     text = re.sub(r"#[^\n]*", "", script).lower()
     pieces = [piece.strip() for piece in re.split(r"[,;\n]+(?!\d)|\bthen\b|\.(?!\d)", text)]
-    groups = [[_parsed(part.strip()) for part in re.split(r"\band\b|\bwhile\b", piece)] for piece in pieces if piece]
+    groups = [
+        [_parsed(part.strip(), names) for part in re.split(r"\band\b|\bwhile\b", piece)] for piece in pieces if piece
+    ]
     if not 1 <= sum(map(len, groups)) <= MOST_STEPS:
         raise BadInput("script", f"1 to {MOST_STEPS} steps", f"{sum(map(len, groups))}", f"write e.g. {EXAMPLE!r}")
     return groups
@@ -124,7 +130,7 @@ def parse_script(script: str) -> list[list[Step]]:
 EXAMPLE = "lift 15 cm, open to 70 deg in 1.5 s, hold, put down"
 
 
-def _parsed(words: str) -> Step:
+def _parsed(words: str, names: Sequence[str]) -> Step:
     tokens = re.findall(r"\d*\.?\d+(?:e[+-]?\d+)?|[^\W\d_]+|°|[^\w\s]", words.replace("degrees", "deg"))
     if not tokens:
         raise BadInput("script", "a verb", repr(words), f"begin with one of {', '.join(VERBS)}")
@@ -133,24 +139,25 @@ def _parsed(words: str) -> Step:
             f"script: {words[:40]!r}", "a step of at most 20 words", f"{len(tokens)}", "part steps by commas"
         )
     verb, rest = _verb(words, tokens)
-    return _with_details(Step(verb, words), rest)
+    return _with_details(Step(verb, words), rest, names)
 
 
 def _verb(words: str, tokens: list[str]) -> tuple[str, list[str]]:
-    if " ".join(tokens[:2]) in _TWO_WORDS:
-        return _TWO_WORDS[" ".join(tokens[:2])], tokens[2:]
+    for pair, verb in _TWO_WORDS.items():
+        first, second = pair.split()
+        if tokens[0] == first and second in tokens[1:]:  # "put the box down"
+            place = tokens.index(second, 1)
+            return verb, tokens[1:place] + tokens[place + 1 :]
     if tokens[0] in _SYNONYMS:
         return _SYNONYMS[tokens[0]], tokens[1:]
-    known = [*VERBS, *_SYNONYMS, *(pair.split()[0] for pair in _TWO_WORDS)]
-    raise BadInput(f"script: {words[:40]!r}", f"a verb: {', '.join(VERBS)}", tokens[0], _nearest(tokens[0], known))
+    whole = [pair for pair in _TWO_WORDS if pair.split()[0] == tokens[0]]
+    near = whole or difflib.get_close_matches(" ".join(tokens[:2]), _TWO_WORDS, 1, 0.75)
+    near = near or difflib.get_close_matches(tokens[0], _SYNONYMS, 1, 0.5)
+    remedy = f"did you mean {near[0]!r}?" if near else f"write e.g. {EXAMPLE!r}"
+    raise BadInput(f"script: {words[:40]!r}", f"a verb: {', '.join(VERBS)}", tokens[0], remedy)
 
 
-def _nearest(word: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(word, known, 1, 0.5)
-    return f"did you mean {near[0]!r}?" if near else f"write e.g. {EXAMPLE!r}"
-
-
-def _with_details(step: Step, tokens: list[str]) -> Step:
+def _with_details(step: Step, tokens: list[str], names: Sequence[str]) -> Step:
     """The step with its direction, amounts and time."""
     values: dict[str, object] = {}
     place, before = 0, ""
@@ -164,9 +171,9 @@ def _with_details(step: Step, tokens: list[str]) -> Step:
             place += 1
         elif word in DIRECTIONS and "direction" not in values:
             values["direction"] = word
-        elif word not in (*_FILLING, "to", "in", "for", "over", "within"):
-            known = [*DIRECTIONS, *UNITS, "to", "in", "for", *_SYNONYMS]
-            remedy = _nearest(word, known)
+        elif word not in (*_FILLING, "to", "in", "for", "over", "within", *names):
+            near = difflib.get_close_matches(word, [*DIRECTIONS, *UNITS], 1, 0.7)
+            remedy = f"did you mean {near[0]!r}?" if near else f"leave {word!r} out"
             raise BadInput(f"script: {step.words[:40]!r}", "a direction, an amount or a time", word, remedy)
         before, place = word, place + 1
     return Step(step.verb, step.words, **values)  # pyright: ignore[reportArgumentType]
@@ -213,10 +220,15 @@ def _planned(step: Step, model: ObjectModel, state: _State, plan: _Plan, start: 
         count = step.count or SHAKES
         span = step.duration_s or count / SHAKES_PER_S
         way = DIRECTIONS[step.direction or "up"] * (SHAKE_M if step.amount is None else step.amount)
+        if count / span > MOST_SHAKES_PER_S:
+            remedy = f"give it {math.ceil(10 * count / MOST_SHAKES_PER_S) / 10:g} s or more"
+            raise BadInput(where, f"at most {MOST_SHAKES_PER_S:g} times a second", f"{count / span:.3g}", remedy)
         plan.shakes.append((start, span, count, way))
         return span
     span = step.duration_s or _easy_span(targets, state)
     for name, target in targets.items():
+        unit = "m/s" if name in "xyz" else "rad/s of the hinge" if name == "hinge" else "rad/s"
+        check_mean_rate(PathStep(step.words, start, start + span), np.array([target - state.value[name]]), unit)
         if plan.keys[name] and plan.keys[name][-1][0] > start + 1e-9:
             raise BadInput(where, "steps at once that move different things", "two that move the same", "write 'then'")
         plan.keys[name] += [(start, state.value[name]), (start + span, target)]
@@ -361,7 +373,6 @@ _TWO_WORDS = {
     "put down": "put down",
     "set down": "put down",
     "lay down": "put down",
-    "put it": "put down",
     "pick up": "lift",
     "hold still": "hold",
 }

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch
+from hoidata.errors import BadInput
+from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair
 from hoidata.sensors.keypoints import hand_keypoints
 from models.bimart.network import ContactModel, Denoiser, MotionModel, Windows
@@ -20,7 +22,9 @@ from models.common.sampling import TRAIN_STEPS, add_noise
 
 VALIDATION_STEPS = (99, 299, 499, 699, 899)
 TINY = 1e-10
-JUMP_M, JUMP_RAD = 0.1, 0.8  # an object that moves farther than this in a frame was cut there
+# A step from a frame to the next that is so much longer than the shorter one beside it was cut there: fast motion is
+# fast before or after too. The body's, the hinge's, and a hand's, both in the world and before the body.
+JUMP_M, JUMP_RAD, HINGE_JUMP_RAD, HAND_JUMP_M = 0.04, 0.3, 0.2, 0.05
 
 
 @dataclass(frozen=True)
@@ -56,16 +60,38 @@ class Targets:
 
 
 def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:
-    """First frames of a clip's windows, none across a jump of the object; a clip that is too short has one, or none."""
+    """First frames of a clip's windows, none across a jump; a clip that is too short has one, or none."""
     last = max(len(clip.scene) - length, 0)
     starts = np.arange(min(loss.skip_first, last), max(last - loss.skip_last, min(loss.skip_first, last)) + 1)
-    body = clip.scene.model_from_canonical
-    step = np.linalg.norm(np.diff(body.translation, axis=0), axis=1)
-    turns = body.rotation[:-1].swapaxes(1, 2) @ body.rotation[1:]
-    cosine = (np.trace(turns, axis1=1, axis2=2) - 1) / 2
-    jumps = np.append(0, np.cumsum((step > JUMP_M) | (cosine < np.cos(JUMP_RAD))))
+    jumps = np.append(0, np.cumsum(_is_jump(clip)))
     stops = np.minimum(starts + length, len(clip.scene)) - 1
     return starts[jumps[stops] == jumps[starts]]
+
+
+def middle_start(clip: Recorded, length: int) -> list[int]:
+    """First frame of the window nearest to the middle of a clip; none where every one crosses a jump."""
+    starts, middle = window_starts(clip, length, LossConfig()), max(len(clip.scene) - length, 0) // 2
+    return starts[np.argsort(np.abs(starts - middle), kind="stable")[:1]].tolist()
+
+
+def _is_jump(clip: Recorded) -> np.ndarray:
+    """(frame - 1,) bool: object or a hand does not go on from a frame to the next."""
+    body, hinge_rad = clip.scene.model_from_canonical, clip.scene.hinge_rad
+    turns_rad = rotation_angle(body.rotation[:-1].swapaxes(1, 2) @ body.rotation[1:])
+    jumps = _beyond(np.linalg.norm(np.diff(body.translation, axis=0), axis=1)) > JUMP_M
+    jumps |= (_beyond(turns_rad) > JUMP_RAD) | (_beyond(np.abs(np.diff(hinge_rad))) > HINGE_JUMP_RAD)
+    for points, present in zip(clip.keypoints_m, clip.present, strict=True):
+        middle = points.mean(axis=1, dtype=np.float64)
+        world = (body @ middle[:, None])[:, 0]
+        step = np.min([np.linalg.norm(np.diff(own, axis=0), axis=1) for own in (middle, world)], axis=0)
+        jumps |= _beyond(np.where(present[1:] & present[:-1], step, np.nan)) > HAND_JUMP_M
+    return jumps
+
+
+def _beyond(step: np.ndarray) -> np.ndarray:
+    """(frame - 1,) by how much each step is longer than the shorter one beside it; NaN where it is not known."""
+    beside = np.pad(step, 1, constant_values=np.nan)
+    return step - np.nan_to_num(np.fmin(beside[:-2], beside[2:]))
 
 
 class Objective:
@@ -85,7 +111,10 @@ class Objective:
         learn_statistics(network, self._every_window())
         self.network = network.to(setup.device)
         held = [recorded_clip(sample, pair, features) for sample in setup.corpus.held_out]
-        middles = [(clip, max(len(clip.scene) - self.length, 0) // 2) for clip in held]
+        middles = [(clip, start) for clip in held for start in middle_start(clip, self.length)]
+        if not middles:
+            remedy = "put other clips into the validation part"
+            raise BadInput("validation", "a window of a clip without a jump", f"none in {len(held)} clips", remedy)
         self.held_out = targets_of(network, middles).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:

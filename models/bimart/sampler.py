@@ -25,8 +25,16 @@ IDLE_M = 0.2  # a hand that is farther than this from the object takes no part
 
 
 @dataclass(frozen=True)
+class WalkConfig(SamplerConfig):
+    """The same with this family's defaults. guidance: lambda_f of classifier-free guidance; 0 is none."""
+
+    steps: int = 10
+    guidance: float = 0.0
+
+
+@dataclass(frozen=True)
 class SamplingConfig:
-    """How both networks are walked. sampler: ``guidance`` is lambda_f of classifier-free guidance; 0: none.
+    """How both networks are walked. sampler: the steps, and classifier-free guidance.
 
     rule: of that guidance. with_map: motions are told contact maps. guide: contact-map guidance, in the last
     ``guide_share`` of the steps. overlapping: windows of a path share their frames at every step; else they are made
@@ -34,7 +42,7 @@ class SamplingConfig:
     "before"). hold_m: joints of the first network that come so near to the object stay there, on its part (OMOMO).
     """
 
-    sampler: SamplerConfig = field(default_factory=lambda: SamplerConfig("ddim", 10, 0.0))
+    sampler: WalkConfig = field(default_factory=WalkConfig)
     rule: Literal["usual", "paper"] = "usual"
     with_map: bool = True
     guide: Guide = "metres"
@@ -45,9 +53,7 @@ class SamplingConfig:
 
 
 OURS = SamplingConfig()
-PAPER = SamplingConfig(
-    SamplerConfig("ddpm", 50, 0.5), rule="paper", guide="released", guide_share=1.0, overlapping=False
-)
+PAPER = SamplingConfig(WalkConfig("ddpm", 50, 0.5), rule="paper", guide="released", guide_share=1.0, overlapping=False)
 RELEASED = replace(PAPER, rule="usual", contact_anchor="before")
 PRESETS = {"ours": OURS, "paper": PAPER, "released": RELEASED}
 

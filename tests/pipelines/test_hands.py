@@ -1,5 +1,6 @@
 """What `hoidata hands` takes an object's motion from, and its answers to what it cannot take."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
 from hoidata.hands import load_embedded_hands
 from hoidata.object_paths import scripted_path
-from pipelines.hands import Asked, HandsWish, asked_motion, hinge_range
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from pipelines.hands import Asked, HandsWish, asked_motion, chosen_networks, hinge_range
 from pipelines.objects import MeshWish
 from pipelines.pages.motion_files import mesh_arrays, motion_arrays
 from tests.builders.clips import clip_of
@@ -51,6 +54,39 @@ def test_length_tells_the_pace_and_the_way_stays(laptop):
     assert slow.thing.translation_m[[0, -1]] == pytest.approx(own.thing.translation_m[[0, -1]], abs=1e-6)
     assert slow.thing.translation_m[:, 2].max() < own.thing.translation_m[:, 2].max() + 1e-4
     assert slow.steps[1].end_s / own.steps[1].end_s == pytest.approx(180 / (own.thing.n_frames - 1))
+
+
+def test_a_length_that_the_answer_names_is_long_enough_and_the_longest_is_taken(laptop):
+    told = {"object": str(laptop), "script": "lift 1 m, turn 180 deg", "mesh": MeshWish("cm", "z")}
+    with pytest.raises(BadInput) as error:
+        asked(length_s=0.5, **told)
+    seconds = float(re.findall(r"ask for ([\d.]+) s", str(error.value))[0])
+    assert asked(length_s=seconds, **told).thing.n_frames == round(seconds * 30) + 1
+    assert asked(length_s=120, **told).thing.n_frames == 3601
+    assert asked(**{**told, "script": "hold 119 s"}).thing.n_frames == 3601
+
+
+def test_a_range_of_a_hinge_that_is_not_there_is_noted(laptop):
+    notes = [
+        asked(object=str(laptop), script="hold", mesh=MeshWish("cm", "z", hinge), hinge_range="0:90").notes
+        for hinge in ("", HINGE)
+    ]
+    assert ["--hinge-range" in " ".join(own) for own in notes] == [True, False]
+
+
+def test_datasets_that_are_not_converted_are_passed_over_and_unknown_ones_are_named(tmp_path, monkeypatch, make_clip):
+    monkeypatch.chdir(tmp_path)
+    clip = make_clip(4)
+    write_store(tmp_path / "data/embedded/arctic/clips", [clip], generated_info("arctic", HANDS))
+    names = ("grab", "arctic")
+    name = clip.object.model.name
+    assert asked_motion(HandsWish(object=name, script="hold"), "embedded", names, HANDS).thing.model.name == name
+    with pytest.raises(BadInput, match=f"one of: {name}"):
+        asked_motion(HandsWish(object="bananas", script="hold"), "embedded", names, HANDS)
+    with pytest.raises(BadInput, match="did you mean 'arctic'"):
+        asked_motion(HandsWish(object=name, script="hold", model="acrtic"), "embedded", names, HANDS)
+    with pytest.raises(BadInput, match="a dataset: grab, arctic, got nothing"):
+        chosen_networks("nothing", "embedded", names, HANDS)
 
 
 def test_keyframes_of_a_file_are_taken(laptop, tmp_path):
@@ -93,6 +129,13 @@ def test_the_objects_motion_of_a_generated_file_comes_back_with_mesh_and_hinge(t
         ({"script": "hold", "hinge_range": "10:110"}, "0:110"),
         ({"script": "open to 100 deg", "mesh": MeshWish("cm", "z", HINGE), "hinge_range": "0:90"}, "0 to 90 deg"),
         ({"script": "hold", "length_s": 0.1}, "another length"),
+        ({"script": "hold", "length_s": float("nan")}, "0.3 to 120 s, got nan"),
+        ({"script": "hold", "length_s": float("inf")}, "0.3 to 120 s, got inf"),
+        ({"script": "hold", "length_s": 120.1}, "0.3 to 120 s, got 120.1 s"),
+        ({"script": "lift 1 m, put down", "length_s": 0.3}, "--length: expected at most 2.5 m/s"),
+        ({"script": "lift 50 cm, turn 360 deg, turn 360 deg", "length_s": 0.4}, "--length: expected at most"),
+        ({"script": "moves.txt"}, "moves.txt, which is not there"),
+        ({"script": "moves/first"}, "which is not there"),
         ({"motion": "none.npz"}, "nothing there"),
         ({"keyframes": "none.csv"}, "correct the path"),
     ],

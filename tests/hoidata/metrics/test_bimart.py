@@ -51,9 +51,14 @@ def test_a_constant_acceleration_is_given_per_frame_and_per_second(make_clip, mo
     hand = replace(still.hands["right"], global_orient=np.tile(still.hands["right"].global_orient[:1], (9, 1)))
     path = np.zeros((9, 3))
     path[:, 0] = 0.5 * 3.0 * time**2
-    pair = pair_of(replace(clip, hands=clip.hands | {"right": replace(hand, wrist_m=path.astype(np.float32))}), clip)
+    made = replace(clip, hands=clip.hands | {"right": replace(hand, wrist_m=path.astype(np.float32))})
+    pair = pair_of(made, clip)
     assert bimart.accel_paper(pair, 1) == pytest.approx(np.full(7, 100 * 3.0 / 900), abs=1e-4)
     assert bimart.accel_corrected(pair, 1) == pytest.approx(np.full(7, 3.0), abs=1e-3)
+    doubled = replace(clip, source_frames=(np.arange(9) // 2).astype(np.int32))
+    pair = pair_of(made, doubled)  # 15 fps: frames 0, 2, 4, 6 and 8 were recorded
+    assert bimart.accel_paper(pair, 1) == pytest.approx(np.full(3, 100 * 3.0 / 225), abs=1e-4)
+    assert bimart.accel_corrected(pair, 1) == pytest.approx(np.full(3, 3.0), abs=1e-3)
 
 
 def test_mul_is_the_mean_distance_of_all_pairs_of_motions(make_clip, moved, pair_of):

@@ -18,6 +18,7 @@ from tests.builders.objects import box_model, model_of, notebook, two_parts
 
 NONE = Contacts(np.zeros((0, 3)), np.zeros((0, 3)))
 DOWN = np.array([0.0, 0.0, -1.0])
+THREE = np.arange(3)
 LYING = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
 
 
@@ -68,7 +69,7 @@ def test_penetration_is_the_share_of_vertices_deep_in_a_known_box_added_up_over_
 def test_a_body_needs_its_weight_its_acceleration_and_the_moment_of_both():
     time = np.arange(3)[:, None, None] / FPS
     places = np.array([[0.2, 0, 0], [0.4, 0, 0]]) + 0.5 * np.array([0, 0, 2.0]) * time**2
-    wrench = cams.needed_wrenches({0: Masses(places, np.array([0.5, 0.5]))}, 1, FPS**2, 9.81 * DOWN, np.zeros(3))
+    wrench = cams.needed_wrenches({0: Masses(places, np.array([0.5, 0.5]))}, THREE, FPS**2, 9.81 * DOWN, np.zeros(3))
     assert wrench[0] == pytest.approx([0, 0, 11.81, 0, -0.3 * 11.81, 0])
 
 
@@ -79,7 +80,7 @@ def test_six_points_move_as_an_even_solid_does():
     turn = np.zeros((3, 3))
     turn[:, 2] = 0.5 * 4.0 * time**2
     (body,) = cams.even_masses(ObjectTrack(bar, turn, np.zeros((3, 3)))).values()
-    wrench = cams.needed_wrenches({0: body}, 1, 1e6, np.zeros(3), np.zeros(3))
+    wrench = cams.needed_wrenches({0: body}, THREE, 1e6, np.zeros(3), np.zeros(3))
     assert wrench[0] == pytest.approx([0, 0, 0, 0, 0, (0.3**2 + 0.1**2) / 12 * 4.0], rel=1e-3, abs=1e-9)
 
 
@@ -88,7 +89,7 @@ def test_a_lid_that_nothing_holds_lacks_its_moment_about_the_hinge():
     track = ObjectTrack(notebook(), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3))
     bodies = cams.even_masses(track)
     assert [body.mass_kg.sum() for body in bodies.values()] == pytest.approx([0.5, 0.5])
-    wanted = cams.needed_wrenches(bodies, 1, FPS**2, 9.81 * DOWN, np.zeros(3))
+    wanted = cams.needed_wrenches(bodies, THREE, FPS**2, 9.81 * DOWN, np.zeros(3))
     feet = np.array([[x, y, -0.005] for x in (-0.1, 0.1) for y in (-0.05, 0.05)])
     table = [Contacts(feet, np.tile(DOWN, (4, 1))), NONE]
     axis = np.array([[0, y, 0] for y in np.linspace(-0.05, 0.05, 11)])
@@ -115,6 +116,45 @@ def test_a_plate_on_a_hand_is_carried_and_one_in_the_air_only_by_the_papers_tabl
     assert of(floating, lowest)[1] == [1] * 4
     assert of(on_the_hand(plate, falling(9.81), 0.5))[1] == [1] * 4  # what falls freely needs nothing
     assert of(held, None) == ([], [])  # gravity is not known
+
+
+def test_frames_without_a_hand_and_made_ones_are_not_asked_who_carries(pair_of):
+    """A plate on a hand that goes down at 6 m/s^2, and the same recorded at 15 fps and doubled.
+
+    Second differences over made frames would be of 12 m/s^2.
+    """
+    plate = box_model((0.2, 0.4, 0.02))
+    clip = on_the_hand(plate, falling(6.0, 9))
+    doubled = between_every_two(clip)
+    gone = replace(clip.hands["right"], valid=np.arange(9) < 5)
+    left = replace(clip, hands=clip.hands | {"right": gone})
+
+    def con(own):
+        pair = pair_of(own, own, table_m=-9.0)
+        return cams.con_paper(pair, 1).tolist(), cams.con_corrected(pair, 1).tolist()
+
+    assert con(clip) == ([1] * 7, [1] * 7)
+    assert con(doubled) == ([1] * 3, [1] * 3)
+    assert con(left) == ([1] * 4, [1] * 4)  # frames 1 to 4
+
+
+def test_a_plate_that_falls_faster_than_freely_is_not_carried_at_any_frame_rate(pair_of):
+    clip = on_the_hand(box_model((0.2, 0.4, 0.02)), falling(9.81 + 1.0, 9))
+    for own, frames in ((clip, 7), (between_every_two(clip), 3)):
+        assert cams.con_corrected(pair_of(own, own, table_m=-9.0), 1).tolist() == [0] * frames
+
+
+def between_every_two(clip):
+    """The clip as a doubled recording: every second frame is the mean of its neighbours."""
+    frames = np.arange(clip.n_frames)
+    before, after = frames // 2 * 2, (frames + 1) // 2 * 2
+
+    def mean(rows):
+        return (rows[before] + rows[after]) / np.float32(2)
+
+    hands = {side: replace(hand, wrist_m=mean(hand.wrist_m)) for side, hand in clip.hands.items()}
+    thing = replace(clip.object, translation_m=mean(clip.object.translation_m))
+    return replace(clip, hands=hands, object=thing, source_frames=(frames // 2).astype(np.int32), source_fps=15.0)
 
 
 # --- arms about the hinge
@@ -146,6 +186,13 @@ def test_both_parts_must_be_touched_to_turn_them_against_each_other(make_clip, p
 
     assert art(0.0) == ([1] * 4, [1] * 2)
     assert art(0.12) == ([0] * 4, [0] * 2)
+    clip = on_the_hand(book, np.zeros((5, 3)), hinge_rad=angle)
+    for own in (
+        replace(clip, source_frames=np.int32([0, 0, 1, 1, 2])),  # frames 1 and 3 are made
+        replace(clip, hands=clip.hands | {"right": replace(clip.hands["right"], valid=np.arange(5) % 2 == 0)}),
+    ):
+        pair = pair_of(own, own)
+        assert (cams.art_paper(pair, 1).tolist(), cams.art_corrected(pair, 1).tolist()) == ([1] * 2, [1])
 
 
 # --- the released definitions, written anew

@@ -73,7 +73,12 @@ def test_velocity_passes_through_a_key_without_a_stop():
         (b"time_s,qw,qx,qy,qz\n0,1,0,0,0\n1,2,0,0,0\n", "length 2"),
         (b"time_s,z_cm\n0,0\n1,-5\n", "under it"),
         (b"time_s,z_cm\n0,0\n0.1,100\n", "times as long"),
-        (b"time_s,rz_deg\n0,0\n2,175\n", "add a key in between"),
+        (b"time_s,rx_deg,rz_deg\n0,20,0\n2,20,175\n", "add a key in between"),
+        (b"time_s,z_cm,rx_deg,rz_deg\n0,10,90,0\n4,10,90,350\n", "got 350 deg"),
+        (b"time_s,qw,qx,qy,qz\n0,1,0,0,0\n4,0.02,0,0,0.9998\n", "add a key in between"),
+        (b"time_s,rz_rad\n0,0\n20,90\n", "call it rz_deg"),
+        (b"time_s,hinge_rad\n0,0\n12,70\n", "call it hinge_deg"),
+        (b"time_s,rz_deg\n0,0\n0.02,360\n", "give 'keyframes 1 to 2' 1.0 s"),
         (b"time_s,hinge_deg\n0,0\n2,40\n", "is rigid"),
         (b"[1, 2]", "a list of objects"),
         (b'[{"time_s": 0}, {"time_s": 1, "z_m": 0.1}]', "the same names"),
@@ -86,6 +91,23 @@ def test_what_cannot_be_gets_an_answer_that_says_what_to_do(data, words):
     with pytest.raises(BadInput) as error:
         keyframed_path(box_model(), parse_keyframes(data, "k"))
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("degrees", [200, 270, 360, -720])
+@pytest.mark.parametrize("axis", ["rx", "rz"])
+def test_a_turn_about_one_axis_goes_as_far_round_as_it_is_written(axis, degrees):
+    keys = parse_keyframes(f"time_s,z_cm,{axis}_deg\n0,40,10\n4,40,10\n9,40,{10 + degrees}\n".encode(), "k.csv")
+    turns = Rotation.from_rotvec(keyframed_path(box_model(), keys).track.rotvec.astype(float))
+    whole = np.degrees((turns[1:] * turns[:-1].inv()).as_rotvec()).sum(axis=0)
+    assert whole == pytest.approx(degrees * np.eye(3)["xyz".index(axis[1])], abs=1e-2)
+
+
+def test_a_hinge_beyond_180_degrees_needs_a_range_that_says_so():
+    keys = parse_keyframes(b"time_s,z_cm,hinge_deg\n0,40,0\n9,40,-200\n", "k.csv")
+    with pytest.raises(BadInput, match="--hinge-range"):
+        keyframed_path(hinged_box(), keys)
+    path = keyframed_path(hinged_box(), keys, (np.radians(-220), 0.0))
+    assert np.degrees(path.track.hinge_rad.min()) == pytest.approx(-200, abs=1e-3)
 
 
 def test_an_angle_beyond_the_stop_names_the_stop():

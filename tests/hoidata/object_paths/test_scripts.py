@@ -1,5 +1,7 @@
 """A short script becomes the motion it says."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -87,6 +89,19 @@ def test_opening_to_an_angle_and_by_an_angle_are_told_apart(script, degrees):
     assert np.degrees(made(script).track.hinge_rad[-1]) == pytest.approx(degrees, abs=1e-4)
 
 
+@pytest.mark.parametrize(
+    "script",
+    [
+        "pick it up, put it down",
+        "lift the laptop, put the laptop down",
+        "lift, set down",
+        "pick up the laptop, lay it down",
+    ],
+)
+def test_the_objects_name_and_the_words_between_say_nothing(script):
+    assert heights(made(script)) == pytest.approx(heights(made("lift, put down")))
+
+
 def test_a_hinge_that_opens_the_other_way_is_opened_by_the_same_words():
     hinge = made("lift 40 cm, open to 60 deg", limits_rad=(-2.0, 0.0)).track.hinge_rad
     assert np.degrees(hinge[-1]) == pytest.approx(-60)
@@ -119,7 +134,12 @@ def test_velocity_and_acceleration_never_jump():
         ("lift 15", "write 15 cm"),
         ("lift 15 deg", "a length (cm)"),
         ("open to 7 cm", "an angle (deg)"),
-        ("lift 15 cm sideways", "sideways"),
+        ("lift 15 cm sideways", "leave 'sideways' out"),
+        ("move 15 cm lefft", "did you mean 'left'"),
+        ("lift the mug 10 cm", "leave 'mug' out"),
+        ("put the laptop on the table", "did you mean 'put down'"),
+        ("pick it", "did you mean 'pick up'"),
+        ("puut down", "did you mean 'put down'"),
         ("move 15 cm", "move left 20 cm"),
         ("lift 1 m in 0.1 s", "times as long"),
         ("lift 10 cm and lift 5 cm", "write 'then'"),
@@ -134,12 +154,28 @@ def test_velocity_and_acceleration_never_jump():
         ("turn up", "left or right"),
         ("tilt up", "left, right"),
         ("lift - cm", "15 cm"),
+        ("turn 360 deg in 0.03 s", "give 'turn 360 deg in 0.03 s' 1.0 s"),
+        ("lift 20 cm, shake 100 times in 1 s", "give it 10 s"),
+        ("open to 400 deg in 10 s", "0 to 120 deg"),
     ],
 )
 def test_what_cannot_be_gets_an_answer_that_says_what_to_do(script, words):
     with pytest.raises(BadInput) as error:
         made(script)
     assert words in str(error.value)
+
+
+@pytest.mark.parametrize("script", ["lift 1 m in 0.1 s", "turn 720 deg in 0.5 s", "lift 45 cm in 0.3 s"])
+def test_a_step_that_is_too_fast_is_taken_in_the_time_the_answer_names(script):
+    with pytest.raises(BadInput) as error:
+        made(script)
+    seconds = re.findall(r"' ([\d.]+) s or more", str(error.value))[0]
+    assert made(re.sub(r"in [\d.]+ s", f"in {seconds} s", script)).track.n_frames > float(seconds) * FPS
+
+
+def test_a_lid_opens_no_farther_than_180_degrees_where_nobody_says_more():
+    with pytest.raises(BadInput, match=r"-180 to 180 deg, got 400 deg.*--hinge-range"):
+        made("lift 50 cm, open to 400 deg in 10 s", limits_rad=None)
 
 
 def test_a_rigid_object_is_not_opened_but_may_be_lifted():

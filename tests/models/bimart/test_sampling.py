@@ -6,22 +6,22 @@ import numpy as np
 import pytest
 import torch
 
-from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import BasisSettings
+from hoidata.settings import build_config
 from models.bimart.guidance import Map, combined, discrepancy, metre_step, released_step
-from models.bimart.learning import LossConfig, window_starts
+from models.bimart.learning import LossConfig, middle_start, window_starts
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
-from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig, held_joints
+from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig, WalkConfig, held_joints
 from models.bimart.scene import FeatureConfig, Recorded, Scene
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
-from models.common.sampling import SamplerConfig
 from models.common.transformer import TransformerConfig
 from tests.builders.objects import hinged_box
 
 FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window=8, state="local", most_m=0.2)
 TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)
-FAST = replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5))
+FAST = replace(OURS, sampler=WalkConfig("ddim", 2, 0.5))
 
 
 def path_features(frames: int, seed: int = 0, shift_m: float = 0.0) -> np.ndarray:
@@ -153,15 +153,51 @@ def test_a_switch_of_what_is_seen_changes_its_own_part_alone(change: dict, diffe
     assert {name for name in names if not torch.equal(*(getattr(own, name) for own in kinds))} == differs
 
 
-def test_no_window_crosses_a_jump_of_the_object_and_ends_may_be_left_out() -> None:
-    features = path_features(30)
-    features[17:, :3] += 1.0
-    nothing = np.zeros((2, 30, 6), np.float16)
-    clip = Recorded(
-        Scene.of(BOX, features, FEATURES.basis), nothing, nothing, nothing, nothing[..., 0] == 0, np.ones(2)
-    )
+def recorded(features: np.ndarray, hand_m: np.ndarray | None = None) -> Recorded:
+    """A clip of an object's motion (frame, 10) and of two hands in the world, at rest 30 cm from it or (frame, 3)."""
+    own = Scene.of(BOX, features, FEATURES.basis)
+    world = np.broadcast_to([0.3, 0, 0], (len(own), 3)) if hand_m is None else hand_m
+    seen = (own.model_from_canonical.inverse() @ world[:, None])[:, 0]
+    points = np.broadcast_to(seen[None, :, None], (2, len(own), 4, 3))
+    nothing = np.zeros((2, len(own), 6), np.float16)
+    return Recorded(own, nothing, points, nothing, nothing[..., 0] == 0, np.ones(2))
+
+
+WAY = np.array([0.6, 0, 0.8], np.float32)
+
+
+@pytest.mark.parametrize("jump", ["far", "5 cm", "hinge", "turn", "hands"])
+def test_no_window_crosses_a_jump_of_object_or_hands_and_ends_may_be_left_out(jump: str) -> None:
+    features, hand = path_features(30), None
+    if jump in ("far", "5 cm"):
+        features[17:, :3] += WAY * (1.0 if jump == "far" else 0.05)
+    elif jump == "hinge":
+        features[17:, 9] += 0.3
+    elif jump == "turn":
+        turned = rotvec_to_rotmat(np.array([0, 0, 0.5])) @ rot6d_to_rotmat(features[17:, 3:9].astype(float))
+        features[17:, 3:9] = rotmat_to_rot6d(turned)
+    else:
+        hand = 0.01 * np.arange(30)[:, None] * WAY + 0.07 * (np.arange(30) >= 17)[:, None] * WAY
+    clip = recorded(features, hand)
     assert window_starts(clip, 8, LossConfig()).tolist() == [*range(10), *range(17, 23)]
     assert window_starts(clip, 8, LossConfig(skip_first=3, skip_last=4)).tolist() == [*range(3, 10), 17, 18]
+    assert middle_start(clip, 8) == [9]  # 11 is the middle
+    assert middle_start(clip, 20) == []
+
+
+def test_fast_motion_and_a_hand_that_rests_beside_an_object_that_spins_are_no_jumps() -> None:
+    time = np.arange(30.0)[:, None]
+    turn = rotmat_to_rot6d(rotvec_to_rotmat(np.concatenate((0 * time, 0 * time, 0.35 * time), 1)))
+    features = np.concatenate((0.06 * time, 0 * time, 0 * time, turn, 0.1 * time), axis=1).astype(np.float32)
+    assert window_starts(recorded(features), 8, LossConfig()).tolist() == [*range(23)]
+    assert middle_start(recorded(features), 8) == [11]
+
+
+def test_a_hand_that_was_not_tracked_does_not_jump() -> None:
+    hand = np.where((np.arange(30) < 17)[:, None], 0, 9) * WAY
+    clip = recorded(path_features(30), hand)
+    present = np.tile(np.arange(30) >= 17, (2, 1))
+    assert window_starts(replace(clip, present=present), 8, LossConfig()).tolist() == [*range(23)]
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +213,7 @@ def asked_path(frames: int, seed: int, number: int = 0) -> Path:
 
 def test_a_motion_is_drawn_from_its_own_seed_in_any_company(model: BimArt) -> None:
     first, second = asked_path(12, 1), asked_path(12, 2, 1)
-    for config in (FAST, replace(FAST, sampler=SamplerConfig("ddpm", 3, 0.5))):
+    for config in (FAST, replace(FAST, sampler=WalkConfig("ddpm", 3, 0.5))):
         ready = replace(model, config=config)
         alone, again, other = (ready.make([path])[0] for path in (first, first, replace(first, seed=5)))
         together = ready.make([second, first])[1]
@@ -214,6 +250,14 @@ def test_presets_differ_as_the_paper_and_its_code_do() -> None:
     assert PRESETS == {"ours": OURS, "paper": PAPER, "released": RELEASED}
     assert replace(RELEASED, rule="paper", contact_anchor=None) == PAPER
     assert SamplingConfig() == OURS
+
+
+def test_settings_of_the_sampler_keep_what_they_do_not_tell() -> None:
+    told = build_config(SamplingConfig, {"sampler": {"steps": 20}}, "sample.bimart.sampling")
+    assert told == replace(OURS, sampler=replace(OURS.sampler, steps=20))
+    assert told.sampler.guidance == 0
+    guided = build_config(SamplingConfig, {"sampler": {"guidance": 0.5}}, "sample.bimart.sampling")
+    assert guided == replace(OURS, sampler=replace(OURS.sampler, guidance=0.5))
 
 
 def test_joints_that_come_near_stay_at_their_place_of_the_part_and_others_go_on() -> None:
