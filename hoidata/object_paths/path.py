@@ -135,7 +135,7 @@ def check_mean_rate(step: PathStep, way: np.ndarray, unit: str) -> None:
     if size > limit * span:
         enough = max(LEAST_JERK[0] * size / limit, math.sqrt(LEAST_JERK[1] * size / most_change))
         got = f"{size / span:.3g} in {step.words!r}"
-        raise BadInput("object path", f"at most {limit:g} {unit}", got, _slower(step, enough / span))
+        raise BadInput("object path", f"at most {limit:g} {unit}", got, _slower(step, enough))
 
 
 def _check_rates(path: ObjectPath, shift_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> None:
@@ -146,7 +146,8 @@ def _check_rates(path: ObjectPath, shift_m: np.ndarray, rotmats: np.ndarray, hin
             inside = _steps_at(path, frame) or [PathStep("it", 0.0, (len(shift_m) - 1) / FPS)]
             longest = max(inside, key=lambda step: step.end_s - step.start_s)
             own = slice(math.floor(longest.start_s * FPS), math.ceil(longest.end_s * FPS) + 1)
-            remedy = _slower(longest, max(other.factor(own) for other in kinds))
+            factor = max(other.factor(own) for other in kinds)
+            remedy = _slower(longest, factor * (longest.end_s - longest.start_s))
             raise BadInput("object path", kind.expected, f"{kind.size[frame]:.3g} at {_step_at(path, frame)}", remedy)
 
 
@@ -190,10 +191,10 @@ def _rates(place_m: np.ndarray, rotmats: np.ndarray, hinge_rad: np.ndarray) -> I
                 yield _Rate(unit, order, np.linalg.norm(values, axis=1), limits[order - 1])
 
 
-def _slower(step: PathStep, factor: float) -> str:
-    """What to do about a step that is ``factor`` times too fast."""
-    seconds = _rounded_up((step.end_s - step.start_s) * factor)
-    return f"give {step.words!r} {seconds:.1f} s or more ({_rounded_up(factor):.1f} times as long), or check the units"
+def _slower(step: PathStep, enough_s: float) -> str:
+    """What to do about a step that is too fast."""
+    times = f"{_rounded_up(enough_s / (step.end_s - step.start_s)):.1f} times as long"
+    return f"give {step.words!r} {_rounded_up(enough_s):.1f} s or more ({times}), or check the units"
 
 
 def _rounded_up(value: float) -> float:

@@ -198,8 +198,8 @@ def _amount(
     value = sign * float(number) * factor
     if kind == "time" or (kind == "count" and "count" in takes):
         name = "duration_s" if kind == "time" else "count"
-        if not 0 < value <= 120:
-            raise BadInput(where, "more than nothing, and at most 120", f"{value:g} {unit}", "correct the number")
+        if not 1e-3 <= value <= 120:
+            raise BadInput(where, "0.001 or more, and at most 120", f"{value:g} {unit}", "correct the number")
         return {name: value}
     if kind not in takes:
         told = " or ".join({"length": "a length (cm)", "angle": "an angle (deg)"}.get(k, k) for k in takes) or "a time"

@@ -155,6 +155,8 @@ def test_velocity_and_acceleration_never_jump():
         ("tilt up", "left, right"),
         ("lift - cm", "15 cm"),
         ("turn 360 deg in 0.03 s", "give 'turn 360 deg in 0.03 s' 1.0 s"),
+        ("lift 0 cm in 1e-17 s", "0.001 or more"),
+        ("turn 360 deg in 0.001 s", "1.0 s or more"),
         ("lift 20 cm, shake 100 times in 1 s", "give it 10 s"),
         ("open to 400 deg in 10 s", "0 to 120 deg"),
     ],
