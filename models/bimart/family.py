@@ -1,9 +1,9 @@
 """BimArt as a family: hands for the object's motion of a request; recorded wrists are not looked at."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from models.bimart.contact_training import CONTACT
 from models.bimart.diagnostics import diagnose
 from models.bimart.lookups import moved_hands, training_clips
 from models.bimart.motion_training import MOTION
-from models.bimart.sampler import BimArt, Made, Path, SamplingConfig
+from models.bimart.sampler import BimArt, Made, Path, preset_of, sampling_of
 from models.bimart.scene import Scene
 from models.common.checkpoints import FILE_NAME, load_checkpoint
 from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
@@ -35,9 +35,13 @@ Change = Literal["none", "other path", "other object", "zero map", "no map"]
 
 @dataclass(frozen=True)
 class FamilyConfig:
-    """sampling: how the networks are walked. refined: hands are refined against the object after they are fitted."""
+    """preset: how the networks are walked, as they were trained where nothing is told; sampling: laid over it.
 
-    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    refined: hands are refined against the object after they are fitted.
+    """
+
+    preset: Literal["ours", "paper", "released"] | None = None
+    sampling: Mapping[str, Any] = field(default_factory=dict)
     refined: bool = True
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
 
@@ -57,8 +61,10 @@ class HandsForPaths:
     def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "HandsForPaths":
         """Without contact maps (MDM) there need be no contact model."""
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
-        sampling = replace(config.sampling, with_map=config.sampling.with_map and change != "no map")
         motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
+        preset = config.preset or preset_of(motion.network.config)  # pyright: ignore[reportArgumentType]
+        sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
+        sampling = replace(sampling, with_map=sampling.with_map and change != "no map")
         folder = sources.checkpoints / CONTACT.name
         has_contact = sampling.with_map or (folder / FILE_NAME).is_file()
         contact = load_checkpoint(folder, CONTACT, sources.device) if has_contact else None

@@ -3,9 +3,9 @@
 Each motion is drawn from its own seed, whatever else is asked for with it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -14,8 +14,9 @@ from torch import Tensor
 from hoidata.errors import BadInput
 from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import distance_map
+from hoidata.settings import build_config
 from models.bimart.guidance import Guide, Map, combined, metre_step, released_step
-from models.bimart.network import ContactModel, Denoiser, MotionModel, Prepared, Windows
+from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Prepared, Windows
 from models.bimart.scene import Anchor, FeatureConfig, Scene, split_motion
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
 from models.common.checkpoints import Checkpoint
@@ -56,6 +57,20 @@ OURS = SamplingConfig()
 PAPER = SamplingConfig(WalkConfig("ddpm", 50, 0.5), rule="paper", guide="released", guide_share=1.0, overlapping=False)
 RELEASED = replace(PAPER, rule="usual", contact_anchor="before")
 PRESETS = {"ours": OURS, "paper": PAPER, "released": RELEASED}
+
+
+def sampling_of(preset: str, told: Mapping[str, Any], where: str) -> SamplingConfig:
+    """The sampling of a preset with what is told laid over it. Raises BadInput as ``build_config`` does."""
+    config = build_config(SamplingConfig, told, where)
+    walk = told.get("sampler", {})
+    sampler = replace(PRESETS[preset].sampler, **{name: getattr(config.sampler, name) for name in walk})
+    own = {name: getattr(config, name) for name in told if name != "sampler"}
+    return replace(PRESETS[preset], sampler=sampler, **own)
+
+
+def preset_of(config: DenoiserConfig) -> str:
+    """The preset that a network's settings are of: what sets the three apart."""
+    return "ours" if config.told else "paper" if config.untold == "frame" else "released"
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import pytest
 import yaml
 
 from hoidata.settings import build_config
+from models.bimart.sampler import preset_of
 from models.common.training import Plan
 from models.registry import load_network
 from pipelines.stages.train import TrainParams
@@ -40,6 +41,12 @@ def test_paper_and_release_differ_in_the_switches_of_the_list() -> None:
     assert found[0] == common | {"training.learning_rate", "training.ema_decay"}
     motion = {"network.latents", "network.features.anchor", "loss.dropout_of", "training.schedule"}
     assert found[1] == common | motion
+
+
+@pytest.mark.parametrize("preset", ["paper", "released", "ours"])
+@pytest.mark.parametrize("size", ["small", "full"])
+def test_networks_say_which_preset_they_are_of(preset: str, size: str) -> None:
+    assert preset_of(plan(preset, size, "bimart-motion").network) == preset
 
 
 @pytest.mark.parametrize("preset", ["paper", "released", "ours"])

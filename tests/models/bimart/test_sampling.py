@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import BasisSettings
@@ -13,7 +14,18 @@ from hoidata.settings import build_config
 from models.bimart.guidance import Map, combined, discrepancy, metre_step, released_step
 from models.bimart.learning import LossConfig, middle_start, window_starts
 from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
-from models.bimart.sampler import OURS, PAPER, PRESETS, RELEASED, BimArt, Path, SamplingConfig, WalkConfig, held_joints
+from models.bimart.sampler import (
+    OURS,
+    PAPER,
+    PRESETS,
+    RELEASED,
+    BimArt,
+    Path,
+    SamplingConfig,
+    WalkConfig,
+    held_joints,
+    sampling_of,
+)
 from models.bimart.scene import FeatureConfig, Recorded, Scene
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
 from models.common.transformer import TransformerConfig
@@ -258,6 +270,13 @@ def test_settings_of_the_sampler_keep_what_they_do_not_tell() -> None:
     assert told.sampler.guidance == 0
     guided = build_config(SamplingConfig, {"sampler": {"guidance": 0.5}}, "sample.bimart.sampling")
     assert guided == replace(OURS, sampler=replace(OURS.sampler, guidance=0.5))
+
+
+def test_a_preset_keeps_what_is_not_told_beside_it() -> None:
+    told = sampling_of("released", {"sampler": {"steps": 20}, "hold_m": 0.03}, "sample.bimart.sampling")
+    assert told == replace(RELEASED, sampler=replace(RELEASED.sampler, steps=20), hold_m=0.03)
+    with pytest.raises(BadInput, match="guidence"):
+        sampling_of("ours", {"guidence": 1}, "sample.bimart.sampling")
 
 
 def test_joints_that_come_near_stay_at_their_place_of_the_part_and_others_go_on() -> None:
