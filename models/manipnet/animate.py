@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
@@ -14,19 +13,14 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracks import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from hoidata.objects.user_mesh import UNITS_M
 from models.manipnet.control import Control, Motion
 from models.manipnet.examples import between
+from models.manipnet.plausible import UNSEEN_M, plausible_reading
 from models.manipnet.rollout import Predictor, Task, roll_out
-from models.manipnet.trajectory_files import Body, TrajectoryFile
+from models.manipnet.trajectory_files import MOST_FRAMES, TrajectoryFile
 
-NEAR_M = 0.12  # from the middle of the palm to the object: a hand that never comes nearer handles nothing
-PALM_M = 0.08  # from the wrist to the middle of the palm
-SWALLOWED_M = 0.03  # so deep in an object no palm is
 SEAM_S = 1.0  # over so long a time fingers are led from and to where the recording goes on
-UNSEEN_M = 1.0
-FACING = np.array([0.8, 0.0, -0.6])  # canonical: where a hand that holds something looks to
-LOOKS_AWAY, LOOKS_TO = 0.2, 0.6  # mean cosines between that and the way to the object
+INTERPOLATED_S = 2.0  # up to so long a gap between known poses is best filled straight (docs/fingers.md)
 
 
 class Given(NamedTuple):
@@ -38,113 +32,25 @@ class Given(NamedTuple):
 
 
 def given_control(found: TrajectoryFile, model: ObjectModel, hands: Mapping[Side, TrackedHand]) -> Given:
-    """A file's trajectories at an object. Raises BadInput where no hand comes near or looks to it.
-
-    Both are told by where the palms are: a unit or an order of numbers that is not meant puts them elsewhere.
-    """
+    """A file's trajectories at an object. Raises BadInput where they cannot be meant, with what may have been."""
     if model.is_articulated and found.hinge_rad is None:
         raise BadInput(found.where, "hinge_rad for a hinged object", "none", "add the column")
-    thing = found.thing
-    if found.at_box:
-        middle = (model.vertices_m.min(axis=0) + model.vertices_m.max(axis=0)) / 2
-        thing = Body(thing.position_m - thing.rotmats @ middle, thing.rotmats)
-    body = Motion(found.time_s, thing.rotmats, thing.position_m)
-    turn = {side: _model_from_file(found, hands[side]) for side in SIDES}
-    wrists = {
-        side: Motion(found.time_s, own.rotmats @ turn[side], own.position_m) for side, own in found.wrists.items()
-    }
-    away = Motion(found.time_s[:1], np.eye(3)[None], thing.position_m[:1] + np.array([UNSEEN_M, 0, 0]))
-    control = Control({side: wrists.get(side, away) for side in SIDES}, body, model, found.hinge_rad)
-    nearest: dict[Side, float] = {side: _nearest_m(control, side, hands[side]) for side in found.wrists}
-    active: list[Side] = [side for side in SIDES if nearest.get(side, np.inf) < NEAR_M]
-    if not active:
-        _refuse_far(found, control, hands, nearest)
-    for side in active:
-        _check_outside(found, control, side, hands[side])
-        _check_facing(found, control, side, hands[side])
+    read = plausible_reading(found, model, hands)
     notes = [
         f"the {side} hand stays {metres:.2f} m away from the object and keeps its neutral pose"
-        for side, metres in nearest.items()
-        if side not in active
+        for side, metres in read.nearest_m.items()
+        if side not in read.active
     ]
     if note := surface_index(model).solid_note:
         notes.append(f"{note}; fingers may pass through where there is no inside")
-    return Given(control, active, notes)
-
-
-def _model_from_file(found: TrajectoryFile, hand: TrackedHand) -> np.ndarray:
-    """(3, 3) from the axes of the hand's own wrist joint to those the file has."""
-    if found.axes == "model":
-        return np.eye(3)
-    file_from_canonical = np.diag([-1.0 if hand.side == "left" else 1.0, 1.0, 1.0])
-    return file_from_canonical @ hand.wrist_from_canonical.T
-
-
-def _palms(control: Control, side: Side, hand: TrackedHand, scale: float = 1.0) -> np.ndarray:
-    """(frame, 3) the middle of the palm in the object's frame; positions of all bodies scaled."""
-    wrist, thing = control.wrists[side], control.thing
-    ahead = hand.wrist_from_canonical @ [PALM_M, 0.0, 0.0]
-    palm = wrist.position_m * scale + wrist.rotmats @ ahead
-    return ((palm - thing.position_m * scale)[:, None] @ thing.rotmats)[:, 0]
-
-
-def _nearest_m(control: Control, side: Side, hand: TrackedHand, scale: float = 1.0) -> float:
-    """How near the palm comes to the object in any frame; negative inside."""
-    return float(_distances_m(control, _palms(control, side, hand, scale)).min())
-
-
-def _distances_m(control: Control, places_m: np.ndarray) -> np.ndarray:
-    """(frame,) signed distances of a place in each frame from the surface, negative inside."""
-    return surface_index(control.model).nearest(places_m[:, None], control.hinge_rad).distance_m[:, 0]
-
-
-def _refuse_far(
-    found: TrajectoryFile, control: Control, hands: Mapping[Side, TrackedHand], nearest: Mapping[Side, float]
-) -> None:
-    """Raise BadInput that says how near the hands come, and which unit of the positions would bring them to it."""
-    likely = [
-        name
-        for name, factor in UNITS_M.items()
-        if factor != 1 and min(_nearest_m(control, side, hands[side], factor) for side in nearest) < NEAR_M
-    ]
-    got = ", ".join(f"the {side} one {metres:.3g} m" for side, metres in nearest.items())
-    remedy = f"perhaps the positions are not metres: --trajectory-unit {likely[0]}" if likely else "check the positions"
-    raise BadInput(found.where, f"a palm that comes within {NEAR_M} m of the object", got, remedy)
-
-
-def _check_outside(found: TrajectoryFile, control: Control, side: Side, hand: TrackedHand) -> None:
-    """Raise BadInput where the object holds the palm of a hand most of the time: its mesh has another unit."""
-    distance_m = _distances_m(control, _palms(control, side, hand))
-    inside = (distance_m < -SWALLOWED_M).sum() / max((distance_m < NEAR_M).sum(), 1)
-    if inside > 0.5:
-        got = f"a {side} palm inside it in {100 * inside:.0f} % of the frames in which it is near"
-        remedy = "perhaps the mesh has another unit (--unit cm), or another origin than the trajectories mean"
-        raise BadInput(f"{found.where} with {control.model.name}", "an object beside the hands", got, remedy)
-
-
-def _check_facing(found: TrajectoryFile, control: Control, side: Side, hand: TrackedHand) -> None:
-    """Raise BadInput where a hand at the object looks away from it, and would not with w last in its quaternions."""
-    palms = _palms(control, side, hand)
-    near = _distances_m(control, palms) < NEAR_M
-    centre = control.model.vertices_m.mean(axis=0)
-    wrist, thing = control.wrists[side], control.thing
-    toward = thing.position_m + thing.rotmats @ centre - wrist.position_m
-    toward = (toward / np.linalg.norm(toward, axis=1, keepdims=True))[near]
-    looks = hand.wrist_from_canonical @ FACING
-
-    def facing(rotmats: np.ndarray) -> float:
-        return float(np.einsum("fi,fij,j->f", toward, rotmats[near], looks).mean())
-
-    as_read = Rotation.from_matrix(found.wrists[side].rotmats).as_quat()  # x, y, z, w
-    other = Rotation.from_quat(as_read[:, [3, 0, 1, 2]]).as_matrix() @ _model_from_file(found, hand)
-    if facing(wrist.rotmats) < LOOKS_AWAY and facing(other) > LOOKS_TO:
-        got = f"a {side} hand that looks away from the object it is at, and to it if they are x, y, z, w"
-        raise BadInput(found.where, "quaternions in the order w, x, y, z", got, "put w first")
+    return Given(read.control, read.active, notes)
 
 
 def at_30_fps(control: Control) -> Control:
-    """The same trajectories at the rate of clips, from their first frame on."""
+    """The same trajectories at the rate of clips, from their first frame on. Raises BadInput for too many frames."""
     count = int(np.floor((control.thing.time_s[-1] - control.thing.time_s[0]) * FPS + 1e-6)) + 1
+    if count > MOST_FRAMES:
+        raise BadInput("time_s", f"at most {MOST_FRAMES} frames at {FPS} per second", f"{count}", "cut it into pieces")
     time_s = control.thing.time_s[0] + np.arange(count) / FPS
     hinge = control.hinge_at(time_s)
 
@@ -176,21 +82,53 @@ def clip_control(clip: Clip) -> Control:
     return Control(wrists, thing, clip.object.model, hinge)
 
 
-def new_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, frames: slice,
-                recorded: np.ndarray | None, seam_s: float = SEAM_S) -> np.ndarray:  # fmt: skip
-    """Finger rotations (frame, joint - 1, 3, 3) of some frames of ``control``, which are a step apart.
+class Gap(NamedTuple):
+    """Frames ``first`` to ``stop - 1`` of a hand, and its finger poses (15, 3, 3) in the known frames beside them.
 
-    recorded: (all frames, joint - 1, 3, 3). Only the poses just before and after the frames are taken from it: what the
-    network makes is led over ``seam_s`` from the first and to the last. Without one before: from the neutral pose on.
+    None where no frame is known on that side.
     """
-    n_frames = len(control.thing.time_s)
-    first, stop, _ = frames.indices(n_frames)
-    before = recorded[first - 1] if first > 0 and recorded is not None else None
-    after = recorded[stop] if stop < n_frames and recorded is not None else None
-    given = int(before is not None)
-    start = hand.rest_rotmats if before is None else before
-    (made,) = roll_out(predictor, [Task(hand, side, control, control.thing.time_s[first - given : stop], start)])
-    return led(made[given:], before, after, round(seam_s / predictor.settings.step_s))
+
+    first: int
+    stop: int
+    before: np.ndarray | None
+    after: np.ndarray | None
+
+    @property
+    def is_short(self) -> bool:
+        """Whether plain interpolation is nearer to recorded fingers than the network."""
+        known = self.before is not None and self.after is not None
+        return known and self.stop - self.first <= round(INTERPOLATED_S * FPS)
+
+
+def gap_of(track: HandTrack, frames: slice) -> Gap:
+    """The gap that some frames of a track are in: lost frames beside them belong to it, up to the nearest seen ones."""
+    seen, fingers = np.flatnonzero(track.valid), track_rotmats(track)[:, 1:].astype(np.float64)
+    earlier, later = seen[seen < frames.start], seen[seen >= frames.stop]
+    first, before = (earlier[-1] + 1, fingers[earlier[-1]]) if len(earlier) else (frames.start, None)
+    stop, after = (later[0], fingers[later[0]]) if len(later) else (frames.stop, None)
+    return Gap(int(first), int(stop), before, after)
+
+
+def new_fingers(predictor: Predictor, hand: TrackedHand, side: Side, control: Control, gap: Gap,
+                seam_s: float = SEAM_S) -> np.ndarray:  # fmt: skip
+    """Finger rotations (frame, joint - 1, 3, 3) of a gap in ``control``, whose frames are a step apart.
+
+    What the network makes is led over ``seam_s`` from the pose before and to the one after. Without one before: from
+    the neutral pose on.
+    """
+    given = int(gap.before is not None)
+    start = hand.rest_rotmats if gap.before is None else gap.before
+    (made,) = roll_out(
+        predictor, [Task(hand, side, control, control.thing.time_s[gap.first - given : gap.stop], start)]
+    )
+    return led(made[given:], gap.before, gap.after, round(seam_s / predictor.settings.step_s))
+
+
+def straight_fingers(gap: Gap) -> np.ndarray:
+    """Finger rotations (frame, joint - 1, 3, 3) of a gap, evenly between the poses on both sides of it."""
+    if gap.before is None or gap.after is None:
+        raise ValueError("a gap without a known pose on both sides")
+    return interpolated(gap.before, gap.after, gap.stop - gap.first)
 
 
 def led(made: np.ndarray, before: np.ndarray | None, after: np.ndarray | None, seam: int) -> np.ndarray:
@@ -213,17 +151,18 @@ def interpolated(before: np.ndarray, after: np.ndarray, count: int) -> np.ndarra
     return between(*ends, np.arange(1, count + 1) / (count + 1))
 
 
-def recorded_fingers(track: HandTrack) -> np.ndarray:
-    """(frame, 15, 3, 3) of a recorded hand."""
-    return track_rotmats(track)[:, 1:].astype(np.float64)
+def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray, wrist: Motion) -> HandTrack:
+    """A track whose finger poses of some frames are these, (frame, 15, 3, 3); it counts as seen in them.
 
-
-def with_fingers(track: HandTrack, frames: slice, fingers: np.ndarray) -> HandTrack:
-    """A track whose finger poses of some frames are these, (frame, 15, 3, 3); it counts as seen in them."""
+    wrist: of all frames; taken where the hand was lost, since a track says nothing there.
+    """
     pose, valid = track.hand_pose.copy(), track.valid.copy()
+    place, turn = track.wrist_m.copy(), track.global_orient.copy()
     pose[frames] = rotmat_to_rotvec(fingers).reshape(len(fingers), -1)
     valid[frames] = True
-    return replace(track, hand_pose=pose.astype(np.float32), valid=valid)
+    lost = valid & ~track.valid
+    place[lost], turn[lost] = wrist.position_m[lost], rotmat_to_rotvec(wrist.rotmats[lost])
+    return replace(track, wrist_m=place, global_orient=turn, hand_pose=pose, valid=valid)
 
 
 def clip_of(control: Control, fingers: Mapping[Side, np.ndarray], up: tuple[float, float, float] | None,

@@ -30,7 +30,9 @@ from hoidata.objects.user_mesh import UNITS_M
 Axes = Literal["model", "canonical"]
 BODIES = ("object", *SIDES)
 PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+ENDINGS = (".csv", ".npz", ".txt")
 FASTEST_HZ, SLOWEST_HZ = 1000.0, 5.0
+LONGEST_STEP_S = 1.0  # over a longer pause nobody knows where hands were
 LARGEST = 1e30  # of any number: squares of it are numbers still
 MOST_BYTES, MOST_FRAMES, LONGEST_LINE = 64 * 2**20, 200_000, 1 << 16
 MANIPNET_UNIT = "dm"  # of the release's trajectories and meshes
@@ -49,7 +51,8 @@ class Body:
 class TrajectoryFile:
     """What a file says. axes: of the wrists. at_box: the object's position is the middle of its bounding box.
 
-    up: (3,) where the file's kind says so, else None. mesh_unit: of the meshes that come with files of this kind.
+    up: (3,) where the file's kind says so, else None. mesh_unit: of the meshes that come with files of this kind. unit:
+    of the positions, as it was told; "" where the file's kind says unit and axes.
     """
 
     where: str
@@ -61,26 +64,37 @@ class TrajectoryFile:
     at_box: bool = False
     up: tuple[float, float, float] | None = None
     mesh_unit: str = ""
+    unit: str = "m"
 
 
-def read_trajectories(path: Path, unit: str = "m", axes: Axes = "model") -> TrajectoryFile:
-    """Read a file by its ending. Raises BadInput that names the line, column or array and what to do."""
-    if unit not in UNITS_M:
+def read_trajectories(path: Path, unit: str = "", axes: Axes = "model") -> TrajectoryFile:
+    """Read a file by its ending. Raises BadInput that names the line, column or array and what to do.
+
+    unit, axes: as they are told of a CSV or NPZ file; metres where no unit is.
+    """
+    if unit and unit not in UNITS_M:
         raise BadInput("--trajectory-unit", f"one of {', '.join(UNITS_M)}", unit, "name the unit of the positions")
+    if path.suffix.lower() not in ENDINGS:
+        is_packed = path.suffix.lower() == ".gz"
+        remedy = f"unpack it: gunzip --keep {path}" if is_packed else "export it as one of these"
+        raise BadInput(path, f"a file of trajectories ({', '.join(ENDINGS)})", f"{path.suffix or 'no ending'}", remedy)
     if not path.is_file():
-        raise BadInput(path, "a file of trajectories (.csv, .npz, .txt)", "nothing there", "correct the path")
+        raise BadInput(path, f"a file of trajectories ({', '.join(ENDINGS)})", "nothing there", "correct the path")
     if path.stat().st_size > MOST_BYTES:
         raise BadInput(path, f"at most {MOST_BYTES} bytes", f"{path.stat().st_size}", "cut it into pieces")
     if path.suffix.lower() == ".npz":
-        found = from_arrays(load_npz_arrays(path), str(path), UNITS_M[unit])
+        found = from_arrays(load_npz_arrays(path), str(path), unit or "m")
     elif path.suffix.lower() == ".csv":
-        found = parse_csv(path.read_bytes(), str(path), UNITS_M[unit])
+        found = parse_csv(path.read_bytes(), str(path), unit or "m")
+    elif unit or axes != "model":
+        told = f"--trajectory-unit {unit}" if unit else f"--wrist-axes {axes}"
+        raise BadInput(path, "no unit or axes beside ManipNet's text, which says both", told, "leave it out")
     else:
         return parse_manipnet(path.read_bytes(), str(path))
     return replace(found, axes=axes)
 
 
-def parse_csv(data: bytes, where: str, unit_m: float = 1.0) -> TrajectoryFile:
+def parse_csv(data: bytes, where: str, unit: str = "m") -> TrajectoryFile:
     """The CSV form, of any bytes."""
     try:
         # One more than there may be, so that too many are noticed and not kept.
@@ -103,7 +117,7 @@ def parse_csv(data: bytes, where: str, unit_m: float = 1.0) -> TrajectoryFile:
         arrays |= {f"{body}_position": own[:, :3], f"{body}_quaternion": own[:, 3:]}
     if "hinge_rad" in columns:
         arrays["hinge_rad"] = columns["hinge_rad"]
-    return from_arrays(arrays, where, unit_m)
+    return from_arrays(arrays, where, unit)
 
 
 def _lines(data: bytes) -> Iterator[str]:
@@ -113,19 +127,19 @@ def _lines(data: bytes) -> Iterator[str]:
         yield line
 
 
-def from_arrays(arrays: Mapping[str, np.ndarray], where: str, unit_m: float = 1.0) -> TrajectoryFile:
+def from_arrays(arrays: Mapping[str, np.ndarray], where: str, unit: str = "m") -> TrajectoryFile:
     """The NPZ form; also what the CSV form becomes."""
     if "time_s" not in arrays:
         raise BadInput(where, "an array time_s", f"{', '.join(arrays) or 'none'}"[:200], "add the time of every frame")
     time_s = _array(arrays, "time_s", (), where)
     _check_times(time_s, where)
     there: list[Side] = [side for side in SIDES if f"{side}_position" in arrays]
-    wrists: dict[Side, Body] = {side: _body(arrays, side, len(time_s), where, unit_m) for side in there}
+    wrists: dict[Side, Body] = {side: _body(arrays, side, len(time_s), where, UNITS_M[unit]) for side in there}
     if not wrists:
         raise BadInput(where, "the wrist of a hand, left or right", "neither", "add left_... or right_...")
-    thing = _body(arrays, "object", len(time_s), where, unit_m)
+    thing = _body(arrays, "object", len(time_s), where, UNITS_M[unit])
     hinge = _array(arrays, "hinge_rad", (), where, len(time_s)) if "hinge_rad" in arrays else None
-    return TrajectoryFile(where, time_s, wrists, thing, hinge)
+    return TrajectoryFile(where, time_s, wrists, thing, hinge, unit=unit)
 
 
 def parse_manipnet(data: bytes, where: str) -> TrajectoryFile:
@@ -142,8 +156,8 @@ def parse_manipnet(data: bytes, where: str) -> TrajectoryFile:
         own = table[:, 7 * number : 7 * number + 7]
         arrays[f"{body}_quaternion"] = own[:, [3, 0, 1, 2]] * _MIRROR_QUATERNION
         arrays[f"{body}_position"] = own[:, 4:] * _MIRROR_POSITION
-    found = from_arrays(arrays, where, UNITS_M[MANIPNET_UNIT])
-    return replace(found, axes="canonical", at_box=True, up=(0.0, 1.0, 0.0), mesh_unit=MANIPNET_UNIT)
+    found = from_arrays(arrays, where, MANIPNET_UNIT)
+    return replace(found, axes="canonical", at_box=True, up=(0.0, 1.0, 0.0), mesh_unit=MANIPNET_UNIT, unit="")
 
 
 def _numbers(rows: list[list[str]], count: int, where: str) -> np.ndarray:
@@ -192,6 +206,10 @@ def _check_times(time_s: np.ndarray, where: str) -> None:
             remedy = "they look like frame numbers: divide them by the frame rate"
         expected = f"seconds, {SLOWEST_HZ:g} to {FASTEST_HZ:g} frames in each"
         raise BadInput(f"{where}: time_s", expected, f"a step of {step:g}", remedy)
+    if steps.max() > LONGEST_STEP_S:
+        row = int(steps.argmax()) + 1
+        expected = f"steps of at most {LONGEST_STEP_S:g} s"
+        raise BadInput(f"{where}: time_s", expected, f"{steps[row - 1]:g} s after row {row}", "cut the file there")
 
 
 def _body(arrays: Mapping[str, np.ndarray], body: str, count: int, where: str, unit_m: float) -> Body:

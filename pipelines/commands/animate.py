@@ -22,7 +22,9 @@ def animate(
     frames: Annotated[str, typer.Option(help="Of a clip, like 30:90; all when left out.")] = "",
     model: Annotated[str, typer.Option(help="Dataset whose network to use; the clip's own, or the first.")] = "",
     rule: Annotated[Literal["ours", "paper", "released", "off"], typer.Option(help="Of post-processing.")] = "ours",
-    trajectory_unit: Annotated[str, typer.Option(help="Of positions in .csv and .npz: m, cm, mm, dm, inch.")] = "m",
+    trajectory_unit: Annotated[
+        str, typer.Option(help="Of positions in .csv and .npz: m, cm, mm, dm, inch; metres when left out.")
+    ] = "",
     wrist_axes: Annotated[
         Literal["model", "canonical"],
         typer.Option(help="Of wrists in .csv and .npz: the hand model's, or x to the fingers, y to the thumb."),
@@ -33,6 +35,10 @@ def animate(
         typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; when left out metres, dm beside a ManipNet .txt."),
     ] = "",
     hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
+    way: Annotated[
+        Literal["auto", "network", "interpolate"],
+        typer.Option(help="Frames of a clip; auto: interpolate up to 2 s between known poses, else the network."),
+    ] = "auto",
     profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
 ) -> None:
     """Wrists and object stay as they are given; writes arrays, an animated GLB and a page that plays it."""
@@ -46,7 +52,7 @@ def animate(
     paths = [str(here / name) if name and (here / name).is_file() else name for name in (what, object)]
     sides = SIDES if fingers == "both" else (fingers,)
     wish = AnimateWish(
-        sides, frames, model, rule, paths[1], trajectory_unit, wrist_axes, world_up, MeshWish(unit, "", hinge)
+        sides, frames, model, rule, paths[1], trajectory_unit, wrist_axes, world_up, MeshWish(unit, "", hinge), way
     )
     datasets = tuple(read_params(project)["datasets"])
     for path in animate_files(paths[0], wish, profile or current_profile(), datasets, out):

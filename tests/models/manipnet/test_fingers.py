@@ -23,7 +23,7 @@ from models.common.checkpoints import load_checkpoint
 from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
-from models.manipnet.animate import new_fingers
+from models.manipnet.animate import Gap, new_fingers
 from models.manipnet.examples import sized
 from models.manipnet.family import Fingers
 from models.manipnet.features import FeatureSettings, outputs, pose_features
@@ -314,11 +314,8 @@ def test_frames_of_a_clip_are_made_from_the_poses_beside_them_alone(
         hands_of(HANDS, sample.betas, None)["right"],
     )
     recorded = finger_rotmats_of(sample.hands[1])
-    made = new_fingers(fingers.predictor, hand, "right", control, frames, recorded)
-    other = recorded.copy()
-    kept = np.isin(np.arange(len(other)), [8, 20])
-    other[~kept] = rotvec_to_rotmat(np.random.default_rng(0).normal(size=(int((~kept).sum()), 15, 3)))
-    np.testing.assert_array_equal(made, new_fingers(fingers.predictor, hand, "right", control, frames, other))
-    other[20] = hand.rest_rotmats @ rotvec_to_rotmat(np.full((15, 3), 0.2))
-    assert np.abs(made - new_fingers(fingers.predictor, hand, "right", control, frames, other)).max() > 0.05
+    gap = Gap(frames.start, frames.stop, recorded[8], recorded[20])
+    made = new_fingers(fingers.predictor, hand, "right", control, gap)
+    other = gap._replace(after=hand.rest_rotmats @ rotvec_to_rotmat(np.full((15, 3), 0.2)))
+    assert np.abs(made - new_fingers(fingers.predictor, hand, "right", control, other)).max() > 0.05
     assert len(made) == 11

@@ -1,19 +1,24 @@
 """Promises of the readers of trajectories, and of what is said when they cannot be meant."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from fuzz.seeds import trajectory_tables
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
+from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.animate import given_control, interpolated, led
-from models.manipnet.trajectory_files import PARTS, parse_csv, parse_manipnet, read_trajectories
-from tests.builders.objects import box_model, notebook
+from models.manipnet.animate import at_30_fps, given_control, interpolated, led
+from models.manipnet.control import Control, Motion
+from models.manipnet.plausible import reading
+from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
+from tests.builders.objects import box_model, model_of, notebook
 
 HANDS = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
 BOX = box_model((0.06, 0.06, 0.1))
@@ -21,7 +26,9 @@ FRAMES = 6
 WORLD = Rotation.from_rotvec([-1.3, -0.6, 0.0])
 
 
-def table(scale: float = 1.0, order: str = "wxyz", step: float = 1 / 30, away_m: float = 0.0) -> str:
+def table(
+    scale: float = 1.0, order: str = "wxyz", step: float = 1 / 30, away_m: float = 0.0, world: Rotation = WORLD
+) -> str:
     """A right hand that moves with a box it holds, turned so that fingers and palm look to it."""
     looks = HANDS["right"].wrist_from_canonical
     # Canonical x (fingers) to -y of the world, canonical z (back of the hand) to +z; the palm above the box.
@@ -34,15 +41,20 @@ def table(scale: float = 1.0, order: str = "wxyz", step: float = 1 / 30, away_m:
         hand = thing + np.array([0.0, 0.08 + away_m, 0.07])
         turn = [Rotation.from_rotvec([0, 0, 0.02 * frame]), wrist]
         # The whole scene turned: quaternions that say the same in any order would be no test of it.
-        thing, hand, turn = WORLD.apply(thing), WORLD.apply(hand), [WORLD * one for one in turn]
+        thing, hand, turn = world.apply(thing), world.apply(hand), [world * one for one in turn]
         quaternions = [one.as_quat() if order == "xyzw" else one.as_quat()[[3, 0, 1, 2]] for one in turn]
         numbers = [frame * step, *thing * scale, *quaternions[0], *hand * scale, *quaternions[1]]
         lines.append(",".join(f"{number:.9g}" for number in numbers))
     return "\n".join(lines)
 
 
-def given(text: str, model=BOX):
-    return given_control(parse_csv(text.encode(), "mine.csv"), model, HANDS)
+def given(text: str, model=BOX, unit: str = "m", axes: Axes = "model"):
+    return given_control(replace(parse_csv(text.encode(), "mine.csv", unit), axes=axes), model, HANDS)
+
+
+def with_last_time(time_s: str) -> str:
+    *lines, last = table().splitlines()
+    return "\n".join([*lines, ",".join([time_s, *last.split(",")[1:]])])
 
 
 def test_a_table_is_read_as_it_is_written_in_any_order_of_columns() -> None:
@@ -98,11 +110,67 @@ def test_manipnets_text_is_seen_in_the_mirror_in_metres_at_the_box_centre() -> N
         (table(away_m=0.6), "a palm that comes within"),
         (table().replace("time_s", "seconds"), "time_s"),
         (table().splitlines()[0], "3 to"),
+        (with_last_time("1e12"), r"1e\+12 s after row 5"),
+        (with_last_time("3600"), "3599.87 s after row 5; cut the file there"),
     ],
 )
 def test_what_cannot_be_meant_is_told_with_a_remedy(text: str, words: str) -> None:
     with pytest.raises(BadInput, match=words):
         given(text)
+
+
+@pytest.mark.parametrize("told", ["m", "cm", "mm", "dm"])
+@pytest.mark.parametrize("meant", ["m", "cm", "mm"])
+def test_the_unit_that_was_meant_is_named_whichever_was_told(meant: str, told: str) -> None:
+    text = table(scale=1 / UNITS_M[meant])
+    if told == meant:
+        assert given(text, unit=told).active == ["right"]
+        return
+    with pytest.raises(BadInput) as refused:
+        given(text, unit=told)
+    assert refused.value.remedy.endswith(f"--trajectory-unit {meant}")
+
+
+def test_a_wrist_in_the_hollow_of_a_mug_cannot_be_meant() -> None:
+    rings = [trimesh.creation.annulus(0.045, 0.05, 0.1), trimesh.creation.cylinder(0.045, 0.005)]
+    mug = model_of(trimesh.util.concatenate(rings), "mug")
+    inside = reading(parse_csv(table(scale=0.01).encode(), "mine.csv"), mug, HANDS)
+    assert inside.nearest_m["right"] < 0.12
+    with pytest.raises(BadInput, match=r"a wrist at least 1.5 cm off mug"):
+        given(table(scale=0.01), mug)
+
+
+def test_the_other_axes_of_the_wrist_are_named_where_they_alone_would_do() -> None:
+    with pytest.raises(BadInput, match="--wrist-axes model"):
+        given(table(), axes="canonical")
+
+
+def test_files_that_are_no_trajectories_are_told_by_their_ending(tmp_path: Path) -> None:
+    for name, words in (("demo1.txt.gz", "gunzip --keep"), ("mine.cvs", r"\.csv, \.npz, \.txt")):
+        (tmp_path / name).write_bytes(b"1")
+        with pytest.raises(BadInput, match=words):
+            read_trajectories(tmp_path / name)
+    (tmp_path / "demo.txt").write_text("120\n")
+    with pytest.raises(BadInput, match="--trajectory-unit cm; leave it out"):
+        read_trajectories(tmp_path / "demo.txt", "cm")
+
+
+def test_too_many_frames_at_30_per_second_are_refused_before_they_are_made() -> None:
+    times = np.linspace(0, 1e9, 3)
+    still = Motion(times, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
+    with pytest.raises(BadInput, match="at most 200000 frames"):
+        at_30_fps(Control(dict.fromkeys(SIDES, still), still, BOX))
+
+
+def test_w_last_is_refused_in_nearly_every_world_and_w_first_in_none() -> None:
+    refused = []
+    for world in Rotation.from_quat(np.random.default_rng(0).normal(size=(20, 4))):
+        assert given(table(world=world)).active == ["right"]
+        try:
+            given(table(order="xyzw", world=world))
+        except BadInput as error:
+            refused.append("put w first" in error.remedy)
+    assert sum(refused) >= 19  # of many worlds 99 %: in some the hand that is not meant holds the object as well
 
 
 def test_a_hinged_object_needs_angles_and_an_open_mesh_is_said_to_have_no_inside() -> None:
