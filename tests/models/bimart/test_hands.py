@@ -45,9 +45,9 @@ def sampler() -> HandsForPaths:
         motion.keypoint_ids.copy_(torch.from_numpy(ids))
         contact.mean.fill_(0.02)
         contact.scale.fill_(0.005)
-    config = FamilyConfig(replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5)))
-    model = BimArt(contact.eval(), motion.eval(), config.sampling, torch.device("cpu"))
-    return HandsForPaths(model, PAIR, config, synthetic=True)
+    sampling = replace(OURS, sampler=SamplerConfig("ddim", 2, 0.5))
+    model = BimArt(contact.eval(), motion.eval(), sampling, torch.device("cpu"))
+    return HandsForPaths(model, PAIR, FamilyConfig(), synthetic=True)
 
 
 @pytest.fixture(scope="module")
