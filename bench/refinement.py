@@ -2,6 +2,7 @@
 
 ``python -m bench refinement``. Windows of 64 frames of both hands from clips in ``data/embedded/arctic/clips`` (or
 HOIDATA_BENCH_CLIPS), their keypoints spoilt as a generator's are: pushed about slowly by centimetres, shaking, noisy.
+HOIDATA_BENCH_FIRST: number of the first clip; our weights were set on the windows of 3, the default.
 *released*: what BimArt's release does, written anew from its description (Adam to the keypoints, then 100 steps of
 AdamW; vertices inside by ray parity over all triangles, distances to object vertices). Its fit is timed on
 ``TIMED_FITS`` steps, its refinement on one, and both scaled by the number of steps; what it reaches is found with an
@@ -62,7 +63,8 @@ def windows(pair: HandPair, ids: np.ndarray, frames: int, count: int) -> list[Wi
     """Windows in which both hands were tracked throughout and one touches, of evenly spread clips."""
     store = open_store(os.environ.get("HOIDATA_BENCH_CLIPS", Path("data/embedded/arctic/clips")), pair)
     found = []
-    for number, clip_id in enumerate(store.ids[3 :: max(1, len(store.ids) // (6 * count))]):
+    first = int(os.environ.get("HOIDATA_BENCH_FIRST", "3"))
+    for number, clip_id in enumerate(store.ids[first :: max(1, len(store.ids) // (6 * count))]):
         clip = store.clip(clip_id)
         if clip.n_frames < frames or not all(track.valid.all() for track in clip.hands.values()) or len(found) == count:
             continue
