@@ -76,8 +76,8 @@ def _measured(
         counts = sample_family(family, paths.data, paths.table_networks, out, sampled, hands, settings=own)
         if not counts["clips"]:
             return {"title": row.title, "empty": empty_reason(out)}
-        found = evaluate_store(out / "clips", paths.data, hands, metrics=metrics, jobs=jobs())
+        found = evaluate_store(out / "clips", paths.data, hands, metrics=metrics, jobs=jobs(), by_clip=True)
         inside = read_json(out / "diagnostics.json")
     print(f"{paths}: {name}: {counts['clips']} motions", flush=True)
-    kept = ("motions", "figures", "intervals", "counts", "synthetic")
+    kept = ("motions", "figures", "intervals", "counts", "synthetic", "by_clip")
     return {"title": row.title, **{key: found[key] for key in kept}, "diagnostics": inside}

@@ -1,6 +1,7 @@
 """Stage tables: BimArt's Tables 1 and 3 from the rows of all runs, and Table 6 from recorded clips, as Markdown."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from hoidata.files import write_whole
 from hoidata.files.written import Facts, read_json
 from models.bimart_tables.rows import ROWS
 from models.bimart_tables.variants import variant_of
-from pipelines.promises import Kept, Promise, kept
+from pipelines.promises import PROMISES, Promise
 from pipelines.stages.base import EMPTY, StagePaths, empty_reason, load_hands
 
 RIVALS = ("nearest-window", "nearest-window-refined", "nearest-windows", "random-window", "mean-pose-at-object")
@@ -77,22 +78,83 @@ def _row(seeds: list[Facts]) -> list[str]:
 
 
 def controls_lines(paths: StagePaths) -> list[str]:
-    """What every control must do beyond the 95 % interval over clips, and in how many runs it does."""
-    found: dict[Promise, list[Kept]] = {}
+    """What every control must do, clip by clip beside the row it is compared with, and in how many runs it does."""
+    found: dict[Promise, list[Compared]] = {}
     for folder in sorted(paths.table_rows.glob("*")):
         rows = _rows_by_family(folder)
-        for one in kept(rows):
-            if one.holds is not None and _as_many_chances(one.promise, rows):
-                found.setdefault(one.promise, []).append(one)
+        for promise in PROMISES:
+            if (one := compared(promise, rows)) is not None:
+                found.setdefault(promise, []).append(one)
     lines = []
     for promise, own in found.items():
-        values = _cell(one.reference for one in own), _cell(one.value for one in own)
-        holds = f"{sum(bool(one.holds) for one in own)} of {len(own)}"
-        must = f"{promise.must}, beside {promise.beside}"
-        lines.append([promise.control, promise.metric, must, *values, holds])
+        means = _cell(one.beside for one in own), _cell(one.control for one in own)
+        apart = ", ".join(f"{one.low:.3g} to {one.high:.3g}" for one in own)
+        holds = f"{sum(one.holds(promise.must) for one in own)} of {len(own)}"
+        lines.append(
+            [promise.control, promise.metric, f"{promise.must}, beside {promise.beside}", *means, apart, holds]
+        )
     title = "## What controls must do beyond the 95 % interval over clips"
-    columns = ("control", "figure", "must", "beside", "control's", "runs in which it does")
+    columns = (
+        "control",
+        "figure",
+        "must",
+        "beside",
+        "control's",
+        "difference, 95 % in each run",
+        "runs in which it does",
+    )
     return ["", title, "", *_table(columns, lines)] if lines else []
+
+
+@dataclass(frozen=True)
+class Compared:
+    """The figures of a control and of the row beside it over the clips of both, and their difference's interval."""
+
+    beside: float
+    control: float
+    low: float
+    high: float
+
+    def holds(self, must: str) -> bool:
+        return {"fall": self.high < 0, "rise": self.low > 0, "stay": self.high >= 0}[must]
+
+
+def compared(promise: Promise, rows: Mapping[str, Facts]) -> Compared | None:
+    """A promise of rows by family, over the clips that have a value in both; None where it cannot be told."""
+    if promise.must not in ("fall", "rise", "stay") or not {promise.control, promise.beside} <= set(rows):
+        return None
+    if not _as_many_chances(promise, rows):
+        return None
+    from hoidata.metrics.intervals import bootstrap_interval
+
+    clips, others = (rows[name]["by_clip"] for name in (promise.beside, promise.control))
+    shared = [
+        clip
+        for clip in clips
+        if clip in others and all(promise.metric in own[clip]["parts"] for own in (clips, others))
+    ]
+    parts = np.array(
+        [[*clips[clip]["parts"][promise.metric], *others[clip]["parts"][promise.metric]] for clip in shared]
+    )
+    interval = bootstrap_interval(parts, [clips[clip]["group"] for clip in shared], _difference) if shared else None
+    if interval is None:
+        return None
+    total, count, other, counted = parts.sum(axis=0)
+    return Compared(total / count, other / counted, *interval)
+
+
+def _difference(parts: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """(draw,) of control less the row beside it; parts (clip, 4): both sums and counts; weights (draw, clip)."""
+    total, count, other, counted = (weights @ parts).T
+    return other / counted - total / count
+
+
+def _rows_by_family(folder: Path) -> dict[str, Facts]:
+    """The measured rows of a run that are a family as it stands in the registry, by its name."""
+    rows = ROWS[variant_of(folder.name)[0]].items()
+    paths = {row.family: folder / f"{name}.json" for name, row in rows if not row.settings}
+    found = {family: read_json(path) for family, path in paths.items() if path.is_file()}
+    return {family: row for family, row in found.items() if "by_clip" in row}
 
 
 def _as_many_chances(promise: Promise, rows: Mapping[str, Facts]) -> bool:
@@ -101,13 +163,6 @@ def _as_many_chances(promise: Promise, rows: Mapping[str, Facts]) -> bool:
 
     best_of = {metric.name for metric in METRICS if metric.reduction == "best of a clip's samples"}
     return promise.metric not in best_of or rows[promise.control]["motions"] == rows[promise.beside]["motions"]
-
-
-def _rows_by_family(folder: Path) -> dict[str, Facts]:
-    """The rows of a run that are a family as it stands in the registry, by its name."""
-    rows = ROWS[variant_of(folder.name)[0]].items()
-    paths = {row.family: folder / f"{name}.json" for name, row in rows if not row.settings}
-    return {family: read_json(path) for family, path in paths.items() if path.is_file()}
 
 
 def maps_lines(found: Mapping[str, list[Facts]]) -> list[str]:
