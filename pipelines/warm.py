@@ -149,8 +149,9 @@ def _receive(connection: socket.socket) -> dict[str, Any]:
 
 def _pass_signals_on(connection: socket.socket) -> None:
     """Signals for the one that asks are for the stage and its workers too; and without it there is no one to answer."""
-    while received := connection.recv(1):
-        os.killpg(0, received[0])
+    with suppress(ConnectionError):  # one that was killed may not have read all: its end is a reset then
+        while received := connection.recv(1):
+            os.killpg(0, received[0])
     os.killpg(0, signal.SIGKILL)
 
 

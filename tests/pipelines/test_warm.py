@@ -95,6 +95,20 @@ def test_a_stage_ends_with_the_one_that_asked(warm, tmp_path: Path) -> None:
     until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in fork))
 
 
+def test_a_stage_ends_with_one_that_was_killed_before_it_read_all() -> None:
+    said = """import os, socket
+from pipelines import warm
+os.setsid()
+stage, asking = socket.socketpair()
+stage.send(b"an answer that nobody reads")
+asking.close()  # so that the stage is told of a reset, not of an end
+warm._pass_signals_on(stage)"""
+    assert (
+        subprocess.run([sys.executable, "-c", said], cwd=Path(__file__).parents[2], check=False).returncode
+        == -signal.SIGKILL
+    )
+
+
 def socket_of(process: Path, warm: dict[str, str]) -> bool:
     """Whether a process is a fork of the server: its command names the socket, and its folder is where it was asked."""
     try:

@@ -283,7 +283,7 @@ def _carried(scenes, pair, frame):
         for way in (*np.eye(3), *-np.eye(3)):
             wrench = [*way, *np.cross(point - about, way)]
             columns.append(np.array([*(-np.array(wrench)), *wrench]))
-    found = lsq_linear(np.array(columns).T, np.array(wanted), (0, np.inf), tol=1e-14, max_iter=2000)
+    found = lsq_linear(np.array(columns).T, np.array(wanted), (0, np.inf), method="bvls", max_iter=5000)
     return float(np.linalg.norm(found.fun) < 0.01)
 
 
