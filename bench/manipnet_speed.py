@@ -125,10 +125,10 @@ def _spent_ms(
     return 1000 * np.array(spent[WARM_UP:])
 
 
-def picture(spent_ms: Mapping[str, np.ndarray], width: int = 760) -> str:
+def picture(spent_ms: Mapping[str, np.ndarray], width: int = 820) -> str:
     """SVG of a bar per row, as long as its frame takes, in the colours of its parts."""
     colours, left, high = ("#9aa3ad", "#2a6fb0", "#2f8f4e", "#c2562d"), 330, 22
-    scale = (width - left - 60) / max(float(parts.sum()) for parts in spent_ms.values())
+    scale = (width - left - 120) / max(float(parts.sum()) for parts in spent_ms.values())
     marks = [
         f'<rect x="{left + 110 * number}" y="6" width="12" height="12" fill="{colour}"/>'
         f'<text x="{left + 16 + 110 * number}" y="16">{name}</text>'
