@@ -61,9 +61,14 @@ def run(paths: StagePaths) -> None:
 def read_rows(paths: StagePaths) -> dict[str, list[Facts]]:
     """What was measured of each row, by its name, seed by seed."""
     known = [name for rows in ROWS.values() for name in rows]
-    files = sorted(paths.table_rows.glob("*/*.json"))
-    rows = [(file.stem, read_json(file)) for file in files if file.name != EMPTY]
+    files = [file for folder in _runs(paths) for file in sorted(folder.glob("*.json")) if file.name != EMPTY]
+    rows = [(file.stem, read_json(file)) for file in files]
     return {name: own for name in known if (own := [row for stem, row in rows if stem == name])}
+
+
+def _runs(paths: StagePaths) -> list[Path]:
+    """The folder of each run's rows, without what a killed one left beside them."""
+    return sorted(paths.table_rows.glob("[!.]*"))
 
 
 def _row(seeds: list[Facts]) -> list[str]:
@@ -80,7 +85,7 @@ def _row(seeds: list[Facts]) -> list[str]:
 def controls_lines(paths: StagePaths) -> list[str]:
     """What every control must do, clip by clip beside the row it is compared with, and in how many runs it does."""
     found: dict[Promise, list[Compared]] = {}
-    for folder in sorted(paths.table_rows.glob("*")):
+    for folder in _runs(paths):
         rows = _rows_by_family(folder)
         for promise in PROMISES:
             if (one := compared(promise, rows)) is not None:
@@ -151,10 +156,12 @@ def _difference(parts: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def _rows_by_family(folder: Path) -> dict[str, Facts]:
     """The measured rows of a run that are a family as it stands in the registry, by its name."""
-    rows = ROWS[variant_of(folder.name)[0]].items()
-    paths = {row.family: folder / f"{name}.json" for name, row in rows if not row.settings}
-    found = {family: read_json(path) for family, path in paths.items() if path.is_file()}
-    return {family: row for family, row in found.items() if "by_clip" in row}
+    found: dict[str, Facts] = {}
+    for name, row in ROWS[variant_of(folder.name)[0]].items():
+        path = folder / f"{name}.json"
+        if not row.settings and path.is_file() and "by_clip" in (facts := read_json(path)):
+            found.setdefault(row.family, facts)  # the first of a family, not the same with more motions
+    return found
 
 
 def _as_many_chances(promise: Promise, rows: Mapping[str, Facts]) -> bool:

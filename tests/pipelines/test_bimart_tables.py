@@ -1,11 +1,13 @@
 """Promises of BimArt's tables as a page: controls that lose are told from those that do not, clip by clip."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
 from pipelines.promises import Promise
+from pipelines.stages import tables
 from pipelines.stages.base import StagePaths
 from pipelines.stages.tables import compared, controls_lines, maps_lines, read_rows
 
@@ -70,6 +72,22 @@ def test_a_figure_that_must_stay_does_and_one_that_must_fall_does(rows: Path) ->
     (PATHS.table_rows / "rivals-0" / "pressed-deep.json").unlink()
     write(PATHS.table_rows / "rivals-0" / "pressed-deep.json", bimart_con_paper=(0.1, 0.2))
     assert cells(controls_lines(PATHS), "pressed-deep", "bimart_con_paper")[-1] == "0 of 1"
+
+
+def test_the_nearest_window_is_the_row_of_one_window_and_not_that_of_many(
+    rows: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tables, "PROMISES", (Promise("nearest-window", F1, "fall"),))
+    write(rows / "rivals-0" / "ground-truth.json", contact_f1=(1.0, 1.0))
+    write(rows / "rivals-0" / "nearest-windows.json", contact_f1=(0.1, 0.2))
+    write(rows / "rivals-0" / "nearest-window.json", contact_f1=(0.4, 0.6))
+    assert cells(controls_lines(PATHS), "nearest-window", F1)[4] == "0.5"
+
+
+def test_rows_that_a_killed_run_left_count_nowhere(rows: Path) -> None:
+    found = controls_lines(PATHS), read_rows(PATHS)
+    shutil.copytree(rows / "part-0", rows / ".part-0.abc.part")
+    assert (controls_lines(PATHS), read_rows(PATHS)) == found
 
 
 def test_clips_of_one_row_alone_are_not_compared(rows: Path) -> None:
