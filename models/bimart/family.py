@@ -22,6 +22,7 @@ from models.bimart.contact_training import CONTACT
 from models.bimart.diagnostics import diagnose
 from models.bimart.lookups import moved_hands, training_clips
 from models.bimart.motion_training import MOTION
+from models.bimart.network import MotionModel
 from models.bimart.sampler import BimArt, Made, Path, preset_of, sampling_of
 from models.bimart.scene import Scene
 from models.common.checkpoints import FILE_NAME, load_checkpoint
@@ -62,7 +63,8 @@ class HandsForPaths:
         """Without contact maps (MDM) there need be no contact model."""
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
         motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
-        preset = config.preset or preset_of(motion.network.config)  # pyright: ignore[reportArgumentType]
+        assert isinstance(motion.network, MotionModel)
+        preset = config.preset or preset_of(motion.network.config)
         sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
         sampling = replace(sampling, with_map=sampling.with_map and change != "no map")
         folder = sources.checkpoints / CONTACT.name
