@@ -27,6 +27,8 @@ from hoidata.clips.features import (
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandPair
 
+# Of rows that say how an object has turned since its first frame, after its features: how it lay there.
+OBJECT_START_6D = slice(OBJECT_FEATURES, OBJECT_FEATURES + 6)
 # A feature that hardly varies in training is scaled as if it varied this much, so that noise in it stays harmless.
 SMALLEST_SCALE = 0.05
 
@@ -144,7 +146,7 @@ class Hands(nn.Module):
 
 @dataclass(frozen=True)
 class Normaliser:
-    """Mean and spread of every feature over the training frames: hand (2, 99) by side, object (10,)."""
+    """Mean and spread of every feature over the training frames: hand (2, 99) by side, object (10,) or (16,)."""
 
     hand_mean: Tensor
     hand_scale: Tensor
@@ -157,14 +159,15 @@ class Normaliser:
         means, scales = np.zeros((2, HAND_FEATURES)), np.ones((2, HAND_FEATURES))
         for side in range(2):
             means[side], scales[side] = _moments([own[side][there[side]] for own, _, there in clips], HAND_FEATURES)
-        object_mean, object_scale = _moments([own for _, own, _ in clips], OBJECT_FEATURES)
+        objects = [own for _, own, _ in clips]
+        object_mean, object_scale = _moments(objects, objects[0].shape[-1] if objects else OBJECT_FEATURES)
         arrays = (means, scales, object_mean, object_scale)
         return cls(*(torch.from_numpy(np.asarray(array, dtype=np.float32)) for array in arrays))
 
     @classmethod
-    def nothing(cls) -> "Normaliser":
+    def nothing(cls, object_features: int = OBJECT_FEATURES) -> "Normaliser":
         """Leaves features as they are: metres and numbers."""
-        shapes = (2, HAND_FEATURES), (OBJECT_FEATURES,)
+        shapes = (2, HAND_FEATURES), (object_features,)
         return cls(torch.zeros(shapes[0]), torch.ones(shapes[0]), torch.zeros(shapes[1]), torch.ones(shapes[1]))
 
     def spread_to(self, spread: float) -> "Normaliser":
@@ -195,7 +198,8 @@ def _moments(frames: list[Tensor], size: int) -> tuple[np.ndarray, np.ndarray]:
     if not len(rows):
         return np.zeros(size), np.ones(size)
     scale = rows.std(axis=0)
-    for group in (WRIST,) if size == HAND_FEATURES else (OBJECT_POSITION, OBJECT_ROTATION_6D):
+    turns = (OBJECT_ROTATION_6D, OBJECT_START_6D)[: 2 if size == OBJECT_START_6D.stop else 1]
+    for group in (WRIST,) if size == HAND_FEATURES else (OBJECT_POSITION, *turns):
         # One scale per position (and per object rotation) keeps directions comparable.
         scale[group] = np.sqrt((scale[group] ** 2).mean())
     return rows.mean(axis=0), np.maximum(scale, SMALLEST_SCALE)

@@ -68,15 +68,20 @@ def draw_motion(hands_shape: tuple[int, ...], object_shape: tuple[int, ...], gen
     return _unflatten(torch.randn(hands_shape[0], sum(sizes), generator=generator), hands_shape, object_shape)
 
 
-def draw_each(longest: tuple[int, int], rows: tuple[int, int], generators: Sequence[torch.Generator]) -> Motion:
-    """Noise (B, 2, K, 99) and (B, L, 10), a generator for each of B motions. rows: K and L.
+def draw_each(
+    longest: tuple[int, int],
+    rows: tuple[int, int],
+    generators: Sequence[torch.Generator],
+    object_features: int = OBJECT_FEATURES,
+) -> Motion:
+    """Noise (B, 2, K, 99) and (B, L, object_features), a generator for each of B motions. rows: K and L.
 
     The ``longest`` motion's noise is drawn and cut: a motion's noise does not depend on the others of its batch.
     """
     drawn = [
         (
             torch.randn(longest[0], 2, HAND_FEATURES, generator=generator)[: rows[0]].transpose(0, 1),
-            torch.randn(longest[1], OBJECT_FEATURES, generator=generator)[: rows[1]],
+            torch.randn(longest[1], object_features, generator=generator)[: rows[1]],
         )
         for generator in generators
     ]

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
-from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES, OBJECT_POSITION, WRIST
+from hoidata.clips.features import HAND_FEATURES, OBJECT_POSITION, WRIST
 from models.common.features import Normaliser, proper_hands, proper_object, scaled_text
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
@@ -133,7 +133,7 @@ class DiffusionModel(nn.Module):
         # Trained with the contact model and frozen here; kept so that a checkpoint of this model is enough to sample.
         self.object_net = PointNet(3, config.point_net).requires_grad_(False)
         self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * self.hand_rows, width) for _ in range(2)])
-        self.object_in = nn.Linear(OBJECT_FEATURES * self.object_rows, width)
+        self.object_in = nn.Linear(self.code.object_features * self.object_rows, width)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.text_in = _text_layers(config)
         as_map = config.contact_input == "map"
@@ -145,7 +145,7 @@ class DiffusionModel(nn.Module):
         self.encoder = Encoder(config.transformer)
         head = width * (2 if config.hand_head == "hand and object" else 1)
         self.hands_out = nn.ModuleList([nn.Linear(head, HAND_FEATURES * self.hand_rows) for _ in range(2)])
-        self.object_out = nn.Linear(width, OBJECT_FEATURES * self.object_rows)
+        self.object_out = nn.Linear(width, self.code.object_features * self.object_rows)
 
     @torch.no_grad()
     def object_feature(self, points_m: Tensor) -> Tensor:
@@ -156,7 +156,7 @@ class DiffusionModel(nn.Module):
     def forward(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, keep: Tensor | None = None
     ) -> Motion:
-        """Clean hands (B, 2, K, 99) and object (B, L, 10) from noised ones at timesteps (B,).
+        """Clean hands (B, 2, K, 99) and object (B, L, 10 or 16) from noised ones at timesteps (B,).
 
         keep: (B, 2) factors 0 or 1 of the text and object conditions, for condition dropout and guidance.
         Padding and hands that do not act neither enter nor influence anything; their outputs mean nothing.
@@ -306,7 +306,7 @@ class MotionGenerator:
         noise: Motion,
         generator: torch.Generator | list[torch.Generator],
     ) -> Motion:
-        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise (B, 2, K, 99) and (B, L, 10).
+        """Hands (B, 2, F, 99) and object (B, F, 10), model frame, from noise (B, 2, K, 99) and (B, L, 10 or 16).
 
         generator: of DDPM's noise. The object's origin is at zero in the first frame.
         """

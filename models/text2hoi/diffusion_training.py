@@ -24,7 +24,7 @@ from models.common import losses
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
-from models.common.features import Hands, Normaliser, object_rotmat, place_points, to_object_frame
+from models.common.features import OBJECT_START_6D, Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
 from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawer
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
@@ -33,7 +33,7 @@ from models.text2hoi.thresholds import ContactNetwork
 
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
 HAND_GROUPS = (WRIST, GLOBAL_ORIENT_6D, HAND_POSE_6D)
-OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT_HINGE + 1))
+OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT_HINGE + 1), OBJECT_START_6D)
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class DiffusionLossConfig:
 class _Target:
     """What a batch of clips is to become: normalised rows, which are there, true joints in the object's frame, touch.
 
-    hands (B, 2, K, 99), object (B, L, 10); present (B, 2, K), there (B, L); joints_m (B, 2, F, 21, 3), touching
+    hands (B, 2, K, 99), object (B, L, 10 or 16); present (B, 2, K), there (B, L); joints_m (B, 2, F, 21, 3), touching
     (B, 2, F, 21) bool.
     """
 
@@ -129,7 +129,7 @@ class DiffusionObjective:
         self.signal = alphas_cumprod(device)
         self.frames, self.entries = weights.frames, weights.entries if weights.distance_weight > 0 else 0
         self.targets = Targets(network.code, self.normaliser, device)
-        shares = feature_shares(weights.weighting, device)
+        shares = feature_shares(weights.weighting, device, network.code.object_features)
         self.hand_shares, self.object_shares = (share / network.config.signal_scale**2 for share in shares)
         self.features: dict[str, Tensor] = {}
         self.held_out = collate(corpus.held_out).to(device)
@@ -240,10 +240,12 @@ def thinned(shape: Sequence[int], generator: torch.Generator) -> Tensor:
     return torch.rand(*shape, generator=generator) < share
 
 
-def feature_shares(weighting: str, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Shares of a hand's 99 and an object's 10 numbers in the loss; each sums to one, but for "sum"."""
-    shares = []
-    for size, groups in ((HAND_FEATURES, HAND_GROUPS), (OBJECT_FEATURES, OBJECT_GROUPS)):
+def feature_shares(
+    weighting: str, device: torch.device, object_features: int = OBJECT_FEATURES
+) -> tuple[Tensor, Tensor]:
+    """Shares of a hand's 99 and an object's 10 or 16 numbers in the loss; each sums to one, but for "sum"."""
+    shares, object_groups = [], [group for group in OBJECT_GROUPS if group.stop <= object_features]
+    for size, groups in ((HAND_FEATURES, HAND_GROUPS), (object_features, object_groups)):
         share = torch.full((size,), 1.0 if weighting == "sum" else 1 / size, device=device)
         for group in groups if weighting == "grouped" else ():
             share[group] = 1 / (len(groups) * (group.stop - group.start))
@@ -264,7 +266,7 @@ def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net)).to(setup.device)
     network.object_net.load_state_dict(contact.object_net.state_dict())
     coded = [network.code.encode(sample) for sample in setup.corpus.train]
-    normaliser = Normaliser.nothing()
+    normaliser = Normaliser.nothing(network.code.object_features)
     if network.config.normalised:
         normaliser = Normaliser.of([(own.hands, own.object, own.present) for own in coded])
     normaliser = normaliser.spread_to(network.config.signal_scale).to(setup.device)

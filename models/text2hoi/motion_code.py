@@ -5,6 +5,7 @@ frame the object has at the same moment, where a hand that holds still on a movi
 stand for frames, as control points of B-splines (``models.common.spline``).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -14,14 +15,22 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
-from hoidata.clips.features import HAND_POSE_6D, OBJECT_HINGE, OBJECT_POSITION
+from hoidata.clips.features import HAND_POSE_6D, OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
-from models.common.features import hand_rotmats, hands_in_object_frame, hands_in_world, object_rotmat
+from models.common.features import (
+    OBJECT_START_6D,
+    hand_rotmats,
+    hands_in_object_frame,
+    hands_in_world,
+    object_rotmat,
+)
 from models.common.sampling import Motion
 from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
+from models.text2hoi.object_rows import mean_start, turned_from, turned_since_start, unwhiten, whiten
 
 # What is like a metre of movement: 0.1 of a rotation's numbers per centimetre; fingers, of which there are many, more.
-OBJECT_REACH = torch.tensor([1.0] * 3 + [10.0] * 7)
+# How an object lay at first is one rotation, the mean of its rows, which need not be alike.
+OBJECT_REACH = torch.tensor([1.0] * 3 + [10.0] * 7 + [math.inf] * 6)
 HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
 
 
@@ -31,6 +40,10 @@ class MotionCodeConfig:
     per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
     object, or a hand on it, that is generated with knots nearer than this to each other stands still (0: as generated).
 
+    object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
+    lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many
+    frames (0: the course itself).
+
     convention: what rotations mean; "own", or that of a dataset in the authors' code, for networks they trained:
     GRAB's objects are transposed, ARCTIC's fingers are offsets from ``finger_mean_rad``, 45 numbers for each hand.
     """
@@ -38,6 +51,8 @@ class MotionCodeConfig:
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
+    object_turn: Literal["absolute", "since start"] = "absolute"
+    whitening_frames: float = 0.0
     rest_m: float = 0.0
     convention: Literal["own", "h2o", "grab", "arctic"] = "own"
     finger_mean_rad: tuple[float, ...] = ()
@@ -45,7 +60,7 @@ class MotionCodeConfig:
 
 @dataclass(frozen=True)
 class CodedClip:
-    """One recorded clip: hands (2, K, 99), object (L, 10), and where each hand is there (2, K) bool."""
+    """One recorded clip: hands (2, K, 99), object (L, 10 or 16), and where each hand is there (2, K) bool."""
 
     hands: Tensor
     object: Tensor
@@ -54,7 +69,7 @@ class CodedClip:
 
 @dataclass(frozen=True)
 class MotionCode:
-    """Motions of hands (B, 2, F, 99) and object (B, F, 10) as rows (B, 2, K, 99) and (B, L, 10), and back."""
+    """Motions of hands (B, 2, F, 99) and object (B, F, 10) as rows (B, 2, K, 99) and (B, L, 10 or 16), and back."""
 
     config: MotionCodeConfig
 
@@ -64,6 +79,11 @@ class MotionCode:
             return n_frames, n_frames
         intervals = intervals_of(n_frames, self.config.knot_frames)
         return intervals + 3, intervals * self.config.object_knots + 3
+
+    @property
+    def object_features(self) -> int:
+        """Numbers in a row of the object."""
+        return OBJECT_START_6D.stop if self.config.object_turn == "since start" else OBJECT_FEATURES
 
     @property
     def largest(self) -> tuple[int, int]:
@@ -82,24 +102,29 @@ class MotionCode:
         present = torch.from_numpy(sample.valid & sample.active_hands[:, None])
         if self.config.hand_frame == "object":
             hands = hands_in_object_frame(hands[None], thing[None])[0]
+        if self.config.object_turn == "since start":
+            thing = turned_since_start(thing)
         if not self.config.knot_frames:
-            return CodedClip(hands, thing, present)
+            return CodedClip(hands, self._whitened(thing), present)
         intervals = intervals_of(len(thing), self.config.knot_frames)
         curves = torch.stack([fit_spline(hand, own, intervals) for hand, own in zip(hands, present, strict=True)])
         objects = fit_spline(thing, torch.ones(len(thing)), intervals * self.config.object_knots)
         # A control point moves four intervals; it is there where the hand is in any frame of them.
         touched = stacked_bases([len(thing)], [intervals], len(thing), torch.device("cpu"))[0].T > 0
-        return CodedClip(curves, objects, (present.float() @ touched.T.float()) > 0)
+        return CodedClip(curves, self._whitened(objects), (present.float() @ touched.T.float()) > 0)
 
     def curves(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper."""
+        objects, there = self._course(objects), self.rows(counts, objects.device)[1]
+        start = mean_start(objects, there) if self.config.object_turn == "since start" else None
         if not self.config.knot_frames:
-            return self.converted(hands, objects, 1)
+            return self.converted(hands, objects if start is None else turned_from(objects, start), 1)
         n_frames = max(counts)
         knots = [intervals_of(n, self.config.knot_frames) for n in counts]
         hands = spline_values(hands, stacked_bases(list(counts), knots, n_frames, hands.device))
         knots = [n * self.config.object_knots for n in knots]
-        return hands, spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
+        objects = spline_values(objects, stacked_bases(list(counts), knots, n_frames, hands.device))
+        return hands, objects if start is None else turned_from(objects, start)
 
     def settled(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
         """Rows of generated motions, those at rest alike; hands only where they are given in the object's frame."""
@@ -109,7 +134,21 @@ class MotionCode:
         if self.config.hand_frame == "object":
             reach = self.config.rest_m * HAND_REACH.to(hands)
             hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
-        return hands, settled(objects, there, self.config.rest_m * OBJECT_REACH.to(objects))
+        reach = self.config.rest_m * OBJECT_REACH[: objects.shape[-1]].to(objects)
+        return hands, self._whitened(settled(self._course(objects), there, reach))
+
+    def _whitened(self, objects: Tensor) -> Tensor:
+        return whiten(objects, self._reach) if self.config.whitening_frames else objects
+
+    def _course(self, objects: Tensor) -> Tensor:
+        """Rows of an object that lie on its course, from those that may be whitened."""
+        return unwhiten(objects, self._reach) if self.config.whitening_frames else objects
+
+    @property
+    def _reach(self) -> float:
+        """Rows of an object in ``whitening_frames``."""
+        frames = self.config.knot_frames / self.config.object_knots if self.config.knot_frames else 1
+        return self.config.whitening_frames / frames
 
     def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
         """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""

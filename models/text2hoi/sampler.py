@@ -160,7 +160,7 @@ class Text2Hoi:
         generator = motion_generator(self.trained["diffusion"])
         condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact)
         code = generator.network.code
-        noise = draw_each(code.largest, code.sizes(batch.frames.shape[1]), generators)
+        noise = draw_each(code.largest, code.sizes(batch.frames.shape[1]), generators, code.object_features)
         coarse, objects = generator.sample(condition, self.config.sampler, noise, generators)
         contact_maps = contact.amax(1)
         refined = coarse

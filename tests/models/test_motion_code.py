@@ -21,6 +21,9 @@ EVERY_CODE = [
     replace(MotionCodeConfig(), hand_frame="object"),
     replace(OURS, hand_frame="world"),
     OURS,
+    MotionCodeConfig(object_turn="since start"),
+    MotionCodeConfig(whitening_frames=8),
+    replace(OURS, object_turn="since start", whitening_frames=8),
 ]
 
 
