@@ -1,26 +1,51 @@
 """Two motions learnt by heart: what is learnt step by step stays on course when it is run."""
 
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
+from hoidata.clips.clip import Side
+from hoidata.datasets.base import RawTree, SequenceKey
+from hoidata.datasets.manipnet.adapter import read_hand_recording
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
+from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from models.common.training import TrainingConfig
-from models.manipnet.control import Control, Motion
-from models.manipnet.examples import fit_examples, hand_examples, other_poses, prepared
+from models.manipnet.control import Control, Motion, recording_control
+from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared
 from models.manipnet.features import FeatureSettings
-from models.manipnet.lookups import joint_errors_m
-from models.manipnet.network import NetworkConfig
+from models.manipnet.lookups import as_right, joint_errors_m
+from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Predictor, Task, roll_out
 from tests.builders.objects import box_model
 
-FPS, FRAMES = 30, 150
+ROOT = os.environ.get("HOIDATA_MANIPNET", "")
+FPS, FRAMES, SECONDS = 30, 150, 120
 HAND = mano_hand(load_embedded_hands(), "right")
 SETTINGS = FeatureSettings(step_s=1 / FPS)
 BOX = box_model((0.06, 0.06, 0.1))
+# No dropout, which is against knowing. After 3,000 steps the loss is small, yet in some frames a step makes an error
+# larger than it was, and the worst frame was 14.5 mm off. With more steps every frame leaves less of it.
+NETWORK = NetworkConfig(encoder=64, keep=1.0, features=SETTINGS)
+TRAINING = TrainingConfig(15_000, 64, 2e-3, 0.0, "cosine", 20)
+
+
+@dataclass(frozen=True, eq=False)
+class Stretch:
+    """Five seconds of one hand. fingers: (frame, joint - 1, 3, 3) at ``time_s``."""
+
+    hand: TrackedHand
+    side: Side
+    control: Control
+    time_s: np.ndarray
+    fingers: np.ndarray
 
 
 def waves(draws: np.random.Generator, size: float, *shape: int) -> np.ndarray:
@@ -30,8 +55,8 @@ def waves(draws: np.random.Generator, size: float, *shape: int) -> np.ndarray:
     return size * np.sin(2 * np.pi * rate * time_s + phase)
 
 
-def motion(seed: int) -> tuple[Control, np.ndarray]:
-    """Five seconds of a hand that plays with a box at its palm, and its fingers (frame, 15, 3, 3)."""
+def played(seed: int) -> Stretch:
+    """A hand that plays with a box at its palm."""
     draws, time_s = np.random.default_rng(seed), np.arange(FRAMES) / FPS
     turn, place = rotvec_to_rotmat(waves(draws, 0.6, 3)), waves(draws, 0.2, 3)
     palm = HAND.wrist_from_canonical @ [0.08, 0.0, -0.05]
@@ -39,28 +64,66 @@ def motion(seed: int) -> tuple[Control, np.ndarray]:
     still = Motion(time_s[:1], np.eye(3)[None], np.array([[1.0, 0, 0]]))
     body = Motion(time_s, rotvec_to_rotmat(waves(draws, 0.8, 3)), thing)
     control = Control({"left": still, "right": Motion(time_s, turn, place)}, body, BOX)
-    return control, HAND.rest_rotmats @ rotvec_to_rotmat(waves(draws, 0.35, 15, 3))
+    return Stretch(HAND, "right", control, time_s, HAND.rest_rotmats @ rotvec_to_rotmat(waves(draws, 0.35, 15, 3)))
+
+
+def recorded(name: str, first_s: int, side: Side) -> Stretch:
+    """From a recording with its own hands."""
+    recording = read_hand_recording(RawTree(Path(ROOT)), SequenceKey("manipnet", "manipnet", name))
+    rate, step = round(recording.fps), round(recording.fps / FPS)
+    frames = slice(first_s * rate, first_s * rate + FRAMES * step, step)
+    assert recording.usable[frames.start : frames.stop].all()
+    fingers, time_s = recording.finger_rotmats(side, frames), recording.time_s[frames]
+    return Stretch(recording.tracked_hand(side), side, recording_control(recording), time_s, fingers)
+
+
+def steps_of(stretches: list[Stretch]) -> list[Examples]:
+    """The steps of all, from recorded poses and from others, as many of each, as delivered."""
+    usable, examples = np.ones(FRAMES, bool), []
+    pool = np.concatenate([as_right(one.hand, one.fingers) for one in stretches])
+    for number, one in enumerate(stretches):
+        surface = surface_index(one.control.model)
+        for given in (None, other_poses(one.fingers, as_right(one.hand, pool), number)):
+            own = (one.control, one.side, one.hand, one.fingers, one.time_s, usable, surface, SETTINGS, given)
+            examples.append(hand_examples(*own))
+    return examples
+
+
+def learnt(stretches: list[Stretch]) -> ManipNet:
+    """A network that knows them, in at most two minutes of one core."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    began, examples = time.process_time(), steps_of(stretches)
+    right = stretches[0].hand if stretches[0].side == "right" else stretches[0].hand.mirrored()
+    network = prepared(NETWORK, right, examples)
+    losses = fit_examples(network, examples, TRAINING, 0)
+    assert np.mean(losses[-20:]) < 0.001 * losses[0]
+    print(f"{time.process_time() - began:.0f} s")
+    assert time.process_time() - began < SECONDS
+    return network
+
+
+def assert_followed(network: ManipNet, stretches: list[Stretch]) -> None:
+    """From their first pose on each joint is within 5 mm in each frame; of a still hand their mean leaves 20 mm."""
+    tasks = [Task(one.hand, one.side, one.control, one.time_s, one.fingers[0]) for one in stretches]
+    for made, one in zip(roll_out(Predictor(network, "off"), tasks), stretches, strict=True):
+        joints_mm = 1000 * joint_errors_m(one.hand, made, one.fingers)
+        still_mm = 1000 * joint_errors_m(one.hand, np.repeat(one.fingers[:1], FRAMES, axis=0), one.fingers)
+        frames_mm = joints_mm.mean(axis=1)
+        told = f"{frames_mm.mean():.2f} mm, {np.percentile(frames_mm, 99):.2f} in 99 %, {frames_mm.max():.2f} in all"
+        print(f"{told}; a joint {joints_mm.max():.2f}; still {still_mm.mean(axis=1).max():.1f}")
+        assert joints_mm.max() < 5
+        assert still_mm.mean(axis=1).max() > 20
 
 
 @pytest.mark.long
-def test_two_motions_of_five_seconds_are_learnt_and_followed_within_5_mm_in_nine_frames_of_ten() -> None:
-    torch.manual_seed(0)
-    motions, time_s = [motion(0), motion(1)], np.arange(FRAMES) / FPS
-    pool, usable = np.concatenate([fingers for _, fingers in motions]), np.ones(FRAMES, bool)
-    examples = []
-    for number, (control, fingers) in enumerate(motions):
-        for given in (None, other_poses(fingers, pool, number)):
-            own = (control, "right", HAND, fingers, time_s, usable, surface_index(BOX), SETTINGS, given)
-            examples.append(hand_examples(*own))
-    network = prepared(NetworkConfig(encoder=64, keep=1.0, features=SETTINGS), HAND, examples)
-    losses = fit_examples(network, examples, TrainingConfig(3000, 64, 2e-3, 0.0, "cosine", 20), 0)
-    assert np.mean(losses[-20:]) < 0.01 * losses[0]
-    tasks = [Task(HAND, "right", control, time_s, fingers[0]) for control, fingers in motions]
-    for made, (_, fingers) in zip(roll_out(Predictor(network, "off"), tasks), motions, strict=True):
-        wrong = joint_errors_m(HAND, made, fingers).mean(axis=1)
-        still = joint_errors_m(HAND, np.repeat(fingers[:1], FRAMES, axis=0), fingers).mean(axis=1)
-        print(f"{1000 * wrong.mean():.2f} mm, at most {1000 * wrong.max():.2f}; still: {1000 * still.max():.1f}")
-        assert wrong.mean() < 0.003
-        # Not every frame: one of the two motions was seen to leave 5 mm for some frames, and to come back.
-        assert np.mean(wrong < 0.005) > 0.9
-        assert still.max() > 0.02
+def test_two_motions_of_five_seconds_are_learnt_and_followed_within_5_mm() -> None:
+    stretches = [played(0), played(1)]
+    assert_followed(learnt(stretches), stretches)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the data are not part of this repository")
+def test_two_recorded_stretches_of_five_seconds_are_learnt_and_followed_within_5_mm() -> None:
+    stretches = [recorded("cyl_med3", 5, "right"), recorded("cube_med2", 0, "left")]
+    assert_followed(learnt(stretches), stretches)
