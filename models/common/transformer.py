@@ -13,12 +13,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from hoidata.errors import BadInput
+
+NARROW = 4  # times narrower than the tokens
 FUSED_FIRST: list[SDPBackend] = [SDPBackend.EFFICIENT_ATTENTION, SDPBackend.FLASH_ATTENTION, SDPBackend.MATH]
 
 
 @dataclass(frozen=True)
 class TransformerConfig:
-    """Sizes of the encoder; the defaults are the paper's."""
+    """Sizes of the encoder; the defaults are the paper's. modulated: a condition acts in every block (of pre-norm)."""
 
     width: int = 512
     layers: int = 8
@@ -27,6 +30,26 @@ class TransformerConfig:
     dropout: float = 0.1
     norm_first: bool = False
     frames_per_token: int = 1
+    modulated: bool = False
+
+
+class Modulation(nn.Module):
+    """What a condition does to one half of a block: scale and shift of what it reads, scale of what it adds.
+
+    Peebles and Xie 2023 (adaLN). Through a narrow layer, and starting with none, as without it.
+    """
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        last = nn.Linear(width // NARROW, 3 * width)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.layers = nn.Sequential(nn.SiLU(), nn.Linear(width, width // NARROW), nn.SiLU(), last)
+
+    def forward(self, condition: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Factor, shift and factor (batch, 1, width) of a condition (batch, 1, width)."""
+        scale, shift, share = self.layers(condition).chunk(3, -1)
+        return 1 + scale, shift, 1 + share
 
 
 class Block(nn.Module):
@@ -45,9 +68,19 @@ class Block(nn.Module):
             nn.Linear(config.feed_forward, config.width),
         )
         self.drop = nn.Dropout(config.dropout)
+        halves = 2 if config.modulated else 0
+        self.modulations = nn.ModuleList([Modulation(config.width) for _ in range(halves)])
 
-    def forward(self, x: Tensor, attention_mask: Tensor) -> Tensor:
-        """x: (batch, token, width). attention_mask: (batch, token) bool, the tokens that may be attended to."""
+    def forward(self, x: Tensor, attention_mask: Tensor, condition: Tensor | None = None) -> Tensor:
+        """x: (batch, token, width). attention_mask: (batch, token) bool, the tokens that may be attended to.
+
+        condition: (batch, 1, width), which modulated blocks need and others do not look at.
+        """
+        if self.modulations:
+            (scale, shift, share), (feed_scale, feed_shift, feed_share) = (own(condition) for own in self.modulations)
+            attended = self.attend(self.norm_attention(x) * scale + shift, attention_mask)
+            x = x + share * self.drop(attended)
+            return x + feed_share * self.drop(self.feed_forward(self.norm_feed_forward(x) * feed_scale + feed_shift))
         if self.norm_first:
             x = x + self.drop(self.attend(self.norm_attention(x), attention_mask))
             return x + self.drop(self.feed_forward(self.norm_feed_forward(x)))
@@ -73,14 +106,16 @@ class Encoder(nn.Module):
 
     def __init__(self, config: TransformerConfig) -> None:
         super().__init__()
+        if config.modulated and not config.norm_first:
+            raise BadInput("transformer", "norm_first: true with modulated: true", "norm_first: false", "set both")
         self.blocks = nn.ModuleList([Block(config) for _ in range(config.layers)])
         self.last_norm = nn.LayerNorm(config.width) if config.norm_first else nn.Identity()
 
-    def forward(self, x: Tensor, attention_mask: Tensor) -> Tensor:
-        """(batch, token, width) to the same; ``attention_mask`` as in :class:`Block`."""
+    def forward(self, x: Tensor, attention_mask: Tensor, condition: Tensor | None = None) -> Tensor:
+        """(batch, token, width) to the same; the other arguments as in :class:`Block`."""
         x, attention_mask, back = packed(x, attention_mask)
         for block in self.blocks:
-            x = block(x, attention_mask)
+            x = block(x, attention_mask, condition)
         x = self.last_norm(x)
         return x if back is None else x.gather(1, back[..., None].expand(-1, -1, x.shape[-1]))
 

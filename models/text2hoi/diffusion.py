@@ -43,7 +43,7 @@ class DiffusionConfig:
     text_input: a linear layer, or "projection", a normalised one with a hidden layer. condition_everywhere: the
     condition is added to every token instead of being one. frames_to_go: tokens know how far they are from the end.
     signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
-    is to happen (Chen 2023).
+    is to happen (Chen 2023). input_gate: how much of the noised rows is let in depends on the timestep.
     """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
@@ -65,6 +65,7 @@ class DiffusionConfig:
     condition_everywhere: bool = False
     frames_to_go: bool = False
     signal_scale: float = 1.0
+    input_gate: bool = False
     condition_dropout: float = 0.1
 
 
@@ -135,6 +136,7 @@ class DiffusionModel(nn.Module):
         self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * self.hand_rows, width) for _ in range(2)])
         self.object_in = nn.Linear(self.code.object_features * self.object_rows, width)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
+        self.gate_in = nn.Linear(width, width) if config.input_gate else None
         self.text_in = _text_layers(config)
         as_map = config.contact_input == "map"
         body = config.point_net.widths[-1] + config.points * as_map + config.scale_input + 3 * config.centroid
@@ -218,20 +220,23 @@ class DiffusionModel(nn.Module):
         hands = hands * known.hand_rows[..., None]
         agents = [self.hands_in[side](to_tokens(hands[:, side], k)) for side in known.sides]
         agents.append(self.object_in(to_tokens(objects * known.object_rows[..., None], wide)))
+        time = self.step_in(sinusoid(timesteps, self.config.transformer.width))
+        if self.gate_in is not None:
+            agents = [x * (1 + self.gate_in(time)[:, None]) for x in agents]
         codes = agent_codes(self.config.transformer.width, hands.device)
         codes = torch.stack([codes[agent] for agent in (*known.sides, 2)])
         codes = codes if self.config.codes == "frames and agents" else torch.zeros_like(codes)
         tokens = [x + code + self._codes(known.lengths, x.shape[1]) for x, code in zip(agents, codes, strict=True)]
         masks = [attention_mask_of(known.hand_rows[:, side], k) for side in known.sides]
         masks.append(attention_mask_of(known.object_rows, wide))
-        first, points = self._condition(timesteps, known, keep)
+        first, points = self._condition(time, known, keep)
         moving = torch.cat(tokens, 1)
         if self.config.condition_everywhere:
             moving = moving + first
         x = torch.cat((moving, first, points), 1)
         points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:] > 0)
         mask = torch.cat((*masks, masks[-1].new_ones(len(x), 1), points_mask), 1)
-        *own, body = self.encoder(x, mask)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
+        *own, body = self.encoder(x, mask, first)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
         found = [hands.new_zeros(hands[:, 0].shape)] * 2
         for side, token in zip(known.sides, own, strict=True):
             seen = torch.cat((token, body), -1) if self.config.hand_head == "hand and object" else token
@@ -252,12 +257,11 @@ class DiffusionModel(nn.Module):
             codes = codes + self.to_go_in(torch.cat((sinusoid(to_go, width), sinusoid(done, width)), -1))
         return codes
 
-    def _condition(self, timesteps: Tensor, known: _Prepared, keep: Tensor | None) -> tuple[Tensor, Tensor]:
+    def _condition(self, time: Tensor, known: _Prepared, keep: Tensor | None) -> tuple[Tensor, Tensor]:
         """The condition token (B, 1, width) and the contact tokens: Text2HOI eq. 3."""
         text, body, points = known.text, known.object, known.points
         if keep is not None:
             text, body = text * keep[:, :1], body * keep[:, 1:]
-        time = self.step_in(sinusoid(timesteps, self.config.transformer.width))
         return (time + text + body + known.extent)[:, None], points
 
 
