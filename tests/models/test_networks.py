@@ -5,16 +5,17 @@ from typing import Literal
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
 from models.common.features import Hands, Normaliser
 from models.common.point_net import PointNetConfig
 from models.common.sampling import add_noise, alphas_cumprod
-from models.common.transformer import Encoder, TransformerConfig, packed
+from models.common.transformer import Block, Encoder, TransformerConfig, packed
 from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
@@ -57,6 +58,8 @@ SWITCHES = {
     "condition everywhere": {"condition_everywhere": True},
     "frames to go": {"frames_to_go": True},
     "signal scale": {"signal_scale": 0.2},
+    "gate": {"input_gate": True},
+    "modulated": {"transformer": replace(SMALL, modulated=True)},
     "told": {"told": True},
     "released": {"hand_head": "hand and object", "centroid": True, "first_code": 1},
     "no codes": {"codes": "none"},
@@ -104,6 +107,8 @@ def test_each_switch_changes_its_part_of_the_weights_only() -> None:
         "condition everywhere": set(),
         "frames to go": {"to_go_in"},
         "signal scale": set(),
+        "gate": {"gate_in"},
+        "modulated": {"encoder"},
         "told": {"extent_in"},
         "released": {"hands_out", "object_condition_in"},
         "no codes": set(),
@@ -117,6 +122,60 @@ def test_each_switch_changes_its_part_of_the_weights_only() -> None:
 
 def shapes(config: DiffusionConfig) -> dict[str, tuple[int, ...]]:
     return {name: tuple(weight.shape) for name, weight in DiffusionModel(config).named_parameters()}
+
+
+def modulated_block() -> Block:
+    torch.manual_seed(0)
+    block = Block(replace(SMALL, modulated=True)).eval()
+    for weight in block.modulations.parameters():
+        nn.init.normal_(weight, std=0.3)
+    return block
+
+
+def test_a_modulated_block_is_adaptive_layer_norm() -> None:
+    """Peebles and Xie 2023, by hand: each half reads scale * norm(x) + shift, and what it adds is scaled."""
+    block, x, condition = modulated_block(), torch.randn(2, 7, 32), torch.randn(2, 1, 32)
+    mask, found = torch.ones(2, 7, dtype=torch.bool), x
+    halves = [(block.norm_attention, lambda y: block.attend(y, mask)), (block.norm_feed_forward, block.feed_forward)]
+    for (norm, half), modulation in zip(halves, block.modulations, strict=True):
+        _, narrow, _, last = modulation.layers
+        said = nn.functional.silu(nn.functional.silu(condition) @ narrow.weight.T + narrow.bias) @ last.weight.T
+        scale, shift, share = (said + last.bias).split(32, -1)
+        read = norm(found) * (1 + scale) + shift
+        found = found + (1 + share) * half(read)
+    torch.testing.assert_close(block(x, mask, condition), found)
+
+
+def test_modulation_starts_as_none_and_then_hears_the_condition() -> None:
+    torch.manual_seed(0)
+    plain, block = Block(SMALL).eval(), Block(replace(SMALL, modulated=True))
+    block.eval().load_state_dict(plain.state_dict(), strict=False)
+    x, mask, condition = torch.randn(2, 7, 32), torch.ones(2, 7, dtype=torch.bool), torch.randn(2, 1, 32)
+    torch.testing.assert_close(block(x, mask, condition), plain(x, mask))
+    heard = modulated_block()
+    assert (heard(x, mask, condition) - heard(x, mask, condition + 1)).abs().max() > 0.01
+
+
+def test_modulation_behind_a_norm_is_refused() -> None:
+    with pytest.raises(BadInput, match="norm_first"):
+        Encoder(replace(SMALL, norm_first=False, modulated=True))
+
+
+def test_the_gate_lets_in_what_the_timestep_says(batch: ClipBatch) -> None:
+    """Shut for every step, noised rows change nothing; open, they do."""
+    model = diffusion_model(input_gate=True)
+    condition, steps = condition_of(batch, model), torch.tensor([10, 500, 900])
+    hands, objects = rows_of(batch, model)
+    assert model.gate_in is not None
+    nn.init.zeros_(model.gate_in.weight)
+    found = []
+    for open_by in (0.0, -1.0):
+        nn.init.constant_(model.gate_in.bias, open_by)
+        with torch.no_grad():
+            pair = [model(hands, moved, steps, condition)[1] for moved in (objects, objects + 1)]
+        found.append(float((pair[0] - pair[1]).abs().max()))
+    assert found[0] > 1e-3
+    assert found[1] == 0
 
 
 def test_tokens_nobody_attends_to_change_nothing_when_they_are_left_out() -> None:
