@@ -119,6 +119,15 @@ def test_another_prompt_is_never_the_own_one(sources: Sources) -> None:
         assert any(np.array_equal(features, other.text[0]) for other in others)
 
 
+def test_another_prompt_is_what_text2hoi_is_told(sources: Sources) -> None:
+    request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
+    told = replace(request, text=other_prompts(sources)[request.clip_id])
+    (made,) = load_family("other-prompt").load(sources).sample([request])
+    own, expected = load_family("text2hoi").load(sources).sample([request, told])
+    np.testing.assert_allclose(joints_of(made), joints_of(expected), atol=1e-5)
+    assert abs(joints_of(made) - joints_of(own)).max() > 1e-4
+
+
 def test_a_motion_is_the_same_alone_and_in_company_and_differs_with_its_seed(sources: Sources) -> None:
     family = load_family("text2hoi").load(sources)
     short, long = samples_of(sources.annotated, "test")

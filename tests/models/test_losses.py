@@ -117,6 +117,9 @@ def test_relative_orientation_by_hand() -> None:
     assert float(losses.relative_orientation_loss(still, turned, still, body, mask)) == pytest.approx(4)
     along = quarter.expand(1, 2, 1, 3, 3)
     assert float(losses.relative_orientation_loss(along, turned, still, body, mask)) == pytest.approx(0)
+    # Nor is the truth itself, whose object has turned under its hand; one turned along is a quarter off from that.
+    assert float(losses.relative_orientation_loss(still, turned, still, turned, mask)) == pytest.approx(0)
+    assert float(losses.relative_orientation_loss(along, turned, still, turned, mask)) == pytest.approx(4)
 
 
 def test_simple_loss_and_noise_by_hand() -> None:

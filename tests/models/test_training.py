@@ -9,16 +9,17 @@ import pytest
 import torch
 import trimesh
 from safetensors import safe_open
+from torch import nn
 
 from hoidata.annotation.encoders import load_encoder
-from hoidata.batches.dataset import HoiDataset
+from hoidata.batches.dataset import ClipBatch, HoiDataset
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import load_checkpoint, save_checkpoint
-from models.common.corpus import batches
-from models.common.training import TrainingConfig, learning_rate_factor, train_network
+from models.common.corpus import Corpus, batches
+from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
 from models.text2hoi.generation import GeneratedMotion, Generator, Wish, _started_at_origin
 from models.text2hoi.sampler import Text2HoiMotion
@@ -178,6 +179,32 @@ def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
     encoder.identity = {"name": "another"}
     with pytest.raises(BadInput, match="text features"):
         Generator.load(trained, pair, encoder)
+
+
+class Downhill:
+    """One weight that starts at 2, whose loss is itself: every step of Adam lowers it by the learning rate."""
+
+    frames = entries = 0
+
+    def __init__(self) -> None:
+        self.network: nn.Module = nn.ParameterList([torch.tensor(2.0)])
+
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, torch.Tensor]:
+        return {"total": self.validation(self.network)}
+
+    def validation(self, network: nn.Module) -> torch.Tensor:
+        return next(network.parameters())
+
+
+@pytest.mark.parametrize(("warmup", "expected"), [(0, (1.99, 1.971)), (1, (1.9, 1.89)), (2, (1.95, 1.85))])
+def test_kept_weights_are_a_running_average_from_the_end_of_the_warm_up_on(
+    annotated: AnnotatedStore, warmup: int, expected: tuple[float, float]
+) -> None:
+    """Weights 2, 1.9, 1.8: 0.9 x 2 + 0.1 x 1.9 is 1.99, 0.9 x 1.99 + 0.1 x 1.8 is 1.971; until then they are kept."""
+    config = TrainingConfig(2, 2, 0.1, weight_decay=0.0, warmup=warmup, ema_decay=0.9, validate_every=1)
+    kept, log = fit(Downhill(), Corpus.of(annotated, 0), config, 0, torch.device("cpu"))
+    assert [row["validation"] for row in log] == pytest.approx(expected)
+    assert float(next(kept.parameters())) == pytest.approx(expected[1])
 
 
 def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:

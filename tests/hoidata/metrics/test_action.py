@@ -70,6 +70,14 @@ def test_reversals_are_the_turning_points_of_a_shake_and_not_of_a_lift_that_wait
     assert numbers_of(track(waits[:, None] * [0, 0, 1]))["reversals_per_s"] == 0
 
 
+@pytest.mark.parametrize(("turn_deg", "reversals"), [(30, 0), (90, 0), (115, 0), (125, 1), (180, 1)])
+def test_a_corner_turns_back_where_it_is_sharper_than_120_degrees(turn_deg, reversals):
+    """Half a second along x at 1 cm per frame, then as long in a way that is so far from it: one second in all."""
+    turned = np.radians(turn_deg)
+    steps = np.repeat([[1, 0, 0], [np.cos(turned), np.sin(turned), 0]], 15, axis=0)
+    assert numbers_of(track(0.01 * np.cumsum(steps, axis=0)))["reversals_per_s"] == reversals
+
+
 def test_the_hinge_counts_from_where_it_was_and_a_rigid_object_has_none():
     hinge = np.radians(np.concatenate([np.linspace(10, -70, 20), np.linspace(-70, -20, 20)]))
     found = numbers_of(track(hinge_rad=hinge, model=notebook()))

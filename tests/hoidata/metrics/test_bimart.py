@@ -19,8 +19,9 @@ from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.registry import METRICS
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from hoidata.surface.contact import PlacedHand
 from tests.builders.clips import clip_of, flat_hand
-from tests.builders.objects import model_of, notebook
+from tests.builders.objects import box_model, model_of, notebook, two_parts
 
 RADIUS_M = 0.05
 FACE_UP = Rotation.from_euler("x", 90, degrees=True).as_rotvec()
@@ -123,6 +124,17 @@ def test_open_parts_have_an_unreliable_inside_as_released_and_none_in_the_correc
     # Centimetres away from those two triangles, but before them on a line along x.
     assert bimart.art_paper(pair, 1).tolist() == [100, 100, 100]
     assert len(bimart.art_corrected(pair, 1)) == len(bimart.pen_1cm_corrected(pair, 1)) == 0
+
+
+def test_what_two_parts_both_enclose_is_outside_as_released():
+    """Cubes of 4 cm, the second shifted by 3 cm along x: they share the slab from x = 1 cm to 2 cm."""
+    cube, shifted = box_model((0.04, 0.04, 0.04)), box_model((0.04, 0.04, 0.04), middle_m=(0.03, 0, 0))
+    model = two_parts(cube, shifted, (0, 0, 1))
+    places = np.array([[0, 0.003, 0.001], [0.015, 0.003, 0.001], [0.044, 0.003, 0.001], [0.057, 0.003, 0.001]])
+    hand = PlacedHand(places[None], np.zeros(1, int), np.zeros(1), np.zeros((0, 3), int), 1)
+    found = bimart.signed_in(hand, model, bimart.shells(bimart.surface_index(model)))
+    # 1 cm from the face at x = 1 cm; between the faces at 1 cm and 2 cm; 6 mm within, and 7 mm beyond x = 5 cm.
+    assert found[0] == pytest.approx([0.010, -0.005, 0.006, -0.007], abs=1e-9)
 
 
 def test_an_object_without_hinge_has_no_art_and_one_at_rest_no_con(pair_of):

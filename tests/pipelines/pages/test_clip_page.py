@@ -21,6 +21,7 @@ from hoidata.hands import track_joints, track_vertices
 from hoidata.store.annotated import load_annotated
 from hoidata.surface.stage import surface_store
 from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
+from pipelines.pages.clip_page_facts import clip_facts
 from pipelines.pages.clip_page_series import measure_clip
 from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline
 from pipelines.pages.glb import write_glb
@@ -89,6 +90,14 @@ def world_points(annotated, clip):
     return np.stack(placed)
 
 
+def box_distance_m(clip, places):
+    """(frame, place) distances of world places (frame, place, 3) to a rigid box of 8 x 12 x 6 cm, by formula."""
+    turns, half = Rotation.from_rotvec(clip.object.rotvec).as_matrix(), np.array((0.04, 0.06, 0.03))
+    away = places.astype(np.float64) - clip.object.translation_m[:, None]
+    beyond = np.abs(np.einsum("fvi,fij->fvj", away, turns)) - half
+    return np.abs(np.linalg.norm(np.maximum(beyond, 0), axis=2) + np.minimum(beyond.max(axis=2), 0))
+
+
 @pytest.mark.parametrize("clip_id", ["test/s1/lid", "test/s2/box"])
 def test_touched_points_and_nearest_distances_are_those_of_brute_force(dataset, hands, clip_id):
     clip = dataset.clip(clip_id)
@@ -137,17 +146,11 @@ def test_depth_is_how_far_a_vertex_lies_within_the_box(dataset, hands):
 def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
     """Distance to a box of 8 x 12 x 6 cm by formula: from joints, and vertices nearer than 5 mm."""
     clip = dataset.clip("test/s2/box")
-    series, half = measure_clip(dataset, clip, hands), np.array((0.04, 0.06, 0.03))
-    turns = Rotation.from_rotvec(clip.object.rotvec).as_matrix()
-
-    def distance(places):
-        beyond = np.abs(np.einsum("fvi,fij->fvj", places - clip.object.translation_m[:, None], turns)) - half
-        return np.abs(np.linalg.norm(np.maximum(beyond, 0), axis=2) + np.minimum(beyond.max(axis=2), 0))
-
+    series = measure_clip(dataset, clip, hands)
     track = clip.hands["right"]
-    joints = distance(track_joints(track, hands["right"]).astype(np.float64)).min(axis=1)
+    joints = box_distance_m(clip, track_joints(track, hands["right"])).min(axis=1)
     np.testing.assert_allclose(series.surface["right"].joint_m[track.valid], joints[track.valid], atol=1e-6)
-    vertices = distance(track_vertices(track, hands["right"]).astype(np.float64))
+    vertices = box_distance_m(clip, track_vertices(track, hands["right"]))
     clear = np.abs(vertices - 0.005) > 1e-6
     expected = (vertices < 0.005) & track.valid[:, None]
     np.testing.assert_array_equal(series.surface["right"].touched[clear], expected[clear])
@@ -239,6 +242,24 @@ def test_page_tells_words_evidence_quality_split_and_sources(dataset, page):
     assert "(chosen)</td><td>test</td>" in text
     assert "(0, 0, -1), stated by the source" in text
     assert "SYNTHETIC" in text
+
+
+def test_page_gives_the_nearest_distances_in_centimetres(dataset, page, hands):
+    """Of the right hand where it is there: from a joint to a sampled point, and to the box by formula."""
+    clip = dataset.clip("test/s2/box")
+    track = clip.hands["right"]
+    joints, points = track_joints(track, hands["right"]).astype(np.float64), world_points(dataset, clip)
+    to_points = np.linalg.norm(joints[:, :, None] - points[:, None], axis=3)[track.valid].min()
+    to_surface = box_distance_m(clip, joints)[track.valid].min()
+    [row] = re.findall(r"<td>right</td>.*?</tr>", page("test/s2/box").read_text(), re.S)
+    shown = [float(number) for number in re.findall(r"([\d.]+) cm<", row)]
+    assert shown == pytest.approx([100 * to_points, 100 * to_surface], abs=0.0051)
+
+
+def test_fit_to_keypoints_is_told_with_its_error_in_millimetres(dataset, hands):
+    fitted = replace(dataset.clip("test/s2/box"), hands_from="keypoints", fit_error_m=0.0042)
+    said = dict(clip_facts(dataset, fitted, hands))["hands from"]
+    assert said == "a hand model fitted to the source's keypoints, mean error 4.2 mm"
 
 
 def test_page_says_where_annotator_and_distances_disagree(page):

@@ -13,6 +13,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.store.annotated import load_annotated
 from hoidata.surface.stage import surface_store
 from hoidata.surface.store import open_surface
+from pipelines.pages.dataset_facts import read_dataset
 from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
 from pipelines.pages.report import ReportFolders, write_report
 from pipelines.pages.surface_facts import contact_by_object
@@ -76,6 +77,13 @@ def test_page_counts_lists_and_links(project, hands, tmp_path):
     assert sorted(links) == ["clips/grab_s1_box_1.html", "clips/grab_s1_box_2.html", "clips/grab_s2_lid_1.html"]
     assert all((tmp_path / "out" / link).is_file() for link in links)
     assert "Contact and penetration" not in text
+
+
+def test_minutes_are_of_frames_at_30_per_second(page_clip, hands, tmp_path):
+    clips = [replace(page_clip(frames=frames), clip_id=f"grab/s1/box_{frames}") for frames in (1800, 900)]
+    write_clips(tmp_path / "clips", clips, "grab")
+    tiles = {name: number for number, name in read_dataset(tmp_path, "grab", hands).tiles}
+    assert (tiles["clips"], tiles["frames at 30 fps"], tiles["minutes"]) == ("2", "2,700", "1.5")
 
 
 def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, hands, tmp_path):

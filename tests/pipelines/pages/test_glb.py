@@ -112,6 +112,11 @@ def test_edges_of_a_box_stay_crisp_and_a_ball_is_smooth():
 
 
 def test_quaternions_do_not_flip_between_frames():
-    turns = np.stack([np.zeros(60), np.zeros(60), np.linspace(0, 9, 60)], axis=1)
-    quaternions = continuous_quaternions(turns)
+    """Nearly two turns about z, in axis-angle of at most half a turn: the axis turns about twice on the way."""
+    angle = np.linspace(0, 12, 60)
+    wrapped = np.arctan2(np.sin(angle), np.cos(angle))
+    assert (np.abs(np.diff(wrapped)) > np.pi).sum() == 2
+    quaternions = continuous_quaternions(np.outer(wrapped, (0, 0, 1)))
     assert (np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1]) > 0.9).all()
+    ahead = Rotation.from_quat(quaternions).apply((1, 0, 0))
+    np.testing.assert_allclose(ahead, np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), atol=1e-12)
