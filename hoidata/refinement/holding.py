@@ -46,6 +46,7 @@ class HoldSettings:
     least: int = 6
     gap: int = 12
     blend: int = 8
+    carry: int = 8
     reach_m: tuple[float, ...] = (0.003, 0.012, 0.03)
     keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02)
     air_frames: int = 4
@@ -57,10 +58,11 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
 
     A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
     """
-    starts: dict[Side, _Start] = {}
-    for side in SIDES:
-        if (start := _start(pair, side, clip, settings)) is not None:
-            starts[side] = start
+    grips = {side: grip for side in SIDES if (grip := _grip(pair, side, clip, settings)) is not None}
+    free = ~np.any([grip.held for grip in grips.values()], axis=0) if grips else np.zeros(0, bool)
+    starts = {
+        side: grip.carrying(free, settings.carry).start(clip.object, settings.blend) for side, grip in grips.items()
+    }
     load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
     for reach, keypoint in zip(settings.reach_m, settings.keypoint_m, strict=True) if starts else ():
         tracks, wishes = dict(clip.hands), replace(settings.solver, reach_m=reach, keypoint_m=keypoint)
@@ -136,7 +138,56 @@ class _Start:
         return replace(track, **{name: np.where(valid, getattr(made, name), own) for name, own in kept.items()})
 
 
-def _start(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Start | None:
+@dataclass(frozen=True)
+class _Grip:
+    """Where one hand holds a part. pose: of the hand, world. moving: (frame - 1,) whether the part moves under it to
+    the next frame.
+    """
+
+    track: HandTrack
+    skin: Skin
+    pose: HandPose
+    holds: list[Interval]
+    moving: np.ndarray
+    object_from_part: RigidTransform
+    world_from_part: RigidTransform
+
+    @property
+    def held(self) -> np.ndarray:
+        """(frame,) bool."""
+        held = np.zeros(len(self.track.valid), bool)
+        for start, stop in self.holds:
+            held[start:stop] = True
+        return held
+
+    def carrying(self, free: np.ndarray, most: int) -> "_Grip":
+        """With holds drawn out over up to ``most`` frames before and after in which the part moves.
+
+        free: (frame,) bool, no hand holds it. What moves in nobody's hand would slip through the one that comes.
+        """
+        free = free & self.track.valid
+        before, after = free & np.append(self.moving, False), free & np.append(False, self.moving)
+        holds = []
+        for start, stop in self.holds:
+            first, last = start - _leading(before[:start][::-1], most), stop + _leading(after[stop:], most)
+            before[:last] = False
+            holds.append(Interval(first, last))
+        return replace(self, holds=holds)
+
+    def start(self, thing: ObjectTrack, blend: int) -> _Start:
+        """The hand in the part's frame, at rest in its holds."""
+        part_from_world = self.world_from_part.inverse()
+        pose = _at_rest(self.pose.seen_from(part_from_world), self.holds, blend)
+        field = ObjectField(_in_part(thing, self.object_from_part))
+        return _Start(self.track, self.skin, pose, self.holds, part_from_world, field)
+
+
+def _leading(wanted: np.ndarray, most: int) -> int:
+    """How many of the first ``most`` are True before one is not."""
+    return int(np.append(wanted[:most], False).argmin())
+
+
+def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Grip | None:
     """None for a hand that holds nothing."""
     track, thing = clip.hands[side], clip.object
     if not track.valid.any():
@@ -150,11 +201,9 @@ def _start(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _S
     chosen = int((touching & (part == 1)).sum() > (touching & (part == 0)).sum())
     object_from_part = thing.model.object_from_part(chosen, thing.hinge_rad)
     world_from_part = thing.world_from_object @ object_from_part
-    holds = _holds(points_m, (touching & (part == chosen)).any(axis=1), world_from_part, track.valid, settings)
-    if not holds:
-        return None
-    pose = _at_rest(world.seen_from(world_from_part.inverse()), holds, settings.blend)
-    return _Start(track, skin, pose, holds, world_from_part.inverse(), ObjectField(_in_part(thing, object_from_part)))
+    touched = (touching & (part == chosen)).any(axis=1)
+    holds, moving = _holds(points_m, touched, world_from_part, track.valid, settings)
+    return _Grip(track, skin, world, holds, moving, object_from_part, world_from_part) if holds else None
 
 
 def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrack:
@@ -169,8 +218,10 @@ def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrac
 
 def _holds(
     points_m: np.ndarray, touching: np.ndarray, world_from_part: RigidTransform, valid: np.ndarray, own: HoldSettings
-) -> list[Interval]:
-    """Intervals in which a hand, vertices (frame, vertex, 3) world, touches (frame,) a part and hardly moves on it."""
+) -> tuple[list[Interval], np.ndarray]:
+    """Intervals in which a hand, vertices (frame, vertex, 3) world, touches (frame,) a part and hardly moves on it; and
+    (frame - 1,) whether the part moves under it.
+    """
     some = world_from_part.inverse() @ points_m[:, ::20]
     speed = np.linalg.norm(np.diff(some, axis=0), axis=-1).mean(axis=1) * FPS
     carried = world_from_part[1:] @ some[:-1] - world_from_part[:-1] @ some[:-1]
@@ -180,7 +231,7 @@ def _holds(
     for start, stop in runs(~held):
         if start > 0 and stop < len(held) and stop - start <= own.gap and valid[start:stop].all():
             held[start:stop] = True
-    return [found for found in runs(held) if found.stop - found.start >= own.least]
+    return [found for found in runs(held) if found.stop - found.start >= own.least], moving
 
 
 def _at_rest(pose: HandPose, holds: Sequence[Interval], blend: int) -> HandPose:

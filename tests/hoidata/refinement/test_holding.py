@@ -53,7 +53,7 @@ def pressed(side: Side, top_m: np.ndarray, inside_m: float, wobble_m: float, tur
 @pytest.fixture(scope="module")
 def pushed() -> tuple[Clip, dict[Side, HandTrack]]:
     """Two hands 12 mm inside the top of a box that rises and turns, swaying by 4 mm on it; and what becomes of them."""
-    turn = rotvec_to_rotmat(np.linspace(0, 1, FRAMES)[:, None] * [0, 0, 0.5])
+    turn = rotvec_to_rotmat(np.interp(np.arange(FRAMES), [0, 9, 38, FRAMES], [0, 0, 0.5, 0.5])[:, None] * [0, 0, 1.0])
     place = np.stack((0 * LIFT, 0 * LIFT, LIFT), 1)
     thing = ObjectTrack(BOX, rotmat_to_rotvec(turn).astype(np.float32), place.astype(np.float32))
     hands = {}
@@ -92,6 +92,48 @@ def test_far_from_its_hold_a_hand_is_left_as_it_was(pushed):
         assert max(moved[0], moved[-1]) < 0.005
         acceleration = [np.abs(np.diff(track.wrist_m, 2, axis=0)).max() for track in (clip.hands[side], made[side])]
         assert acceleration[1] < acceleration[0] + 0.005
+
+
+def test_what_moves_in_no_hand_is_held_for_longer():
+    """A box that is pushed aside already while the hand comes and still when it has gone: no skin slides on it."""
+    aside = np.interp(np.arange(FRAMES), [0, 5, 40, FRAMES], [0, 0, 0.4, 0.4])
+    place = np.stack((aside, 0 * aside, 0 * aside), 1)
+    still = np.zeros((FRAMES, 3), np.float32)
+    turn = np.tile(np.eye(3), (FRAMES, 1, 1))
+    clip = clip_of(
+        "toy/s1/d",
+        ObjectTrack(BOX, still, place.astype(np.float32)),
+        {
+            "left": pressed("left", place + 1.0, 0.0, 0.0, turn),
+            "right": pressed("right", place + np.array([0, 0, 0.03]), 0.004, 0.002, turn),
+        },
+    )
+    slid = []
+    for carry in (0, 8):
+        skin = in_object(clip, "right", hold_hands(PAIR, clip, HoldSettings(carry=carry))["right"])
+        slid.append(np.linalg.norm(np.diff(skin[5:41], axis=0), axis=-1).max())
+    assert slid[0] > 0.003
+    assert slid[1] < 1e-6
+
+
+def test_a_hand_that_comes_to_what_the_other_carries_takes_its_time():
+    clip, made = coming_to_a_carried_box()
+    apart = np.linalg.norm(made["right"].wrist_m - clip.hands["right"].wrist_m, axis=1)
+    assert apart[:4].max() < 0.005
+
+
+def coming_to_a_carried_box() -> tuple[Clip, dict[Side, HandTrack]]:
+    """The left hand holds a box that moves in all frames; the right one comes in the tenth."""
+    place = np.stack((np.linspace(0, 0.5, FRAMES), 0 * LIFT, 0 * LIFT), 1)
+    turn, still = np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3), np.float32)
+    hands = {
+        side: pressed(side, place + np.array([0, y, 0.03]), 0.004, 0.0, turn)
+        for side, y in (("left", -0.08), ("right", 0.08))
+    }
+    held = hands["left"]
+    held = replace(held, wrist_m=(place + held.wrist_m[20] - place[20]).astype(np.float32))
+    clip = clip_of("toy/s1/e", ObjectTrack(BOX, still, place.astype(np.float32)), {**hands, "left": held})
+    return clip, hold_hands(PAIR, clip)
 
 
 def test_hands_that_touch_nothing_and_frames_without_a_hand_keep_their_numbers(pushed):
