@@ -46,7 +46,7 @@ class HoldSettings:
     least: int = 6
     gap: int = 12
     blend: int = 8
-    carry: int = 8
+    carry: int = 4
     reach_m: tuple[float, ...] = (0.003, 0.012, 0.03)
     keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02)
     air_frames: int = 4

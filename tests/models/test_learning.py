@@ -101,7 +101,7 @@ def test_exchanged_prompts_exchange_the_paths_of_the_object(learnt: Learnt) -> N
     batch = collate(learnt.clips)
     code, draws = learnt.generator.network.code, torch.Generator().manual_seed(0)
     rows = code.sizes(int(batch.lengths.max()))
-    noise = draw_motion((2, 2, rows[0], 99), (2, rows[1], 10), draws)
+    noise = draw_motion((2, 2, rows[0], 99), (2, rows[1], code.object_features), draws)
     for order, verbs in (([0, 1], [0, 1]), ([1, 0], [1, 0])):
         # Words, and the length they ask for; where to touch stays as it was.
         asked = condition(learnt, batch, batch.text[order])
