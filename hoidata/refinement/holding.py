@@ -58,11 +58,14 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
 
     A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
     """
-    grips = {side: grip for side in SIDES if (grip := _grip(pair, side, clip, settings)) is not None}
+    grips: dict[Side, _Grip] = {}
+    for side in SIDES:
+        if (grip := _grip(pair, side, clip, settings)) is not None:
+            grips[side] = grip
     free = ~np.any([grip.held for grip in grips.values()], axis=0) if grips else np.zeros(0, bool)
-    starts = {
-        side: grip.carrying(free, settings.carry).start(clip.object, settings.blend) for side, grip in grips.items()
-    }
+    starts: dict[Side, _Start] = {}
+    for side, grip in grips.items():
+        starts[side] = grip.carrying(free, settings.carry).start(clip.object, settings.blend)
     load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
     for reach, keypoint in zip(settings.reach_m, settings.keypoint_m, strict=True) if starts else ():
         tracks, wishes = dict(clip.hands), replace(settings.solver, reach_m=reach, keypoint_m=keypoint)
