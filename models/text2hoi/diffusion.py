@@ -220,7 +220,7 @@ class DiffusionModel(nn.Module):
         hands = hands * known.hand_rows[..., None]
         agents = [self.hands_in[side](to_tokens(hands[:, side], k)) for side in known.sides]
         agents.append(self.object_in(to_tokens(objects * known.object_rows[..., None], wide)))
-        time = self.step_in(sinusoid(timesteps, self.config.transformer.width))
+        time = self._time(timesteps)
         if self.gate_in is not None:
             agents = [x * (1 + self.gate_in(time)[:, None]) for x in agents]
         codes = agent_codes(self.config.transformer.width, hands.device)
@@ -256,6 +256,10 @@ class DiffusionModel(nn.Module):
             done = place * MAX_FRAMES / lengths[:, None]
             codes = codes + self.to_go_in(torch.cat((sinusoid(to_go, width), sinusoid(done, width)), -1))
         return codes
+
+    def _time(self, timesteps: Tensor) -> Tensor:
+        """(B, width) what is told of timesteps (B,)."""
+        return self.step_in(sinusoid(timesteps, self.config.transformer.width))
 
     def _condition(self, time: Tensor, known: _Prepared, keep: Tensor | None) -> tuple[Tensor, Tensor]:
         """The condition token (B, 1, width) and the contact tokens: Text2HOI eq. 3."""

@@ -219,7 +219,7 @@ def test_the_condition_follows_equations_2_and_3(seen: ClipBatch) -> None:
     condition = Condition.of(seen, feature, seen.text[:, 0], seen.contact)
     steps = torch.tensor([3, 500, 999])
     with torch.no_grad():
-        found = network._condition(steps, network.prepare(condition), None)[0][:, 0].numpy()
+        found = network._condition(network._time(steps), network.prepare(condition), None)[0][:, 0].numpy()
     weights = {name: value.detach().numpy() for name, value in network.named_parameters()}
 
     def layer(name: str, x: np.ndarray) -> np.ndarray:
