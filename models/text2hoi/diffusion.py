@@ -73,7 +73,7 @@ class DiffusionConfig:
 class Condition:
     """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3); part (B, N);
     contact (B, 2, N) 0 or 1 for each hand; active_hands (B, 2) hand flags; lengths (B,), and as plain values counts and
-    sides (``RequestBatch``).
+    sides (``RequestBatch``). object_told: whether F_obj and what goes with it is looked at.
     """
 
     text: Tensor
@@ -86,6 +86,7 @@ class Condition:
     lengths: Tensor
     counts: tuple[int, ...]
     sides: tuple[bool, bool]
+    object_told: bool = True
 
     @classmethod
     def of(cls, batch: RequestBatch, object_feature: Tensor, text: Tensor, contact: Tensor) -> "Condition":
@@ -179,7 +180,7 @@ class DiffusionModel(nn.Module):
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
         return _Prepared(
             self.text_in(scaled_text(condition.text) if self.config.text_scaled else condition.text),
-            self.object_condition_in(self._body(condition, contact)),
+            self._body(condition, contact),
             self.extent_in(extent) if self.extent_in is not None else points.new_zeros(()),
             points,
             points_mask,
@@ -190,15 +191,17 @@ class DiffusionModel(nn.Module):
         )
 
     def _body(self, condition: Condition, contact: Tensor) -> Tensor:
-        """(B, D) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
+        """(B, width) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
         config, body = self.config, [condition.object]
+        if not condition.object_told:
+            return condition.object.new_zeros(len(condition.object), config.transformer.width)
         if config.contact_input == "map":
             body.append(contact.any(1).float())
         if config.scale_input:
             body.append(normalised_points(condition.points_m)[1])
         if config.centroid:
             body.append(condition.points_m.mean(1))
-        return torch.cat(body, -1)
+        return self.object_condition_in(torch.cat(body, -1))
 
     def denoise(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, known: _Prepared, keep: Tensor | None = None

@@ -178,6 +178,21 @@ def test_the_gate_lets_in_what_the_timestep_says(batch: ClipBatch) -> None:
     assert found[1] == 0
 
 
+def test_an_object_that_is_not_told_changes_nothing_but_where_it_is_touched(batch: ClipBatch) -> None:
+    model = diffusion_model()
+    hands, objects = rows_of(batch, model)
+    steps, told = torch.tensor([10, 500, 900]), condition_of(batch, model)
+
+    def moved_by(told: Condition, other: Condition) -> float:
+        with torch.no_grad():
+            return float((model(hands, objects, steps, told)[1] - model(hands, objects, steps, other)[1]).abs().max())
+
+    untold = replace(told, object_told=False)
+    assert moved_by(told, replace(told, object=told.object + 1)) > 1e-3
+    assert moved_by(untold, replace(untold, object=told.object + 1)) == 0
+    assert moved_by(untold, replace(untold, points_m=told.points_m + 0.05)) > 1e-4
+
+
 def test_tokens_nobody_attends_to_change_nothing_when_they_are_left_out() -> None:
     torch.manual_seed(0)
     encoder, x = Encoder(SMALL).eval(), torch.randn(3, 20, 32)
