@@ -1,10 +1,12 @@
 """``hoidata`` and ``python -m hoidata``; with the word ``stage`` a stage, as dvc.yaml of a project of `init` does."""
 
+import os
 import sys
 from importlib import import_module
 
 from hoidata.beside import add_to_path
 from hoidata.errors import HoidataError
+from hoidata.processor import same_kernels
 
 
 def main() -> None:
@@ -13,6 +15,7 @@ def main() -> None:
         add_to_path()
     except HoidataError as error:
         sys.exit(f"hoidata: {error}")
+    os.environ.update(same_kernels())
     if sys.argv[1:2] == ["stage"]:
         sys.argv.pop(1)
         sys.exit(import_module("pipelines.stages.__main__").main())

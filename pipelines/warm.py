@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.beside import python_path
+from hoidata.processor import same_kernels
 
 SOCKET = "HOIDATA_WARM"
 PRELOADED = (
@@ -32,7 +33,7 @@ PRELOADED = (
 )  # fmt: skip
 # Read as libraries are loaded. Threads of OpenMP that wait must sleep: spinning ones cost a busy machine ten times as
 # much. One thread of BLAS: its matrices are small here, two threads took five times as long and gave other last bits.
-ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1"}
+ENVIRONMENT = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0", "OPENBLAS_NUM_THREADS": "1", **same_kernels()}
 TAKEN = b"t"
 KILLED = 128 + signal.SIGKILL
 FORWARDED = (signal.SIGINT, signal.SIGTERM)
@@ -158,7 +159,7 @@ def _pass_signals_on(connection: socket.socket) -> None:
 def _run(request: dict[str, Any]) -> int:
     os.chdir(request["folder"])
     os.environ.clear()
-    os.environ.update(request["environment"])
+    os.environ.update({**request["environment"], **ENVIRONMENT})  # its worker processes read it anew
     # The stage's own modules are those that the one that asks would import.
     sys.path[:] = request["path"]
     for name in [name for name in sys.modules if name.partition(".")[0] == "pipelines"]:

@@ -102,12 +102,15 @@ class Block(nn.Module):
 
 
 class Encoder(nn.Module):
-    """A stack of blocks; pre-norm stacks end with a norm."""
+    """A stack of blocks; pre-norm stacks end with a norm. has_condition: whether its network gives one to the blocks."""
 
-    def __init__(self, config: TransformerConfig) -> None:
+    def __init__(self, config: TransformerConfig, has_condition: bool = False) -> None:
         super().__init__()
         if config.modulated and not config.norm_first:
             raise BadInput("transformer", "norm_first: true with modulated: true", "norm_first: false", "set both")
+        if config.modulated and not has_condition:
+            wanted = "modulated: false in a network that has no condition for every block"
+            raise BadInput("transformer", wanted, "modulated: true", "set it for Text2HOI's diffusion network only")
         self.blocks = nn.ModuleList([Block(config) for _ in range(config.layers)])
         self.last_norm = nn.LayerNorm(config.width) if config.norm_first else nn.Identity()
 

@@ -145,7 +145,7 @@ class DiffusionModel(nn.Module):
         self.points_in = _hidden_layer(TOKEN_FEATURES, width) if config.contact_input == "tokens" else None
         self.extent_in = nn.Linear(3, width) if config.told else None
         self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
-        self.encoder = Encoder(config.transformer)
+        self.encoder = Encoder(config.transformer, has_condition=True)
         head = width * (2 if config.hand_head == "hand and object" else 1)
         self.hands_out = nn.ModuleList([nn.Linear(head, HAND_FEATURES * self.hand_rows) for _ in range(2)])
         self.object_out = nn.Linear(width, self.code.object_features * self.object_rows)

@@ -158,7 +158,12 @@ def test_modulation_starts_as_none_and_then_hears_the_condition() -> None:
 
 def test_modulation_behind_a_norm_is_refused() -> None:
     with pytest.raises(BadInput, match="norm_first"):
-        Encoder(replace(SMALL, norm_first=False, modulated=True))
+        Encoder(replace(SMALL, norm_first=False, modulated=True), has_condition=True)
+
+
+def test_modulation_without_a_condition_is_refused_when_the_network_is_built() -> None:
+    with pytest.raises(BadInput, match="modulated: false"):
+        RefinerModel(RefinerConfig(transformer=replace(SMALL, modulated=True)))
 
 
 def test_the_gate_lets_in_what_the_timestep_says(batch: ClipBatch) -> None:
