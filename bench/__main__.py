@@ -7,6 +7,7 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 import sys
 
 from bench import (
+    ablation,
     adapters,
     batches,
     bimart,
@@ -42,6 +43,7 @@ BENCHMARKS = {
     "text": text.main,
     "batches": batches.main,
     "samplers": samplers.main,
+    "ablation": ablation.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,

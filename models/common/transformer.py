@@ -102,7 +102,7 @@ class Block(nn.Module):
 
 
 class Encoder(nn.Module):
-    """A stack of blocks; pre-norm stacks end with a norm. has_condition: whether its network gives one to the blocks."""
+    """A stack of blocks; pre-norm stacks end with a norm. has_condition: the network gives one to every block."""
 
     def __init__(self, config: TransformerConfig, has_condition: bool = False) -> None:
         super().__init__()
