@@ -14,6 +14,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.asked import read_asked
+from hoidata.refinement import HoldSettings, hold_hands
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.controls import HANDS_AWAY_M
@@ -27,7 +28,10 @@ from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
 SPOILT = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
-LOOKUPS = ("prompt-lookup", "random-clip", "other-verb", "swapped-hands", "other-hands", "nearest-clip")
+LOOKUPS = (
+    *("prompt-lookup", "prompt-lookup-held", "random-clip", "other-verb", "swapped-hands", "other-hands"),
+    "nearest-clip",
+)
 MODELS = ("one-call", "other-contact", "other-prompt-own-contact")
 
 
@@ -93,6 +97,16 @@ def test_the_hand_that_was_not_asked_for_is_left_as_it_was(sources, annotated, t
         np.testing.assert_array_equal(
             motions(sources, family, sample)[0].hands[idle].wrist_m, annotated.clip(sample.clip_id).hands[idle].wrist_m
         )
+
+
+def test_a_held_lookup_is_the_lookup_with_the_hold_that_ours_has(sources, test):
+    for sample in test:
+        found, held = (motions(sources, name, sample)[0] for name in ("prompt-lookup", "prompt-lookup-held"))
+        np.testing.assert_array_equal(held.object.translation_m, found.object.translation_m)
+        side = acting(sample)
+        wanted = track_joints(hold_hands(HANDS, found, HoldSettings())[side], HANDS[side])
+        np.testing.assert_array_equal(joints(held, side), wanted)
+        assert np.abs(joints(held, side) - joints(found, side)).max() > 1e-4
 
 
 def test_static_holds_the_first_frame_in_which_the_hand_touches(sources, annotated, test):
