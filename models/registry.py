@@ -37,6 +37,8 @@ FAMILIES = {
     "other-prompt-own-contact": "models.text2hoi.controls:OTHER_PROMPT_OWN_CONTACT",
     "prompt-lookup": "models.baselines.lookups:PROMPT_LOOKUP",
     "prompt-lookup-held": "models.text2hoi.held_lookup:PROMPT_LOOKUP_HELD",
+    "verb-lookup": "models.baselines.lookups:VERB_LOOKUP",
+    "verb-lookup-held": "models.text2hoi.held_lookup:VERB_LOOKUP_HELD",
     "random-clip": "models.baselines.lookups:RANDOM_CLIP",
     "other-verb": "models.baselines.lookups:OTHER_VERB",
     "swapped-hands": "models.baselines.lookups:SWAPPED_HANDS",

@@ -67,6 +67,12 @@ class Prompt:
         nearness = self.nearness(train, request)
         return [row for row in of_the_hand(train, request) if nearness[row] == 2] or by_sentence(train, request)
 
+    def same_verb(self, train: Train, request: Request) -> Sequence[int]:
+        """Clips of the same verb and hand, on whatever object; those of the same object first."""
+        verb, thing = self._of(request)
+        rows = [row for row in of_the_hand(train, request) if train[row].verb == verb]
+        return sorted(rows, key=lambda row: train[row].object_key != thing)
+
     def other_hand(self, train: Train, request: Request) -> Sequence[int]:
         """Clips in which a hand asked for is seen and does not act; those of the same verb and object first."""
         nearness = self.nearness(train, request)
@@ -120,6 +126,11 @@ def _family(name: str, title: str, load: Callable[[Train, Prompt], Lookup]) -> F
 NEAREST_CLIP = _family("nearest-clip", "nearest training clip", lambda train, prompt: Lookup(train, by_sentence))
 PROMPT_LOOKUP = _family(
     "prompt-lookup", "training clip of the prompt", lambda train, prompt: Lookup(train, prompt.same)
+)
+VERB_LOOKUP = _family(
+    "verb-lookup",
+    "training clip of the verb",
+    lambda train, prompt: Lookup(train, prompt.same_verb, "of this hand with this verb"),
 )
 RANDOM_CLIP = _family(
     "random-clip", "random training clip", lambda train, prompt: Lookup(train, of_the_hand, "of this hand")

@@ -1,14 +1,15 @@
-"""The rival that has everything of `ours` but its networks: the training clip of the prompt, held as ours are."""
+"""Rivals that have all of `ours` but its networks: training clips of the prompt or the verb, held as ours are."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
 from hoidata.refinement import HoldSettings, hold_hands
 from hoidata.settings import build_config
-from models.baselines.lookups import PROMPT_LOOKUP
+from models.baselines.lookups import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, LeftOut, Sampler, Sources
 from models.text2hoi.sampler import SamplingConfig
 
@@ -22,9 +23,9 @@ class HeldLookup:
     hold: HoldSettings
 
     @classmethod
-    def load(cls, sources: Sources) -> "HeldLookup":
+    def load(cls, lookup: Family, sources: Sources) -> "HeldLookup":
         config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
-        return cls(PROMPT_LOOKUP.load(sources), sources.hands, config.hold)
+        return cls(lookup.load(sources), sources.hands, config.hold)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [
@@ -33,4 +34,8 @@ class HeldLookup:
         ]
 
 
-PROMPT_LOOKUP_HELD = Family("prompt-lookup-held", "training clip of the prompt, held", HeldLookup.load)
+def _held(lookup: Family) -> Family:
+    return Family(f"{lookup.name}-held", f"{lookup.title}, held", partial(HeldLookup.load, lookup))
+
+
+PROMPT_LOOKUP_HELD, VERB_LOOKUP_HELD = _held(PROMPT_LOOKUP), _held(VERB_LOOKUP)

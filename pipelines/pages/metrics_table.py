@@ -21,7 +21,7 @@ ALL_METRICS: tuple[AnyMetric, ...] = (
     *FEATURE_METRICS,
     *(row for rows in ASKED_LISTS.values() for row in rows),
 )
-LOOKUPS = ("nearest-clip", "prompt-lookup", "prompt-lookup-held")
+LOOKUPS = ("nearest-clip", "verb-lookup", "verb-lookup-held", "prompt-lookup", "prompt-lookup-held")
 CONTROLS = "controls"
 NO_FIGURE = "-"
 OTHER_EVALUATOR = "another evaluator"

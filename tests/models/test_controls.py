@@ -29,8 +29,8 @@ from tests.models.toy import FAST
 HANDS = load_embedded_hands()
 SPOILT = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
 LOOKUPS = (
-    *("prompt-lookup", "prompt-lookup-held", "random-clip", "other-verb", "swapped-hands", "other-hands"),
-    "nearest-clip",
+    *("prompt-lookup", "prompt-lookup-held", "verb-lookup", "verb-lookup-held", "random-clip", "other-verb"),
+    *("swapped-hands", "other-hands", "nearest-clip"),
 )
 MODELS = ("one-call", "other-contact", "other-prompt-own-contact")
 
@@ -233,6 +233,7 @@ def test_the_prompt_is_looked_up_by_verb_object_and_hand_before_the_sentence(ann
     assert list(prompt.same([clips[0], train[0]], request)) == list(by_sentence([clips[0], train[0]], request))
     assert sorted(prompt.other_verb([*clips, train[0]], request)) == [0, 2]
     assert prompt.other_verb([other, replace(other, verb="lift"), clips[0]], request) == [2, 1]
+    assert prompt.same_verb([other, clips[0], train[0], clips[1]], request) == [3, 0]
 
 
 def test_random_clips_are_of_the_same_hand_and_each_motion_gets_another(train, test):
