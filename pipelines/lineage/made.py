@@ -2,7 +2,8 @@
 
 dvc.lock is not committed in its place: it names the digests of all code, so that every edit would change it, and of
 networks, whose last bits depend on the processor. Here stand the outputs of the data stages by DVC's digest, which are
-the same wherever they are made, and the networks by the digest of their weights alone, with the processor.
+the same on every processor (``hoidata.processor``), and the networks by the digest of their weights alone, with the
+processor.
 """
 
 import json
