@@ -22,7 +22,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 from filelock import FileLock, Timeout
 
 from bench.harness import show
@@ -42,6 +41,7 @@ from models.registry import load_network
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.params import laid_over, read_params
+from pipelines.stages.tables import mean_and_spread
 
 KEPT = Path(".hoidata/ablation")
 CODE = (
@@ -237,7 +237,7 @@ def show_rows(study: Study, names: Sequence[str], seeds: Sequence[int]) -> None:
     for name in names:
         paths = [study.figures_path(ROWS[name], seed) for seed in seeds]
         found = [json.loads(path.read_text()) for path in paths if path.is_file()]
-        cells = [_cell([one[key] for one in found if key in one]) for key in COLUMNS]
+        cells = [mean_and_spread(one.get(key) for one in found) for key in COLUMNS]
         lines.append([name, str(len(found)), f"{parameters(study.train, ROWS[name]):,}", *cells])
     title = f"{study.data}, {study.steps} steps, {CLIPS} clips at most, one motion each"
     show(title, ["row", "seeds", "parameters", *COLUMNS.values()], lines)
@@ -248,13 +248,6 @@ def parameters(train: Settings, row: Row) -> int:
     network = load_network("diffusion")
     settings = build_config(network.config, row.settings(train, "diffusion").get("network", {}), "params.yaml: train")
     return sum(weight.numel() for weight in network.build(settings).parameters())
-
-
-def _cell(values: Sequence[float]) -> str:
-    if not values:
-        return "-"
-    spread = f" ({np.std(values, ddof=1):.2g})" if len(values) > 1 else ""
-    return f"{np.mean(values):.3g}{spread}"
 
 
 if __name__ == "__main__":

@@ -69,13 +69,13 @@ def _cost() -> dict[str, float]:
 
 
 def _machine() -> dict[str, Any]:
-    from pipelines.lineage.made import processor
+    from hoidata.processor import processor_name
 
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     git = subprocess.run(["git", "rev-parse", "--verify", "--quiet", "HEAD"], capture_output=True, text=True)
     return {
         "host": platform.node(),
-        "processor": processor(),
+        "processor": processor_name(),
         "cores": len(os.sched_getaffinity(0)),
         "memory_gib": round(memory / 2**30, 1),
         "device": _device(),

@@ -2,12 +2,11 @@
 
 dvc.lock is not committed in its place: it names the digests of all code, so that every edit would change it, and of
 networks, whose last bits depend on the processor. Here stand the outputs of the data stages by DVC's digest, which are
-the same on every processor (``hoidata.processor``), and the networks by the digest of their weights alone, with the
-processor.
+the same on every x86-64 processor with AVX2 (``hoidata.processor``), and the networks by the digest of their weights
+alone, with the processor.
 """
 
 import json
-import platform
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from hoidata.errors import BadInput
 from hoidata.files.atomic import write_whole
 from hoidata.files.sealed import payload_digest
 from hoidata.files.written import read_json
+from hoidata.processor import processor_name
 from pipelines.lineage.locks import dvc_digest, read_locks
 from pipelines.lineage.provenance import library_versions
 from pipelines.lineage.tree import Node
@@ -30,7 +30,7 @@ def write_made(root: Path, profile: str, path: Path) -> Path:
     table = {
         "schema": SCHEMA,
         "profile": profile,
-        "processor": processor(),
+        "processor": processor_name(),
         "libraries": library_versions(),
         "outputs": {out: dvc_digest(root / out) for out in outs},
         "networks": {name: payload_digest(root / name) for name in _networks(root, profile)},
@@ -63,7 +63,7 @@ def _node(kind: Any, root: Path, name: str, digest: str | None, found: str | Non
 
 
 def _other_circumstances(table: dict[str, Any]) -> list[str]:
-    here = {"processor": processor(), **library_versions()}
+    here = {"processor": processor_name(), **library_versions()}
     then = {"processor": table["processor"], **table["libraries"]}
     return [f"{name} {then.get(name)} there, {value} here" for name, value in here.items() if then.get(name) != value]
 
@@ -71,13 +71,3 @@ def _other_circumstances(table: dict[str, Any]) -> list[str]:
 def _networks(root: Path, profile: str) -> list[str]:
     paths = (root / "checkpoints" / profile).rglob("*.safetensors")
     return sorted(path.relative_to(root).as_posix() for path in paths)
-
-
-def processor() -> str:
-    """The processor's name, as the system gives it."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        lines = []
-    names = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    return next(names, platform.processor() or platform.machine())

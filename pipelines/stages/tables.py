@@ -77,7 +77,8 @@ def _row(seeds: list[Facts]) -> list[str]:
     if not measured:
         return [seeds[0]["title"], "0", seeds[0]["empty"], *["-"] * len(COLUMNS)]
     cells = [
-        " / ".join(_cell(seed["figures"].get(name) for seed in measured) for name in own) for own in COLUMNS.values()
+        " / ".join(mean_and_spread(seed["figures"].get(name) for seed in measured) for name in own)
+        for own in COLUMNS.values()
     ]
     return [seeds[0]["title"], str(len(measured)), str(sum(seed["motions"] for seed in measured)), *cells]
 
@@ -92,7 +93,7 @@ def controls_lines(paths: StagePaths) -> list[str]:
                 found.setdefault(promise, []).append(one)
     lines = []
     for promise, own in found.items():
-        means = _cell(one.beside for one in own), _cell(one.control for one in own)
+        means = mean_and_spread(one.beside for one in own), mean_and_spread(one.control for one in own)
         apart = ", ".join(f"{one.low:.3g} to {one.high:.3g}" for one in own)
         holds = f"{sum(one.holds(promise.must) for one in own)} of {len(own)}"
         lines.append(
@@ -175,11 +176,12 @@ def _as_many_chances(promise: Promise, rows: Mapping[str, Facts]) -> bool:
 def maps_lines(found: Mapping[str, list[Facts]]) -> list[str]:
     """How far drawn contact maps lie from the recorded ones, beside the object's mean map of training."""
     inside = [row["diagnostics"]["bimart-contact"] for row in found.get("bimart", []) if row.get("diagnostics")]
-    rows = [[name, _cell(one[name] for one in inside)] for name in sorted(inside[0])] if inside else []
+    rows = [[name, mean_and_spread(one[name] for one in inside)] for name in sorted(inside[0])] if inside else []
     return ["", "## Contact maps: error, mm", "", *_table(("of", "mm"), rows)] if rows else []
 
 
-def _cell(values: Iterable[float | None]) -> str:
+def mean_and_spread(values: Iterable[float | None]) -> str:
+    """The mean, in brackets the standard deviation of several; a dash for none."""
     known = [value for value in values if value is not None]
     if not known:
         return "-"

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from hoidata import processor
-from hoidata.processor import same_kernels
+from hoidata.processor import processor_name, same_kernels
 from pipelines.warm import SOCKET, WarmProcess
 
 needs_avx2 = pytest.mark.skipif(not same_kernels(), reason="this processor has no AVX2")
@@ -21,7 +21,6 @@ print(hashlib.sha256((rows @ rows).tobytes()).hexdigest(), hashlib.sha256(numpy.
 DOORS = {
     "stage": "import os; from pipelines.warm import ENVIRONMENT; os.environ.update(ENVIRONMENT)\n" + COMPUTE,
     "command": f"""
-import sys
 import pipelines.cli
 from hoidata.__main__ import main
 pipelines.cli.main = lambda: exec({COMPUTE!r})
@@ -37,7 +36,8 @@ PROCESSORS = (
 
 def said(code: str, environment: dict[str, str]) -> str:
     told = {**os.environ, **environment}
-    return subprocess.run([sys.executable, "-c", code], env=told, capture_output=True, text=True, check=True).stdout
+    call = [sys.executable, "-c", code]
+    return subprocess.run(call, env=told, capture_output=True, text=True, check=True, timeout=120).stdout
 
 
 @needs_avx2
@@ -75,3 +75,11 @@ def test_a_processor_without_avx2_and_another_system_are_left_alone(monkeypatch,
     assert same_kernels() == {}
     monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "none")
     assert same_kernels() == {}
+
+
+def test_the_processor_is_named_as_the_system_names_it(monkeypatch, tmp_path: Path) -> None:
+    (tmp_path / "cpuinfo").write_text("processor: 0\nmodel name\t: A: fast one\n\nmodel name\t: another\n")
+    monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "cpuinfo")
+    assert processor_name() == "A: fast one"
+    monkeypatch.setattr(processor, "_CPUINFO", tmp_path / "none")
+    assert processor_name()
