@@ -2,8 +2,9 @@
 
 Text2HOI Sec. 3.2 and supplement, Tables S7-S9: tokens [condition] + (left, right, object) x frames, frame-wise and
 agent-wise position codes, x0-prediction, masks by hand type and length. Each deviation is a switch of the config, off
-by default: what stands for a motion (``motion_code``), contact as points to attend to, sentences through a learnt
-projection, the condition in every token, codes that count to the end. Hand flags are explicit inputs beside the masks.
+by default: what stands for a motion (``motion_code``), contact as points to attend to, sentences read for their verb
+(``verb_reading``), the condition in every token, codes that count to the end. Hand flags are explicit inputs beside
+the masks.
 """
 
 from dataclasses import dataclass, field, replace
@@ -15,7 +16,7 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES, OBJECT_POSITION, WRIST
-from models.common.features import Normaliser, proper_hands, proper_object, scaled_text
+from models.common.features import Normaliser, proper_hands, proper_object
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
 from models.common.transformer import (
@@ -29,6 +30,7 @@ from models.common.transformer import (
 )
 from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
+from models.text2hoi.verb_reading import VerbReading
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,10 @@ class DiffusionConfig:
     as they are. codes: of frames and agents, or (for an ablation) less. first_code: number of the first frame's code.
     contact_input: "map", the paper's raw numbers, "tokens", ``contact_tokens`` of each kind, or "none". scale_input,
     centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
-    is read from its own token, or from the object's as well (released). text_scaled: to a length of sqrt(512).
-    text_input: a linear layer, or "projection", a normalised one with a hidden layer. condition_everywhere: the
-    condition is added to every token instead of being one. frames_to_go: tokens know how far they are from the end.
+    is read from its own token, or from the object's as well (released). object_feature: whether F_obj, the point
+    network's summary of the object, is told; of few objects it is a name. text_input: a linear layer, or "verbs", a
+    hidden layer that is told which of ``verbs`` verbs the sentence means. condition_everywhere: the condition is added
+    to every token instead of being one. frames_to_go: tokens know how far they are from the end.
     signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
     is to happen (Chen 2023). input_gate: how much of the noised rows is let in depends on the timestep.
     """
@@ -56,12 +59,13 @@ class DiffusionConfig:
     first_code: int = 0
     contact_input: Literal["map", "tokens", "none"] = "map"
     contact_tokens: int = 12
+    object_feature: bool = True
     scale_input: bool = True
     centroid: bool = False
     told: bool = False
     hand_head: Literal["hand", "hand and object"] = "hand"
-    text_scaled: bool = False
-    text_input: Literal["linear", "projection"] = "linear"
+    text_input: Literal["linear", "verbs"] = "linear"
+    verbs: int = 0
     condition_everywhere: bool = False
     frames_to_go: bool = False
     signal_scale: float = 1.0
@@ -73,7 +77,7 @@ class DiffusionConfig:
 class Condition:
     """What a motion is generated for. text (B, 512); object (B, G): F_obj; points_m, normals (B, N, 3); part (B, N);
     contact (B, 2, N) 0 or 1 for each hand; active_hands (B, 2) hand flags; lengths (B,), and as plain values counts and
-    sides (``RequestBatch``). object_told: whether F_obj and what goes with it is looked at.
+    sides (``RequestBatch``).
     """
 
     text: Tensor
@@ -86,7 +90,6 @@ class Condition:
     lengths: Tensor
     counts: tuple[int, ...]
     sides: tuple[bool, bool]
-    object_told: bool = True
 
     @classmethod
     def of(cls, batch: RequestBatch, object_feature: Tensor, text: Tensor, contact: Tensor) -> "Condition":
@@ -133,15 +136,16 @@ class DiffusionModel(nn.Module):
         self.hand_rows = config.transformer.frames_per_token
         self.object_rows = self.hand_rows * config.motion.object_knots
         # Trained with the contact model and frozen here; kept so that a checkpoint of this model is enough to sample.
-        self.object_net = PointNet(3, config.point_net).requires_grad_(False)
+        self.object_net = PointNet(3, config.point_net).requires_grad_(False) if config.object_feature else None
         self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * self.hand_rows, width) for _ in range(2)])
         self.object_in = nn.Linear(self.code.object_features * self.object_rows, width)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.gate_in = nn.Linear(width, width) if config.input_gate else None
         self.text_in = _text_layers(config)
         as_map = config.contact_input == "map"
-        body = config.point_net.widths[-1] + config.points * as_map + config.scale_input + 3 * config.centroid
-        self.object_condition_in = nn.Linear(body, width)
+        summary = config.point_net.widths[-1] if config.object_feature else 0
+        body = summary + config.points * as_map + config.scale_input + 3 * config.centroid
+        self.object_condition_in = nn.Linear(body, width) if body else None
         self.points_in = _hidden_layer(TOKEN_FEATURES, width) if config.contact_input == "tokens" else None
         self.extent_in = nn.Linear(3, width) if config.told else None
         self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
@@ -152,7 +156,9 @@ class DiffusionModel(nn.Module):
 
     @torch.no_grad()
     def object_feature(self, points_m: Tensor) -> Tensor:
-        """F_obj (B, G) of object points (B, N, 3), metres."""
+        """F_obj (B, G) of object points (B, N, 3), metres; (B, 0) where it is not told."""
+        if self.object_net is None:
+            return points_m.new_zeros(len(points_m), 0)
         self.object_net.eval()
         return self.object_net(normalised_points(points_m)[0])[0]
 
@@ -179,7 +185,7 @@ class DiffusionModel(nn.Module):
             points = self.points_in(points)
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
         return _Prepared(
-            self.text_in(scaled_text(condition.text) if self.config.text_scaled else condition.text),
+            self.text_in(condition.text),
             self._body(condition, contact),
             self.extent_in(extent) if self.extent_in is not None else points.new_zeros(()),
             points,
@@ -193,7 +199,7 @@ class DiffusionModel(nn.Module):
     def _body(self, condition: Condition, contact: Tensor) -> Tensor:
         """(B, width) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
         config, body = self.config, [condition.object]
-        if not condition.object_told:
+        if self.object_condition_in is None:
             return condition.object.new_zeros(len(condition.object), config.transformer.width)
         if config.contact_input == "map":
             body.append(contact.any(1).float())
@@ -275,7 +281,8 @@ class DiffusionModel(nn.Module):
 def _text_layers(config: DiffusionConfig) -> nn.Module:
     if config.text_input == "linear":
         return nn.Linear(config.text, config.transformer.width)
-    return nn.Sequential(nn.LayerNorm(config.text), _hidden_layer(config.text, config.transformer.width))
+    read = VerbReading(config.text, config.verbs)
+    return nn.Sequential(read, _hidden_layer(config.verbs, config.transformer.width))
 
 
 def _hidden_layer(inputs: int, width: int) -> nn.Module:

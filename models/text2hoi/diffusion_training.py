@@ -30,6 +30,7 @@ from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawe
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
 from models.text2hoi.thresholds import ContactNetwork
+from models.text2hoi.verb_reading import Sentences, learn_verbs
 
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
 HAND_GROUPS = (WRIST, GLOBAL_ORIENT_6D, HAND_POSE_6D)
@@ -263,8 +264,12 @@ def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:
 def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     contact = setup.trained["contact"].network
     assert isinstance(contact, ContactNetwork)
-    network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net)).to(setup.device)
-    network.object_net.load_state_dict(contact.object_net.state_dict())
+    sentences = Sentences.of(setup.corpus.train)
+    network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net, verbs=sentences.n_verbs))
+    learn_verbs(network, sentences)
+    if network.object_net is not None:
+        network.object_net.load_state_dict(contact.object_net.state_dict())
+    network = network.to(setup.device)
     coded = [network.code.encode(sample) for sample in setup.corpus.train]
     normaliser = Normaliser.nothing(network.code.object_features)
     if network.config.normalised:

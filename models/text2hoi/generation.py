@@ -29,6 +29,7 @@ from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi, Text2HoiMotion
 from models.text2hoi.sentences import read_sentence, unseen_words
+from models.text2hoi.verb_reading import readings_of
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,9 @@ class GeneratedMotion:
     """clip: the motion, hands that were not asked for invalid. contact: (N,) bool contact map it was made for.
 
     points: where those points lie on the object. coarse: the motion before refinement. evidence: plain values on how
-    the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "unseen": what of
-    the sentence was never in training, in words.
+    the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the
+    verb of training the diffusion network takes the sentence for, with its probability, or None where it is told the
+    sentence's features; "unseen": what of the sentence was never in training, in words.
     """
 
     clip: Clip
@@ -115,11 +117,13 @@ class Generator:
             object_words=object_words or object.name,
         )
         requests = [self._request(first, text, wish, number) for number in range(wish.samples)]
+        read_as = self._read_as(first.text)
         evidence = {
             "text": text,
+            "read_as": read_as,
             "seed": wish.seed,
             "hand": asdict(choice),
-            "unseen": self._unseen(text, verb, object_words or thing, choice.hand),
+            "unseen": [*self._unseen(text, verb, object_words or thing, choice.hand), *_misread(verb, read_as)],
             "trained_on": self.model.facts["datasets"],
             "synthetic": bool(self.model.facts["synthetic"]),
             "contact_threshold_m": self.model.facts["contact_threshold_m"],
@@ -133,6 +137,15 @@ class Generator:
 
     def _unseen(self, text: str, verb: str | None, thing: str | None, hand: HandType) -> list[str]:
         return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)
+
+    def _read_as(self, text: np.ndarray) -> tuple[str, float] | None:
+        """The likeliest verb of a sentence with features (512,), and how likely."""
+        readings = readings_of(self.model.trained["diffusion"].network)
+        verbs = sorted(filter(None, Vocabulary.read(self.model.facts).verbs))
+        if not readings or not verbs:
+            return None
+        found = readings[0](torch.from_numpy(text)[None])[0]
+        return verbs[int(found.argmax())], round(float(found.max()), 3)
 
     def _hand(self, text: str, wish: Wish) -> HandChoice:
         """The hand asked for; else by the rules, and where the text names none by the share among training clips."""
@@ -166,6 +179,13 @@ class Generator:
         own = {"number": request.number, "frames": request.n_frames, "touched_points": int(motion.contact_map.sum())}
         refined, coarse = (self.model.clips([request], [motion], refined=kind)[0] for kind in (True, False))
         return GeneratedMotion(refined, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
+
+
+def _misread(verb: str | None, read_as: tuple[str, float] | None) -> list[str]:
+    """That the motion will be of another verb than the sentence has, in words for a person."""
+    if read_as is None or read_as[0] == verb:
+        return []
+    return [f"the motion is what the networks take the sentence for: {read_as[0]!r} ({read_as[1]:.0%})"]
 
 
 def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, where: Path) -> None:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import MAX_FRAMES
-from models.common.features import scaled_text
+from models.text2hoi.verb_reading import VerbReading
 
 SHORTEST_FRAMES = 8
 EXPECTED_OF = 32  # draws
@@ -23,7 +23,8 @@ WIDEST_DRAW = 2.0  # standard deviations; lengths of one verb have limits, a Gau
 class LengthConfig:
     """Sizes; ``width`` is the paper's 512, and so is ``noise``, 64.
 
-    drawn_by: "noise" among the inputs, or "spread". text_scaled: features at a length of sqrt(512). told: hand flags.
+    drawn_by: "noise" among the inputs, or "spread". text_input: the sentence's features, or "verbs": which of ``verbs``
+    verbs it means (``verb_reading``). told: hand flags.
     """
 
     text: int = 512
@@ -31,7 +32,8 @@ class LengthConfig:
     dropout: float = 0.0
     noise: int = 64
     drawn_by: Literal["noise", "spread"] = "noise"
-    text_scaled: bool = False
+    text_input: Literal["features", "verbs"] = "features"
+    verbs: int = 0
     told: bool = False
 
 
@@ -48,9 +50,11 @@ class LengthModel(nn.Module):
     def __init__(self, config: LengthConfig) -> None:
         super().__init__()
         self.config = config
-        spread = config.drawn_by == "spread"
+        spread, read = config.drawn_by == "spread", config.text_input == "verbs"
+        self.reading = VerbReading(config.text, config.verbs) if read else None
+        said = config.verbs if read else config.text
         self.layers = nn.Sequential(
-            nn.Linear(config.text + 2 * config.told + (0 if spread else config.noise), config.width),
+            nn.Linear(said + 2 * config.told + (0 if spread else config.noise), config.width),
             nn.ReLU() if spread else nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
             nn.Linear(config.width, 2 if spread else 1),
@@ -62,7 +66,7 @@ class LengthModel(nn.Module):
 
     def moments(self, text: Tensor, active_hands: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """(B,) mean and log-spread; of a length that is drawn by noise (B, D) itself, the spread stands for nothing."""
-        text = scaled_text(text) if self.config.text_scaled else text
+        text = text if self.reading is None else self.reading(text)
         inputs = [text, *([active_hands.float()] if self.config.told else [])]
         if self.config.drawn_by == "noise":
             length = self.layers(torch.cat((noise, *inputs), -1))[:, 0].sigmoid()

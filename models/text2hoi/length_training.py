@@ -1,5 +1,7 @@
 """Training of the length network: what one step and one validation are."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -14,6 +16,7 @@ from models.text2hoi.length import (
     length_error,
     length_loss,
 )
+from models.text2hoi.verb_reading import Sentences, learn_verbs
 
 
 class LengthObjective:
@@ -44,7 +47,10 @@ class LengthObjective:
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:
-    return LengthObjective(LengthModel(setup.network).to(setup.device), setup.loss, setup.corpus, setup.device), None
+    sentences = Sentences.of(setup.corpus.train)
+    network = LengthModel(replace(setup.network, verbs=sentences.n_verbs))
+    learn_verbs(network, sentences)
+    return LengthObjective(network.to(setup.device), setup.loss, setup.corpus, setup.device), None
 
 
 LENGTH = Network("length", LengthConfig, LengthModel, _objective, LengthLossConfig)

@@ -36,16 +36,12 @@ AT_ONCE = 256
 class SamplingConfig:
     """sampler: of the diffusion network. refined_by: what corrects its hands, the refiner network or a hold
     (``hoidata.refinement.holding``); "preset": a hold where the diffusion network gives hands in the object's frame, as
-    `ours` does. field_resolution: of the distance grids the refiner sees. object_feature: whether the diffusion network
-    is told F_obj, the point network's summary of the object; "preset": not where touched points are tokens, as in
-    `ours`, which say what the object is like where a hand touches it. Of few objects a summary is a name: an object
-    that was not among them is taken for one that was, and does what that one does.
+    `ours` does. field_resolution: of the distance grids the refiner sees.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
     field_resolution: int = 48
     refined_by: Literal["preset", "network", "hold"] = "preset"
-    object_feature: Literal["preset", "told", "untold"] = "preset"
     hold: HoldSettings = field(default_factory=HoldSettings)
 
 
@@ -99,13 +95,6 @@ class Text2Hoi:
             return self.config.refined_by
         code = motion_generator(self.trained["diffusion"]).network.code.config
         return "hold" if code.hand_frame == "object" else "network"
-
-    @property
-    def object_told(self) -> bool:
-        """Whether the diffusion network is told the object's feature."""
-        if self.config.object_feature != "preset":
-            return self.config.object_feature == "told"
-        return motion_generator(self.trained["diffusion"]).network.config.contact_input != "tokens"
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         """Refined motions."""
@@ -170,7 +159,6 @@ class Text2Hoi:
             contact = torch.stack([own.expand(2, -1) for own in given]).to(contact) * batch.active_hands[..., None]
         generator = motion_generator(self.trained["diffusion"])
         condition = Condition.of(batch, generator.network.object_feature(batch.points_m), batch.text, contact)
-        condition = replace(condition, object_told=self.object_told)
         code = generator.network.code
         noise = draw_each(code.largest, code.sizes(batch.frames.shape[1]), generators, code.object_features)
         coarse, objects = generator.sample(condition, self.config.sampler, noise, generators)

@@ -132,7 +132,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     """Rows (name, value) on how the motions came about: hands and why, length, object, seed, models, training data."""
     evidence, clip = motions[0].evidence, motions[0].clip
     hand = evidence["hand"]
-    kind = "SYNTHETIC" if evidence["synthetic"] else "recorded"
+    kind, read_as = "SYNTHETIC" if evidence["synthetic"] else "recorded", evidence["read_as"]
     clips = ", ".join(f"{count} {kind} {name} clips" for name, count in evidence["trained_on"].items())
     lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
@@ -140,6 +140,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ("hands", f"{hand['hand']} (decided by {hand['source']}: {hand['evidence']})"),
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
+        *([("read as", f"{read_as[0]} ({read_as[1]:.0%})")] if read_as else []),
         ("seed", str(evidence["seed"])),
         ("trained on", clips),
         ("refined by", {"hold": "a hold against the object", "network": "the refiner network"}[evidence["refined_by"]]),

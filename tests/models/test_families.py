@@ -21,7 +21,6 @@ from models.common.family import Sources, motion_clip
 from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
-from models.text2hoi.diffusion import DiffusionModel
 from models.text2hoi.family import other_prompts
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
@@ -182,22 +181,6 @@ def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_
     in_object = MotionCode(MotionCodeConfig(4, hand_frame="object"))
     monkeypatch.setattr(usual.trained["diffusion"].network, "code", in_object)
     assert usual.refined_by == "hold"
-
-
-def test_an_objects_feature_is_left_out_where_touched_points_are_tokens(
-    sources: Sources, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usual = load_family("text2hoi").load(sources)
-    assert isinstance(usual, Text2Hoi)
-    network = usual.trained["diffusion"].network
-    assert isinstance(network, DiffusionModel)
-    found = {}
-    for kind in ("map", "none", "tokens"):
-        monkeypatch.setattr(network, "config", replace(network.config, contact_input=kind))
-        found[kind] = usual.object_told
-    assert found == {"map": True, "none": True, "tokens": False}
-    for setting, told in (("told", True), ("untold", False)):
-        assert replace(usual, config=replace(usual.config, object_feature=setting)).object_told is told
 
 
 def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(

@@ -148,6 +148,18 @@ def test_what_is_asked_for_beside_the_sentence_counts_before_its_words(trained: 
 def test_what_training_never_had_is_said(trained: Path) -> None:
     said = generator(trained).generate("Juggle three oranges with both hands.", user_box(), Wish(frames=8))[0]
     assert "the verb 'juggle' was never in training" in said.evidence["unseen"][0]
+    verb, likely = said.evidence["read_as"]
+    assert verb in ("lift", "open", "pass")
+    assert 1 / 3 <= likely <= 1
+    assert f"take the sentence for: {verb!r} ({likely:.0%})" in said.evidence["unseen"][-1]
+
+
+def test_the_verb_a_sentence_is_taken_for_is_told_and_no_surprise_where_it_is_its_own(trained: Path) -> None:
+    asked = {"lift": "Lift a box with the left hand.", "pass": "Pass a box with the right hand."}
+    for verb, text in asked.items():
+        said = generator(trained).generate(text, user_box(), Wish(frames=8))[0]
+        assert said.evidence["read_as"][0] == verb
+        assert not any("take the sentence for" in note for note in said.evidence["unseen"])
 
 
 def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(trained: Path) -> None:

@@ -15,11 +15,15 @@ PARAMS = {
         "network": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8], "drawn_by": "anchor"},
         "training": BUDGET,
     },
-    "length": {"network": {"width": 16, "drawn_by": "spread", "told": True}, "training": {**BUDGET, "keep_best": True}},
+    "length": {
+        "network": {"width": 16, "drawn_by": "spread", "text_input": "verbs", "told": True},
+        "training": {**BUDGET, "keep_best": True},
+    },
     "diffusion": {
         "network": {
             "transformer": TRANSFORMER,
             "contact_input": "tokens",
+            "text_input": "verbs",
             "motion": {"knot_frames": 4},
             "normalised": True,
             "told": True,

@@ -30,6 +30,7 @@ def motion(page_clip):
         "seed": 7,
         "number": 0,
         "hand": hand,
+        "read_as": ("lift", 0.97),
         "synthetic": True,
         "unseen": ["the object 'vase' was never in training"],
         "contact_threshold_m": 0.02,

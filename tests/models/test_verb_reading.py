@@ -1,0 +1,137 @@
+"""What a network is told of a sentence: its verb, also where verb and noun were never in one sentence before."""
+
+from dataclasses import replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hoidata.annotation.encoders import load_encoder
+from hoidata.batches.dataset import HoiDataset
+from hoidata.store.annotated import load_annotated
+from models.common.checkpoints import load_checkpoint
+from models.common.features import scaled_text
+from models.registry import load_network
+from models.text2hoi.diffusion import DiffusionModel
+from models.text2hoi.length import LengthConfig, LengthModel
+from models.text2hoi.verb_reading import (
+    RIDGES,
+    SHARPNESSES,
+    USUAL,
+    Sentences,
+    VerbReading,
+    choose_shrinkage,
+    learn_verbs,
+)
+
+SIZE, VERBS, NOUNS, FORMS = 96, 6, 8, 3
+
+
+def written(pairs: list[tuple[int, int]], noun_m: float = 3.0) -> Sentences:
+    """Features of a few sentences for each pair of verb and noun: the noun is louder than the verb."""
+    draws = np.random.default_rng(0)
+    verbs, nouns = draws.normal(size=(VERBS, SIZE)), noun_m * draws.normal(size=(NOUNS, SIZE))
+    rows = [(verb, noun) for verb, noun in pairs for _ in range(FORMS)]
+    text = np.array([verbs[verb] + nouns[noun] for verb, noun in rows]) + 0.3 * draws.normal(size=(len(rows), SIZE))
+    text = scaled_text(torch.from_numpy(text)).numpy()
+    return Sentences(text, *np.array(rows).T, np.full(len(rows), 1 / FORMS))
+
+
+def read(known: Sentences, asked: Sentences) -> np.ndarray:
+    """(S, V) probabilities of verbs."""
+    reading = VerbReading(known.text.shape[1], known.n_verbs)
+    reading.learn(known)
+    return reading(torch.from_numpy(asked.text).float()).numpy()
+
+
+def nearest_verb(known: Sentences, asked: Sentences) -> np.ndarray:
+    return known.verb[((asked.text[:, None] - known.text) ** 2).sum(-1).argmin(1)]
+
+
+EVERY = list(product(range(VERBS), range(NOUNS)))
+HELD_OUT = [(verb, noun) for verb, noun in EVERY if (verb + noun) % 3 == 0]
+TOGETHER = [pair for pair in EVERY if pair not in HELD_OUT]
+
+
+def test_verbs_are_read_where_the_nearest_sentence_has_another_one() -> None:
+    both = written([*TOGETHER, *HELD_OUT])
+    new = np.arange(len(both.verb)) >= FORMS * len(TOGETHER)
+    known, asked = both.take(~new), both.take(new)
+    found = read(known, asked)
+    assert (found.argmax(1) == asked.verb).mean() > 0.95
+    assert (nearest_verb(known, asked) == asked.verb).mean() < 0.2
+    np.testing.assert_allclose(found.sum(1), 1, rtol=1e-5)
+
+
+def test_verbs_of_sentences_are_read_by_the_encoder_that_comes_with_us() -> None:
+    verbs, nouns = ("push", "lift", "pour from", "shake", "inspect"), ("mug", "flashlight", "teapot", "cube", "pan")
+    pairs = list(product(range(len(verbs)), range(len(nouns))))
+    wording = [f"{verbs[verb].capitalize()} a {nouns[noun]} with the right hand." for verb, noun in pairs]
+    text = scaled_text(torch.from_numpy(load_encoder("use").encode(wording)).double()).numpy()
+    whole = Sentences(text, *np.array(pairs).T, np.ones(len(pairs)))
+    new = np.array([verb == noun for verb, noun in pairs])
+    found = read(whole.take(~new), whole.take(new))
+    assert found.argmax(1).tolist() == list(range(len(verbs)))
+
+
+def test_the_layer_is_a_ridge_regression_over_pairs_that_weigh_alike() -> None:
+    known = written(TOGETHER[:12])
+    weight = known.weight * np.random.default_rng(1).uniform(0.5, 2, len(known.weight))
+    reading = VerbReading(SIZE, known.n_verbs).double()
+    reading.learn(replace(known, weight=weight))
+    ridge, _ = choose_shrinkage(replace(known, weight=weight))
+    share, wanted = weight / weight.sum(), np.eye(known.n_verbs)[known.verb]
+    away, left = known.text - share @ known.text, wanted - share @ wanted
+    mean_variance = (share[:, None] * away**2).sum() / SIZE
+    # The same problem with the penalty as further rows, by another solver.
+    rows = np.concatenate((np.sqrt(share)[:, None] * away, np.sqrt(ridge * mean_variance) * np.eye(SIZE)))
+    targets = np.concatenate((np.sqrt(share)[:, None] * left, np.zeros((SIZE, known.n_verbs))))
+    np.testing.assert_allclose(reading.weights.numpy(), np.linalg.lstsq(rows, targets)[0], atol=1e-6)
+
+
+def test_louder_nouns_are_shrunk_more_and_chances_stay_chances() -> None:
+    quiet, loud = (choose_shrinkage(written(TOGETHER, noun_m)) for noun_m in (0.0, 10.0))
+    assert quiet[0] in RIDGES
+    assert quiet[1] in SHARPNESSES
+    assert quiet[1] >= loud[1]
+
+
+def test_verbs_that_have_a_noun_of_their_own_cannot_be_asked_for() -> None:
+    assert choose_shrinkage(written([(0, 0), (1, 1), (2, 2)])) == USUAL
+    assert choose_shrinkage(written([(0, 0), (1, 0)])) == USUAL
+
+
+def test_how_long_features_are_and_how_often_a_clip_was_recorded_change_nothing(annotated_root: Path) -> None:
+    clips = list(HoiDataset(load_annotated(annotated_root), "train", crop="start"))
+    once, again = Sentences.of(clips), Sentences.of([*clips, clips[0], clips[0]])
+    np.testing.assert_array_equal(once.text, again.text)
+    np.testing.assert_array_equal(once.weight, again.weight)
+    longer = Sentences.of([replace(clip, text=clip.text * 7) for clip in clips])
+    np.testing.assert_allclose(once.text, longer.text, rtol=1e-6)
+    assert once.n_verbs == len({clip.verb for clip in clips})
+
+
+def test_clips_without_verbs_tell_nothing(annotated_root: Path) -> None:
+    clips = [replace(clip, verb=None) for clip in HoiDataset(load_annotated(annotated_root), "train", crop="start")]
+    nothing = Sentences.of(clips)
+    assert nothing.n_verbs == 1
+    network = LengthModel(LengthConfig(text_input="verbs", verbs=nothing.n_verbs, width=8))
+    learn_verbs(network, nothing)
+    noise = torch.zeros(2, 64)
+    found = network.moments(torch.randn(2, 512), torch.ones(2, 2), noise)[0]
+    assert found[0] == found[1]
+
+
+def test_training_keeps_the_reading_it_began_with_and_stores_it(annotated_root: Path, trained: Path) -> None:
+    sentences = Sentences.of(HoiDataset(load_annotated(annotated_root), "train", crop="start"))
+    for name in ("diffusion", "length"):
+        network = load_checkpoint(trained / name, load_network(name)).network
+        assert isinstance(network, DiffusionModel | LengthModel)
+        readings = [part for part in network.modules() if isinstance(part, VerbReading)]
+        assert len(readings) == 1
+        fresh = VerbReading(512, sentences.n_verbs)
+        fresh.learn(sentences)
+        assert {key: value.tolist() for key, value in readings[0].state_dict().items()} == {
+            key: value.tolist() for key, value in fresh.state_dict().items()
+        }
