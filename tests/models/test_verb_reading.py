@@ -5,6 +5,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from hoidata.annotation.encoders import load_encoder
@@ -90,11 +91,44 @@ def test_the_layer_is_a_ridge_regression_over_pairs_that_weigh_alike() -> None:
     np.testing.assert_allclose(reading.weights.numpy(), np.linalg.lstsq(rows, targets)[0], atol=1e-6)
 
 
-def test_louder_nouns_are_shrunk_more_and_chances_stay_chances() -> None:
-    quiet, loud = (choose_shrinkage(written(TOGETHER, noun_m)) for noun_m in (0.0, 10.0))
-    assert quiet[0] in RIDGES
-    assert quiet[1] in SHARPNESSES
-    assert quiet[1] >= loud[1]
+def left_out_loss(known: Sentences, ridge: float, sharpness: float) -> float:
+    """Cross-entropy of sentences of each noun by the plain normal equations of those of the others."""
+    total = 0.0
+    for noun in range(NOUNS):
+        some, rest = known.take(known.noun == noun), known.take(known.noun != noun)
+        share, wanted = np.diag(rest.weight / rest.weight.sum()), np.eye(VERBS)[rest.verb]
+        middle, prior = (share @ rest.text).sum(0), (share @ wanted).sum(0)
+        spread = (rest.text - middle).T @ share @ (rest.text - middle)
+        penalty = ridge * np.trace(spread) / SIZE * np.eye(SIZE)
+        layer = np.linalg.solve(spread + penalty, (rest.text - middle).T @ share @ (wanted - prior))
+        for text, verb, weight in zip(some.text, some.verb, some.weight, strict=True):
+            odds = np.exp(sharpness * ((text - middle) @ layer + prior))
+            total -= weight * np.log(odds[verb] / odds.sum())
+    return total
+
+
+@pytest.mark.parametrize("noun_m", [0.0, 3.0, 10.0])
+def test_shrinkage_is_the_best_on_sentences_whose_noun_was_left_out(noun_m: float) -> None:
+    known = written(TOGETHER, noun_m)
+    every = {both: left_out_loss(known, *both) for both in product(RIDGES, SHARPNESSES)}
+    assert choose_shrinkage(known) == min(every, key=lambda both: every[both])
+
+
+def test_nouns_that_say_nothing_ask_for_another_shrinkage_than_loud_ones() -> None:
+    assert choose_shrinkage(written(TOGETHER, 0.0)) != choose_shrinkage(written(TOGETHER, 10.0))
+
+
+def test_probabilities_are_as_sharp_as_was_chosen_whatever_the_length_of_features() -> None:
+    known = written(TOGETHER)
+    reading = VerbReading(SIZE, VERBS).double()
+    reading.learn(known)
+    odds = np.exp(
+        choose_shrinkage(known)[1]
+        * ((known.text - reading.mean.numpy()) @ reading.weights.numpy() + reading.offset.numpy())
+    )
+    for length in (0.1, 1.0, 30.0):
+        found = reading(torch.from_numpy(length * known.text)).numpy()
+        np.testing.assert_allclose(found, odds / odds.sum(1, keepdims=True), rtol=1e-6)
 
 
 def test_verbs_that_have_a_noun_of_their_own_cannot_be_asked_for() -> None:
@@ -110,6 +144,10 @@ def test_how_long_features_are_and_how_often_a_clip_was_recorded_change_nothing(
     longer = Sentences.of([replace(clip, text=clip.text * 7) for clip in clips])
     np.testing.assert_allclose(once.text, longer.text, rtol=1e-6)
     assert once.n_verbs == len({clip.verb for clip in clips})
+    pairs = {(clip.verb, clip.object_words) for clip in clips}
+    assert once.weight.sum() == pytest.approx(len(pairs))
+    for verb, noun in zip(once.verb, once.noun, strict=True):
+        assert once.weight[(once.verb == verb) & (once.noun == noun)].sum() == pytest.approx(1)
 
 
 def test_clips_without_verbs_tell_nothing(annotated_root: Path) -> None:
