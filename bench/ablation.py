@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -245,10 +245,13 @@ def show_rows(study: Study, names: Sequence[str], seeds: Sequence[int]) -> None:
 
 
 def parameters(train: Settings, row: Row) -> int:
-    """Of the row's diffusion network."""
-    network = load_network("diffusion")
-    settings = build_config(network.config, row.settings(train, "diffusion").get("network", {}), "params.yaml: train")
-    return sum(weight.numel() for weight in network.build(settings).parameters())
+    """That the row's diffusion network learns; the point network it sees with is the contact network's."""
+    contact, own = (
+        build_config(load_network(name).config, row.settings(train, name).get("network", {}), "params.yaml: train")
+        for name in ("contact", "diffusion")
+    )
+    built = load_network("diffusion").build(replace(own, point_net=contact.point_net))
+    return sum(weight.numel() for weight in built.parameters() if weight.requires_grad)
 
 
 if __name__ == "__main__":

@@ -65,7 +65,7 @@ class DiffusionConfig:
     told: bool = False
     hand_head: Literal["hand", "hand and object"] = "hand"
     text_input: Literal["linear", "verbs"] = "linear"
-    verbs: int = 0
+    verbs: int = 1
     condition_everywhere: bool = False
     frames_to_go: bool = False
     signal_scale: float = 1.0

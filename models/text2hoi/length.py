@@ -33,7 +33,7 @@ class LengthConfig:
     noise: int = 64
     drawn_by: Literal["noise", "spread"] = "noise"
     text_input: Literal["features", "verbs"] = "features"
-    verbs: int = 0
+    verbs: int = 1
     told: bool = False
 
 

@@ -168,6 +168,8 @@ def main() -> int:
         if given.only == str(mutant.number)
         or (not given.only.isdigit() and given.only in " ".join((mutant.file, *mutant.tests)))
     ]
+    if not chosen:
+        raise SystemExit(f"--only {given.only}: no fault has this number, nor a file or test of that name")
     for name in HEAVY:
         importlib.import_module(name)
     counts = try_all(chosen, given.jobs)
