@@ -78,7 +78,15 @@ def generate_files(asked: Asked, out: Path) -> Written:
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampler=asked.sampler)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
+    notes += _taken_for(verb, motions[0].evidence["read_as"])
     return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+
+
+def _taken_for(verb: str | None, read_as: tuple[str, float] | None) -> list[str]:
+    """That the motion is of another verb than the sentence has, in words for a person."""
+    if read_as is None or read_as[0] == verb:
+        return []
+    return [f"the sentence is taken for {read_as[0]!r} ({read_as[1]:.0%})"]
 
 
 def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Models, str]:

@@ -117,13 +117,12 @@ class Generator:
             object_words=object_words or object.name,
         )
         requests = [self._request(first, text, wish, number) for number in range(wish.samples)]
-        read_as = self._read_as(first.text)
         evidence = {
             "text": text,
-            "read_as": read_as,
+            "read_as": self._read_as(first.text),
             "seed": wish.seed,
             "hand": asdict(choice),
-            "unseen": [*self._unseen(text, verb, object_words or thing, choice.hand), *_misread(verb, read_as)],
+            "unseen": self._unseen(text, verb, object_words or thing, choice.hand),
             "trained_on": self.model.facts["datasets"],
             "synthetic": bool(self.model.facts["synthetic"]),
             "contact_threshold_m": self.model.facts["contact_threshold_m"],
@@ -179,13 +178,6 @@ class Generator:
         own = {"number": request.number, "frames": request.n_frames, "touched_points": int(motion.contact_map.sum())}
         refined, coarse = (self.model.clips([request], [motion], refined=kind)[0] for kind in (True, False))
         return GeneratedMotion(refined, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
-
-
-def _misread(verb: str | None, read_as: tuple[str, float] | None) -> list[str]:
-    """That the motion will be of another verb than the sentence has, in words for a person."""
-    if read_as is None or read_as[0] == verb:
-        return []
-    return [f"the motion is what the networks take the sentence for: {read_as[0]!r} ({read_as[1]:.0%})"]
 
 
 def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, where: Path) -> None:
