@@ -4,7 +4,7 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -69,10 +69,16 @@ def test_processes_that_die_once_each_cost_nothing(tmp_path):
 def test_a_process_that_dies_before_it_read_what_it_is_for_costs_nothing():
     """More than a pipe holds, which the parent would go on writing to nobody."""
 
+    killed, over = [], threading.Event()
+
     def kill_the_first() -> None:
-        while not (found := psutil.Process().children()) or "spawn_main" not in " ".join(found[-1].cmdline()):
-            time.sleep(0.001)
-        found[-1].kill()
+        while not killed and not over.wait(0.001):
+            # Of all children: numbers of processes start again at the largest, so the newest is not the last.
+            for child in psutil.Process().children():
+                with suppress(psutil.Error):
+                    if not killed and "spawn_main" in " ".join(child.cmdline()):
+                        child.kill()
+                        killed.append(child.pid)
 
     signal.signal(signal.SIGALRM, lambda *_: pytest.fail("waits for a process that is dead"))
     killer = threading.Thread(target=kill_the_first)
@@ -82,7 +88,9 @@ def test_a_process_that_dies_before_it_read_what_it_is_for_costs_nothing():
         assert dict(in_workers(partial(squared_beside, bytes(1 << 20)), range(4), 2)) == {0: 0, 1: 1, 2: 4, 3: 9}
     finally:
         signal.alarm(0)
+        over.set()
         killer.join()
+    assert killed
 
 
 @pytest.mark.slow
