@@ -29,8 +29,8 @@ USUAL = (0.3, 8.0)
 class Sentences:
     """The distinct sentences of clips that have a verb.
 
-    text (S, D): features, as scaled by ``scaled_text``. verb, noun (S,): numbers from 0, in the order of the words.
-    weight (S,): all pairs of verb and noun weigh the same.
+    text (S, D): features at a length of sqrt(D), as by ``scaled_text``. verb, noun (S,): numbers from 0, in the order of
+    the words. weight (S,): all pairs of verb and noun weigh the same.
     """
 
     text: np.ndarray
@@ -48,8 +48,9 @@ class Sentences:
         }
         keys, pairs = sorted(found), Counter(key[:2] for key in found)
         verb, noun = (np.unique([key[axis] for key in keys], return_inverse=True)[1] for axis in range(2))
-        text = torch.tensor(np.array([found[key] for key in keys] or np.zeros((0, 1))), dtype=torch.float64)
-        return cls(scaled_text(text).numpy(), verb, noun, np.array([1 / pairs[key[:2]] for key in keys]))
+        text = np.array([found[key] for key in keys] or np.zeros((0, 1)), dtype=np.float64)
+        text *= text.shape[1] ** 0.5 / np.maximum(np.linalg.norm(text, axis=1, keepdims=True), 1e-12)
+        return cls(text, verb, noun, np.array([1 / pairs[key[:2]] for key in keys]))
 
     @property
     def n_verbs(self) -> int:

@@ -141,6 +141,7 @@ def test_how_long_features_are_and_how_often_a_clip_was_recorded_change_nothing(
     once, again = Sentences.of(clips), Sentences.of([*clips, clips[0], clips[0]])
     np.testing.assert_array_equal(once.text, again.text)
     np.testing.assert_array_equal(once.weight, again.weight)
+    np.testing.assert_allclose(np.linalg.norm(once.text, axis=1), 512**0.5)
     longer = Sentences.of([replace(clip, text=clip.text * 7) for clip in clips])
     np.testing.assert_allclose(once.text, longer.text, rtol=1e-6)
     assert once.n_verbs == len({clip.verb for clip in clips})
