@@ -29,7 +29,7 @@ USUAL = (0.3, 8.0)
 class Sentences:
     """The distinct sentences of clips that have a verb.
 
-    text (S, D): features at a length of sqrt(D), as by ``scaled_text``. verb, noun (S,): numbers from 0, in the order of
+    text (S, D): features at a length of sqrt(D), as by ``scaled_text``. verb, noun (S,): numbers from 0, in order of
     the words. weight (S,): all pairs of verb and noun weigh the same.
     """
 
