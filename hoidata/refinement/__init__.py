@@ -1,7 +1,15 @@
 """Hands from generated keypoints, fitted and refined against the object; generated hands that hold what they touch."""
 
 from hoidata.refinement.fitting import GeneratedHand, fit_hands
-from hoidata.refinement.holding import HoldSettings, hold_hands
+from hoidata.refinement.holding import HoldSettings, hold_clip, hold_hands
 from hoidata.refinement.refining import RefinementSettings, refine_hands
 
-__all__ = ["GeneratedHand", "HoldSettings", "RefinementSettings", "fit_hands", "hold_hands", "refine_hands"]
+__all__ = [
+    "GeneratedHand",
+    "HoldSettings",
+    "RefinementSettings",
+    "fit_hands",
+    "hold_clip",
+    "hold_hands",
+    "refine_hands",
+]

@@ -3,10 +3,10 @@ to carry it.
 
 A hand is looked at in the frame of the part it touches most, where a hand that holds on is one pose. That pose, and
 corrections of the frames around it, are found by ``hold_solver``; where the hands that come out cannot carry an object
-that is in the air, fingers are drawn in from farther away.
+that is in the air, they are corrected again, with fingers drawn in from farther away.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -24,6 +24,7 @@ from hoidata.physics.standard_units import StandardUnits
 from hoidata.refinement.hold_solver import SolverSettings, corrected
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField
+from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
 
 _ALONG = 9  # places along a capsule's axis at which it is looked at
@@ -34,9 +35,9 @@ class HoldSettings:
     """near_m: a hand touches whose skin is nearer. still_m_s, carried_m_s: a touching hand slower than this on the part
     holds it, where the part is at rest, and where it moves by more than moving_m_s. least: frames of a hold. gap:
     frames between two holds that belong to one. blend: in which a hand comes to its hold, and leaves it. reach_m,
-    keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from the generated one:
-    the first of each, then the next where the hands cannot carry the object in some of air_frames frames in which it is
-    in the air. solver: the other wishes.
+    keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from where it was: the
+    first of each, then the next, on top of what came out, where those hands cannot carry the object in some of
+    air_frames frames in which it is in the air. solver: the other wishes. rest: of the object, before all that.
     """
 
     near_m: float = 0.006
@@ -47,10 +48,17 @@ class HoldSettings:
     gap: int = 12
     blend: int = 8
     carry: int = 4
-    reach_m: tuple[float, ...] = (0.003, 0.012, 0.03)
-    keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02)
+    reach_m: tuple[float, ...] = (0.003, 0.012, 0.03, 0.06)
+    keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02, 0.04)
     air_frames: int = 4
     solver: SolverSettings = field(default_factory=SolverSettings)
+    rest: RestSettings = field(default_factory=RestSettings)
+
+
+def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> Clip:
+    """The clip with its object at rest where it lay (``resting``), and hands that hold it (``hold_hands``)."""
+    clip = rest_object(clip, settings.rest)
+    return replace(clip, hands=hold_hands(pair, clip, settings))
 
 
 def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
@@ -58,27 +66,44 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
 
     A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
     """
+    load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
+    for reach, keypoint in zip(settings.reach_m, settings.keypoint_m, strict=True):
+        starts = _starts(pair, clip, settings)
+        if not starts:
+            break
+        tracks = _solved(pair, clip, starts, replace(settings.solver, reach_m=reach, keypoint_m=keypoint))
+        share = load.carried([hand_capsules(tracks[side].take(load.frames), pair[side]) for side in starts])
+        # What is tried in vain is not kept: it would only be farther from what was generated.
+        if share > most:
+            best, most = tracks, share
+        clip = replace(clip, hands=tracks)
+        if share == 1:
+            break
+    return best
+
+
+def _starts(pair: HandPair, clip: Clip, settings: HoldSettings) -> dict[Side, "_Start"]:
+    """The hands that hold something."""
     grips: dict[Side, _Grip] = {}
     for side in SIDES:
         if (grip := _grip(pair, side, clip, settings)) is not None:
             grips[side] = grip
     free = ~np.any([grip.held for grip in grips.values()], axis=0) if grips else np.zeros(0, bool)
-    starts: dict[Side, _Start] = {}
-    for side, grip in grips.items():
-        starts[side] = grip.carrying(free, settings.carry).start(clip.object, settings.blend)
-    load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
-    for reach, keypoint in zip(settings.reach_m, settings.keypoint_m, strict=True) if starts else ():
-        tracks, wishes = dict(clip.hands), replace(settings.solver, reach_m=reach, keypoint_m=keypoint)
-        for side, start in starts.items():
-            opposite: Side = "right" if side == "left" else "left"
-            other = hand_capsules(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
-            tracks[side] = start.solved(other, wishes)
-        share = load.carried([hand_capsules(tracks[side].take(load.frames), pair[side]) for side in starts])
-        if share > most:
-            best, most = tracks, share
-        if share == 1:
-            break
-    return best
+    return {
+        side: grip.carrying(free, settings.carry).start(clip.object, settings.blend) for side, grip in grips.items()
+    }
+
+
+def _solved(
+    pair: HandPair, clip: Clip, starts: Mapping[Side, "_Start"], wishes: SolverSettings
+) -> dict[Side, HandTrack]:
+    """All hands of a clip, those that hold something corrected one after the other."""
+    tracks = dict(clip.hands)
+    for side, start in starts.items():
+        opposite: Side = "right" if side == "left" else "left"
+        other = hand_capsules(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
+        tracks[side] = start.solved(other, wishes)
+    return tracks
 
 
 @dataclass(frozen=True)

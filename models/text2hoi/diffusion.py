@@ -32,6 +32,9 @@ from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.verb_reading import VerbReading
 
+# How far F_obj of an object may be, of the mean length of those in training, from the nearest of them to be that one.
+SAME_OBJECT = 0.01
+
 
 @dataclass(frozen=True)
 class DiffusionConfig:
@@ -42,9 +45,10 @@ class DiffusionConfig:
     contact_input: "map", the paper's raw numbers, "tokens", ``contact_tokens`` of each kind, or "none". scale_input,
     centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
     is read from its own token, or from the object's as well (released). object_feature: whether F_obj, the point
-    network's summary of the object, is told; of few objects it is a name. text_input: a linear layer, or "verbs", a
-    hidden layer that is told which of ``verbs`` verbs the sentence means. condition_everywhere: the condition is added
-    to every token instead of being one. frames_to_go: tokens know how far they are from the end.
+    network's summary of the object, is told; of few objects it is a name. object_dropout: share of the steps in which
+    it is not; if any, it is told of none but the ``objects`` objects in training. text_input: a linear layer, or
+    "verbs", a hidden layer that is told which of ``verbs`` verbs the sentence means. condition_everywhere: the
+    condition is added to every token instead of being one. frames_to_go: tokens know how far it is to the end.
     signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
     is to happen (Chen 2023). input_gate: how much of the noised rows is let in depends on the timestep.
     """
@@ -71,6 +75,8 @@ class DiffusionConfig:
     signal_scale: float = 1.0
     input_gate: bool = False
     condition_dropout: float = 0.1
+    object_dropout: float = 0.0
+    objects: int = 0
 
 
 @dataclass(frozen=True)
@@ -146,6 +152,9 @@ class DiffusionModel(nn.Module):
         summary = config.point_net.widths[-1] if config.object_feature else 0
         body = summary + config.points * as_map + config.scale_input + 3 * config.centroid
         self.object_condition_in = nn.Linear(body, width) if body else None
+        # A parameter, though no gradient changes it: buffers are averaged over the parts of a batch.
+        known = torch.zeros(config.objects, summary)
+        self.known_objects = nn.Parameter(known, requires_grad=False) if config.objects else None
         self.points_in = _hidden_layer(TOKEN_FEATURES, width) if config.contact_input == "tokens" else None
         self.extent_in = nn.Linear(3, width) if config.told else None
         self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
@@ -167,7 +176,7 @@ class DiffusionModel(nn.Module):
     ) -> Motion:
         """Clean hands (B, 2, K, 99) and object (B, L, 10 or 16) from noised ones at timesteps (B,).
 
-        keep: (B, 2) factors 0 or 1 of the text and object conditions, for condition dropout and guidance.
+        keep: (B, 3) factors 0 or 1 of words, touched points and the object's body, for condition dropout and guidance.
         Padding and hands that do not act neither enter nor influence anything; their outputs mean nothing.
         """
         return self.denoise(hands, objects, timesteps, self.prepare(condition), keep)
@@ -207,7 +216,19 @@ class DiffusionModel(nn.Module):
             body.append(normalised_points(condition.points_m)[1])
         if config.centroid:
             body.append(condition.points_m.mean(1))
-        return self.object_condition_in(torch.cat(body, -1))
+        return self.object_condition_in(torch.cat(body, -1)) * self._known(condition.object)
+
+    def _known(self, summary: Tensor) -> Tensor:
+        """(B, 1) 1 where the object with F_obj (B, G) was in training; all ones for a network told of every object."""
+        if self.known_objects is None:
+            return summary.new_ones(len(summary), 1)
+        apart = torch.cdist(summary, self.known_objects).amin(1, keepdim=True)
+        return (apart < SAME_OBJECT * self.known_objects.norm(dim=-1).mean()).to(summary.dtype)
+
+    def learn_objects(self, summaries: Tensor) -> None:
+        """Keeps F_obj (K, G) of the objects in training."""
+        if self.known_objects is not None:
+            self.known_objects.data.copy_(summaries)
 
     def denoise(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, known: _Prepared, keep: Tensor | None = None
@@ -243,7 +264,7 @@ class DiffusionModel(nn.Module):
         if self.config.condition_everywhere:
             moving = moving + first
         x = torch.cat((moving, first, points), 1)
-        points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:] > 0)
+        points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:2] > 0)
         mask = torch.cat((*masks, masks[-1].new_ones(len(x), 1), points_mask), 1)
         *own, body = self.encoder(x, mask, first)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
         found = [hands.new_zeros(hands[:, 0].shape)] * 2
@@ -274,7 +295,7 @@ class DiffusionModel(nn.Module):
         """The condition token (B, 1, width) and the contact tokens: Text2HOI eq. 3."""
         text, body, points = known.text, known.object, known.points
         if keep is not None:
-            text, body = text * keep[:, :1], body * keep[:, 1:]
+            text, body = text * keep[:, :1], body * keep[:, 2:]
         return (time + text + body + known.extent)[:, None], points
 
 
@@ -299,7 +320,7 @@ def guided(model: DiffusionModel, condition: Condition, guidance: float) -> Deno
     def denoise_guided(hands: Tensor, objects: Tensor, timesteps: Tensor) -> Motion:
         both = [torch.cat((x, x)) for x in (hands, objects, timesteps)]
         # Words are what is pushed; an object that is not there would be a motion of another kind altogether.
-        keep = torch.ones(2 * len(hands), 2, device=hands.device)
+        keep = torch.ones(2 * len(hands), 3, device=hands.device)
         keep[len(hands) :, 0] = 0
         found = [own.chunk(2) for own in model.denoise(both[0], both[1], both[2], doubled, keep)]
         guided_hands, guided_objects = (without + guidance * (told - without) for told, without in found)

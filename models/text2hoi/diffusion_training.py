@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
@@ -138,7 +139,7 @@ class DiffusionObjective:
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         weights, target = self.weights, self.targets.of(batch)
         steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
-        keep = torch.rand(len(batch), 2, generator=generator) >= self.network.config.condition_dropout
+        keep = self.kept(len(batch), generator)
         text = any_form(batch, generator)
         contact = self._shown(batch, text, generator)
         if weights.thin_contact:
@@ -152,6 +153,15 @@ class DiffusionObjective:
         if weights.distance_weight or weights.orientation_weight or weights.joint_weight:
             found |= self._geometry(predicted, batch, target)
         return {"total": sum((factors[name] * found[name] for name in found), torch.zeros(())), **found}
+
+    def kept(self, n: int, generator: torch.Generator) -> Tensor:
+        """(n, 3) bool: whether words, touched points and the object's body are told."""
+        config = self.network.config
+        keep = torch.rand(n, 2, generator=generator) >= config.condition_dropout
+        body = keep[:, 1:]
+        if config.object_dropout:
+            body = body & (torch.rand(n, 1, generator=generator) >= config.object_dropout)
+        return torch.cat((keep, body), 1)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
@@ -264,11 +274,17 @@ def motion_generator(checkpoint: Checkpoint) -> MotionGenerator:
 def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     contact = setup.trained["contact"].network
     assert isinstance(contact, ContactNetwork)
-    sentences = Sentences.of(setup.corpus.train)
-    network = DiffusionModel(replace(setup.network, point_net=contact.config.point_net, verbs=sentences.n_verbs))
+    train, told = setup.corpus.train, setup.network
+    sentences = Sentences.of(train if told.text_input == "verbs" else ())
+    named = told.object_feature and told.object_dropout > 0
+    points = {sample.object_key: sample.points.points_m for sample in (train if named else ())}
+    counted = {"verbs": sentences.n_verbs, "objects": len(points)}
+    network = DiffusionModel(replace(told, point_net=contact.config.point_net, **counted))
     learn_verbs(network, sentences)
     if network.object_net is not None:
         network.object_net.load_state_dict(contact.object_net.state_dict())
+        if points:
+            network.learn_objects(network.object_feature(torch.from_numpy(np.stack(list(points.values())))))
     network = network.to(setup.device)
     coded = [network.code.encode(sample) for sample in setup.corpus.train]
     normaliser = Normaliser.nothing(network.code.object_features)

@@ -1,13 +1,13 @@
 """Rivals that have all of `ours` but its networks: training clips of the prompt or the verb, held as ours are."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import HoldSettings, hold_hands
+from hoidata.refinement import HoldSettings, hold_clip
 from hoidata.settings import build_config
 from models.baselines.lookups import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, LeftOut, Sampler, Sources
@@ -29,7 +29,7 @@ class HeldLookup:
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [
-            replace(found, hands=hold_hands(self.pair, found, self.hold)) if isinstance(found, Clip) else found
+            hold_clip(self.pair, found, self.hold) if isinstance(found, Clip) else found
             for found in self.lookup.sample(requests)
         ]
 

@@ -47,7 +47,7 @@ class LengthObjective:
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:
-    sentences = Sentences.of(setup.corpus.train)
+    sentences = Sentences.of(setup.corpus.train if setup.network.text_input == "verbs" else ())
     network = LengthModel(replace(setup.network, verbs=sentences.n_verbs))
     learn_verbs(network, sentences)
     return LengthObjective(network.to(setup.device), setup.loss, setup.corpus, setup.device), None

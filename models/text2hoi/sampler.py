@@ -4,7 +4,7 @@ Everything a motion is drawn from comes from its request's seed, so it is the sa
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import HoldSettings, hold_hands
+from hoidata.refinement import HoldSettings, hold_clip
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
@@ -113,10 +113,8 @@ class Text2Hoi:
             motion_clip(request, motion.refined if refined else motion.coarse, motion.object, self.facts["synthetic"])
             for request, motion in zip(requests, motions, strict=True)
         ]
-        return [self._held(clip) for clip in found] if refined and self.refined_by == "hold" else found
-
-    def _held(self, clip: Clip) -> Clip:
-        return replace(clip, hands=hold_hands(self.pair, clip, self.config.hold))
+        held = refined and self.refined_by == "hold"
+        return [hold_clip(self.pair, clip, self.config.hold) for clip in found] if held else found
 
     @torch.no_grad()
     def motions(

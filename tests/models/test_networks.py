@@ -19,6 +19,7 @@ from models.common.transformer import Block, Encoder, TransformerConfig, packed
 from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
+from models.text2hoi.diffusion_training import DiffusionObjective
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.motion_code import MotionCodeConfig
 from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
@@ -201,6 +202,39 @@ def test_an_object_that_is_not_told_changes_nothing_but_where_it_is_touched(
 
     assert (moved_by(replace(told, object=told.object + 1)) > 1e-3) is by_feature
     assert (moved_by(replace(told, points_m=told.points_m + 0.05)) > 1e-4) is by_points
+
+
+def test_a_summary_is_told_of_no_object_but_those_in_training(batch: ClipBatch) -> None:
+    """Told of one that was never seen, it would say the name of some other object."""
+    model = diffusion_model(object_dropout=0.5, objects=1, scale_input=False, contact_input="tokens")
+    hands, objects = rows_of(batch, model)
+    steps, told = torch.tensor([10, 500, 900]), condition_of(batch, model)
+
+    def answers(known: torch.Tensor, condition: Condition) -> torch.Tensor:
+        model.learn_objects(known)
+        with torch.no_grad():
+            return model(hands, objects, steps, condition)[1]
+
+    there, elsewhere = told.object[:1], told.object[:1] + 1
+    seen = (told.object - there).norm(dim=-1) < 1e-3 * there.norm()
+    moved = (answers(there, told) - answers(elsewhere, told)).abs().amax((1, 2))
+    assert (moved > 1e-4).equal(seen)
+    untold = replace(told, object=told.object * 3)
+    assert answers(elsewhere, untold).equal(answers(elsewhere, told))
+
+
+@pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0.85, 0.95), (0.5, 0.4, 0.5), (1.0, 0.0, 0.0)])
+def test_an_objects_summary_is_left_out_in_a_share_of_the_steps(
+    annotated: AnnotatedStore, share: float, least: float, most: float
+) -> None:
+    model = diffusion_model(object_dropout=share, condition_dropout=0.1)
+    objective = DiffusionObjective.__new__(DiffusionObjective)
+    objective.network = model
+    kept = objective.kept(4000, torch.Generator().manual_seed(0)).float()
+    assert kept[:, 0].mean() == pytest.approx(0.9, abs=0.02)
+    assert kept[:, 1].mean() == pytest.approx(0.9, abs=0.02)
+    assert least <= kept[:, 2].mean() <= most
+    assert not (kept[:, 2] > kept[:, 1]).any()  # who is told of no touched points is told of no object
 
 
 def test_tokens_nobody_attends_to_change_nothing_when_they_are_left_out() -> None:

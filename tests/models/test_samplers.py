@@ -159,7 +159,7 @@ def test_guidance_is_one_call_of_twice_the_batch_and_the_condition_is_computed_o
         found = denoise(batch.hands, batch.object, steps)
     assert (sizes, len(prepared)) == ([6] * 4, 1)
     told = model(batch.hands, batch.object, steps, condition)
-    untold = model(batch.hands, batch.object, steps, condition, torch.tensor([[0.0, 1.0]]).expand(3, -1))
+    untold = model(batch.hands, batch.object, steps, condition, torch.tensor([[0.0, 1.0, 1.0]]).expand(3, -1))
     for own, with_text, without in zip(found, told, untold, strict=True):
         torch.testing.assert_close(own, without + 2.5 * (with_text - without), atol=1e-5, rtol=1e-4)
 
