@@ -223,6 +223,21 @@ def test_a_summary_is_told_of_no_object_but_those_in_training(batch: ClipBatch) 
     assert answers(elsewhere, untold).equal(answers(elsewhere, told))
 
 
+def test_a_summary_that_is_left_out_of_a_step_changes_nothing_and_touched_points_still_do(batch: ClipBatch) -> None:
+    model = diffusion_model(contact_input="tokens", scale_input=False)
+    hands, objects = rows_of(batch, model)
+    steps, told = torch.tensor([10, 500, 900]), condition_of(batch, model)
+
+    def answers(condition: Condition, keep: list[float]) -> torch.Tensor:
+        with torch.no_grad():
+            return model(hands, objects, steps, condition, torch.tensor([keep]).expand(3, -1))[1]
+
+    other, bare = replace(told, object=told.object + 1), replace(told, contact=torch.zeros_like(told.contact))
+    assert answers(other, [1.0, 1.0, 0.0]).equal(answers(told, [1.0, 1.0, 0.0]))
+    assert not answers(other, [1.0, 1.0, 1.0]).equal(answers(told, [1.0, 1.0, 1.0]))
+    assert not answers(bare, [1.0, 1.0, 0.0]).equal(answers(told, [1.0, 1.0, 0.0]))
+
+
 @pytest.mark.parametrize(("share", "least", "most"), [(0.0, 0.85, 0.95), (0.5, 0.4, 0.5), (1.0, 0.0, 0.0)])
 def test_an_objects_summary_is_left_out_in_a_share_of_the_steps(
     annotated: AnnotatedStore, share: float, least: float, most: float
