@@ -3,7 +3,8 @@
 Text2HOI Sec. 3.3 and supplement, Table S10: a Transformer over left- and right-hand tokens; the object stays. Each
 deviation is a switch, off by default: everything seen and corrected in the object's frame, where the same touch always
 looks the same; the displacement to the surface with its sign beside the attention map, without which inside and outside
-look alike; a residual that starts at zero, of whose layers only the last does, so that all learn from the first step.
+look alike; a residual that starts at zero, of whose layers only the last does, so that all learn from the first step;
+and, as the rival of the supplement's Sec. 8, a refiner that is a diffusion model.
 """
 
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES, HAND_ROTATIONS_6D, WRIST
+from hoidata.errors import BadInput
 from models.common.features import (
     hands_in_object_frame,
     hands_in_world,
@@ -22,6 +24,7 @@ from models.common.features import (
     place_points,
     proper_hands,
 )
+from models.common.sampling import TRAIN_STEPS, SamplerConfig, add_noise, alphas_cumprod, sample
 from models.common.spline import projected
 from models.common.transformer import (
     Encoder,
@@ -46,6 +49,8 @@ class RefinerConfig:
     (released). surface_input: signed distances and displacements are read too. output: the hands, or what is added to
     them; of that, one means wrist_reach_m for the wrist and rotation_reach for a 6D number. knot_frames: the output
     becomes the nearest spline with a knot every so many frames (0: stays), so that corrections never jitter.
+    noise_steps: of a refiner that is a diffusion model (Table S1): by how many of the 1,000 steps it noises coarse
+    hands before it denoises them; 0: it is none.
     """
 
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
@@ -58,6 +63,16 @@ class RefinerConfig:
     wrist_reach_m: float = 1.0
     rotation_reach: float = 1.0
     knot_frames: int = 0
+    noise_steps: int = 0
+
+
+@dataclass(frozen=True)
+class NoisedHands:
+    """What a refiner that is a diffusion model denoises: hands (B, 2, F, 99) in the frame they are seen in, at
+    timesteps (B,)."""
+
+    hands: Tensor
+    timesteps: Tensor
 
 
 @dataclass(frozen=True)
@@ -90,10 +105,15 @@ class RefinerModel(nn.Module):
 
     def __init__(self, config: RefinerConfig) -> None:
         super().__init__()
+        if not 0 <= config.noise_steps <= TRAIN_STEPS:
+            raise BadInput("refiner", f"noise_steps from 0 to {TRAIN_STEPS}", str(config.noise_steps), "set it so")
         self.config = config
         width, k = config.transformer.width, config.transformer.frames_per_token
         inputs = HAND_FEATURES + 2 * JOINT_FEATURES + (JOINT_FEATURES + 21) * config.surface_input
         inputs += 2 * config.points * config.contact_map
+        if config.noise_steps:
+            inputs += HAND_FEATURES
+            self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.hands_in = nn.ModuleList([nn.Linear(inputs * k, width) for _ in range(2)])
         self.encoder = Encoder(config.transformer)
         self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * k) for _ in range(2)])
@@ -104,16 +124,29 @@ class RefinerModel(nn.Module):
         reach[WRIST] = config.wrist_reach_m
         self.register_buffer("reach", reach, persistent=False)
 
-    def forward(self, coarse: CoarseMotion) -> Tensor:
-        """Hands that are absent, and padding, neither influence anything nor mean anything in the result."""
+    def forward(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        """In the world; ``noised`` as in :meth:`corrected`."""
+        hands = self.corrected(coarse, noised)
+        return hands_in_world(hands, coarse.object) if self.config.view == "object" else hands
+
+    def corrected(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        """Refined hands (B, 2, F, 99) in the frame they are seen in; ``noised`` is for diffusion models.
+
+        Hands that are absent, and padding, neither influence anything nor mean anything in the result.
+        """
         k, n_frames = self.config.transformer.frames_per_token, coarse.hands.shape[2]
         local = self.seen(coarse.hands, coarse.object)
-        inputs = self._inputs(coarse, local) * coarse.present[..., None]
+        inputs = self._inputs(coarse, local)
+        if noised is not None:
+            inputs = torch.cat((inputs, noised.hands), -1)
+        inputs = inputs * coarse.present[..., None]
         agents = [layer(to_tokens(inputs[:, side], k)) for side, layer in enumerate(self.hands_in)]
         tokens = torch.stack(agents, 1)
         place = torch.arange(tokens.shape[2], device=tokens.device) * k
         width = self.config.transformer.width
         tokens = tokens + sinusoid(place, width) + agent_codes(width, tokens.device)[:2, None]
+        if noised is not None:
+            tokens = tokens + self.step_in(sinusoid(noised.timesteps, width))[:, None, None]
         attention_mask = attention_mask_of(coarse.present, k).flatten(1)
         # A clip without any present hand still needs one key to attend to; its result is masked anyway.
         attention_mask[:, 0] |= ~attention_mask.any(1)
@@ -122,8 +155,7 @@ class RefinerModel(nn.Module):
         residual = torch.stack(change, 1)
         if self.config.knot_frames:
             residual = projected(residual, list(coarse.asked.counts), self.config.knot_frames)
-        hands = local + residual * self.reach if self.config.output == "residual" else residual
-        return hands_in_world(hands, coarse.object) if self.config.view == "object" else hands
+        return local + residual * self.reach if self.config.output == "residual" else residual
 
     def seen(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of the world in the frame they are seen in, beside objects (B, F, 10)."""
@@ -152,6 +184,20 @@ class RefinerModel(nn.Module):
 
 
 @torch.no_grad()
-def refine(network: RefinerModel, coarse: CoarseMotion) -> Tensor:
-    """Refined hands (B, 2, F, 99), metres, with proper rotations."""
-    return proper_hands(network(coarse))
+def refine(network: RefinerModel, coarse: CoarseMotion, noise: Tensor) -> Tensor:
+    """Refined hands (B, 2, F, 99), metres, with proper rotations.
+
+    noise: (B, 2, F, 99), which a refiner that is a diffusion model begins with and others do not look at.
+    """
+    first = network.config.noise_steps
+    if not first:
+        return proper_hands(network(coarse))
+    hands = network.seen(coarse.hands, coarse.object)
+    steps = torch.full((len(hands),), first - 1, device=hands.device)
+    noised = add_noise(hands, noise.to(hands), steps, alphas_cumprod(hands.device))
+
+    def denoise(x: Tensor, steps: Tensor) -> Tensor:
+        return network.corrected(coarse, NoisedHands(x, steps))
+
+    clean = sample(denoise, noised, SamplerConfig(), [], first)
+    return proper_hands(hands_in_world(clean, coarse.object) if network.config.view == "object" else clean)

@@ -13,10 +13,10 @@ from hoidata.batches.sight import Sight
 from models.common import losses
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
-from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
+from models.common.sampling import TRAIN_STEPS, SamplerConfig, add_noise, alphas_cumprod, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
+from models.text2hoi.refiner import CoarseMotion, NoisedHands, RefinerConfig, RefinerModel
 from models.text2hoi.surface import Surface
 
 GENERATED_AT_ONCE = 32
@@ -112,19 +112,27 @@ class RefinerObjective:
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         numbers = np.random.default_rng(generator.initial_seed()).integers(self.weights.samples, size=len(batch))
         motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, numbers, strict=True)]
-        return self._losses(self.network, self._batch(batch, motions))
+        return self._losses(self.network, self._batch(batch, motions), generator)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, RefinerModel)
-        return self._losses(network, self.held_out)["total"]
+        return self._losses(network, self.held_out, torch.Generator().manual_seed(0))["total"]
 
     def _sight(self, samples: list[ClipSample]) -> Sight:
         return Sight.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
 
-    def _losses(self, network: RefinerModel, seen: _Comparison) -> dict[str, Tensor]:
+    def _noised(self, network: RefinerModel, target: Tensor, generator: torch.Generator) -> NoisedHands | None:
+        """What a refiner that is a diffusion model learns to bring back to ``target`` (eq. 1)."""
+        if not network.config.noise_steps:
+            return None
+        steps = torch.randint(network.config.noise_steps, (len(target),), generator=generator).to(self.device)
+        noise = torch.randn(target.shape, generator=generator).to(self.device)
+        return NoisedHands(add_noise(target, noise, steps, alphas_cumprod(self.device)), steps)
+
+    def _losses(self, network: RefinerModel, seen: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
         batch, coarse, weights = seen.batch, seen.coarse, self.weights
-        refined = network(coarse)
+        refined = network(coarse, self._noised(network, seen.target, generator))
         change = (network.seen(refined, coarse.object) - seen.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
         simple = simple * change.shape[-1] if weights.weighting == "sum" else simple

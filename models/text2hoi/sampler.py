@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
@@ -165,7 +166,9 @@ class Text2Hoi:
         if surface is not None:
             network = self.trained["refiner"].network
             assert isinstance(network, RefinerModel)
-            refined = refine(network, surface.coarse(batch, coarse, objects, contact_maps, batch.hand_frames))
+            seen = surface.coarse(batch, coarse, objects, contact_maps, batch.hand_frames)
+            drawn = draw_each((MAX_FRAMES, 0), (coarse.shape[2], 0), generators)[0]
+            refined = refine(network, seen, drawn)
         parts = zip(coarse, refined, objects, contact_maps, strict=True)
         return [
             Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())

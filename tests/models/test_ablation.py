@@ -73,11 +73,11 @@ def networks_in(folder: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_rows_share_what_they_have_in_common_and_are_made_once(study: Study, capsys) -> None:
-    jobs = [("ours", 0), ("no gate", 0), ("contact by a latent", 0), ("released", 0)]
+    jobs = [("ours", 0), ("no gate", 0), ("contact by a latent", 0), ("released", 0), ("paper, a diffusion refiner", 0)]
     assert fill(study, jobs) == []
-    assert networks_in(ablation.KEPT) == ["contact"] * 3 + ["diffusion"] * 3 + ["refiner"]
+    assert networks_in(ablation.KEPT) == ["contact"] * 4 + ["diffusion"] * 4 + ["refiner"] * 2
     figures = [json.loads(study.figures_path(ROWS[name], 0).read_text()) for name, _ in jobs]
-    assert [sorted(set(one) - set(COLUMNS)) for one in figures] == [[]] * 4
+    assert [sorted(set(one) - set(COLUMNS)) for one in figures] == [[]] * 5
     assert all({"joint_error_mm", "jitter_m_s3"} <= set(one) for one in figures)
     made = {path: path.stat().st_mtime_ns for path in ablation.KEPT.glob("*.json")}
     assert fill(study, jobs) == []

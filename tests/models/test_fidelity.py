@@ -24,7 +24,7 @@ from models.text2hoi.contact_config import ContactLossConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective, feature_shares
 from models.text2hoi.length import LengthModel, length_error
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, attention_map
+from models.text2hoi.refiner import CoarseMotion, NoisedHands, RefinerConfig, RefinerModel, attention_map
 from models.text2hoi.refiner_training import RefinerObjective
 from models.text2hoi.surface import Surface
 from pipelines.stages.base import load_settings
@@ -272,25 +272,57 @@ class Exact(MotionGenerator):
 class Off(RefinerModel):
     """A refiner that adds 0.001 to every number."""
 
-    def forward(self, coarse: CoarseMotion) -> Tensor:
+    def forward(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
         return coarse.hands + 0.001
 
 
-def test_the_refiners_losses_follow_equations_8_and_9(annotated: AnnotatedStore) -> None:
-    """Eq. 9 in the hands' 99 numbers, summed; eq. 8 with lambda_1 = 5."""
+def refiner_objective(network: RefinerModel, annotated: AnnotatedStore) -> RefinerObjective:
+    """On coarse motions that are the recorded ones."""
     corpus, hands = Corpus.of(annotated, 0), Hands(load_embedded_hands())
     generator = Exact(
         DiffusionModel(DiffusionConfig(transformer=TransformerConfig(16, 1, 2, 16))), Normaliser.nothing()
     )
     surface = Surface.of(hands, [clip.object_model for clip in (*corpus.train, *corpus.held_out)], 24, CPU)
-    network = Off(replace(plan("refiner").network, transformer=TransformerConfig(16, 1, 2, 16)))
     weights = replace(plan("refiner").loss, samples=1)
-    made = RefinerObjective(network, weights, corpus, generator, surface, CPU, 0)
-    found = made._losses(network, made.held_out)
+    return RefinerObjective(network, weights, corpus, generator, surface, CPU, 0)
+
+
+def test_the_refiners_losses_follow_equations_8_and_9(annotated: AnnotatedStore) -> None:
+    """Eq. 9 in the hands' 99 numbers, summed; eq. 8 with lambda_1 = 5."""
+    network = Off(replace(plan("refiner").network, transformer=TransformerConfig(16, 1, 2, 16)))
+    made = refiner_objective(network, annotated)
+    found = made._losses(network, made.held_out, torch.Generator())
     assert float(found["simple"]) == pytest.approx(99 * 0.001**2, rel=1e-3)
     assert float(found["contact"]) > 0
     parts = found["simple"] + found["penetration"] + 5 * found["contact"]
     assert float(found["total"]) == pytest.approx(float(parts), rel=1e-6)
+
+
+class Listener(Off):
+    """A refiner that keeps what it is told to denoise."""
+
+    heard: list[NoisedHands]
+
+    def forward(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        assert noised is not None
+        self.heard.append(noised)
+        return super().forward(coarse)
+
+
+def test_a_diffusion_refiner_learns_from_recorded_hands_noised_as_in_equation_1(annotated: AnnotatedStore) -> None:
+    network = Listener(RefinerConfig(transformer=TransformerConfig(16, 1, 2, 16), noise_steps=300))
+    network.heard = []
+    made = refiner_objective(network, annotated)
+    for seed in range(40):
+        made._losses(network, made.held_out, torch.Generator().manual_seed(seed))
+    steps = torch.stack([noised.timesteps for noised in network.heard])
+    assert 0 <= int(steps.min()) < 30
+    assert 270 < int(steps.max()) < 300
+    share = alphas_cumprod()[steps][:, :, None, None, None]
+    hands = torch.stack([noised.hands for noised in network.heard])
+    noise = (hands - share.sqrt() * made.held_out.target) / (1 - share).sqrt()
+    assert float(noise.mean()) == pytest.approx(0, abs=0.02)
+    assert float(noise.std()) == pytest.approx(1, abs=0.02)
 
 
 def test_the_refiner_reads_the_2273_numbers_of_section_12(seen: ClipBatch) -> None:

@@ -22,7 +22,7 @@ from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.diffusion_training import DiffusionObjective
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.motion_code import MotionCodeConfig
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
+from models.text2hoi.refiner import CoarseMotion, NoisedHands, RefinerConfig, RefinerModel, refine
 from models.text2hoi.surface import Surface
 
 SMALL = TransformerConfig(
@@ -327,10 +327,63 @@ def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
     torch.nn.init.normal_(model.hands_out[0].weight, std=0.1)
     torch.nn.init.normal_(model.hands_out[1].weight, std=0.1)
     coarse = coarse_of(batch)
-    noise = torch.randn(coarse.hands.shape, generator=torch.Generator().manual_seed(0))
+    noise = noise_like(coarse, 0)
     other = replace(coarse, hands=torch.where(coarse.present[..., None], coarse.hands, noise))
     with torch.no_grad():
         assert torch.equal(model(coarse)[batch.present], model(other)[batch.present])
+
+
+class Certain(RefinerModel):
+    """A refiner that takes every hand for the same, and keeps what it was to denoise."""
+
+    clean: Tensor
+    heard: list[NoisedHands]
+
+    def corrected(self, coarse: CoarseMotion, noised: NoisedHands | None = None) -> Tensor:
+        assert noised is not None
+        self.heard.append(noised)
+        return self.clean.expand_as(noised.hands)
+
+
+@pytest.mark.parametrize("view", ["world", "object"])
+def test_a_diffusion_refiner_walks_from_noised_coarse_hands_to_clean_ones(
+    batch: ClipBatch, view: Literal["world", "object"]
+) -> None:
+    model = Certain(RefinerConfig(SMALL, view=view, noise_steps=400))
+    model.clean, model.heard = batch.hands[0, 0, 0], []
+    coarse = coarse_of(batch)
+    noise = noise_like(coarse, 0)
+    refined = refine(model, coarse, noise)
+    steps = [int(noised.timesteps[0]) for noised in model.heard]
+    assert (steps[0], len(steps)) == (399, 20)
+    assert steps == sorted(steps, reverse=True)
+    share = alphas_cumprod()[399]
+    begun = share.sqrt() * model.seen(coarse.hands, coarse.object) + (1 - share).sqrt() * noise
+    torch.testing.assert_close(model.heard[0].hands, begun)
+    seen = model.seen(refined, coarse.object)[batch.present]
+    torch.testing.assert_close(seen, model.clean.expand_as(seen), atol=1e-5, rtol=0)
+
+
+def test_a_diffusion_refiner_reads_the_noised_hands_and_their_timestep_and_no_other_does(batch: ClipBatch) -> None:
+    torch.manual_seed(0)
+    model, coarse = RefinerModel(RefinerConfig(SMALL, noise_steps=400)).eval(), coarse_of(batch)
+    steps = torch.full((len(batch),), 10)
+    told = [
+        NoisedHands(coarse.hands, steps),
+        NoisedHands(coarse.hands + 0.1, steps),
+        NoisedHands(coarse.hands, steps * 9),
+    ]
+    found = [model(coarse, noised)[batch.present] for noised in told]
+    assert not torch.allclose(found[0], found[1])
+    assert not torch.allclose(found[0], found[2])
+    plain = RefinerModel(RefinerConfig(SMALL))
+    assert torch.equal(refine(plain, coarse, noise_like(coarse, 0)), refine(plain, coarse, noise_like(coarse, 1)))
+    with pytest.raises(BadInput, match="noise_steps from 0 to 1000"):
+        RefinerModel(RefinerConfig(SMALL, noise_steps=1001))
+
+
+def noise_like(coarse: CoarseMotion, seed: int) -> Tensor:
+    return torch.randn(coarse.hands.shape, generator=torch.Generator().manual_seed(seed))
 
 
 def test_noise_is_mixed_as_in_the_papers_first_equation() -> None:
