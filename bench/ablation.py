@@ -133,16 +133,16 @@ LESS: Mapping[str, Row] = {
     "contact of the last step": Row(changed={"contact": {"training": {"keep_best": False}}}),
 }
 PAPERS: Mapping[str, Row] = {
-    "paper, no codes": Row("paper", {"diffusion": {"network": {"codes": "none"}}}),
-    "paper, codes of frames alone": Row("paper", {"diffusion": {"network": {"codes": "frames"}}}),
-    "paper, no eq. 6": _loss("paper", distance_weight=0.0),
-    "paper, no eq. 7": _loss("paper", orientation_weight=0.0),
-    "paper, no contact": Row("paper", {"diffusion": {"network": {"contact_input": "none"}}}),
-    "paper, no scale": Row("paper", {"diffusion": {"network": {"scale_input": False}}}),
-    "paper, no eq. 10": Row("paper", {"refiner": {"loss": {"penetration_weight": 0.0}}}),
-    "paper, no eq. 11": Row("paper", {"refiner": {"loss": {"contact_weight": 0.0}}}),
+    "paper: no codes": Row("paper", {"diffusion": {"network": {"codes": "none"}}}),
+    "paper: codes of frames alone": Row("paper", {"diffusion": {"network": {"codes": "frames"}}}),
+    "paper: no eq. 6": _loss("paper", distance_weight=0.0),
+    "paper: no eq. 7": _loss("paper", orientation_weight=0.0),
+    "paper: no contact": Row("paper", {"diffusion": {"network": {"contact_input": "none"}}}),
+    "paper: no scale": Row("paper", {"diffusion": {"network": {"scale_input": False}}}),
+    "paper: no eq. 10": Row("paper", {"refiner": {"loss": {"penetration_weight": 0.0}}}),
+    "paper: no eq. 11": Row("paper", {"refiner": {"loss": {"contact_weight": 0.0}}}),
     # The paper does not say how far the diffusion refiner noises; half way keeps the course of the coarse motion.
-    "paper, a diffusion refiner": Row("paper", {"refiner": {"network": {"noise_steps": 500}}}),
+    "paper: a diffusion refiner": Row("paper", {"refiner": {"network": {"noise_steps": 500}}}),
 }
 ROWS: Mapping[str, Row] = {"ours": Row(), "paper": Row("paper"), "released": Row("released"), **LESS, **PAPERS}
 

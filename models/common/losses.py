@@ -21,20 +21,17 @@ def simple_loss(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     return masked_mean((predicted - target).square(), mask[..., None])
 
 
-def distance_map_loss(
-    joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor, scale_m: float
-) -> Tensor:
-    """Eq. 6: squared error of the joint-to-point distances listed in the truth, in units of ``scale_m``.
+def distance_map_loss(joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor) -> Tensor:
+    """Eq. 6: squared error of the joint-to-point distances listed in the truth, in metres.
 
     joints_m (B, 2, F, 21, 3), points_m (B, F, 1024, 3), entries (entry, 5): clip, side, frame, joint, point.
-    scale_m: the threshold below which they are listed (``ClipBatch.contact_threshold_m``).
     """
     if not len(entries):
         return joints_m.sum() * 0
     clip, side, frame, joint, point = entries.unbind(1)
     apart = joints_m[clip, side, frame, joint] - points_m[clip, frame, point]
     predicted = (apart.square().sum(-1) + 1e-10).sqrt()
-    return ((predicted - distance_m) / scale_m).square().mean()
+    return (predicted - distance_m).square().mean()
 
 
 def joint_loss(joints_m: Tensor, true_m: Tensor, mask: Tensor, weight: Tensor, scale_m: float = 0.01) -> Tensor:

@@ -10,13 +10,12 @@ from torch.nn import functional
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from models.common.features import scaled_text
 from models.common.point_net import PointLayer, PointNet, normalised_points
-from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
+from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 
 
 class ContactModel(nn.Module):
-    """Contact probability of every point, given points, scale, sentence and hand flags."""
+    """Contact probability of every point, given points, scale and sentence."""
 
     def __init__(self, config: ContactConfig) -> None:
         super().__init__()
@@ -32,10 +31,9 @@ class ContactModel(nn.Module):
             nn.Linear(heads[1], 2 * config.latent),
         )
         first, second, third = config.decoder_widths
-        more = (3, HAND_FLAGS) if config.told else (0, 0)
         # Table S6's first layer, which sees the same numbers of a clip at each point, in two pieces.
-        self.from_point = nn.Linear(local + more[0], first)
-        self.from_clip = nn.Linear(overall + 1 + config.text + more[1] + config.latent, first, bias=False)
+        self.from_point = nn.Linear(local, first)
+        self.from_clip = nn.Linear(overall + 1 + config.text + config.latent, first, bias=False)
         self.rest = nn.Sequential(
             nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
@@ -52,28 +50,25 @@ class ContactModel(nn.Module):
         mean, log_variance = self.to_latent(overall).chunk(2, -1)
         return mean, log_variance.clamp(-8, 4)
 
-    def decode(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latent: Tensor) -> Tensor:
-        """Logits (B, N) from points (B, N, 3), sentence (B, text), hand flags (B, 2) and z (B, latent)."""
+    def decode(self, points_m: Tensor, text: Tensor, latent: Tensor) -> Tensor:
+        """Logits (B, N) from points (B, N, 3), sentence (B, text) and z (B, latent)."""
         points, scale = normalised_points(points_m)
         overall, local = self.object_net(points)
-        text = scaled_text(text) if self.config.text_scaled else text
-        flags, places = ([active_hands.float()], [points]) if self.config.told else ([], [])
-        clip = torch.cat((overall, scale, text, *flags, latent), -1)
-        mixed = self.from_point(torch.cat((local, *places), -1)) + self.from_clip(clip)[:, None]
-        return self.rest(mixed)[..., 0]
+        clip = torch.cat((overall, scale, text, latent), -1)
+        return self.rest(self.from_point(local) + self.from_clip(clip)[:, None])[..., 0]
 
     def forward(
-        self, points_m: Tensor, text: Tensor, active_hands: Tensor, contact_map: Tensor, noise: Tensor
+        self, points_m: Tensor, text: Tensor, contact_map: Tensor, noise: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Training pass: logits (B, N), mean and log-variance of z; noise (B, latent) for the reparameterisation."""
         mean, log_variance = self.encode(normalised_points(points_m)[0], contact_map)
         latent = mean + (0.5 * log_variance).exp() * noise
-        return self.decode(points_m, text, active_hands, latent), mean, log_variance
+        return self.decode(points_m, text, latent), mean, log_variance
 
     @torch.no_grad()
     def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
         """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I)."""
-        maps = torch.stack([self.decode(points_m, text, active_hands, z).sigmoid() for z in latents], 1)
+        maps = torch.stack([self.decode(points_m, text, z).sigmoid() for z in latents], 1)
         return maps[:, :, None] * active_hands[:, None, :, None]
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
@@ -84,9 +79,8 @@ class ContactModel(nn.Module):
 def contact_loss(
     logits: Tensor, contact_map: Tensor, mean: Tensor, log_variance: Tensor, weights: ContactLossConfig
 ) -> dict[str, Tensor]:
-    """Cross-entropy, Dice (per clip) and KL divergence to N(0, I) per latent, as named parts and their "total"."""
-    cross = functional.binary_cross_entropy_with_logits(logits, contact_map)
-    cross = cross * logits.shape[1] if weights.reduction == "sum" else cross
+    """Summed cross-entropy, Dice (per clip) and KL divergence to N(0, I) per latent, by name, and their "total"."""
+    cross = functional.binary_cross_entropy_with_logits(logits, contact_map) * logits.shape[1]
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact_map).sum(1) + 1) / (probability.sum(1) + contact_map.sum(1) + 1)
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()

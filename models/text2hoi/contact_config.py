@@ -12,10 +12,9 @@ HAND_FLAGS = 2
 class ContactConfig:
     """Sizes; the defaults are the paper's.
 
-    encoder_dropout: before the last layer of z's encoder. text_scaled: sentence features at a length of sqrt(512), not
-    as the encoder gives them. told: what the decoder knows beside Table S6: the points' places, and which hands act.
-    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or anchors,
-    touched points of each hand drawn one after the other (``anchored_contact``), which gives a map for each.
+    encoder_dropout: before the last layer of z's encoder. drawn_by: what a sample is drawn by: the paper's Gaussian
+    latent, which gives one map for both hands, or anchors, touched points of each hand drawn one after the other
+    (``anchored_contact``), which gives a map for each.
     """
 
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
@@ -24,23 +23,19 @@ class ContactConfig:
     text: int = 512
     dropout: float = 0.0
     encoder_dropout: float = 0.0
-    text_scaled: bool = False
-    told: bool = False
     drawn_by: Literal["latent", "anchor"] = "latent"
     anchors: int = 4
 
 
 @dataclass(frozen=True)
 class ContactLossConfig:
-    """Weights of KL divergence, Dice term, and the cross-entropy of anchors, beside the mean cross-entropy.
+    """Weights of KL divergence, Dice term, and the cross-entropy of anchors, beside a map's cross-entropy.
 
-    reduction: the cross-entropy of a map is the sum over its points, or their mean. augment: turn and scale objects.
-    points: how many points of every object a step sees, drawn anew each time.
+    augment: turn and scale objects. points: how many points of every object a step sees, drawn anew each time.
     """
 
     kl_weight: float = 1.0
     dice_weight: float = 1.0
     touch_weight: float = 0.1
-    reduction: Literal["sum", "mean"] = "sum"
     augment: bool = False
     points: int = 1024

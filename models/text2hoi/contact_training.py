@@ -38,7 +38,7 @@ class ContactObjective:
         assert isinstance(network, ContactModel)
         contact_map = batch.contact_map[:, some]
         noise = torch.randn(len(batch), network.config.latent, generator=generator).to(self.device)
-        logits, mean, log_variance = network(points, text, batch.active_hands, contact_map, noise)
+        logits, mean, log_variance = network(points, text, contact_map, noise)
         return contact_loss(logits, contact_map, mean, log_variance, self.weights)
 
     @torch.no_grad()

@@ -43,7 +43,7 @@ class DiffusionLossConfig:
     """Weights beside the simple loss (1): eq. 6 and eq. 7. frames: how many of a clip they see; entries: of eq. 6.
 
     contact: the map a motion is shown: drawn from the contact network, as in use, or the clip's own (released).
-    distance_unit: of eq. 6's distances. weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
+    weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
     mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
     the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
     ``touch_weight`` more. thin_contact: each clip is shown a share of its touched points, as a drawn contact map may be
@@ -55,7 +55,6 @@ class DiffusionLossConfig:
     frames: int = 8
     entries: int = 8192
     contact: Literal["estimated", "recorded"] = "estimated"
-    distance_unit: Literal["metre", "threshold"] = "metre"
     weighting: Literal["sum", "even", "grouped"] = "sum"
     velocity_weight: float = 0.0
     joint_weight: float = 0.0
@@ -232,9 +231,8 @@ class DiffusionObjective:
         hands = code.in_world(own, moved)
         if weights.distance_weight:
             joints, points = self.hands.joints(hands, batch.betas, batch.template_m), place_points(batch, moved)
-            scale_m = batch.contact_threshold_m if weights.distance_unit == "threshold" else 1.0
             given = batch.entries, batch.entry_distance_m
-            found["distance_map"] = losses.distance_map_loss(joints, points, *given, scale_m)
+            found["distance_map"] = losses.distance_map_loss(joints, points, *given)
         if weights.orientation_weight:
             true = losses.take_frames(batch.hands, chosen, 2), losses.take_frames(batch.object, chosen, 1)
             turns = [rot6d_to_rotmat(part[..., GLOBAL_ORIENT_6D]) for part in (hands, true[0])]

@@ -53,6 +53,14 @@ def test_a_row_differs_from_ours_in_its_switch_alone(name: str) -> None:
     assert len(changed) == 1 or name in ("no splines", "norm after each half")
 
 
+def test_all_rows_are_made_where_none_is_named(study: Study, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(Study, "here", lambda: study)
+    monkeypatch.setenv("HOIDATA_BENCH_MINUTES", "-1")
+    ablation.main()
+    left_out = capsys.readouterr().out.rpartition("makes them: ")[2]
+    assert all(f"{name} {seed}" in left_out for name in ROWS for seed in range(3))
+
+
 @pytest.mark.parametrize("name", ROWS)
 def test_a_row_has_as_many_parameters_within_a_quarter(name: str) -> None:
     assert 0.75 <= parameters(TRAIN, ROWS[name]) / parameters(TRAIN, Row()) <= 1.25
@@ -73,7 +81,7 @@ def networks_in(folder: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_rows_share_what_they_have_in_common_and_are_made_once(study: Study, capsys) -> None:
-    jobs = [("ours", 0), ("no gate", 0), ("contact by a latent", 0), ("released", 0), ("paper, a diffusion refiner", 0)]
+    jobs = [("ours", 0), ("no gate", 0), ("contact by a latent", 0), ("released", 0), ("paper: a diffusion refiner", 0)]
     assert fill(study, jobs) == []
     assert networks_in(ablation.KEPT) == ["contact"] * 4 + ["diffusion"] * 4 + ["refiner"] * 2
     figures = [json.loads(study.figures_path(ROWS[name], 0).read_text()) for name, _ in jobs]

@@ -38,7 +38,7 @@ def test_the_entries_of_chosen_frames_are_the_distances_there(batch: ClipBatch) 
     )
     points = place_points(seen, objects)
     assert len(seen.entries) > 0
-    assert float(losses.distance_map_loss(joints, points, seen.entries, seen.entry_distance_m, 0.02)) < 1e-6
+    assert float(losses.distance_map_loss(joints, points, seen.entries, seen.entry_distance_m)) < 1e-9
 
 
 def test_penetration_counts_only_what_is_inside() -> None:
@@ -93,15 +93,15 @@ def test_a_field_turns_the_moving_part_with_the_hinge(batch: ClipBatch, hands: H
 
 
 def test_distance_map_loss_by_hand() -> None:
-    """A joint of the right hand is 5 cm from a point where 2 cm are asked for: (3 cm / 2 cm)^2; the other one fits."""
+    """A joint of the right hand is 5 cm from a point where 2 cm are asked for; the other one fits."""
     joints, points = torch.zeros(1, 2, 1, 21, 3), torch.zeros(1, 1, 3, 3)
     joints[0, 1, 0, 2] = torch.tensor([0.03, 0.0, 0.0])
     points[0, 0, 1] = torch.tensor([0.0, 0.04, 0.0])
     joints[0, 0, 0, 2] = torch.tensor([0.0, 0.05, 0.0])
     entries = torch.tensor([[0, 1, 0, 2, 1], [0, 0, 0, 2, 1]])
-    found = losses.distance_map_loss(joints, points, entries, torch.tensor([0.02, 0.01]), scale_m=0.02)
-    assert float(found) == pytest.approx(2.25 / 2, rel=1e-4)
-    assert float(losses.distance_map_loss(joints, points, entries[:0], torch.zeros(0), scale_m=0.02)) == 0
+    found = losses.distance_map_loss(joints, points, entries, torch.tensor([0.02, 0.01]))
+    assert float(found) == pytest.approx(0.03**2 / 2, rel=1e-4)
+    assert float(losses.distance_map_loss(joints, points, entries[:0], torch.zeros(0))) == 0
 
 
 def test_relative_orientation_by_hand() -> None:
@@ -147,9 +147,9 @@ def test_length_and_contact_losses_by_hand() -> None:
     wider = length_loss(torch.tensor([0.5]), torch.tensor([1.0]), torch.tensor([150]))
     assert float(wider["likelihood"]) == pytest.approx(1 + 0.125 * np.exp(-2))
     logits, touched, latent = torch.full((1, 4), 20.0), torch.tensor([[1.0, 1, 0, 0]]), torch.ones(1, 2)
-    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig(reduction="mean"))
-    # Everything is called touched: 1 - (2 x 2 + 1) / (4 + 2 + 1); half of points wrong by 20; two latents of mean 1.
-    expected = [1 - 5 / 7, 10.0, 1.0]
+    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig())
+    # Everything is called touched: 1 - (2 x 2 + 1) / (4 + 2 + 1); two points wrong by 20; two latents of mean 1.
+    expected = [1 - 5 / 7, 40.0, 1.0]
     assert [float(found[name]) for name in ("dice", "cross_entropy", "kl")] == pytest.approx(expected, rel=1e-4)
     narrow = contact_loss(logits, touched, 0 * latent, -latent, ContactLossConfig())
     assert float(narrow["kl"]) == pytest.approx(np.exp(-1))

@@ -46,7 +46,6 @@ def coarse_of(batch: ClipBatch) -> CoarseMotion:
     return surface.coarse(batch, batch.hands, batch.object, batch.contact_map, batch.present)
 
 
-MEAN = ContactLossConfig(kl_weight=0.01, reduction="mean")
 SWITCHES = {
     "paper": {},
     "tokens of frames": {"transformer": replace(SMALL, frames_per_token=5)},
@@ -411,12 +410,12 @@ def two_clips(batch: ClipBatch) -> ClipBatch:
 def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
     torch.manual_seed(0)
     two = two_clips(batch)
-    model = ContactModel(ContactConfig(POINT_NET, (32, 32, 16), 4, told=True, text_scaled=True))
+    model = ContactModel(ContactConfig(POINT_NET, (32, 32, 16), 4))
     noise = torch.randn(2, 4, generator=torch.Generator().manual_seed(0))
 
     def loss() -> Tensor:
-        logits, mean, spread = model(two.points_m, two.text[:, 0], two.active_hands, two.contact_map, noise)
-        return contact_loss(logits, two.contact_map, mean, spread, MEAN)["total"]
+        logits, mean, spread = model(two.points_m, two.text[:, 0], two.contact_map, noise)
+        return contact_loss(logits, two.contact_map, mean, spread, ContactLossConfig())["total"]
 
     fitted(model.parameters(), loss, 60, 1e-2)
     model.eval()

@@ -227,7 +227,7 @@ def test_imported_networks_answer_as_the_published_ones_would(
     noised[1][..., numbers:] = 0
     steps = torch.tensor([0, 400, 999])
     with torch.no_grad():
-        logits = read.network.decode(batch.points_m, given[0], batch.active_hands, given[1])  # pyright: ignore[reportCallIssue]
+        logits = read.network.decode(batch.points_m, *given)  # pyright: ignore[reportCallIssue]
         feature = denoiser.network.object_feature(batch.points_m)  # pyright: ignore[reportCallIssue]
         condition = Condition.of(batch, feature, given[0], batch.contact)
         hands, objects = denoiser.network(*[torch.from_numpy(part).float() for part in noised], steps, condition)
