@@ -44,14 +44,7 @@ from pipelines.params import laid_over, read_params
 from pipelines.stages.tables import mean_and_spread
 
 KEPT = Path(".hoidata/ablation")
-CODE = (
-    "bench/ablation.py",
-    "models/common",
-    "models/text2hoi",
-    "hoidata/batches",
-    "hoidata/metrics",
-    "hoidata/refinement",
-)
+CODE = ("bench/ablation.py", "models/common", "models/text2hoi", "hoidata")
 CLIPS, SAMPLES = 96, 2
 Settings = Mapping[str, Any]
 COLUMNS = {
@@ -97,7 +90,7 @@ def _loss(preset: Literal["ours", "paper"] = "ours", **changed: Any) -> Row:
     return Row(preset, {"diffusion": {"loss": changed}})
 
 
-# One switch each, set as the paper has it; what cannot stand without it goes with it.
+# One switch each, set as the paper has it, or otherwise where the name says so; what cannot stand with it goes too.
 LESS: Mapping[str, Row] = {
     "no splines": _motion(knot_frames=0, object_knots=1),
     "as many knots of the object": _motion(object_knots=1),
@@ -111,11 +104,11 @@ LESS: Mapping[str, Row] = {
     "no gate": _network(input_gate=False),
     "not normalised": _network(normalised=False),
     "hands and length not told": _network(told=False),
-    "contact as a map": _network(contact_input="map"),
+    "contact as a map": _network(contact_input="map", object_dropout=0.0),
     "features of the sentence": _network(text_input="linear"),
     "object's feature never told": _network(object_feature=False),
     "object's feature always told": _network(object_dropout=0.0),
-    "object's size told": _network(scale_input=True),
+    "object's size told": _network(scale_input=True, object_dropout=0.0),
     "condition in its own token": _network(condition_everywhere=False),
     "end not told": _network(frames_to_go=False),
     "signal as large as noise": _network(signal_scale=1.0),
@@ -141,7 +134,7 @@ PAPERS: Mapping[str, Row] = {
     "paper: no scale": Row("paper", {"diffusion": {"network": {"scale_input": False}}}),
     "paper: no eq. 10": Row("paper", {"refiner": {"loss": {"penetration_weight": 0.0}}}),
     "paper: no eq. 11": Row("paper", {"refiner": {"loss": {"contact_weight": 0.0}}}),
-    # The paper does not say how far the diffusion refiner noises; half way keeps the course of the coarse motion.
+    # The paper does not say how far the diffusion refiner noises.
     "paper: a diffusion refiner": Row("paper", {"refiner": {"network": {"noise_steps": 500}}}),
 }
 ROWS: Mapping[str, Row] = {"ours": Row(), "paper": Row("paper"), "released": Row("released"), **LESS, **PAPERS}

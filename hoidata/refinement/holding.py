@@ -73,7 +73,7 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
             break
         tracks = _solved(pair, clip, starts, replace(settings.solver, reach_m=reach, keypoint_m=keypoint))
         share = load.carried([hand_capsules(tracks[side].take(load.frames), pair[side]) for side in starts])
-        # What is tried in vain is not kept: it would only be farther from what was generated.
+        # A try that carries no more than the best so far is no answer, but the next one goes on from it.
         if share > most:
             best, most = tracks, share
         clip = replace(clip, hands=tracks)

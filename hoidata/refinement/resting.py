@@ -1,13 +1,13 @@
-"""An object not yet taken, or put down again, lies on what it lay on at first, and is never under it.
+"""An object not yet taken, or put down where it lay, lies as high as at first, and does not pass through the table.
 
 Generated objects come back some millimetres too high or too low, or pass through the table on the way. All that is in
-the frame is moved up or down together, so nothing changes between hands and object.
+the frame is moved up or down together, so nothing changes between hands and object. An object that ends elsewhere, and
+on its way is far below where it lay, was put down on something lower.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d
 
 from hoidata.clips.clip import FPS, Clip
 from hoidata.physics.scene import object_scene
@@ -17,14 +17,16 @@ _ENOUGH = 500  # vertices tell whether a rigid body moves
 
 @dataclass(frozen=True)
 class RestSettings:
-    """still_m_s: an object slower than this at the clip's ends is at rest there. level_m: nearer than this to its
-    first height it is meant to lie where it lay; farther, it was put down elsewhere. smooth: frames, odd, over which
-    an object that passes through the table is lifted.
+    """still_m_s, drift_m: an object that is slower at the clip's ends, and as high within this, is at rest.
+    level_m: nearer than this to its first height it is meant to lie where it lay; farther, it was put down elsewhere,
+    and if it was ever that far below, it stays there. fade: frames in which an object that was raised before it was
+    taken, and is put down elsewhere, comes back to its own height.
     """
 
     still_m_s: float = 0.03
+    drift_m: float = 0.01
     level_m: float = 0.03
-    smooth: int = 11
+    fade: int = 11
 
 
 def rest_object(clip: Clip, settings: RestSettings = RestSettings()) -> Clip:
@@ -36,41 +38,39 @@ def rest_object(clip: Clip, settings: RestSettings = RestSettings()) -> Clip:
         return clip
     scene = object_scene(clip)
     some = 1 + scene.vertices_m.shape[1] // _ENOUGH
-    first, last = _at_rest(scene.vertices_m[:, ::some], settings.still_m_s)
+    speed = np.linalg.norm(np.diff(scene.vertices_m[:, ::some], axis=0), axis=-1).max(axis=1) * FPS
+    still, lowest_m = speed <= settings.still_m_s, scene.lowest_m
+    first, last = (_resting(*ends, settings.drift_m) for ends in ((still, lowest_m), (still[::-1], lowest_m[::-1])))
     if not first:
         return clip
-    return _raised(clip, -clip.gravity * _rises(scene.lowest_m, first, last, settings)[:, None])
+    return _raised(clip, -clip.gravity * _rises(lowest_m, first, last, settings)[:, None])
 
 
-def _at_rest(vertices_m: np.ndarray, still_m_s: float) -> tuple[int, int]:
-    """How many frames of (frame, vertex, 3) at the start, and at the end, the object has not been moved in."""
-    speed = np.linalg.norm(np.diff(vertices_m, axis=0), axis=-1).max(axis=1) * FPS
-    moving = np.append(speed > still_m_s, True)
-    return int(moving.argmax()), int(np.append(moving[-2::-1], True).argmax())
+def _resting(still: np.ndarray, lowest_m: np.ndarray, drift_m: float) -> int:
+    """How many frames from the first on an object lies; still (frame - 1,): it does not move to the next one."""
+    near = np.abs(lowest_m[:-1] - lowest_m[0]) < drift_m
+    return int(np.append(still & near, False).argmin())
 
 
 def _rises(lowest_m: np.ndarray, first: int, last: int, settings: RestSettings) -> np.ndarray:
     """(frame,) metres to raise: to the first height at both ends, and between them as far as it is below."""
     n_frames, too_low = len(lowest_m), lowest_m[0] - lowest_m
-    rises = np.zeros(n_frames)
-    rises[:first] = too_low[:first]
-    stop = n_frames - last
+    rises, stop = np.zeros(n_frames), n_frames - last
     level = last > 0 and np.abs(too_low[stop:]).max() < settings.level_m
+    rises[:first] = too_low[:first]
     if level:
         rises[stop:] = too_low[stop:]
-        u = np.arange(1, stop - first + 1) / (stop - first + 1)
-        rises[first:stop] = rises[first - 1] + u * u * (3 - 2 * u) * (rises[stop] - rises[first - 1])
+    end = rises[stop] if level else 0.0
+    way = stop - first if level else min(settings.fade, n_frames - first)
+    share = _smooth(np.arange(1, way + 1) / (way + 1))
+    rises[first : first + way] = rises[first - 1] + share * (end - rises[first - 1])
     below = np.maximum(too_low - rises, 0)
-    if level or below.max() < settings.level_m:
-        rises += _covering(below, settings.smooth)
-    return rises
+    return rises if not level and below.max() >= settings.level_m else rises + below
 
 
-def _covering(values: np.ndarray, width: int) -> np.ndarray:
-    """Smooth values, nowhere less than ``values``: the largest of each ``width`` frames, averaged over as many."""
-    half, window = width // 2, np.hanning(width + 2)[1:-1]
-    largest = np.pad(maximum_filter1d(values, width), half, mode="edge")
-    return np.convolve(largest, window / window.sum(), "valid")
+def _smooth(share: np.ndarray) -> np.ndarray:
+    """From 0 to 1 with no speed at either end."""
+    return share * share * (3 - 2 * share)
 
 
 def _raised(clip: Clip, up_m: np.ndarray) -> Clip:

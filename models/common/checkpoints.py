@@ -85,7 +85,7 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
     if info.get("model") != network.name:
         remedy = "point to the right folder"
         raise BadInput(path, f"a checkpoint of {network.name}", f"one of {info.get('model')}", remedy)
-    module = network.build(build_config(network.config, info["config"], f"{path}: config"))
+    module = network.build(_config(network, info, path))
     with safe_open(path, framework="pt") as stored:
         tensors: dict[str, Tensor] = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
     try:
@@ -98,6 +98,14 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
         Normaliser(**normaliser).to(device) if normaliser else None,
         info,
     )
+
+
+def _config(network: StoredNetwork, info: dict[str, Any], path: Path) -> Any:
+    try:
+        return build_config(network.config, info["config"], f"{path}: config")
+    except BadInput as error:
+        remedy = "train, or import, it again with this version"
+        raise BadInput(path, "settings this version knows", str(error), remedy) from error
 
 
 def write_empty(folder: str | Path, reason: str) -> Path:

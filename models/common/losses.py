@@ -16,11 +16,6 @@ def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
     return (values * mask).sum() / mask.sum().clamp_min(1.0)
 
 
-def simple_loss(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
-    """Mean squared error of features (..., D) over the frames of ``mask`` (...): eq. 5 and 9."""
-    return masked_mean((predicted - target).square(), mask[..., None])
-
-
 def distance_map_loss(joints_m: Tensor, points_m: Tensor, entries: Tensor, distance_m: Tensor) -> Tensor:
     """Eq. 6: squared error of the joint-to-point distances listed in the truth, in metres.
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES, OBJECT_POSITION, WRIST
+from hoidata.errors import BadInput
 from models.common.features import Normaliser, proper_hands, proper_object
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
@@ -32,7 +33,7 @@ from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.verb_reading import VerbReading
 
-# How far F_obj of an object may be, of the mean length of those in training, from the nearest of them to be that one.
+# An object counts as known if its F_obj is nearer to that of a training object than this share of their mean length.
 SAME_OBJECT = 0.01
 
 
@@ -46,9 +47,10 @@ class DiffusionConfig:
     centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
     is read from its own token, or from the object's as well (released). object_feature: whether F_obj, the point
     network's summary of the object, is told; of few objects it is a name. object_dropout: share of the steps in which
-    it is not; if any, it is told of none but the ``objects`` objects in training. text_input: a linear layer, or
-    "verbs", a hidden layer that is told which of ``verbs`` verbs the sentence means. condition_everywhere: the
-    condition is added to every token instead of being one. frames_to_go: tokens know how far it is to the end.
+    it is not; if any, it is told of the objects in training alone (their number, ``objects``, is set by training).
+    text_input: a linear layer, or "verbs", a hidden layer that is told which of ``verbs`` verbs (set by training too)
+    the sentence means. condition_everywhere: the condition is added to every token instead of being one. frames_to_go:
+    tokens know how far it is to the end.
     signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
     is to happen (Chen 2023). input_gate: how much of the noised rows is let in depends on the timestep.
     """
@@ -136,6 +138,9 @@ class DiffusionModel(nn.Module):
 
     def __init__(self, config: DiffusionConfig) -> None:
         super().__init__()
+        if config.object_dropout and (config.contact_input == "map" or config.scale_input or config.centroid):
+            wanted = "neither contact_input: map nor scale_input nor centroid beside object_dropout"
+            raise BadInput("diffusion", wanted, "one of them", "set object_dropout: 0: it would hide them as well")
         self.config, self.code = config, MotionCode(config.motion)
         self.register_buffer("signal", alphas_cumprod(), persistent=False)
         width = config.transformer.width
@@ -222,13 +227,15 @@ class DiffusionModel(nn.Module):
         """(B, 1) 1 where the object with F_obj (B, G) was in training; all ones for a network told of every object."""
         if self.known_objects is None:
             return summary.new_ones(len(summary), 1)
-        apart = torch.cdist(summary, self.known_objects).amin(1, keepdim=True)
+        # By differences: as products, which a GPU rounds to ten bits, an object would be far from itself.
+        apart = torch.cdist(summary, self.known_objects, compute_mode="donot_use_mm_for_euclid_dist")
+        apart = apart.amin(1, keepdim=True)
         return (apart < SAME_OBJECT * self.known_objects.norm(dim=-1).mean()).to(summary.dtype)
 
     def learn_objects(self, summaries: Tensor) -> None:
-        """Keeps F_obj (K, G) of the objects in training."""
+        """Keeps F_obj (K, G) of the ``config.objects`` objects in training."""
         if self.known_objects is not None:
-            self.known_objects.data.copy_(summaries)
+            self.known_objects.data[:] = summaries.reshape(self.known_objects.shape)
 
     def denoise(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, known: _Prepared, keep: Tensor | None = None

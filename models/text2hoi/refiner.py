@@ -37,6 +37,7 @@ from models.common.transformer import (
 )
 
 JOINT_FEATURES = 63
+SAMPLER = SamplerConfig()  # of a refiner that is a diffusion model
 ATTENTION_RATE_PER_M = 50.0
 REACH_M = 0.05
 
@@ -105,8 +106,9 @@ class RefinerModel(nn.Module):
 
     def __init__(self, config: RefinerConfig) -> None:
         super().__init__()
-        if not 0 <= config.noise_steps <= TRAIN_STEPS:
-            raise BadInput("refiner", f"noise_steps from 0 to {TRAIN_STEPS}", str(config.noise_steps), "set it so")
+        if config.noise_steps and not SAMPLER.steps <= config.noise_steps <= TRAIN_STEPS:
+            wanted = f"noise_steps 0, or {SAMPLER.steps} to {TRAIN_STEPS}"
+            raise BadInput("refiner", wanted, str(config.noise_steps), "set it so")
         self.config = config
         width, k = config.transformer.width, config.transformer.frames_per_token
         inputs = HAND_FEATURES + 2 * JOINT_FEATURES + (JOINT_FEATURES + 21) * config.surface_input
@@ -184,20 +186,20 @@ class RefinerModel(nn.Module):
 
 
 @torch.no_grad()
-def refine(network: RefinerModel, coarse: CoarseMotion, noise: Tensor) -> Tensor:
+def refine(network: RefinerModel, coarse: CoarseMotion, noise: Tensor | None = None) -> Tensor:
     """Refined hands (B, 2, F, 99), metres, with proper rotations.
 
-    noise: (B, 2, F, 99), which a refiner that is a diffusion model begins with and others do not look at.
+    noise: (B, 2, F, 99), which a refiner that is a diffusion model begins with; others need none.
     """
-    first = network.config.noise_steps
-    if not first:
+    if noise is None:
         return proper_hands(network(coarse))
     hands = network.seen(coarse.hands, coarse.object)
+    first = network.config.noise_steps
     steps = torch.full((len(hands),), first - 1, device=hands.device)
     noised = add_noise(hands, noise.to(hands), steps, alphas_cumprod(hands.device))
 
     def denoise(x: Tensor, steps: Tensor) -> Tensor:
         return network.corrected(coarse, NoisedHands(x, steps))
 
-    clean = sample(denoise, noised, SamplerConfig(), [], first)
+    clean = sample(denoise, noised, SAMPLER, [], first)
     return proper_hands(hands_in_world(clean, coarse.object) if network.config.view == "object" else clean)

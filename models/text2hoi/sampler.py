@@ -36,8 +36,9 @@ AT_ONCE = 256
 @dataclass(frozen=True)
 class SamplingConfig:
     """sampler: of the diffusion network. refined_by: what corrects its hands, the refiner network or a hold
-    (``hoidata.refinement.holding``); "preset": a hold where the diffusion network gives hands in the object's frame, as
-    `ours` does. field_resolution: of the distance grids the refiner sees.
+    (``hoidata.refinement.holding``), which also sees to it that the object lies where it lay; "preset": a hold where
+    the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
+    refiner sees.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -167,8 +168,8 @@ class Text2Hoi:
             network = self.trained["refiner"].network
             assert isinstance(network, RefinerModel)
             seen = surface.coarse(batch, coarse, objects, contact_maps, batch.hand_frames)
-            drawn = draw_each((MAX_FRAMES, 0), (coarse.shape[2], 0), generators)[0]
-            refined = refine(network, seen, drawn)
+            rows = (MAX_FRAMES, 0), (coarse.shape[2], 0)
+            refined = refine(network, seen, draw_each(*rows, generators)[0] if network.config.noise_steps else None)
         parts = zip(coarse, refined, objects, contact_maps, strict=True)
         return [
             Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())

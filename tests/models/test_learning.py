@@ -153,7 +153,7 @@ def test_the_refiner_takes_more_than_half_of_planted_noise_away(learnt: Learnt) 
     batch = collate(clips)
     coarse = planted(batch.hands, torch.Generator().manual_seed(2))
     seen = surface.coarse(batch, coarse, batch.object, batch.contact_map, batch.present)
-    refined = refine(refiner, seen, torch.zeros_like(coarse))
+    refined = refine(refiner, seen)
     apart = [(hands - batch.hands)[..., :3].norm(dim=-1) for hands in (coarse, refined)]
     off = [float(distance[batch.present].mean()) for distance in apart]
     assert off[0] == pytest.approx(0.01, rel=1e-3)

@@ -18,7 +18,7 @@ from models.common.sampling import add_noise, alphas_cumprod
 from models.common.transformer import Block, Encoder, TransformerConfig, packed
 from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel
+from models.text2hoi.diffusion import SAME_OBJECT, Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.diffusion_training import DiffusionObjective
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.motion_code import MotionCodeConfig
@@ -241,7 +241,7 @@ def test_a_summary_that_is_left_out_of_a_step_changes_nothing_and_touched_points
 def test_an_objects_summary_is_left_out_in_a_share_of_the_steps(
     annotated: AnnotatedStore, share: float, least: float, most: float
 ) -> None:
-    model = diffusion_model(object_dropout=share, condition_dropout=0.1)
+    model = diffusion_model(object_dropout=share, condition_dropout=0.1, scale_input=False)
     objective = DiffusionObjective.__new__(DiffusionObjective)
     objective.network = model
     kept = objective.kept(4000, torch.Generator().manual_seed(0)).float()
@@ -332,6 +332,23 @@ def test_refined_hands_do_not_depend_on_padding_or_absent_hands(
         assert torch.equal(model(coarse)[batch.present], model(other)[batch.present])
 
 
+def test_an_object_is_known_up_to_a_hundredth_however_many_there_are() -> None:
+    """Distances by a matrix product, as of more than 25 rows by default, would be off by more than that."""
+    model = diffusion_model(object_dropout=0.5, objects=60, scale_input=False)
+    drawn = torch.Generator().manual_seed(0)
+    known, away = (torch.randn(60, POINT_NET.widths[-1], generator=drawn) for _ in range(2))
+    model.learn_objects(known)
+    step = away / away.norm(dim=-1, keepdim=True) * SAME_OBJECT * known.norm(dim=-1).mean()
+    assert bool((model._known(known + 0.9999 * step) == 1).all())
+    assert bool((model._known(known + 1.0001 * step) == 0).all())
+
+
+@pytest.mark.parametrize("other", [{"contact_input": "map"}, {"scale_input": True}, {"centroid": True}])
+def test_what_object_dropout_would_hide_as_well_is_refused(other: dict) -> None:
+    with pytest.raises(BadInput, match="object_dropout: 0"):
+        diffusion_model(**{"object_dropout": 0.5, "scale_input": False, **other})
+
+
 class Certain(RefinerModel):
     """A refiner that takes every hand for the same, and keeps what it was to denoise."""
 
@@ -375,10 +392,9 @@ def test_a_diffusion_refiner_reads_the_noised_hands_and_their_timestep_and_no_ot
     found = [model(coarse, noised)[batch.present] for noised in told]
     assert not torch.allclose(found[0], found[1])
     assert not torch.allclose(found[0], found[2])
-    plain = RefinerModel(RefinerConfig(SMALL))
-    assert torch.equal(refine(plain, coarse, noise_like(coarse, 0)), refine(plain, coarse, noise_like(coarse, 1)))
-    with pytest.raises(BadInput, match="noise_steps from 0 to 1000"):
-        RefinerModel(RefinerConfig(SMALL, noise_steps=1001))
+    for steps in (19, 1001):
+        with pytest.raises(BadInput, match="noise_steps 0, or 20 to 1000"):
+            RefinerModel(RefinerConfig(SMALL, noise_steps=steps))
 
 
 def noise_like(coarse: CoarseMotion, seed: int) -> Tensor:

@@ -17,10 +17,11 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore
-from models.common.checkpoints import load_checkpoint, save_checkpoint
+from models.common.checkpoints import _config, load_checkpoint, save_checkpoint
 from models.common.corpus import Corpus, batches
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
+from models.text2hoi.diffusion import DiffusionModel
 from models.text2hoi.generation import GeneratedMotion, Generator, Wish, _started_at_origin
 from models.text2hoi.sampler import Text2HoiMotion
 from pipelines.generation import Asked, Models, generate_files
@@ -74,6 +75,26 @@ def test_a_wrong_or_missing_checkpoint_is_named(trained: Path, tmp_path: Path) -
     broken.write_bytes(b"not a checkpoint")
     with pytest.raises(BadInput, match="a checkpoint of hoidata"):
         load_checkpoint(tmp_path, load_network("contact"))
+
+
+def test_a_trained_network_knows_the_objects_it_was_trained_on_and_no_other(
+    trained: Path, annotated: AnnotatedStore
+) -> None:
+    network = load_checkpoint(trained / "diffusion", load_network("diffusion")).network
+    assert isinstance(network, DiffusionModel)
+    points = {sample.object_key: sample.points.points_m for sample in Corpus.of(annotated, 0).train}
+    summary = network.object_feature(torch.from_numpy(np.stack(list(points.values()))))
+    assert len(points) == 2
+    assert network._known(summary).tolist() == [[1], [1]]
+    longer = torch.from_numpy(points.popitem()[1]) * torch.tensor([1.0, 1.0, 1.5])
+    assert network._known(network.object_feature(longer[None])).tolist() == [[0]]
+
+
+def test_a_checkpoint_with_a_setting_that_is_gone_says_to_train_it_again(trained: Path, tmp_path: Path) -> None:
+    stored = load_checkpoint(trained / "contact", load_network("contact"))
+    stored.info["config"]["network_of_old"] = True
+    with pytest.raises(BadInput, match=r"network_of_old.*again with this version"):
+        _config(load_network("contact"), stored.info, tmp_path)
 
 
 def test_unknown_settings_are_refused_with_the_known_ones(annotated_root: Path, tmp_path: Path) -> None:

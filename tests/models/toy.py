@@ -27,6 +27,8 @@ PARAMS = {
             "motion": {"knot_frames": 4},
             "normalised": True,
             "told": True,
+            "object_dropout": 0.5,
+            "scale_input": False,
         },
         "training": BUDGET,
     },
