@@ -116,7 +116,7 @@ def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[Sta
         return trained[0], f"models: {trained[0]}, as asked for"
     found = [(_vocabulary(paths).knows(verb, thing) + 8 * _has_object(paths, asked.object), paths) for paths in trained]
     score, best = max(found, key=lambda item: item[0])
-    known = ", ".join(filter(None, (verb, thing))) if score else "none of the words"
+    known = (", ".join(filter(None, (verb, thing))) or str(asked.object)) if score else "none of the words"
     return best, f"models: {best}, which know best of {len(trained)}: {known} (--model chooses another)"
 
 

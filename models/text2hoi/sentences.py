@@ -25,6 +25,7 @@ def unseen_words(
     known: Vocabulary, text: str, verb: str | None, thing: str | None, hand: HandType, encoder: TextEncoder
 ) -> list[str]:
     """What of a sentence was never in training, each with the nearest that was; in words for a person."""
+    thing = thing or _known_object(known, text)
     notes = []
     if not verb or verb not in known.verbs:
         word = verb or _first_verb(text)
@@ -38,6 +39,12 @@ def unseen_words(
     if (verb, thing, hand) not in known.counts:
         return [f"{verb!r} with {thing!r} was in training, never with hand type {hand!r}"]
     return []
+
+
+def _known_object(known: Vocabulary, text: str) -> str | None:
+    """The object of training whose words stand in ``text``, the longest; a sentence with a strange verb is not read."""
+    found = [thing for thing in known.objects if thing and re.search(rf"\b{re.escape(thing)}\b", text.lower())]
+    return max(found, key=len, default=None)
 
 
 def _stranger(kind: str, word: str | None, known: Mapping[str, int], encoder: TextEncoder) -> str:

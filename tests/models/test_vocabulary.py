@@ -53,6 +53,14 @@ def test_unknown_words_come_with_the_nearest_known():
     assert "'vase'" in said[1]
 
 
+def test_a_known_object_beside_a_strange_verb_is_no_stranger():
+    assert [
+        note.split(" was")[0]
+        for note in unseen_words(KNOWN, "Juggle a mug.", *read_sentence("Juggle a mug."), "right", load_encoder("hash"))
+    ] == ["the verb 'juggle'"]
+    assert len(unseen_words(KNOWN, "Juggle a smug mugger.", None, None, "right", load_encoder("hash"))) == 2
+
+
 def test_the_better_known_sentence_scores_higher():
     scores = [
         KNOWN.knows(*words)
