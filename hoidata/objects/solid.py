@@ -65,11 +65,15 @@ def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
 
 def encloses(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
     """A closed surface holds more than 0.1 % of its convex hull."""
+    used = vertices_m[np.unique(faces)]
+    volume = abs(volume_m3(vertices_m, faces))
+    if volume > LEAST_SHARE * np.prod(np.ptp(used, axis=0)) > 0:
+        return True  # the hull lies in its box, and a hull of 100,000 places takes seconds
     try:
-        hull = ConvexHull(vertices_m[np.unique(faces)]).volume
+        hull = ConvexHull(used).volume
     except (QhullError, ValueError):  # flat, or fewer than four points
         return False
-    return abs(volume_m3(vertices_m, faces)) > LEAST_SHARE * hull
+    return volume > LEAST_SHARE * hull
 
 
 def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

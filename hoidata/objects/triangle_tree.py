@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 LEAF = 8
 DEEPEST = 64  # levels a search has room for: triangles are halved, so 2^60 of them would fit
@@ -47,19 +48,34 @@ def _figures(corners_m: np.ndarray) -> np.ndarray:
 def _halved(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Order of the triangles, links and boxes of the nodes: each halved across the longest side of its centres' box."""
     low, high = corners_m.min(axis=1), corners_m.max(axis=1)
-    centre, order = (low + high) / 2, np.arange(len(corners_m))
-    links, boxes = [], []
-    waiting = [(0, len(order), -1)]  # start, stop, and the node it is the second child of
-    while waiting:
-        start, stop, parent = waiting.pop()
-        own = order[start:stop]
+    order = np.arange(len(corners_m))
+    link, box = np.zeros((2 * len(order), 3), np.int32), np.empty((2 * len(order), 6))
+    count = _halve(low, high, (low + high) / 2, order, link, box)
+    return order, link[:count].copy(), box[:count].copy()
+
+
+@njit(cache=True)
+def _halve(low_m, high_m, centre_m, order, link, box):  # pragma: no cover (compiled)
+    """Sort ``order`` into leaves, fill the rows of ``link`` and ``box`` that nodes need, and say how many those are."""
+    waiting, size, count = np.empty((DEEPEST, 3), np.int64), 1, 0  # start, stop, and the node it is the second child of
+    waiting[0] = 0, len(order), -1
+    while size:
+        size -= 1
+        start, stop, parent = waiting[size]
+        own = order[start:stop].copy()
         if parent >= 0:
-            links[parent][0] = len(links)
-        links.append([0, start, stop])
-        boxes.append(np.concatenate((low[own].min(axis=0), high[own].max(axis=0))))
+            link[parent, 0] = count
+        link[count, 1], link[count, 2] = start, stop
+        longest, axis = -1.0, 0
+        for way in range(3):
+            box[count, way], box[count, 3 + way] = low_m[own, way].min(), high_m[own, way].max()
+            along = centre_m[own, way]
+            if along.max() - along.min() > longest:
+                longest, axis = along.max() - along.min(), way
+        count += 1
         if stop - start > LEAF:
-            axis = np.ptp(centre[own], axis=0).argmax()
-            order[start:stop] = own[np.argsort(centre[own, axis], kind="stable")]
+            order[start:stop] = own[np.argsort(centre_m[own, axis], kind="mergesort")]  # stable: equal ones keep order
             middle = start + -(-(stop - start) // (2 * LEAF)) * LEAF  # full leaves in the first half
-            waiting += [(middle, stop, len(links) - 1), (start, middle, -1)]
-    return order, np.array(links, dtype=np.int32), np.array(boxes)
+            waiting[size], waiting[size + 1] = (middle, stop, count - 1), (start, middle, -1)
+            size += 2
+    return count
