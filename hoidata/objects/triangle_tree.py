@@ -56,7 +56,11 @@ def _halved(corners_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 @njit(cache=True)
 def _halve(low_m, high_m, centre_m, order, link, box):  # pragma: no cover (compiled)
-    """Sort ``order`` into leaves, fill the rows of ``link`` and ``box`` that nodes need, and say how many those are."""
+    """Sort ``order`` into leaves, fill the rows of ``link`` and ``box`` that nodes need, and say how many those are.
+
+    low_m, high_m, centre_m: (triangle, 3) of each triangle's own box. order: (triangle,) numbers. link: (row, 3) zeros
+    and box: (row, 6), of at least twice as many rows as triangles.
+    """
     waiting, size, count = np.empty((DEEPEST, 3), np.int64), 1, 0  # start, stop, and the node it is the second child of
     waiting[0] = 0, len(order), -1
     while size:

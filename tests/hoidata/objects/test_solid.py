@@ -166,6 +166,13 @@ def test_a_cup_as_thin_as_paper_is_solid_and_two_sheets_a_hundredth_of_a_millime
     assert isinstance(found, Solid) if is_solid else found == NoSolid("it encloses nothing")
 
 
+def test_a_thin_rod_askew_is_solid_though_it_fills_less_than_a_thousandth_of_its_box() -> None:
+    rod = trimesh.creation.box((0.002, 0.002, 0.4))
+    rod.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), (1, 1, 1)))
+    assert rod.volume < 1e-3 * rod.extents.prod() / 2
+    assert isinstance(solid_of(np.array(rod.vertices), np.array(rod.faces)), Solid)
+
+
 def test_a_closed_surface_with_one_side_only_is_refused() -> None:
     """The projective plane of six corners: each edge has two triangles, but they cannot all be turned alike."""
     corners = np.random.default_rng(0).normal(size=(6, 3))
