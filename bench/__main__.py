@@ -28,6 +28,7 @@ from bench import (
     store,
     surface,
     text,
+    verbs,
 )
 
 BENCHMARKS = {
@@ -41,6 +42,7 @@ BENCHMARKS = {
     "physics": physics.main,
     "realism": realism.main,
     "text": text.main,
+    "verbs": verbs.main,
     "batches": batches.main,
     "samplers": samplers.main,
     "ablation": ablation.main,

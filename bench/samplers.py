@@ -4,14 +4,16 @@
 with a mask, called 1,000 times: it is timed on a few calls and scaled. Weights are random; both compute the same sizes.
 """
 
+import copy
 import time
 from collections.abc import Callable
+from typing import get_args
 
 import torch
 from torch import Tensor, nn
 
 from bench.harness import medians, show
-from models.common.precision import compute_in_bfloat16
+from models.common.precision import SamplingPrecision, compute_in
 from models.common.sampling import SamplerConfig, sample_motion
 from models.common.transformer import TransformerConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, guided
@@ -41,9 +43,13 @@ def main() -> None:
             rows.append([f"{kind}, {steps} steps", f"{seconds:.1f}", f"{stock_s / seconds:.0f}"])
         show("One motion of 150 frames and both hands", ["way", "processor s", "times faster"], rows)
         exact = run(model, SamplerConfig("dpm++", 10))
-        compute_in_bfloat16(model)
-        apart = (run(model, SamplerConfig("dpm++", 10)) - exact)[..., :3].abs().max()
-        print(f"bfloat16 in the Transformer moves wrists by up to {float(apart) * 1e3:.2f} (thousandths of a unit)")
+        for precision in get_args(SamplingPrecision)[1:]:
+            lower = copy.deepcopy(model)
+            compute_in(lower, precision)
+            apart = (run(lower, SamplerConfig("dpm++", 10)) - exact)[..., :3].abs().max()
+            print(
+                f"{precision} in the Transformer moves wrists by up to {float(apart) * 1e3:.2f} (thousandths of a unit)"
+            )
 
 
 def stock_encoder(size: TransformerConfig) -> nn.TransformerEncoder:

@@ -1,4 +1,4 @@
-"""Half the bits where the time is: Transformers and point networks in bfloat16, geometry and losses in float32."""
+"""Half the bits where the time is: Transformers and point networks in 16 bits, geometry and losses in float32."""
 
 from typing import Any, Literal
 
@@ -9,18 +9,23 @@ from models.common.point_net import PointNet
 from models.common.transformer import Encoder
 
 Precision = Literal["float32", "bfloat16"]
+# float16 rounds to an eighth of what bfloat16 does; gradients would need scaling there, so it is for sampling alone.
+SamplingPrecision = Literal["float32", "bfloat16", "float16"]
 
 
-def compute_in_bfloat16(network: nn.Module) -> None:
-    """From now on these parts of ``network`` compute in bfloat16 (autocast: weights stay float32) and give float32."""
+def compute_in(network: nn.Module, precision: SamplingPrecision) -> None:
+    """From now on these parts of ``network`` compute in ``precision`` (autocast) and give float32, as weights stay."""
+    if precision == "float32":
+        return
     for module in network.modules():
         if isinstance(module, Encoder | PointNet):
-            setattr(module, "forward", _lowered(module.forward))  # noqa: B010 (pyright knows forward as a method)
+            lowered = _lowered(module.forward, getattr(torch, precision))
+            setattr(module, "forward", lowered)  # noqa: B010 (pyright knows forward as a method)
 
 
-def _lowered(forward: Any) -> Any:
+def _lowered(forward: Any, dtype: torch.dtype) -> Any:
     def lowered(x: Tensor, *given: Any) -> Any:
-        with torch.autocast(x.device.type, torch.bfloat16):
+        with torch.autocast(x.device.type, dtype):
             found = forward(x, *given)
         return found.float() if isinstance(found, Tensor) else tuple(own.float() for own in found)
 

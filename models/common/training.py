@@ -32,7 +32,7 @@ from models.common.checkpoints import (
 from models.common.corpus import Balance, Corpus, Wanted, batches
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands
-from models.common.precision import Precision, compute_in_bfloat16
+from models.common.precision import Precision, compute_in
 from models.common.progress import LOG_NAME, Progress, Row, State, write_log
 from models.common.repeatable import own_draws, seed_draws
 from models.common.team import Team
@@ -174,8 +174,7 @@ def fit(
     learnt = [parameter for parameter in network.parameters() if parameter.requires_grad]
     optimiser = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
     state = State(network, copy.deepcopy(network).eval().requires_grad_(False), optimiser)
-    if config.precision == "bfloat16":
-        compute_in_bfloat16(network)
+    compute_in(network, config.precision)
     if progress:
         progress.load(state)
     shared = team.own_parts(config.parts), config.parts

@@ -20,6 +20,7 @@ from hoidata.refinement import HoldSettings, hold_clip
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
+from models.common.precision import SamplingPrecision, compute_in
 from models.common.sampling import SamplerConfig, draw_each
 from models.text2hoi.contact_training import touched_maps
 from models.text2hoi.diffusion import Condition
@@ -38,10 +39,11 @@ class SamplingConfig:
     """sampler: of the diffusion network. refined_by: what corrects its hands, the refiner network or a hold
     (``hoidata.refinement.holding``), which also sees to it that the object lies where it lay; "preset": a hold where
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
-    refiner sees.
+    refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    precision: SamplingPrecision = "float32"
     field_resolution: int = 48
     refined_by: Literal["preset", "network", "hold"] = "preset"
     hold: HoldSettings = field(default_factory=HoldSettings)
@@ -83,7 +85,9 @@ class Text2Hoi:
         trained = {
             network.name: load_checkpoint(Path(checkpoints) / network.name, network, device) for network in NETWORKS
         }
-        return cls(trained, Hands(hands).to(device), config or SamplingConfig(), device, hands)
+        config = config or SamplingConfig()
+        compute_in(trained["diffusion"].network, config.precision)
+        return cls(trained, Hands(hands).to(device), config, device, hands)
 
     @property
     def facts(self) -> dict[str, Any]:

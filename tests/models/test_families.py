@@ -163,6 +163,18 @@ def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources
     np.testing.assert_array_equal(joints_of(plain), joints_of(unrefined))
 
 
+def test_sampling_in_16_bits_moves_hands_by_less_than_a_millimetre_float16_less_than_bfloat16(sources: Sources) -> None:
+    requests = [requests_for(own, PredictionConfig(samples=1))[0] for own in samples_of(sources.annotated, "test")]
+    hands = {}
+    for precision in ("float32", "bfloat16", "float16"):
+        told = {"text2hoi": {**FAST["text2hoi"], "precision": precision}}
+        model = load_family("text2hoi").load(replace(sources, settings=told))
+        assert isinstance(model, Text2Hoi)
+        hands[precision] = torch.cat([own.coarse[..., :3].flatten() for own in model.motions(requests, refined=False)])
+    moved = {name: float((own - hands["float32"]).abs().max()) for name, own in hands.items()}
+    assert 0 < moved["float16"] < moved["bfloat16"] < 1e-3
+
+
 def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_the_objects_frame(
     sources: Sources, monkeypatch: pytest.MonkeyPatch
 ) -> None:
