@@ -4,7 +4,7 @@ Text2HOI (Sec. 4.1) always takes the most similar of three templates. That inven
 none, so it is kept apart as :func:`most_similar_hand`.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -86,15 +86,6 @@ def most_similar_hand(
     cosines = features[1:] @ features[0]
     order = np.argsort(-cosines, kind="stable")
     return HAND_TYPES[order[0]], float(cosines[order[0]] - cosines[order[1]])
-
-
-def hand_prior(hand_types: Iterable[HandType]) -> dict[HandType, float]:
-    """Share of each hand type among training clips; thirds when there are none."""
-    counts: dict[HandType, float] = dict.fromkeys(HAND_TYPES, 0.0)
-    for hand in hand_types:
-        counts[hand] += 1
-    total = sum(counts.values())
-    return {hand: count / total if total else 1 / 3 for hand, count in counts.items()}
 
 
 def _by_rule(mentions: Mentions) -> HandType | None:

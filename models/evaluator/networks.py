@@ -14,7 +14,7 @@ from torch.nn.utils.rnn import pack_padded_sequence
 
 from hoidata.metrics.paths import JOINTS
 from models.common.features import scaled_text
-from models.evaluator.inputs import CORRECTED_SIZE, FAR_M, OBJECT, PAPER_SIZE
+from models.evaluator.inputs import CORRECTED_SIZE, FAR_M, OBJECT
 
 PLANES = ((0, 1), (0, 2))  # of x, y, z
 PLANAR_SCALE = 0.1
@@ -94,10 +94,6 @@ class MotionEncoder(nn.Module):
         """(B, outputs) of length one, of sentence features (B, text)."""
         assert self.text is not None
         return nn.functional.normalize(self.text(scaled_text(text)), dim=-1)
-
-    @property
-    def input_size(self) -> int:
-        return PAPER_SIZE if self.config.trunk == "planar" else CORRECTED_SIZE
 
 
 def turned(motion: Tensor, angle: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hoidata.annotation.encoders import HashEncoder
-from hoidata.annotation.hand_choice import hand_prior, select_hand
+from hoidata.annotation.hand_choice import select_hand
 
 BLIND = list(csv.DictReader((Path(__file__).parent / "blind_sentences.csv").read_text().splitlines()))
 NAMED = [row for row in BLIND if row["hand"] != "none"]
@@ -28,7 +28,7 @@ def test_few_blind_sentences_are_read_wrong(encoder) -> None:
 
 
 def test_a_blind_sentence_without_a_hand_gets_none_or_the_prior_by_name() -> None:
-    prior = hand_prior(["right", "right", "left"])
+    prior = {"left": 1 / 3, "right": 2 / 3, "both": 0.0}
     for row in BLIND:
         if row["hand"] == "none":
             assert select_hand(row["sentence"]).hand is None

@@ -5,7 +5,7 @@ import pytest
 
 from hoidata.annotation.encoders import HashEncoder
 from hoidata.annotation.grammar import default_grammar
-from hoidata.annotation.hand_choice import HAND_TYPES, choose_hand, hand_prior, most_similar_hand, select_hand
+from hoidata.annotation.hand_choice import HAND_TYPES, choose_hand, most_similar_hand, select_hand
 from hoidata.annotation.prompts import read_prompt
 from hoidata.annotation.sentences import four_sentences
 
@@ -122,21 +122,21 @@ def test_a_lead_below_the_margin_is_a_guess_and_not_taken(lead: float, hand: str
 
 
 def test_a_prior_answers_last_and_is_named() -> None:
-    prior = hand_prior(["right", "right", "both", "left"])
+    prior = {"left": 0.25, "right": 0.5, "both": 0.25}
     choice = select_hand("pick up the cup", prior=prior)
     assert (choice.hand, choice.source, choice.confidence) == ("right", "prior", 0.5)
     assert select_hand("lift it with the left hand", prior=prior).source == "rule"
 
 
 def test_a_prior_never_answers_with_a_hand_the_sentence_rules_out() -> None:
-    prior = hand_prior(["right", "right", "both", "left"])
+    prior = {"left": 0.25, "right": 0.5, "both": 0.25}
     assert select_hand("lift it without using your right hand", prior=prior).hand == "left"
-    assert select_hand("one hand only", prior=hand_prior(["both", "both", "left"])).hand == "left"
+    assert select_hand("one hand only", prior={"left": 1 / 3, "right": 0.0, "both": 2 / 3}).hand == "left"
 
 
 def test_the_papers_plain_choice_always_answers_where_the_rules_do_not() -> None:
     """These name no hand that acts: the rules give the prior by name, the paper's arg-max one of the three."""
-    prior = hand_prior(["both", "both", "left"])
+    prior = {"left": 1 / 3, "right": 0.0, "both": 2 / 3}
     for text in ("Lift a book.", "pick up the cup", "do not use the left hand"):
         assert choose_hand(text, HashEncoder(), prior).source == "prior"
         plain = choose_hand(text, HashEncoder(), prior, "similarity")
