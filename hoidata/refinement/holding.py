@@ -26,6 +26,7 @@ from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
+from hoidata.refinement.waiting import WaitSettings, wait_for_hands
 
 _ALONG = 9  # places along a capsule's axis at which it is looked at
 
@@ -37,7 +38,8 @@ class HoldSettings:
     frames between two holds that belong to one. blend: in which a hand comes to its hold, and leaves it. reach_m,
     keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from where it was: the
     first of each, then the next, on top of what came out, where those hands cannot carry the object in some of
-    air_frames frames in which it is in the air. solver: the other wishes. rest: of the object, before all that.
+    air_frames frames in which it is in the air. solver: the other wishes. rest: of the object, before all that. wait:
+    of the object for hands that come and go, after it.
     """
 
     near_m: float = 0.006
@@ -53,12 +55,16 @@ class HoldSettings:
     air_frames: int = 4
     solver: SolverSettings = field(default_factory=SolverSettings)
     rest: RestSettings = field(default_factory=RestSettings)
+    wait: WaitSettings = field(default_factory=WaitSettings)
 
 
 def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> Clip:
-    """The clip with its object at rest where it lay (``resting``), and hands that hold it (``hold_hands``)."""
+    """The clip with its object at rest where it lay (``resting``), hands that hold it (``hold_hands``), and an object
+    that waits for them (``waiting``).
+    """
     clip = rest_object(clip, settings.rest)
-    return replace(clip, hands=hold_hands(pair, clip, settings))
+    held = replace(clip, hands=hold_hands(pair, clip, settings))
+    return wait_for_hands(pair, held, settings.wait)
 
 
 def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
