@@ -14,7 +14,7 @@ from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.metrics.asked import read_asked
-from hoidata.refinement import HoldSettings, hold_hands
+from hoidata.refinement import HoldSettings, hold_clip
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.controls import HANDS_AWAY_M
@@ -102,10 +102,9 @@ def test_the_hand_that_was_not_asked_for_is_left_as_it_was(sources, annotated, t
 def test_a_held_lookup_is_the_lookup_with_the_hold_that_ours_has(sources, test):
     for sample in test:
         found, held = (motions(sources, name, sample)[0] for name in ("prompt-lookup", "prompt-lookup-held"))
-        np.testing.assert_array_equal(held.object.translation_m, found.object.translation_m)
-        side = acting(sample)
-        wanted = track_joints(hold_hands(HANDS, found, HoldSettings())[side], HANDS[side])
-        np.testing.assert_array_equal(joints(held, side), wanted)
+        side, wanted = acting(sample), hold_clip(HANDS, found, HoldSettings())
+        np.testing.assert_array_equal(held.object.translation_m, wanted.object.translation_m)
+        np.testing.assert_array_equal(joints(held, side), track_joints(wanted.hands[side], HANDS[side]))
         assert np.abs(joints(held, side) - joints(found, side)).max() > 1e-4
 
 
