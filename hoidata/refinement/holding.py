@@ -67,6 +67,15 @@ def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings(
     return wait_for_hands(pair, held, settings.wait)
 
 
+def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> float:
+    """Share of some frames in the air in which the hands of a clip can carry its object; 1 where it never is there."""
+    load = _Load.of(clip, settings.air_frames)
+    hands: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
+    if not hands:
+        return float(not len(load.frames))
+    return load.carried([hand_capsules(clip.hands[side].take(load.frames), pair[side]) for side in hands])
+
+
 def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
     """The hands of a clip, still, touching and outside while they hold; one that never does stays as it was.
 

@@ -27,7 +27,7 @@ from models.common.checkpoints import FILE_NAME, Checkpoint
 from models.common.sampling import SamplerConfig
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
-from models.text2hoi.sampler import SamplingConfig, Text2Hoi, Text2HoiMotion
+from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi, Text2HoiMotion
 from models.text2hoi.sentences import read_sentence, unseen_words
 from models.text2hoi.verb_reading import readings_of
 
@@ -130,9 +130,9 @@ class Generator:
             "refined_by": self.model.refined_by,
         }
         # One by one: the last bits of a matrix product depend on how many rows it has.
-        motions = [_started_at_origin(self.model.motions([request])[0]) for request in requests]
-        made = zip(requests, motions, strict=True)
-        return [self._generated(request, motion, points, evidence) for request, motion in made]
+        answers = [self.model.answers([request], placed=_started_at_origin)[0] for request in requests]
+        made = zip(requests, answers, strict=True)
+        return [self._generated(request, answer, points, evidence) for request, answer in made]
 
     def _unseen(self, text: str, verb: str | None, thing: str | None, hand: HandType) -> list[str]:
         return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)
@@ -173,11 +173,17 @@ class Generator:
         return self.model.sample_lengths(text, active_hands, torch.Generator().manual_seed(request.seed))[0]
 
     def _generated(
-        self, request: Request, motion: Text2HoiMotion, points: SampledPoints, evidence: dict[str, Any]
+        self, request: Request, answer: Answer, points: SampledPoints, evidence: dict[str, Any]
     ) -> GeneratedMotion:
-        own = {"number": request.number, "frames": request.n_frames, "touched_points": int(motion.contact_map.sum())}
-        refined, coarse = (self.model.clips([request], [motion], refined=kind)[0] for kind in (True, False))
-        return GeneratedMotion(refined, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
+        motion = answer.motion
+        own = {
+            "number": request.number,
+            "frames": request.n_frames,
+            "touched_points": int(motion.contact_map.sum()),
+            "draws": answer.draws,
+        }
+        coarse = self.model.clips([request], [motion], refined=False)[0]
+        return GeneratedMotion(answer.clip, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
 
 
 def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, where: Path) -> None:

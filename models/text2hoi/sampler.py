@@ -3,8 +3,9 @@
 Everything a motion is drawn from comes from its request's seed, so it is the same in any company.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,7 +17,7 @@ from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import HoldSettings, hold_clip
+from hoidata.refinement import HoldSettings, carried_share, hold_clip
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
@@ -32,6 +33,7 @@ from models.text2hoi.surface import Surface
 from models.text2hoi.thresholds import ContactNetwork
 
 AT_ONCE = 256
+ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,8 @@ class SamplingConfig:
     (``hoidata.refinement.holding``), which also sees to it that the object lies where it lay; "preset": a hold where
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
+    draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
+    at; the one that carries most is the answer.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -47,6 +51,7 @@ class SamplingConfig:
     field_resolution: int = 48
     refined_by: Literal["preset", "network", "hold"] = "preset"
     hold: HoldSettings = field(default_factory=HoldSettings)
+    draws: int = 3
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,18 @@ class Text2HoiMotion:
     refined: Tensor
     object: Tensor
     contact_map: Tensor
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
+    no hold asked for it. draws: how many motions were drawn for it.
+    """
+
+    motion: Text2HoiMotion
+    clip: Clip
+    carried: float
+    draws: int = 1
 
 
 @dataclass(frozen=True)
@@ -110,8 +127,47 @@ class Text2Hoi:
         self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
     ) -> tuple[list[Clip], list[np.ndarray]]:
         """Motions, and the contact map (N,) bool each of them was drawn for; arguments as in ``motions``."""
-        motions = self.motions(requests, refined, contact_maps)
-        return self.clips(requests, motions, refined), [motion.contact_map.numpy() > 0 for motion in motions]
+        answers = self.answers(requests, refined, contact_maps)
+        return [own.clip for own in answers], [own.motion.contact_map.numpy() > 0 for own in answers]
+
+    def answers(
+        self,
+        requests: Sequence[Request],
+        refined: bool = True,
+        contact_maps: Sequence[Tensor] | None = None,
+        placed: Callable[[Text2HoiMotion], Text2HoiMotion] = lambda motion: motion,
+    ) -> list[Answer]:
+        """Motions and their clips, drawn again where held hands cannot carry; other arguments as in ``motions``.
+
+        placed: what is done to a motion before it becomes a clip.
+        """
+        best = self._drawn(requests, refined, contact_maps, placed)
+        if not (refined and self.refined_by == "hold"):
+            return best
+        for draw in range(2, self.config.draws + 1):
+            weak = [number for number, own in enumerate(best) if own.carried < ENOUGH]
+            if not weak:
+                break
+            again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
+            given = None if contact_maps is None else [contact_maps[number] for number in weak]
+            for number, own in zip(weak, self._drawn(again, refined, given, placed), strict=True):
+                kept = own if own.carried > best[number].carried else best[number]
+                best[number] = replace(kept, draws=draw)
+        return best
+
+    def _drawn(
+        self,
+        requests: Sequence[Request],
+        refined: bool,
+        contact_maps: Sequence[Tensor] | None,
+        placed: Callable[[Text2HoiMotion], Text2HoiMotion],
+    ) -> list[Answer]:
+        """Every request answered once; what only holds can tell is 1 elsewhere."""
+        motions = [placed(motion) for motion in self.motions(requests, refined, contact_maps)]
+        clips = self.clips(requests, motions, refined)
+        held = refined and self.refined_by == "hold"
+        shares = [carried_share(self.pair, clip, self.config.hold) if held else 1.0 for clip in clips]
+        return [Answer(*own) for own in zip(motions, clips, shares, strict=True)]
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:
         """Motions as clips, after refinement or before it."""
@@ -186,3 +242,8 @@ class Text2Hoi:
         assert isinstance(network, ContactNetwork)
         latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1)
         return touched_maps(self.trained["contact"], batch, batch.text, latents)
+
+
+def _next_seed(seed: int, draw: int) -> int:
+    """Of the ``draw``-th motion for one request."""
+    return int.from_bytes(sha256(f"{seed} draw {draw}".encode()).digest()[:7])

@@ -136,12 +136,18 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     clips = ", ".join(f"{count} {kind} {name} clips" for name, count in evidence["trained_on"].items())
     lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
+    drawn = [
+        f"sample {shown.evidence['number'] + 1}: {shown.evidence['draws']} motions, for hands that carry the object"
+        for shown in motions
+        if shown.evidence["draws"] > 1
+    ]
     return [
         ("hands", f"{hand['hand']} (decided by {hand['source']}: {hand['evidence']})"),
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
         *([("read as", f"{read_as[0]} ({read_as[1]:.0%})")] if read_as else []),
         ("seed", str(evidence["seed"])),
+        *([("drawn again", "; ".join(drawn))] if drawn else []),
         ("trained on", clips),
         ("refined by", {"hold": "a hold against the object", "network": "the refiner network"}[evidence["refined_by"]]),
         ("checkpoints", f"{checkpoints} (sha256: {digests})"),

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,9 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
-from hoidata.hands import load_embedded_hands, track_joints
+from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.metrics.asked import read_asked
-from hoidata.refinement import hold_hands
+from hoidata.refinement import HoldSettings, hold_hands
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.common.family import Sources, motion_clip
@@ -193,6 +194,40 @@ def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_
     in_object = MotionCode(MotionCodeConfig(4, hand_frame="object"))
     monkeypatch.setattr(usual.trained["diffusion"].network, "code", in_object)
     assert usual.refined_by == "hold"
+
+
+@pytest.mark.parametrize(
+    ("shares", "taken", "draws"),
+    [((1.0,), 0, 1), ((0.0, 0.75), 1, 2), ((0.25, 0.0, 0.0), 0, 3), ((0.0, 0.25, 0.0), 1, 3)],
+    ids=["carries", "the second carries", "none carries more", "the second carries more"],
+)
+def test_a_motion_whose_hands_cannot_carry_is_drawn_again(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], taken: int, draws: int
+) -> None:
+    request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
+    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold"}}
+    model = load_family("text2hoi").load(replace(sources, settings=told))
+    assert isinstance(model, Text2Hoi)
+    found, left = list[Clip](), list(shares)
+
+    def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings) -> float:
+        found.append(clip)
+        return left.pop(0)
+
+    monkeypatch.setattr("models.text2hoi.sampler.carried_share", carried_share)
+    (answer,) = model.answers([request])
+    assert (answer.draws, len(found), left) == (draws, draws, [])
+    assert (answer.carried, answer.clip) == (shares[taken], found[taken])
+    for one, other in pairwise(found):
+        assert abs(joints_of(one) - joints_of(other)).max() > 1e-3
+
+
+def test_only_a_hold_asks_whether_hands_carry(sources: Sources, monkeypatch: pytest.MonkeyPatch) -> None:
+    request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
+    model = load_family("text2hoi").load(sources)
+    assert isinstance(model, Text2Hoi)
+    monkeypatch.setattr("models.text2hoi.sampler.carried_share", None)
+    assert [answer.draws for answer in model.answers([request])] == [1]
 
 
 def test_sampling_writes_an_ordinary_store_and_the_familys_own_figures(

@@ -12,7 +12,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.realism import VARIANTS, score
 from hoidata.physics.scene import clip_scene
-from hoidata.refinement import HoldSettings, hold_hands
+from hoidata.refinement import HoldSettings, carried_share, hold_hands
 from hoidata.refinement.hold_solver import spline_shares
 from tests.builders.clips import DOWN, clip_of
 from tests.builders.objects import box_model, two_parts
@@ -83,6 +83,18 @@ def test_a_hand_that_swayed_inside_what_it_held_is_still_on_its_surface(pushed):
         assert 0.5 < depth_mm(BOX, after)[HELD].max() < 3.5
         assert depth_mm(BOX, after).max() < 5  # nor on its way to the hold, and away from it
         assert np.linalg.norm(after - before, axis=-1).mean() < 0.02
+
+
+def test_the_share_that_is_carried_is_none_without_hands_at_the_box_and_all_where_it_never_rises(pushed):
+    clip, made = pushed
+    held = replace(clip, hands=made)
+    away = {side: replace(track, wrist_m=track.wrist_m + np.float32(1)) for side, track in made.items()}
+    nobody = {side: replace(track, valid=np.zeros(FRAMES, bool)) for side, track in made.items()}
+    lying = replace(clip.object, translation_m=np.zeros((FRAMES, 3), np.float32), rotvec=np.zeros((FRAMES, 3), "f4"))
+    assert carried_share(PAIR, replace(held, hands=away)) == carried_share(PAIR, replace(held, hands=nobody)) == 0
+    assert carried_share(PAIR, replace(held, hands=nobody, object=lying)) == 1
+    realism = score(clip_scene(held, PAIR), VARIANTS["SI"])
+    assert carried_share(PAIR, held) == pytest.approx(realism.passed.mean(), abs=0.3)
 
 
 def test_far_from_its_hold_a_hand_is_left_as_it_was(pushed):
