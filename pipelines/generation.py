@@ -1,7 +1,9 @@
 """A sentence and an object to motions, with the models of the dataset that knows its words best, as files."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.settings import AnnotationSettings
@@ -78,15 +80,21 @@ def generate_files(asked: Asked, out: Path) -> Written:
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampler=asked.sampler)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
-    notes += _taken_for(verb, motions[0].evidence["read_as"])
+    notes += _taken_for(verb, motions[0].evidence)
     return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
 
 
-def _taken_for(verb: str | None, read_as: tuple[str, float] | None) -> list[str]:
-    """That the motion is of another verb than the sentence has, in words for a person."""
-    if read_as is None or read_as[0] == verb:
+def _taken_for(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
+    """That the motion is of another verb than the sentence has, or what the networks were told; for a person."""
+    read_as = evidence["read_as"]
+    if read_as is None:
         return []
-    return [f"the sentence is taken for {read_as[0]!r} ({read_as[1]:.0%})"]
+    if read_as[0] != verb:
+        return [f"the sentence is taken for {read_as[0]!r} ({read_as[1]:.0%})"]
+    if evidence["told"] == evidence["text"]:
+        return []
+    plainly = evidence["plainly_read_as"][0]
+    return [f"the networks are told {evidence['told']!r}: the sentence as it is they would take for {plainly!r}"]
 
 
 def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Models, str]:

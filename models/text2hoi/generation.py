@@ -29,6 +29,7 @@ from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi, Text2HoiMotion
 from models.text2hoi.sentences import read_sentence, unseen_words
+from models.text2hoi.understanding import understand
 from models.text2hoi.verb_reading import readings_of
 
 
@@ -39,7 +40,8 @@ class GeneratedMotion:
     points: where those points lie on the object. coarse: the motion before refinement. evidence: plain values on how
     the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the
     verb of training the diffusion network takes the sentence for, with its probability, or None where it is told the
-    sentence's features; "unseen": what of the sentence was never in training, in words.
+    sentence's features; "told": the sentence the networks were told, not the user's where they would take that for
+    another verb ("plainly_read_as"); "unseen": what of the sentence was never in training, in words.
     """
 
     clip: Clip
@@ -105,12 +107,13 @@ class Generator:
         verb, thing = read_sentence(text)
         choice = self._hand(text, wish)
         assert choice.hand is not None  # a prior decides last
-        points = sample_points(object)
+        points, read = sample_points(object), self._read_as
+        told = understand(text, verb, thing, choice.hand, self.vocabulary, self.encoder, read)
         first = Request(
             motion_id=f"generated/{object.name}",
             object=object,
             points=ObjectPoints(points.points_m, points.normals, points.part),
-            text=self.encoder.encode([text])[0],
+            text=told.text,
             active_hands=np.array([choice.hand in (side, "both") for side in SIDES]),
             n_frames=0,
             clip_id=text,
@@ -119,7 +122,9 @@ class Generator:
         requests = [self._request(first, text, wish, number) for number in range(wish.samples)]
         evidence = {
             "text": text,
-            "read_as": self._read_as(first.text),
+            "told": told.sentence,
+            "read_as": told.read_as,
+            "plainly_read_as": told.plainly,
             "seed": wish.seed,
             "hand": asdict(choice),
             "unseen": self._unseen(text, verb, object_words or thing, choice.hand),

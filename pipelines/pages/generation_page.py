@@ -146,6 +146,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
         *([("read as", f"{read_as[0]} ({read_as[1]:.0%})")] if read_as else []),
+        *([("told", evidence["told"])] if evidence["told"] != evidence["text"] else []),
         ("seed", str(evidence["seed"])),
         *([("drawn again", "; ".join(drawn))] if drawn else []),
         ("trained on", clips),

@@ -31,6 +31,8 @@ def motion(page_clip):
         "number": 0,
         "hand": hand,
         "read_as": ("lift", 0.97),
+        "told": "Lift a <b>jar</b> with the left hand.",
+        "draws": 3,
         "synthetic": True,
         "unseen": ["the object 'vase' was never in training"],
         "contact_threshold_m": 0.02,
@@ -88,6 +90,8 @@ def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, wri
         "the object &#39;vase&#39; was never in training",
         "z is &lt;taken&gt; for up",
         "Lift a box &amp; hold it",
+        "Lift a &lt;b&gt;jar&lt;/b&gt; with the left hand.",
+        "sample 1: 3 motions",
     ):
         assert words in page, words
 
