@@ -33,9 +33,9 @@ def hand_at(side: Side, away_m: np.ndarray, world_from_object: RigidTransform, p
     )
 
 
-def carried_box(comes_m: np.ndarray) -> Clip:
-    """A box that one hand carries along a bow while it turns; the other hand comes to it."""
-    share = np.clip((np.arange(FRAMES) - 10) / 40, 0, 1)
+def carried_box(comes_m: np.ndarray, first: int = 10, frames: int = 40) -> Clip:
+    """A box that one hand carries along a bow for some frames while it turns; the other hand comes to it."""
+    share = np.clip((np.arange(FRAMES) - first) / frames, 0, 1)
     share = share * share * (3 - 2 * share)
     turn = rotvec_to_rotmat(share[:, None] * [0, 0, 0.6])
     place = np.stack((0.4 * share, 0.2 * np.sin(np.pi * share), 0.1 * share), 1)
@@ -120,6 +120,18 @@ def test_a_hand_that_sweeps_for_long_is_not_out_of_step():
     slides.wrist_m[15:45, 1] -= np.linspace(0, 0.2, 30, dtype=np.float32)
     sliding = replace(clip, hands={**clip.hands, "right": slides})
     assert wait_for_hands(PAIR, sliding) is sliding
+
+
+@pytest.mark.parametrize("frames", [24, 40])
+def test_what_it_misses_is_made_up_for_near_by(frames: int):
+    clip = carried_box(COMES, frames=frames)
+    before, after = (own.object.translation_m[:, 0] for own in (clip, wait_for_hands(PAIR, clip)))
+    assert np.abs(after - before)[:15].max() < 0.1 * np.abs(after - before).max()
+
+
+def test_an_object_that_moves_only_under_the_sweep_has_nowhere_to_make_up_for_it():
+    clip = carried_box(COMES, first=31, frames=2)
+    assert wait_for_hands(PAIR, clip) is clip
 
 
 def test_a_frame_without_the_hand_stays_as_it_was():
