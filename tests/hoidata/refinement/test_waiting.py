@@ -126,7 +126,7 @@ def test_a_hand_that_sweeps_for_long_is_not_out_of_step():
 def test_what_it_misses_is_made_up_for_near_by(frames: int):
     clip = carried_box(COMES, frames=frames)
     before, after = (own.object.translation_m[:, 0] for own in (clip, wait_for_hands(PAIR, clip)))
-    assert np.abs(after - before)[:15].max() < 0.1 * np.abs(after - before).max()
+    assert np.abs(after - before)[:15].max() < 0.15 * np.abs(after - before).max()
 
 
 def test_an_object_that_moves_only_under_the_sweep_has_nowhere_to_make_up_for_it():
