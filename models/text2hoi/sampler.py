@@ -47,11 +47,11 @@ class SamplingConfig:
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
-    precision: SamplingPrecision = "float32"
     field_resolution: int = 48
     refined_by: Literal["preset", "network", "hold"] = "preset"
     hold: HoldSettings = field(default_factory=HoldSettings)
     draws: int = 3
+    precision: SamplingPrecision = "float32"
 
 
 @dataclass(frozen=True)
