@@ -1,8 +1,8 @@
-"""Does what is typed act on an object that no training clip shows?
+"""Does what is typed act on a mug that no training clip shows?
 
 ``python -m bench verbs`` in a project that has trained the study corpus (``hoidata profile study``, ``hoidata repro``).
-A generated mug; every verb that the evaluator tells apart is typed with either hand (those for two hands: with both),
-several seeds each (HOIDATA_BENCH_SEEDS). Counted: how often the evaluator names the verb that was typed, how often
+A generated mug, whose shape is new and whose word is not; every verb that the evaluator tells apart is typed with
+either hand (those for two hands: with both), several seeds each (HOIDATA_BENCH_SEEDS). Counted: how often the evaluator names the verb that was typed, how often
 training's clips of that verb move their objects most alike, how often the object does what the verb says, and how often
 the hand of the words comes within 2 cm. Beside it guessing, and the same motions taken for those of the next verb,
 which must fail. At the end what each verb did, in the mean, for a person to compare.
@@ -19,6 +19,7 @@ import trimesh
 
 from bench.harness import show
 from hoidata.annotation.encoders import load_encoder
+from hoidata.annotation.hand_choice import PHRASES
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips.clip import SIDES, Clip, HandType, Side
 from hoidata.contact.proximity import ProximityIndex
@@ -109,11 +110,10 @@ def typed(verb: str, generator: Generator, annotated: AnnotatedStore) -> list[Ma
     types = annotated.hand_types
     usual = Counter(types.loc[(types["verb"] == verb) & types.index.isin(annotated.ids("train")), "hand_type"])
     hands: Sequence[HandType] = ("both",) if usual.most_common(1)[0][0] == "both" else ("right", "left")
-    words = {"both": "both hands", "left": "the left hand", "right": "the right hand"}
     mug = generated_mug()
     found = []
     for hand in hands:
-        sentence = f"{verb.capitalize()} a mug with {words[hand]}."
+        sentence = f"{verb.capitalize()} a mug {PHRASES[hand]}."
         wishes = (Wish(seed) for seed in range(SEEDS * (3 - len(hands))))
         found += [
             measured(verb, hand, own, generator.hands, annotated.contact_threshold_m)

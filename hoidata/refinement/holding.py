@@ -23,7 +23,7 @@ from hoidata.physics.scene import Scene, object_scene
 from hoidata.physics.standard_units import StandardUnits
 from hoidata.refinement.hold_solver import SolverSettings, corrected
 from hoidata.refinement.kernels import N_UNKNOWNS
-from hoidata.refinement.object_field import ObjectField
+from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
 from hoidata.refinement.waiting import WaitSettings, wait_for_hands
@@ -238,15 +238,13 @@ def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Gr
     skin = Skin(pair[side], np.asarray(track.betas, np.float64)[0], track.template_m)
     world = HandPose.of(track)
     points_m = skin.vertices_m(skin.chain(world))
-    distance, _ = ObjectField(thing).distances(points_m)
-    touching = (distance < settings.near_m) & track.valid[:, None]
-    part = ObjectField(thing).nearest_part(points_m) if thing.model.is_articulated else np.zeros_like(distance, int)
-    chosen = int((touching & (part == 1)).sum() > (touching & (part == 0)).sum())
-    object_from_part = thing.model.object_from_part(chosen, thing.hinge_rad)
-    world_from_part = thing.world_from_object @ object_from_part
-    touched = (touching & (part == chosen)).any(axis=1)
-    holds, moving = _holds(points_m, touched, world_from_part, track.valid, settings)
-    return _Grip(track, skin, world, holds, moving, object_from_part, world_from_part) if holds else None
+    field = ObjectField(thing)
+    touching: np.ndarray = (field.distances(points_m)[0] < settings.near_m) & track.valid[:, None]
+    part, touching = field.part_touched(points_m, touching)
+    moved = world_from_part(thing, part)
+    holds, moving = _holds(points_m, touching.any(axis=1), moved, track.valid, settings)
+    object_from_part = thing.model.object_from_part(part, thing.hinge_rad)
+    return _Grip(track, skin, world, holds, moving, object_from_part, moved) if holds else None
 
 
 def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrack:

@@ -18,7 +18,7 @@ class ObjectField:
         index, self.n_frames = surface_index(thing.model), thing.n_frames
         self.solid_note = index.solid_note
         self._parts = [
-            (surface.grid, _part_from_world(thing, part))
+            (surface.grid, _contiguous(world_from_part(thing, part).inverse()))
             for part, surface in index.filled.items()  # one grid per part, whatever the frames and angles
         ]
 
@@ -35,6 +35,18 @@ class ObjectField:
             lower_signed(*grid, rotation, offset, np.ascontiguousarray(places_m), each[-1], np.zeros(places_m.shape))
         return np.argmin(each, axis=0)
 
+    def part_touched(self, places_m: np.ndarray, touching: np.ndarray) -> tuple[int, np.ndarray]:
+        """Number of the part that most places (frame, place, 3), world, touch; and (frame, place) which touch that one.
+
+        touching: (frame, place) bool, which touch any part.
+        """
+        if not self.moves:
+            return 0, touching
+        nearest = self.nearest_part(places_m)
+        each = [touching & (nearest == part) for part in (0, 1)]
+        part = int(each[1].sum() > each[0].sum())
+        return part, each[part]
+
     def distances(self, places_m: np.ndarray, frames: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Signed distances (frame, place), metres, and their slope (frame, place, 3), world frame.
 
@@ -48,8 +60,11 @@ class ObjectField:
         return distance, slope
 
 
-def _part_from_world(thing: ObjectTrack, part: int) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (frame, 3, 3) and translation (frame, 3)."""
-    world_from_object = thing.world_from_object
-    found: RigidTransform = (world_from_object @ thing.model.object_from_part(part, thing.hinge_rad)).inverse()
-    return np.ascontiguousarray(found.rotation), np.ascontiguousarray(found.translation)
+def world_from_part(thing: ObjectTrack, part: int) -> RigidTransform:
+    """(frame,) the motion of one part of an object."""
+    return thing.world_from_object @ thing.model.object_from_part(part, thing.hinge_rad)
+
+
+def _contiguous(transform: RigidTransform) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (frame, 3, 3) and translation (frame, 3), as compiled code takes them."""
+    return np.ascontiguousarray(transform.rotation), np.ascontiguousarray(transform.translation)

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.geometry.intervals import runs
-from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import HandPair
-from hoidata.refinement.object_field import ObjectField
+from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.skin import HandPose, Skin
 
 _EVERY = 5  # of a hand's vertices: enough to see whether it touches, and how fast
@@ -77,29 +76,25 @@ class _HandAtPart:
             return None
         skin, world = Skin(pair[side], np.asarray(track.betas, np.float64)[0], track.template_m), HandPose.of(track)
         points_m = skin.vertices_m(skin.chain(world))[:, ::_EVERY]
-        near = (ObjectField(thing).distances(points_m)[0] < settings.near_m) & track.valid[:, None]
+        field = ObjectField(thing)
+        near = (field.distances(points_m)[0] < settings.near_m) & track.valid[:, None]
         if not near.any():
             return None
-        of_part = ObjectField(thing).nearest_part(points_m) if thing.is_articulated else np.zeros_like(near, int)
-        part = int((near & (of_part == 1)).sum() > (near & (of_part == 0)).sum())
-        world_from_part = _world_from_part(thing, part)
-        local = world_from_part.inverse() @ points_m
+        part, _ = field.part_touched(points_m, near)
+        part_from_world = world_from_part(thing, part).inverse()
+        local = part_from_world @ points_m
         slip = np.linalg.norm(np.diff(local, axis=0), axis=-1) * FPS
         sweeps = (near[1:] & near[:-1] & (slip > settings.slip_m_s)).any(axis=1)
-        return cls(track, world.seen_from(world_from_part.inverse()), part, sweeps)
+        return cls(track, world.seen_from(part_from_world), part, sweeps)
 
     def carried(self, thing: ObjectTrack) -> HandTrack:
         """The hand as it was, seen from its part, where that is now; frames without it stay as they were."""
-        pose, track, valid = self.pose.seen_from(_world_from_part(thing, self.part)), self.track, self.track.valid
+        pose, track, valid = self.pose.seen_from(world_from_part(thing, self.part)), self.track, self.track.valid
         made = pose.track(track.betas[0], valid, track.template_m)
         wrist, turn = (
             np.where(valid[:, None], getattr(made, name), getattr(track, name)) for name in ("wrist_m", "global_orient")
         )
         return replace(track, wrist_m=wrist, global_orient=turn)
-
-
-def _world_from_part(thing: ObjectTrack, part: int) -> RigidTransform:
-    return thing.world_from_object @ thing.model.object_from_part(part, thing.hinge_rad)
 
 
 def _steps_m(thing: ObjectTrack) -> np.ndarray:
@@ -119,10 +114,9 @@ def _moments(steps_m: np.ndarray, sweeps: np.ndarray, settings: WaitSettings) ->
     weight = np.where(sweeps | (own < _AT_REST), _STANDS, 1.0)
     differences, sums = np.diff(np.eye(len(own)), axis=0), np.tri(len(own))
     matrix = np.diag(weight) + settings.even * differences.T @ differences + settings.keep * sums.T @ sums
-    change, by_end = np.linalg.solve(matrix, np.stack((np.where(sweeps, -weight * own, 0), np.ones_like(own)), 1)).T
-    change = change - by_end * change.sum() / by_end.sum()  # it ends where it ended
+    change = np.linalg.solve(matrix, np.where(sweeps, -weight * own, 0))
     steps = np.where(sweeps, 0, np.maximum(own + change, 0))
-    steps *= own.sum() / steps.sum()
+    steps *= own.sum() / steps.sum()  # it ends where it ended
     rising = 1e-6 * np.arange(len(own) + 1)  # so that every moment is found, at rest too
     way, new_way = (np.append(0, np.cumsum(array)) + rising for array in (own, steps))
     return np.interp(new_way, way, np.arange(len(way), dtype=np.float64))

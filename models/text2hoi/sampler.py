@@ -142,8 +142,6 @@ class Text2Hoi:
         placed: what is done to a motion before it becomes a clip.
         """
         best = self._drawn(requests, refined, contact_maps, placed)
-        if not (refined and self.refined_by == "hold"):
-            return best
         for draw in range(2, self.config.draws + 1):
             weak = [number for number, own in enumerate(best) if own.carried < ENOUGH]
             if not weak:
@@ -165,7 +163,7 @@ class Text2Hoi:
         """Every request answered once; what only holds can tell is 1 elsewhere."""
         motions = [placed(motion) for motion in self.motions(requests, refined, contact_maps)]
         clips = self.clips(requests, motions, refined)
-        held = refined and self.refined_by == "hold"
+        held = self._held(refined)
         shares = [carried_share(self.pair, clip, self.config.hold) if held else 1.0 for clip in clips]
         return [Answer(*own) for own in zip(motions, clips, shares, strict=True)]
 
@@ -175,8 +173,11 @@ class Text2Hoi:
             motion_clip(request, motion.refined if refined else motion.coarse, motion.object, self.facts["synthetic"])
             for request, motion in zip(requests, motions, strict=True)
         ]
-        held = refined and self.refined_by == "hold"
-        return [hold_clip(self.pair, clip, self.config.hold) for clip in found] if held else found
+        return [hold_clip(self.pair, clip, self.config.hold) for clip in found] if self._held(refined) else found
+
+    def _held(self, refined: bool) -> bool:
+        """Whether a hold corrects motions, where they are refined."""
+        return refined and self.refined_by == "hold"
 
     @torch.no_grad()
     def motions(

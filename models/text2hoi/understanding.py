@@ -13,11 +13,10 @@ from functools import partial
 import numpy as np
 
 from hoidata.annotation.encoders import TextEncoder
-from hoidata.annotation.hand_choice import select_hand
+from hoidata.annotation.hand_choice import PHRASES, select_hand
 from hoidata.clips.clip import HandType
 from models.common.vocabulary import Vocabulary
 
-HANDS: dict[HandType, str] = {"left": "the left hand", "right": "the right hand", "both": "both hands"}
 MOST_OBJECTS = 12
 
 Reading = tuple[str, float]
@@ -64,7 +63,7 @@ def understand(
 
 def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vocabulary) -> Sequence[list[str]]:
     """The sentence with the hand in words; then that with objects of training in the place of its own."""
-    named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!')} with {HANDS[hand]}."
+    named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!')} {PHRASES[hand]}."
     place = re.compile(rf"\b(an?\s+)?{re.escape(thing)}\b", re.IGNORECASE) if thing else None
     if place is None or not place.search(named):
         return [[named]]
