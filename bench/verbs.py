@@ -2,10 +2,11 @@
 
 ``python -m bench verbs`` in a project that has trained the study corpus (``hoidata profile study``, ``hoidata repro``).
 A generated mug, whose shape is new and whose word is not; every verb that the evaluator tells apart is typed with
-either hand (those for two hands: with both), several seeds each (HOIDATA_BENCH_SEEDS). Counted: how often the evaluator names the verb that was typed, how often
-training's clips of that verb move their objects most alike, how often the object does what the verb says, and how often
-the hand of the words comes within 2 cm. Beside it guessing, and the same motions taken for those of the next verb,
-which must fail. At the end what each verb did, in the mean, for a person to compare.
+either hand (those for two hands: with both), several seeds each (HOIDATA_BENCH_SEEDS). Counted: how often the
+evaluator names the verb that was typed, how often training's clips of that verb move their objects most alike, how
+often the object does what the verb says, and how often the hand of the words comes within 2 cm. Beside it guessing,
+and the same motions taken for those of the next verb, which must fail. At the end what each verb did, in the mean, for
+a person to compare.
 """
 
 import os
