@@ -67,15 +67,27 @@ def draw_threshold(checkpoint: Checkpoint) -> float:
 
 
 def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
-    """(B, 2, N) a map for each hand, 0 or 1, for sentences (B, 512) and latents (1, B, ...) as the network draws them.
+    """(B, K, 2, N) maps by hand, 0 or 1, for sentences (B, 512) and latents (K, B, ...) as the network draws them.
 
     Where no point reaches the threshold the likeliest ones count.
     """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
-    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device))[:, 0]
+    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device))
     limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
-    return ((probability >= limit) & batch.active_hands[..., None]).float()
+    return ((probability >= limit) & batch.active_hands[:, None, :, None]).float()
+
+
+def most_typical(maps: Tensor) -> Tensor:
+    """(B, 2, N) of each row's maps (B, K, 2, N), 0 or 1, the one whose F1 with the others, either hand's, is best.
+
+    The first of equals. Minimum Bayes risk: what is most like other draws is most like what may be expected.
+    """
+    either = maps.amax(2)
+    shared, size = either @ either.transpose(1, 2), either.sum(-1)
+    agreement = 2 * shared / (size[:, :, None] + size[:, None]).clamp_min(1)
+    best = agreement.sum(-1).argmax(-1)
+    return maps[torch.arange(len(maps), device=maps.device), best]
 
 
 def contact_drawer(checkpoint: Checkpoint) -> DrawContact:
@@ -84,7 +96,7 @@ def contact_drawer(checkpoint: Checkpoint) -> DrawContact:
     assert isinstance(network, ContactNetwork)
     return lambda batch, text, generator: touched_maps(
         checkpoint, batch, text, network.draw_latents(1, len(batch), generator)
-    )
+    )[:, 0]
 
 
 def _objective(setup: Setup) -> tuple[Objective, None]:

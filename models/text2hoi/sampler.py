@@ -23,7 +23,8 @@ from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.precision import SamplingPrecision, compute_in
 from models.common.sampling import SamplerConfig, draw_each
-from models.text2hoi.contact_training import touched_maps
+from models.text2hoi.anchored_contact import AnchoredContact
+from models.text2hoi.contact_training import most_typical, touched_maps
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import motion_generator
 from models.text2hoi.length import LengthModel
@@ -43,7 +44,8 @@ class SamplingConfig:
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
-    at; the one that carries most is the answer.
+    at; the one that carries most is the answer. contact_draws: how many contact maps are drawn for a motion by a
+    network that draws anchors; the one most like the others is asked for. Draws of a latent hardly differ: one.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -52,6 +54,7 @@ class SamplingConfig:
     hold: HoldSettings = field(default_factory=HoldSettings)
     draws: int = 3
     precision: SamplingPrecision = "float32"
+    contact_draws: int = 12
 
 
 @dataclass(frozen=True)
@@ -238,11 +241,12 @@ class Text2Hoi:
         ]
 
     def _contact(self, batch: RequestBatch, generators: Sequence[torch.Generator]) -> Tensor:
-        """(B, 2, N) one drawn map for each hand, 0 or 1."""
+        """(B, 2, N) one map for each hand, 0 or 1: the most typical of those that are drawn."""
         network = self.trained["contact"].network
         assert isinstance(network, ContactNetwork)
-        latents = torch.cat([network.draw_latents(1, 1, generator) for generator in generators], 1)
-        return touched_maps(self.trained["contact"], batch, batch.text, latents)
+        count = self.config.contact_draws if isinstance(network, AnchoredContact) else 1
+        latents = torch.cat([network.draw_latents(count, 1, generator) for generator in generators], 1)
+        return most_typical(touched_maps(self.trained["contact"], batch, batch.text, latents))
 
 
 def _next_seed(seed: int, draw: int) -> int:

@@ -2,14 +2,17 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch
+from hoidata.contact.agreement import f1_score
 from models.common.point_net import PointNetConfig
 from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss, picked
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
+from models.text2hoi.contact_training import most_typical
 from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens, spread_out
 
 POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16), align=False)
@@ -78,6 +81,26 @@ def test_a_clips_maps_do_not_depend_on_the_others_in_the_batch(batch: ClipBatch)
     many = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents)
     one = model.sample(batch.points_m[1:2], batch.text[1:2, 0], batch.active_hands[1:2], latents[:, 1:2])
     torch.testing.assert_close(many[1:2], one, atol=1e-5, rtol=1e-4)
+
+
+def test_the_most_typical_map_agrees_best_with_all_others() -> None:
+    generator = torch.Generator().manual_seed(3)
+    maps = (torch.rand(20, 7, 2, 40, generator=generator) < torch.rand(20, 7, 1, 1, generator=generator)).float()
+    maps[0, :, :] = 0  # nothing is touched in any
+    for drawn, chosen in zip(maps, most_typical(maps), strict=True):
+        touched = drawn.amax(1).numpy() > 0
+        means = [np.mean([f1_score(own, other) for other in touched if other is not own]) for own in touched]
+        assert torch.equal(chosen, drawn[int(np.argmax(means))]) or touched.sum() == 0
+
+
+def test_a_map_unlike_all_others_is_never_the_typical_one() -> None:
+    usual, odd = torch.zeros(2, 30), torch.zeros(2, 30)
+    usual[1, :9], odd[0, 20:] = 1, 1
+    for place in range(4):
+        maps = usual.repeat(1, 4, 1, 1)
+        maps[0, place] = odd
+        assert torch.equal(most_typical(maps)[0], usual)
+    assert torch.equal(most_typical(odd[None, None])[0], odd)
 
 
 @pytest.mark.slow
