@@ -19,6 +19,15 @@ def runs(flags: np.ndarray) -> list[Interval]:
     return [Interval(int(start), int(stop)) for start, stop in pairs]
 
 
+def bridged(flags: np.ndarray, longest: int) -> np.ndarray:
+    """Flags (frame,) with gaps of at most ``longest`` frames between True ones filled."""
+    filled = flags.copy()
+    for start, stop in runs(~flags):
+        if start > 0 and stop < len(flags) and stop - start <= longest:
+            filled[start:stop] = True
+    return filled
+
+
 def widened(interval: Interval, margin: int, usable: np.ndarray) -> Interval:
     """The interval with up to ``margin`` frames before and after it, as far as the frames are usable (frame,)."""
     start, stop = interval

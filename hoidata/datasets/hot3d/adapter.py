@@ -25,7 +25,7 @@ from hoidata.datasets.hot3d.files import HandFormat, Poses
 from hoidata.datasets.hot3d.sources import PARTS, Source, read_source
 from hoidata.datasets.hot3d.words import object_words
 from hoidata.errors import BadInput
-from hoidata.geometry.intervals import Interval, runs, widened
+from hoidata.geometry.intervals import Interval, bridged, runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair, track_joints
 from hoidata.hands.fitting import fit_hands, fit_shape
@@ -198,7 +198,7 @@ class Hot3dAdapter(Described):
         for first, last in _unbroken(times):
             inside = np.zeros(len(times), bool)
             inside[first:last] = usable[first:last]
-            for touch in runs(_bridged(near & inside) & inside):
+            for touch in runs(bridged(near & inside, BRIDGE_FRAMES) & inside):
                 interval = widened(touch, self.margin_frames, inside)
                 if interval.stop - interval.start < self.shortest_frames:
                     found.short.append(touch)
@@ -328,15 +328,6 @@ def _unbroken(times: np.ndarray) -> list[Interval]:
     """Frames that follow each other at 30 a second."""
     edges = np.flatnonzero(np.diff(times) > 1.5 * STEP_NS) + 1
     return [Interval(int(a), int(b)) for a, b in zip(np.r_[0, edges], np.r_[edges, len(times)], strict=True)]
-
-
-def _bridged(flags: np.ndarray) -> np.ndarray:
-    """Flags with inner gaps of at most 10 frames filled."""
-    filled = flags.copy()
-    for start, stop in runs(~flags):
-        if start > 0 and stop < len(flags) and stop - start <= BRIDGE_FRAMES:
-            filled[start:stop] = True
-    return filled
 
 
 def _divided(interval: Interval, longest: int) -> list[Interval]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.geometry.intervals import Interval, runs, sudden_steps
+from hoidata.geometry.intervals import Interval, bridged, runs, sudden_steps
 from hoidata.geometry.rotations import rotation_angle
 
 FROZEN_SOURCE_FRAMES = 12
@@ -85,8 +85,8 @@ def interactions(usable: np.ndarray, touched: np.ndarray, lifted: np.ndarray) ->
     frames. Long stretches are divided evenly.
     """
     pieces: list[Interval] = []
-    for touch in runs(_bridged(touched) & usable):
-        windows = _lift_windows(touch, _bridged(lifted & _mask(touch, len(lifted))))
+    for touch in runs(bridged(touched, BRIDGE_FRAMES) & usable):
+        windows = _lift_windows(touch, bridged(lifted & _mask(touch, len(lifted)), BRIDGE_FRAMES))
         edges = [touch.start, *(edge for window in windows for edge in window), touch.stop]
         for start, stop in pairwise(edges):
             if stop > start:
@@ -153,15 +153,6 @@ def _mask(stretch: tuple, length: int) -> np.ndarray:
     mask = np.zeros(length, dtype=bool)
     mask[stretch[0] : stretch[1]] = True
     return mask
-
-
-def _bridged(flags: np.ndarray) -> np.ndarray:
-    """Flags with inner gaps of at most 10 frames filled."""
-    filled = flags.copy()
-    for start, stop in runs(~flags):
-        if start > 0 and stop < len(flags) and stop - start <= BRIDGE_FRAMES:
-            filled[start:stop] = True
-    return filled
 
 
 def _lift_windows(touch: Interval, lifted: np.ndarray) -> list[Interval]:
