@@ -8,8 +8,8 @@
 several started side by side share the rows. On `study` 400 steps teach nothing (`ours` does what the verb says in .05):
 take 1,200 or more there.
 
-Every row of `ours` is held by the same hold; `paper` and `released` have their own refiner. Rows under `paper` are
-those of the paper's Tables 2 and S1, a refiner that is a diffusion model.
+Rows of `ours` are held, `paper` and `released` have their own refiner. Rows under `paper` are those of the paper's
+Tables 2 and S1, a refiner that is a diffusion model. The last rows of `ours` change how its motions are made alone.
 """
 
 import json
@@ -62,10 +62,11 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Row:
-    """The preset of all networks, and by network what is laid over its settings."""
+    """The preset of all networks, by network what is laid over its settings, and what over ``sample.text2hoi``."""
 
     preset: Literal["ours", "paper", "released"] = "ours"
     changed: Mapping[str, Settings] = field(default_factory=dict)
+    sampled: Settings = field(default_factory=dict)
 
     @property
     def networks(self) -> tuple[str, ...]:
@@ -76,6 +77,11 @@ class Row:
         """Of one network by the section ``train`` of params.yaml, without steps and seed."""
         own, small = (train[name].get(network, {}) for name in (self.preset, "small"))
         return laid_over(laid_over(own, small), self.changed.get(network, {}))
+
+    def sampling(self) -> SamplingConfig:
+        """How its motions are made: ours are held, the others have their own refiner."""
+        refined_by = {"refined_by": "hold" if self.preset == "ours" else "network"}
+        return build_config(SamplingConfig, laid_over(refined_by, self.sampled), "bench: ablation")
 
 
 def _network(**changed: Any) -> Row:
@@ -124,6 +130,10 @@ LESS: Mapping[str, Row] = {
     "contact by a latent": Row(changed={"contact": {"network": {"drawn_by": "latent"}}}),
     "contact at a constant rate": Row(changed={"contact": {"training": {"schedule": "constant"}}}),
     "contact of the last step": Row(changed={"contact": {"training": {"keep_best": False}}}),
+    # What is done when motions are made, by the networks of `ours`.
+    "the first contact map drawn": Row(sampled={"contact_draws": 1}),
+    "a motion drawn once": Row(sampled={"draws": 1}),
+    "an object that never waits": Row(sampled={"hold": {"wait": {"most": 0}}}),
 }
 PAPERS: Mapping[str, Row] = {
     "paper: no codes": Row("paper", {"diffusion": {"network": {"codes": "none"}}}),
@@ -181,7 +191,7 @@ class Study:
     def figures_path(self, row: Row, seed: int) -> Path:
         """Where a row's figures are kept."""
         settings = [self.settings(row, network, seed) for network in row.networks]
-        return KEPT / f"row-{value_digest([self.made_from, row.preset, settings])[:16]}.json"
+        return KEPT / f"row-{value_digest([self.made_from, row.preset, settings, row.sampled])[:16]}.json"
 
     def figures(self, row: Row, seed: int) -> dict[str, float]:
         """What is measured of a row's motions for evenly spread test clips."""
@@ -195,9 +205,8 @@ class Study:
 
 def _answering(sources: Sources, folders: Mapping[str, Path], row: Row) -> Text2Hoi:
     """The row's networks, ready to answer; a refiner that nothing asks is not among them."""
-    config = SamplingConfig(refined_by="hold" if row.preset == "ours" else "network")
     trained = {name: load_checkpoint(path, load_network(name), sources.device) for name, path in folders.items()}
-    return Text2Hoi(trained, Hands(sources.hands).to(sources.device), config, sources.device, sources.hands)
+    return Text2Hoi(trained, Hands(sources.hands).to(sources.device), row.sampling(), sources.device, sources.hands)
 
 
 def main() -> None:

@@ -49,6 +49,8 @@ def test_a_row_differs_from_ours_in_its_switch_alone(name: str) -> None:
     for network in NETWORKS:
         ours, own = planned(Row(), network), planned(LESS[name], network)
         changed += [key for key in ours if ours[key] != own[key]]
+    sampled, own_sampled = (dict(leaves(asdict(row.sampling()))) for row in (Row(), LESS[name]))
+    changed += [key for key in sampled if sampled[key] != own_sampled[key]]
     assert 1 <= len(changed) <= 2
     together = "no splines", "norm after each half", "contact as a map", "object's size told"
     assert len(changed) == 1 or name in together
@@ -93,6 +95,8 @@ def test_rows_share_what_they_have_in_common_and_are_made_once(study: Study, cap
     assert made == {path: path.stat().st_mtime_ns for path in ablation.KEPT.glob("*.json")}
     show_rows(study, [name for name, _ in jobs], [0, 1])
     assert "contact by a latent" in capsys.readouterr().out
+    once = study.figures_path(ROWS["a motion drawn once"], 0)
+    assert once != study.figures_path(ROWS["ours"], 0)
     assert replace(study, made_from="other").figures_path(ROWS["ours"], 0) != study.figures_path(ROWS["ours"], 0)
 
 
