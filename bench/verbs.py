@@ -19,13 +19,13 @@ import numpy as np
 import trimesh
 
 from bench.harness import show
+from hoidata.actions.action import Actions, action_numbers, training_actions
 from hoidata.annotation.encoders import load_encoder
 from hoidata.annotation.hand_choice import PHRASES
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips.clip import SIDES, Clip, HandType, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
-from hoidata.metrics.action import Actions, action_numbers, training_actions
 from hoidata.metrics.pair import Motion
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore, load_annotated

@@ -22,7 +22,7 @@ To add a metric: a function of (pair, every) that gives the values of one motion
   k-th is motion k of every clip; it says what another run of the sampler would give. `clips`: a bootstrap that draws
   clips again by source sequence, with all their motions; it says what other clips would give. Neither covers training.
 - `asked.npz` beside the folder of clips holds the contact maps that were asked for (`asked.py`); without it there is no
-  adherence. `action.py` lists the numbers of what an object does; limits of verbs stand in `actions.toml`.
+  adherence. `hoidata/actions` lists the numbers of what an object does, and the limits of verbs (`actions.toml`).
 - A store whose info says `"length": "own"` holds motions of lengths the family chose. Its hands are seen where it has
   them, and what is compared frame by frame has no figure. Rows of given and of own length are never one row.
 

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from hoidata.actions.action import verb_of
 from hoidata.clips.clip import SIDES, Side
-from hoidata.metrics.action import verb_of
 from hoidata.metrics.pair import Motion, acting_sides
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store

@@ -18,11 +18,11 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
+from hoidata.actions.action import Actions, training_actions, verb_of
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
-from hoidata.metrics.action import Actions, training_actions, verb_of
 from hoidata.metrics.asked import AskedDistances, read_asked, read_asked_distances
 from hoidata.metrics.encoded import Encoder
 from hoidata.metrics.encoded_store import encoder_summary

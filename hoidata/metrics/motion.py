@@ -7,8 +7,8 @@ from functools import lru_cache
 
 import numpy as np
 
+from hoidata.actions.action import action_numbers
 from hoidata.clips.clip import FPS, SIDES, Side
-from hoidata.metrics.action import action_numbers
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.touch import made_entries
 from hoidata.physics.mano_capsules import world_rotmats

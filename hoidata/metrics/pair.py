@@ -6,10 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from hoidata.actions.action import Actions
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
-from hoidata.metrics.action import Actions
 from hoidata.metrics.asked import AskedDistances
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene

@@ -168,13 +168,13 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "Action", "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,
-        "mean over motions", "all", "this project: limits of height, way, tilt, hinge and hands (`action.py`)",
+        "mean over motions", "all", "this project: limits of height, way, tilt, hinge and hands (`hoidata/actions`)",
         thresholds="`actions.toml`, or the verb's own training clips: 1st to 99th percentile and half a deviation",
     ),
     Metric(
         "Action", "action_named", "the object moves most like the verb's training clips",
         "", "higher", motion.action_named,
-        "mean over motions", "all", "this project: nearest centroid of the standardised numbers of `action.py`",
+        "mean over motions", "all", "this project: nearest centroid of the standardised numbers of `hoidata/actions`",
     ),
     Metric(
         "Motion", "length_error_frames", "error of the length a family chose",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from hoidata.metrics.action import verb_of
+from hoidata.actions.action import verb_of
 from hoidata.metrics.encoded import UNKNOWN, label_words, recorded
 from hoidata.metrics.paths import FRAMES, even_frames, joints_and_presence
 from hoidata.store.annotated import AnnotatedStore

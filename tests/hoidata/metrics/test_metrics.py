@@ -7,12 +7,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
+from hoidata.actions.action import action_numbers, learn_actions
 from hoidata.clips.clip import FPS, HandTrack, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.metrics import forces, motion, touch
 from hoidata.metrics.registry import METRICS
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.mano_capsules import hand_capsules
+from tests.builders.clips import with_object
 
 HALF_M = np.array([0.05, 0.04, 0.03])  # of the box of tests/conftest.py
 
@@ -265,3 +267,20 @@ def test_capsule_depth_is_how_far_capsules_reach_over_a_plane(make_clip, pair_of
     assert forces.capsule_depth_mm(pair_of(held, held, table_m=-1.0), 1) == pytest.approx([expected], abs=1e-3)
     floating = on_a_hand(make_clip, hand_below_m=0.5)
     assert len(forces.capsule_depth_mm(pair_of(floating, held, table_m=-1.0), 1)) == 0
+
+
+def test_a_motion_is_judged_by_the_verb_of_its_reference(make_clip, pair_of):
+    clip = make_clip(30)
+    lifted = with_object(clip, translation_m=clip.object.translation_m + np.linspace(0, 0.5, 30)[:, None] * [0, 0, 1])
+    untouched = np.zeros((2, 30), bool)
+    lift, rest = (action_numbers(own.object, np.array([0.0, 0.0, -1.0]), untouched) for own in (lifted, clip))
+    learnt = learn_actions({"lift": [lift] * 3, "pour": [rest] * 3})
+    actions = replace(learnt, limits={"lift": {"end_rise_m": (0.35, 0.9)}})
+    for predicted, verb, followed in ((lifted, "lift", [1.0]), (clip, "lift", [0.0]), (lifted, "juggle", [])):
+        pair = replace(pair_of(predicted, clip), verb=verb, actions=actions)
+        assert motion.action_followed(pair, 1).tolist() == followed
+    named = [
+        motion.action_named(replace(pair_of(lifted, clip), verb=verb, actions=actions), 1).tolist()
+        for verb in ("lift", "pour", "juggle")
+    ]
+    assert named == [[1.0], [0.0], []]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import hoidata.metrics
+import hoidata.actions
 from hoidata.clips.clip import SIDES
 from hoidata.files import sha256_file
 from hoidata.geometry.rotations import rotvec_to_rotmat
@@ -117,7 +117,7 @@ def test_what_a_verb_does_is_its_reverse_backwards_from_where_that_ends(verb, re
 
 
 def test_every_verb_has_limits_for_what_its_object_does():
-    limits = tomllib.loads((Path(hoidata.metrics.__file__).parent / "actions.toml").read_text())
+    limits = tomllib.loads((Path(hoidata.actions.__file__).parent / "actions.toml").read_text())
     assert set(limits) == set(VERBS)
     for pairs in limits.values():
         assert all(low < high for low, high in (pair for pair in pairs.values() if isinstance(pair, list)))

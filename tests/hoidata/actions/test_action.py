@@ -1,16 +1,13 @@
 """What an object does, in numbers of motions that are known; what verbs ask, written and learnt."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hoidata.actions.action import NUMBERS, Actions, action_numbers, learn_actions, written_limits
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.errors import BadInput
-from hoidata.metrics import motion
-from hoidata.metrics.action import NUMBERS, Actions, action_numbers, learn_actions, written_limits
-from tests.builders.clips import in_another_world, with_object
+from tests.builders.clips import in_another_world
 from tests.builders.objects import box_model, notebook
 
 DOWN = np.array([0.0, 0.0, -1.0])
@@ -170,17 +167,3 @@ def test_the_limits_that_are_written_here_can_be_read_and_tell_open_from_close()
     written = written_limits()
     assert written["open"]["hinge_net_deg"][0] > 0 > written["close"]["hinge_net_deg"][1]
     assert written["hand over"]["hand_changes"] == (1, 2)
-
-
-def test_a_motion_is_judged_by_the_verb_of_its_reference(make_clip, pair_of):
-    clip = make_clip(30)
-    lifted = with_object(clip, translation_m=clip.object.translation_m + np.linspace(0, 0.5, 30)[:, None] * [0, 0, 1])
-    actions = replace(learn_actions(lifts_and_pours(0)), limits={"lift": {"end_rise_m": (0.35, 0.9)}})
-    for predicted, verb, followed in ((lifted, "lift", [1.0]), (clip, "lift", [0.0]), (lifted, "juggle", [])):
-        pair = replace(pair_of(predicted, clip), verb=verb, actions=actions)
-        assert motion.action_followed(pair, 1).tolist() == followed
-    named = [
-        motion.action_named(replace(pair_of(lifted, clip), verb=verb, actions=actions), 1).tolist()
-        for verb in ("lift", "pour", "juggle")
-    ]
-    assert named == [[1.0], [0.0], []]
