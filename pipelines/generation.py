@@ -1,6 +1,6 @@
 """A sentence and an object to motions, with the models of the dataset that knows its words best, as files."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
-from models.text2hoi.generation import Generator, Wish
+from models.text2hoi.generation import GeneratedMotion, Generator, Wish
 from models.text2hoi.sentences import read_sentence
 from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.generation_page import write_generation
@@ -80,7 +80,7 @@ def generate_files(asked: Asked, out: Path) -> Written:
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampler=asked.sampler)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
-    notes += _taken_for(verb, motions[0].evidence)
+    notes += [*_taken_for(verb, motions[0].evidence), *_moved_otherwise(motions)]
     return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
 
 
@@ -95,6 +95,17 @@ def _taken_for(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
         return []
     plainly = evidence["plainly_read_as"][0]
     return [f"the networks are told {evidence['told']!r}: the sentence as it is they would take for {plainly!r}"]
+
+
+def _moved_otherwise(motions: Sequence[GeneratedMotion]) -> list[str]:
+    """Which samples move their object as training clips of another verb than the sentence was read as; for a person."""
+    found = []
+    for evidence in (motion.evidence for motion in motions):
+        read_as, moved_as = evidence["read_as"], evidence["moved_as"]
+        if read_as and moved_as and moved_as != read_as[0]:
+            number = evidence["number"] + 1
+            found.append(f"sample {number}: the object moves most like training's {moved_as!r}, not {read_as[0]!r}")
+    return found
 
 
 def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Models, str]:

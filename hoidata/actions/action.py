@@ -151,6 +151,19 @@ class Actions:
         return min(self.centroids, key=lambda verb: float(np.linalg.norm(self.centroids[verb] - asked)))
 
     @property
+    def record(self) -> dict[str, Any]:
+        """What ``named`` needs, as plain values."""
+        centroids = {verb: dict(zip(self.scale, own.tolist(), strict=True)) for verb, own in self.centroids.items()}
+        return {"scale": {name: list(own) for name, own in self.scale.items()}, "centroids": centroids}
+
+    @classmethod
+    def read(cls, record: Mapping[str, Any]) -> "Actions":
+        """From a record; without limits, so that nothing is known of what follows a verb."""
+        scale = {name: (float(mean), float(deviation)) for name, (mean, deviation) in record["scale"].items()}
+        centroids = {verb: np.array([own[name] for name in scale]) for verb, own in record["centroids"].items()}
+        return cls({}, {}, centroids, scale)
+
+    @property
     def facts(self) -> dict[str, Any]:
         """Where each verb's limits come from, for the file of figures."""
         return {"limits": sorted(set(self.limits) - set(self.learnt)), "learnt": dict(sorted(self.learnt.items()))}

@@ -5,6 +5,7 @@ one index per part serve every frame of every clip, and makes every result indep
 """
 
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -13,16 +14,24 @@ from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entri
 from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, point_boxes
 from hoidata.contact.part_frames import part_motion
 from hoidata.errors import BadInput
-from hoidata.objects.sampling import SampledPoints
 
 CONTACT_THRESHOLD_M = 0.02
+
+
+class PartPoints(Protocol):
+    """points_m: (point, 3) on an object's surface, in its frame, the hinge at zero. part: (point,) 0 or 1."""
+
+    @property
+    def points_m(self) -> np.ndarray: ...
+    @property
+    def part(self) -> np.ndarray: ...
 
 
 class ProximityIndex:
     """One object's sampled points, ready for both questions. Build once per object, use for all its clips."""
 
-    def __init__(self, points: SampledPoints) -> None:
-        self.count = len(points)
+    def __init__(self, points: PartPoints) -> None:
+        self.count = len(points.points_m)
         self.parts = [int(part) for part in np.unique(points.part)]
         self._points_m = points.points_m.astype(np.float32, copy=False)
         self._members = [np.flatnonzero(points.part == part) for part in self.parts]

@@ -78,14 +78,14 @@ class Network(StoredNetwork):
 
     objective: how it is trained, with the normalisation it is trained in or None. loss: config of the objective.
     needs: names of the networks that must be trained before. crop: of training clips that are too long.
-    results: what else is found on validation clips and kept in the checkpoint.
+    results: what else is found on training and validation clips and kept in the checkpoint, as plain values.
     """
 
     objective: Callable[[Setup], tuple[Objective, Normaliser | None]]
     loss: type | None = None
     needs: tuple[str, ...] = ()
     crop: Literal["random", "start"] = "random"
-    results: Callable[[nn.Module, Corpus], dict[str, float]] = lambda network, corpus: {}
+    results: Callable[[nn.Module, Corpus], Mapping[str, Any]] = lambda network, corpus: {}
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawe
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
 from models.text2hoi.thresholds import ContactNetwork
+from models.text2hoi.verb_check import action_results
 from models.text2hoi.verb_reading import Sentences, learn_verbs
 
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
@@ -295,5 +296,11 @@ def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
 
 
 DIFFUSION = Network(
-    "diffusion", DiffusionConfig, DiffusionModel, _diffusion_objective, DiffusionLossConfig, needs=(CONTACT.name,)
+    "diffusion",
+    DiffusionConfig,
+    DiffusionModel,
+    _diffusion_objective,
+    DiffusionLossConfig,
+    needs=(CONTACT.name,),
+    results=action_results,
 )

@@ -30,7 +30,7 @@ from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi, Text2HoiMotion
 from models.text2hoi.sentences import read_sentence, unseen_words
 from models.text2hoi.understanding import understand
-from models.text2hoi.verb_reading import readings_of
+from models.text2hoi.verb_check import read_verb
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,9 @@ class GeneratedMotion:
     points: where those points lie on the object. coarse: the motion before refinement. evidence: plain values on how
     the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the
     verb of training the diffusion network takes the sentence for, with its probability, or None where it is told the
-    sentence's features; "told": the sentence the networks were told, not the user's where they would take that for
-    another verb ("plainly_read_as"); "unseen": what of the sentence was never in training, in words.
+    sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "told": the
+    sentence the networks were told, not the user's where they would take that for another verb ("plainly_read_as");
+    "unseen": what of the sentence was never in training, in words.
     """
 
     clip: Clip
@@ -143,13 +144,7 @@ class Generator:
         return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)
 
     def _read_as(self, text: np.ndarray) -> tuple[str, float] | None:
-        """The likeliest verb of a sentence with features (512,), and how likely."""
-        readings = readings_of(self.model.trained["diffusion"].network)
-        verbs = sorted(filter(None, Vocabulary.read(self.model.facts).verbs))
-        if not readings or not verbs:
-            return None
-        found = readings[0](torch.from_numpy(text)[None])[0]
-        return verbs[int(found.argmax())], round(float(found.max()), 3)
+        return read_verb(self.model.trained["diffusion"], torch.from_numpy(text))
 
     def _hand(self, text: str, wish: Wish) -> HandChoice:
         """The hand asked for; else by the rules, and where the text names none by the share among training clips."""
@@ -186,6 +181,7 @@ class Generator:
             "frames": request.n_frames,
             "touched_points": int(motion.contact_map.sum()),
             "draws": answer.draws,
+            "moved_as": answer.moved_as,
         }
         coarse = self.model.clips([request], [motion], refined=False)[0]
         return GeneratedMotion(answer.clip, coarse, motion.contact_map.numpy() > 0, points, evidence | own)

@@ -32,6 +32,7 @@ from models.text2hoi.networks import NETWORKS
 from models.text2hoi.refiner import RefinerModel, refine
 from models.text2hoi.surface import Surface
 from models.text2hoi.thresholds import ContactNetwork
+from models.text2hoi.verb_check import VerbCheck
 
 AT_ONCE = 256
 ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
@@ -44,8 +45,9 @@ class SamplingConfig:
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
-    at; the one that carries most is the answer. contact_draws: how many contact maps are drawn for a motion by a
-    network that draws anchors; the one most like the others is asked for. Draws of a latent hardly differ: one.
+    at, or whose object moves as in training clips of another verb; the best is the answer. contact_draws: how many
+    contact maps are drawn for a motion by a network that draws anchors; the one most like the others is asked for.
+    Draws of a latent hardly differ: one.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -73,13 +75,21 @@ class Text2HoiMotion:
 @dataclass(frozen=True)
 class Answer:
     """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
-    no hold asked for it. draws: how many motions were drawn for it.
+    no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where nobody asked;
+    other_verb: whether that is not what was asked. draws: how many motions were drawn for it.
     """
 
     motion: Text2HoiMotion
     clip: Clip
     carried: float
+    moved_as: str | None = None
+    other_verb: bool = False
     draws: int = 1
+
+    @property
+    def goodness(self) -> tuple[int, float]:
+        """How many of two things hold, that hands carry and that the verb is the one asked for; then the share."""
+        return int(self.carried >= ENOUGH) + (not self.other_verb), self.carried
 
 
 @dataclass(frozen=True)
@@ -140,19 +150,21 @@ class Text2Hoi:
         contact_maps: Sequence[Tensor] | None = None,
         placed: Callable[[Text2HoiMotion], Text2HoiMotion] = lambda motion: motion,
     ) -> list[Answer]:
-        """Motions and their clips, drawn again where held hands cannot carry; other arguments as in ``motions``.
+        """Motions and their clips, drawn again where held hands cannot carry, or the object does as another verb says.
+
+        Other arguments as in ``motions``.
 
         placed: what is done to a motion before it becomes a clip.
         """
         best = self._drawn(requests, refined, contact_maps, placed)
         for draw in range(2, self.config.draws + 1):
-            weak = [number for number, own in enumerate(best) if own.carried < ENOUGH]
+            weak = [number for number, own in enumerate(best) if own.goodness[0] < 2]
             if not weak:
                 break
             again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
             given = None if contact_maps is None else [contact_maps[number] for number in weak]
             for number, own in zip(weak, self._drawn(again, refined, given, placed), strict=True):
-                kept = own if own.carried > best[number].carried else best[number]
+                kept = own if own.goodness > best[number].goodness else best[number]
                 best[number] = replace(kept, draws=draw)
         return best
 
@@ -166,9 +178,14 @@ class Text2Hoi:
         """Every request answered once; what only holds can tell is 1 elsewhere."""
         motions = [placed(motion) for motion in self.motions(requests, refined, contact_maps)]
         clips = self.clips(requests, motions, refined)
-        held = self._held(refined)
-        shares = [carried_share(self.pair, clip, self.config.hold) if held else 1.0 for clip in clips]
-        return [Answer(*own) for own in zip(motions, clips, shares, strict=True)]
+        if not self._held(refined):
+            return [Answer(motion, clip, 1.0) for motion, clip in zip(motions, clips, strict=True)]
+        check, found = VerbCheck.of(self.trained["diffusion"], self.pair), []
+        for request, motion, clip in zip(requests, motions, clips, strict=True):
+            moved_as = check.moved_as(clip, request.points) if check else None
+            other = check is not None and check.fails(request, moved_as)
+            found.append(Answer(motion, clip, carried_share(self.pair, clip, self.config.hold), moved_as, other))
+        return found
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:
         """Motions as clips, after refinement or before it."""

@@ -137,7 +137,8 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     lengths = [f"{shown.clip.n_frames} frames, {shown.clip.n_frames / FPS:.2f} s at {FPS} fps" for shown in motions]
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
     drawn = [
-        f"sample {shown.evidence['number'] + 1}: {shown.evidence['draws']} motions, for hands that carry the object"
+        f"sample {shown.evidence['number'] + 1}: the best of {shown.evidence['draws']} motions, as hands did not carry "
+        "the object or it did not move as the verb says"
         for shown in motions
         if shown.evidence["draws"] > 1
     ]

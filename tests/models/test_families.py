@@ -26,6 +26,7 @@ from models.text2hoi.family import other_prompts
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
 from models.text2hoi.thresholds import best_threshold, mean_f1
+from models.text2hoi.verb_check import VerbCheck
 from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
@@ -197,36 +198,46 @@ def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_
 
 
 @pytest.mark.parametrize(
-    ("shares", "taken", "draws"),
-    [((1.0,), 0, 1), ((0.0, 0.75), 1, 2), ((0.25, 0.0, 0.0), 0, 3), ((0.0, 0.25, 0.0), 1, 3)],
-    ids=["carries", "the second carries", "none carries more", "the second carries more"],
-)
-def test_a_motion_whose_hands_cannot_carry_is_drawn_again(
-    sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], taken: int, draws: int
+    ("shares", "others", "taken", "draws"),
+    [
+        ((1.0,), "n", 0, 1), ((0.0, 0.75), "nn", 1, 2), ((0.25, 0.0, 0.0), "nnn", 0, 3),
+        ((0.0, 0.25, 0.0), "nnn", 1, 3), ((1.0, 0.9), "yn", 1, 2), ((0.9, 0.1, 1.0), "yny", 2, 3),
+        ((0.0, 0.6, 0.1), "yyy", 1, 3),
+    ],
+    ids=["carries", "the second carries", "none carries more", "the second carries more", "the second does as told",
+         "none does both, the third carries most", "all do as another verb says"],
+)  # fmt: skip
+def test_a_motion_whose_hands_cannot_carry_or_that_does_as_another_verb_says_is_drawn_again(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], others: str, taken: int, draws: int
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold"}}
     model = load_family("text2hoi").load(replace(sources, settings=told))
     assert isinstance(model, Text2Hoi)
-    found, left = list[Clip](), list(shares)
+    found, left, verbs = list[Clip](), list(shares), list(others)
 
     def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings) -> float:
         found.append(clip)
         return left.pop(0)
 
     monkeypatch.setattr("models.text2hoi.sampler.carried_share", carried_share)
+    monkeypatch.setattr(VerbCheck, "moved_as", lambda self, clip, points: verbs.pop(0))
+    monkeypatch.setattr(VerbCheck, "fails", lambda self, request, moved_as: moved_as == "y")
     (answer,) = model.answers([request])
     assert (answer.draws, len(found), left) == (draws, draws, [])
-    assert (answer.carried, answer.clip) == (shares[taken], found[taken])
+    assert (answer.carried, answer.clip, answer.moved_as) == (shares[taken], found[taken], others[taken])
     for one, other in pairwise(found):
         assert abs(joints_of(one) - joints_of(other)).max() > 1e-3
 
 
-def test_only_a_hold_asks_whether_hands_carry(sources: Sources, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_a_hold_asks_whether_hands_carry_and_what_the_object_does(
+    sources: Sources, monkeypatch: pytest.MonkeyPatch
+) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
     monkeypatch.setattr("models.text2hoi.sampler.carried_share", None)
+    monkeypatch.setattr("models.text2hoi.sampler.VerbCheck", None)
     assert [answer.draws for answer in model.answers([request])] == [1]
 
 

@@ -23,7 +23,8 @@ from models.common.training import TrainingConfig, fit, learning_rate_factor, tr
 from models.registry import load_network
 from models.text2hoi.diffusion import DiffusionModel
 from models.text2hoi.generation import GeneratedMotion, Generator, Wish, _started_at_origin
-from models.text2hoi.sampler import Text2HoiMotion
+from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
+from models.text2hoi.verb_check import VerbCheck
 from pipelines.generation import Asked, Models, generate_files
 from tests.models.toy import PARAMS, train
 
@@ -193,6 +194,23 @@ def test_a_person_is_told_when_a_sentence_is_taken_for_another_verb(trained: Pat
     page = (tmp_path / "out" / "index.html").read_text()
     read_as = found["Juggle a box with both hands."][0].split("'")[1]
     assert f"{read_as} (" in page
+
+
+def test_a_person_is_told_when_the_object_does_as_another_verb_says(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
+    models = Models(trained, load_embedded_hands(), load_encoder("hash"))
+    asked = Asked("Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=Wish(frames=8))
+    monkeypatch.setattr(Text2Hoi, "refined_by", "hold")
+    notes = {}
+    for verb in ("lift", "open"):
+        monkeypatch.setattr(VerbCheck, "moved_as", lambda self, clip, points, verb=verb: verb)
+        notes[verb] = [note for note in generate_files(asked, tmp_path / verb).notes if "moves most like" in note]
+    assert notes == {"lift": [], "open": ["sample 1: the object moves most like training's 'open', not 'lift'"]}
+    page = (tmp_path / "open" / "index.html").read_text()
+    assert "the best of 3 motions" in page
+    assert "moves most like training&#39;s &#39;open&#39;" in page
 
 
 def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(trained: Path) -> None:

@@ -33,6 +33,7 @@ def motion(page_clip):
         "read_as": ("lift", 0.97),
         "told": "Lift a <b>jar</b> with the left hand.",
         "draws": 3,
+        "moved_as": "lift",
         "synthetic": True,
         "unseen": ["the object 'vase' was never in training"],
         "contact_threshold_m": 0.02,
@@ -91,7 +92,7 @@ def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, wri
         "z is &lt;taken&gt; for up",
         "Lift a box &amp; hold it",
         "Lift a &lt;b&gt;jar&lt;/b&gt; with the left hand.",
-        "sample 1: 3 motions",
+        "sample 1: the best of 3 motions",
     ):
         assert words in page, words
 

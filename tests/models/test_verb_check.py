@@ -1,0 +1,90 @@
+"""An object's motion is told for the verb whose training clips move it most alike, and held against the sentence's."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hoidata.actions.action import Actions, training_actions
+from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.requests import Request
+from hoidata.hands import load_embedded_hands
+from hoidata.store.annotated import AnnotatedStore
+from models.common.checkpoints import Checkpoint, load_checkpoint
+from models.common.predicting import PredictionConfig, requests_for
+from models.text2hoi.diffusion_training import DIFFUSION
+from models.text2hoi.verb_check import VerbCheck, read_verb
+
+HANDS = load_embedded_hands()
+
+
+@pytest.fixture(scope="module")
+def diffusion(trained: Path) -> Checkpoint:
+    return load_checkpoint(trained / "diffusion", DIFFUSION)
+
+
+@pytest.fixture(scope="module")
+def check(diffusion: Checkpoint) -> VerbCheck:
+    made = VerbCheck.of(diffusion, HANDS)
+    assert made is not None
+    return made
+
+
+def clips_of(annotated: AnnotatedStore, split: str) -> list[ClipSample]:
+    return list(HoiDataset(annotated, split, crop="start"))
+
+
+def asked_for(sample: ClipSample) -> Request:
+    return requests_for(sample, PredictionConfig(samples=1))[0]
+
+
+@pytest.mark.parametrize("split", ["train", "validation", "test"])
+def test_a_recorded_clip_moves_as_its_verb(annotated: AnnotatedStore, check: VerbCheck, split: str) -> None:
+    for sample in clips_of(annotated, split):
+        assert check.moved_as(annotated.store.clip(sample.clip_id), sample.points) == sample.verb
+
+
+def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(
+    annotated: AnnotatedStore, check: VerbCheck
+) -> None:
+    for sample in clips_of(annotated, "train"):
+        request = asked_for(sample)
+        read = read_verb(check.trained, torch.from_numpy(request.text))
+        assert read is not None
+        assert read[0] == sample.verb
+        fails = {verb: check.fails(request, verb) for verb in ("lift", "pass", "open")}
+        assert fails == {verb: verb != sample.verb for verb in fails}
+        assert not check.fails(request, None)
+
+
+def test_nothing_is_said_without_gravity_or_of_a_verb_that_no_clip_shows(
+    annotated: AnnotatedStore, check: VerbCheck
+) -> None:
+    sample = clips_of(annotated, "train")[0]
+    clip = replace(annotated.store.clip(sample.clip_id), gravity=None)
+    assert check.moved_as(clip, sample.points) is None
+    strange = replace(check, actions=replace(check.actions, centroids={"pour": np.zeros(1)}))
+    assert not strange.fails(asked_for(sample), "pour")
+
+
+def test_a_network_that_keeps_no_actions_or_is_told_no_verbs_has_no_check(diffusion: Checkpoint) -> None:
+    older = {**diffusion.info, "results": {"validation_loss": 1.0}}
+    assert VerbCheck.of(replace(diffusion, info=older), HANDS) is None
+    told_features = replace(diffusion, network=torch.nn.Linear(1, 1))
+    assert VerbCheck.of(told_features, HANDS) is None
+    assert read_verb(told_features, torch.zeros(512)) is None
+
+
+def test_actions_come_back_from_a_file_whatever_the_order_of_its_keys(annotated: AnnotatedStore) -> None:
+    actions = training_actions(annotated)
+    read = Actions.read(json.loads(json.dumps(actions.record, sort_keys=True)))
+    assert {verb: dict(zip(read.scale, own, strict=True)) for verb, own in read.centroids.items()} == {
+        verb: dict(zip(actions.scale, own, strict=True)) for verb, own in actions.centroids.items()
+    }
+    draws = np.random.default_rng(0)
+    for _ in range(20):
+        numbers = {name: mean + deviation * draws.normal() for name, (mean, deviation) in actions.scale.items()}
+        assert read.named(numbers) == actions.named(numbers)
