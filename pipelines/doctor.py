@@ -14,6 +14,7 @@ from pipelines.params import PROFILES, read_params
 from pipelines.stages.adapters import manifest_of, source_of
 from pipelines.stages.base import HAND, StagePaths, load_hands, load_settings, own_root, root_variable
 
+PYTHONS = ((3, 11), (3, 12), (3, 13))
 NEEDED = ("torch", "numpy", "scipy", "pandas", "pyarrow", "trimesh", "libigl", "safetensors", "dvc", "prefect")
 
 
@@ -36,9 +37,11 @@ def examine() -> list[Finding]:
 
 
 def _python() -> Finding:
-    right = sys.version_info[:2] == (3, 11)
     text = f"{sys.version.split()[0]}, {len(os.sched_getaffinity(0))} cores"
-    return Finding("python", "ok" if right else "broken", text if right else f"{text}; hoidata needs 3.11")
+    if sys.version_info[:2] in PYTHONS:
+        return Finding("python", "ok", text)
+    accepted = " or ".join(f"{major}.{minor}" for major, minor in PYTHONS)
+    return Finding("python", "broken", f"{text}; hoidata needs {accepted}")
 
 
 def _package(name: str) -> Finding:

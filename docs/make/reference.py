@@ -55,8 +55,12 @@ def settings() -> str:
         kind = settings_class(section)
         text = yaml.safe_dump({section: plain_config(kind())}, sort_keys=False, width=100)
         lines.append(f"## {section}\n\n{_paragraphs(kind.__doc__)}\n\n```yaml\n{text}```\n")
-    lines.append("Networks, presets and sizes stand in `params.yaml` itself, under `train`, with their reasons in the")
-    lines.append("[decisions](../decisions/text2hoi-ours.md).\n")
+    lines.append(
+        "Networks, presets and sizes stand in `params.yaml` itself, under `train`; what `sample.text2hoi` may say, in"
+    )
+    lines.append(
+        "`SamplingConfig` of `models/text2hoi/sampler.py`. Reasons: [decisions](../decisions/text2hoi-ours.md).\n"
+    )
     return "\n".join(lines)
 
 

@@ -3,16 +3,19 @@
 import json
 import os
 import shutil
+import tomllib
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
+from packaging.specifiers import SpecifierSet
 from typer.testing import CliRunner, Result
 
 from hoidata.datasets import get_adapter
 from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
+from pipelines.doctor import PYTHONS
 from pipelines.lineage.manifests import ABSENT_HAND, write_manifest
 from pipelines.stages.adapters import manifest_of
 from pipelines.stages.base import StagePaths, load_hands, load_settings, raw_root
@@ -236,6 +239,13 @@ def test_outside_of_a_project_the_command_says_so(tmp_path, project_tools):
 
 
 @pytest.mark.slow
+def test_doctor_accepts_the_pythons_that_an_installation_does():
+    project = tomllib.loads((PROJECT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    accepted = SpecifierSet(project["requires-python"])
+    every = [(3, minor) for minor in range(8, 20)]
+    assert [python for python in every if ".".join(map(str, python)) in accepted] == list(PYTHONS)
+
+
 def test_doctor_names_every_part(project, project_tools):
     result = project_tools.run(project, "hoidata", "doctor", COLUMNS="200")
     assert result.returncode == 0, result.stdout
