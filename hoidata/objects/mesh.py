@@ -12,6 +12,7 @@ from hoidata.objects.ply import MOST_CORNERS, MOST_TRIANGLES, MOST_VERTICES, par
 
 LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen times as much when read
 _MOST = f"at most {MOST_VERTICES} vertices, {MOST_TRIANGLES} triangles and {MOST_CORNERS} corners of one face"
+_FLAT = 1e-9  # of the cube around a mesh: what encloses less has no inside
 _FARTHEST = 1e9  # in any unit; areas and volumes of such a mesh still fit into a float
 
 
@@ -26,7 +27,8 @@ class MassProperties(NamedTuple):
     """A solid of 1 kg and even density.
 
     volume_m3; centre_m (3,), in the mesh frame; inertia_kg_m2 (3, 3) about the centre of mass, mesh axes.
-    source: "solid" from the mesh itself, "convex hull" where the mesh is open or encloses nothing.
+    source: "solid" from the mesh itself, "convex hull" where the mesh is open or encloses nothing. Where that hull is
+    flat, volume and inertia are 0.
     """
 
     volume_m3: float
@@ -124,11 +126,14 @@ def mass_properties(vertices_m: np.ndarray, faces: np.ndarray) -> MassProperties
     encloses less than 0.1 % of its convex hull (two opposite shells), is replaced by that hull, and says so.
     """
     mesh = trimesh.Trimesh(vertices_m, faces, process=True)
-    hull = mesh.convex_hull
-    solid = mesh.is_watertight and abs(mesh.volume) > 1e-3 * hull.volume
-    used = mesh if solid else hull
-    if used.volume < 0:
-        used.invert()
-    volume = float(used.volume)
+    with np.errstate(invalid="ignore", divide="ignore"):  # of what is flat, trimesh divides by no volume
+        hull = mesh.convex_hull
+        solid = mesh.is_watertight and abs(mesh.volume) > 1e-3 * hull.volume
+        used = mesh if solid else hull
+        if used.volume < 0:
+            used.invert()
+        volume = float(used.volume)
+    if volume <= _FLAT * np.ptp(mesh.vertices, axis=0).max() ** 3:
+        return MassProperties(0.0, mesh.vertices.mean(axis=0), np.zeros((3, 3)), "convex hull")
     inertia = np.asarray(used.moment_inertia) / volume
     return MassProperties(volume, np.asarray(used.center_mass), inertia, "solid" if solid else "convex hull")

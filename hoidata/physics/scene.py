@@ -5,9 +5,9 @@ from functools import cached_property
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack
 from hoidata.errors import BadInput
-from hoidata.hands import HandPair
+from hoidata.hands import HandModel, HandPair
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
 from hoidata.physics.contact_forces import GRAVITY_M_S2, BodyMotion, required_wrench
@@ -16,6 +16,7 @@ from hoidata.physics.surface import body_motion
 
 LIFTED_M = 0.015
 TABLE_PERCENTILE = 3
+_AT_ONCE = 16  # frames
 _FALLING = 0.05  # of the weight: an object that needs less support than this falls
 
 
@@ -49,17 +50,18 @@ class Scene:
         """(frame, 6) N and N m about the centre of mass that hands and table together must give."""
         return required_wrench(self.motion, self.fps, self.gravity)
 
-    @cached_property
-    def vertices_m(self) -> np.ndarray:
-        """(frame, vertex, 3) of the object in the world."""
-        model = self.model
-        local = articulate(model.vertices_m, model.part, model.hinge, self.poses.hinge_rad)
-        return self.poses.world_from_part(model, 0) @ local
+    def vertices_m(self, frames: slice) -> np.ndarray:
+        """(chosen frame, vertex, 3) of the object in the world; of all frames at once they may be gigabytes."""
+        model, poses = self.model, self.poses.taken(frames)
+        local = articulate(model.vertices_m, model.part, model.hinge, poses.hinge_rad)
+        return poses.world_from_part(model, 0) @ local
 
     @cached_property
     def lowest_m(self) -> np.ndarray:
         """(frame,) height of the object's lowest vertex, against gravity."""
-        return (-self.vertices_m @ self.gravity).min(axis=1)
+        starts = range(0, self.n_frames, _AT_ONCE)
+        heights = [-self.vertices_m(slice(start, start + _AT_ONCE)) @ self.gravity for start in starts]
+        return np.concatenate([np.zeros(0), *(own.min(axis=1) for own in heights)])
 
     @property
     def table_height_m(self) -> float:
@@ -78,19 +80,20 @@ class Scene:
     def with_capsules(self, capsules: Capsules) -> "Scene":
         """The same object under other hands; what is known of its motion already is kept."""
         twin = replace(self, capsules=capsules)
-        known = ("motion", "wrench", "vertices_m", "lowest_m")
+        known = ("motion", "wrench", "lowest_m")
         vars(twin).update({name: value for name, value in vars(self).items() if name in known})
         return twin
 
 
+def capsules_there(track: HandTrack, hand: HandModel) -> Capsules:
+    """The capsules of a hand in the world, NaN in frames without it."""
+    found, valid = hand_capsules(track, hand), track.valid[:, None, None]
+    return Capsules(np.where(valid, found.start_m, np.nan), np.where(valid, found.end_m, np.nan), found.radius_m)
+
+
 def clip_scene(clip: Clip, hands: HandPair, table_m: float | None = None) -> Scene:
     """A clip's object and the 19 capsules of each of its hands, left before right, at 30 fps. Raises BadInput."""
-    capsules = []
-    for side in SIDES:
-        own, valid = hand_capsules(clip.hands[side], hands[side]), clip.hands[side].valid[:, None, None]
-        capsules.append(
-            Capsules(np.where(valid, own.start_m, np.nan), np.where(valid, own.end_m, np.nan), own.radius_m)
-        )
+    capsules = [capsules_there(clip.hands[side], hands[side]) for side in SIDES]
     return object_scene(clip, table_m).with_capsules(joined(capsules))
 
 

@@ -67,7 +67,7 @@ def table_contacts(scene: Scene, table_m: float) -> tuple[np.ndarray, np.ndarray
     directions = np.cos(angles)[:, None] * normal[0] + np.sin(angles)[:, None] * normal[2]
     frames, points = [], []
     for frame in np.flatnonzero(np.abs(scene.lowest_m - table_m) < SUPPORT_M):
-        vertices = scene.vertices_m[frame]
+        vertices = scene.vertices_m(slice(frame, frame + 1))[0]
         touching = vertices[np.abs(-vertices @ scene.gravity - table_m) < SUPPORT_M]
         outer = touching[np.unique((touching @ directions.T).argmax(axis=0))]
         frames.append(np.full(len(outer), frame))

@@ -6,6 +6,7 @@ of a hold are alike, so a few stand for all of them: time grows with the frames 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -25,23 +26,30 @@ _LEVER_M = np.concatenate((np.ones(3), np.full(3, 0.1), np.full(45, 0.04)))
 class SolverSettings:
     """Standard deviations, metres; a smaller one counts more.
 
-    press_m: how deep skin lies that touches, for it gives way. keypoint_m: of a vertex from the generated one.
-    surface_m: of the nearest skin of each of 16 segments of a holding hand from there; beyond reach_m it hardly counts.
+    press_m: how deep skin lies that touches, for it gives way. surface_m: of the nearest skin of each of 16 segments of
+    a holding hand from there.
     depth_m: of a vertex deeper than press_m in the object, or in the other hand. bend_m: of a control point from the
     middle of its neighbours. knot_frames: of the spline. every: one of so many frames outside of holds is looked at.
     steps: at most; fewer where one gains less than ``enough`` of the cost.
     """
 
     press_m: float = 0.0015
-    keypoint_m: float = 0.006
     surface_m: float = 0.001
-    reach_m: float = 0.003
     depth_m: float = 0.0005
     bend_m: float = 0.004
     knot_frames: int = 5
     every: int = 2
     steps: int = 6
     enough: float = 0.01
+
+
+class Draw(NamedTuple):
+    """How far skin is drawn to the surface: beyond reach_m it hardly is. keypoint_m: deviation of a vertex from the
+    generated one.
+    """
+
+    reach_m: float = 0.003
+    keypoint_m: float = 0.006
 
 
 def corrected(
@@ -52,9 +60,10 @@ def corrected(
     valid: np.ndarray,
     other: Capsules | None,
     settings: SolverSettings,
+    draw: Draw,
 ) -> HandPose:
     """The pose of every frame, corrected; the part's frame throughout. other: capsules of the other hand."""
-    return _Motion(skin, field, pose, holds, valid, other, settings).corrected()
+    return _Motion(skin, field, pose, holds, valid, other, settings, draw).corrected()
 
 
 def spline_shares(n_frames: int, holds: Sequence[Interval], knot_frames: int) -> np.ndarray:
@@ -98,8 +107,9 @@ class _Motion:
         valid: np.ndarray,
         other: Capsules | None,
         settings: SolverSettings,
+        draw: Draw,
     ) -> None:
-        self.skin, self.field, self.pose, self.settings = skin, field, pose, settings
+        self.skin, self.field, self.pose, self.settings, self.draw = skin, field, pose, settings, draw
         self.all_shares = spline_shares(len(valid), holds, settings.knot_frames)
         alike = 1 + 3 * (field.moves or other is not None)
         self.frames, self.weight, holding = _looked_at(holds, valid, alike, settings.every)
@@ -111,7 +121,7 @@ class _Motion:
         self.metric = self._metric()
         self.start = self._see(np.zeros((self.shares.shape[1], N_UNKNOWNS)))
         near = np.maximum(skin.nearest_of_segments(self.start.distance_m)[1], 0)
-        self.trust = np.exp(-0.5 * (near / settings.reach_m) ** 2) * holding[:, None]
+        self.trust = np.exp(-0.5 * (near / draw.reach_m) ** 2) * holding[:, None]
 
     def corrected(self) -> HandPose:
         state, damping = self.start, 1e-3
@@ -139,7 +149,7 @@ class _Motion:
         derivative = derivative.reshape(len(self.frames), -1, N_UNKNOWNS)
         # Of 16 points in all, and a little of each unknown, for fingers that move few of them.
         metric = derivative.swapaxes(1, 2) @ derivative / len(vertex) + 1e-5 * np.eye(N_UNKNOWNS)
-        return 16 * metric / self.settings.keypoint_m**2
+        return 16 * metric / self.draw.keypoint_m**2
 
     def _see(self, unknowns: np.ndarray) -> _State:
         pose = self.own.moved(self.shares @ unknowns)

@@ -12,21 +12,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
-from hoidata.physics.mano_capsules import hand_capsules
-from hoidata.physics.scene import Scene, object_scene
+from hoidata.physics.scene import Scene, capsules_there, object_scene
 from hoidata.physics.standard_units import StandardUnits
-from hoidata.refinement.hold_solver import SolverSettings, corrected
+from hoidata.refinement.hold_solver import Draw, SolverSettings, corrected
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
 from hoidata.refinement.waiting import WaitSettings, wait_for_hands
+from hoidata.workers import one_thread
 
 _ALONG = 9  # places along a capsule's axis at which it is looked at
 
@@ -35,11 +36,12 @@ _ALONG = 9  # places along a capsule's axis at which it is looked at
 class HoldSettings:
     """near_m: a hand touches whose skin is nearer. still_m_s, carried_m_s: a touching hand slower than this on the part
     holds it, where the part is at rest, and where it moves by more than moving_m_s. least: frames of a hold. gap:
-    frames between two holds that belong to one. blend: in which a hand comes to its hold, and leaves it. reach_m,
-    keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from where it was: the
-    first of each, then the next, on top of what came out, where those hands cannot carry the object in some of
-    air_frames frames in which it is in the air. solver: the other wishes. rest: of the object, before all that. wait:
-    of the object for hands that come and go, after it.
+    frames between two holds that belong to one, if the hand is nearer than same_m to where it was on the part. blend:
+    in which a hand comes to its hold, and leaves it. carry: frames by which a hold is drawn out where the part moves in
+    no hand. reach_m, keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from
+    where it was: the first of each, then the next, on top of what came out, where those hands cannot carry the object
+    in some of air_frames frames in which it is in the air. solver: the other wishes. rest: of the object, before all
+    that. wait: of the object for hands that come and go, after it. Raises BadInput for more reaches than deviations.
     """
 
     near_m: float = 0.006
@@ -48,6 +50,7 @@ class HoldSettings:
     moving_m_s: float = 0.02
     least: int = 6
     gap: int = 12
+    same_m: float = 0.02
     blend: int = 8
     carry: int = 4
     reach_m: tuple[float, ...] = (0.003, 0.012, 0.03, 0.06)
@@ -57,7 +60,15 @@ class HoldSettings:
     rest: RestSettings = field(default_factory=RestSettings)
     wait: WaitSettings = field(default_factory=WaitSettings)
 
+    def __post_init__(self) -> None:
+        if len(self.reach_m) != len(self.keypoint_m) or not self.reach_m:
+            got = f"{len(self.reach_m)} and {len(self.keypoint_m)}"
+            raise BadInput(
+                "hold: reach_m, keypoint_m", "as many of each, one at least", got, "give one of each per try"
+            )
 
+
+@one_thread()
 def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> Clip:
     """The clip with its object at rest where it lay (``resting``), hands that hold it (``hold_hands``), and an object
     that waits for them (``waiting``).
@@ -67,27 +78,29 @@ def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings(
     return wait_for_hands(pair, held, settings.wait)
 
 
+@one_thread()
 def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> float:
     """Share of some frames in the air in which the hands of a clip can carry its object; 1 where it never is there."""
     load = _Load.of(clip, settings.air_frames)
     hands: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
     if not hands:
         return float(not len(load.frames))
-    return load.carried([hand_capsules(clip.hands[side].take(load.frames), pair[side]) for side in hands])
+    return load.carried([capsules_there(clip.hands[side].take(load.frames), pair[side]) for side in hands])
 
 
+@one_thread()
 def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> dict[Side, HandTrack]:
     """The hands of a clip, still, touching and outside while they hold; one that never does stays as it was.
 
     A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
     """
     load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
-    for reach, keypoint in zip(settings.reach_m, settings.keypoint_m, strict=True):
-        starts = _starts(pair, clip, settings)
+    for number, (reach, keypoint) in enumerate(zip(settings.reach_m, settings.keypoint_m, strict=True)):
+        starts = _starts(pair, clip, settings if not number else replace(settings, carry=0))  # once drawn out is enough
         if not starts:
             break
-        tracks = _solved(pair, clip, starts, replace(settings.solver, reach_m=reach, keypoint_m=keypoint))
-        share = load.carried([hand_capsules(tracks[side].take(load.frames), pair[side]) for side in starts])
+        tracks = _solved(pair, clip, starts, settings.solver, Draw(reach, keypoint))
+        share = load.carried([capsules_there(tracks[side].take(load.frames), pair[side]) for side in starts])
         # A try that carries no more than the best so far is no answer, but the next one goes on from it.
         if share > most:
             best, most = tracks, share
@@ -110,14 +123,14 @@ def _starts(pair: HandPair, clip: Clip, settings: HoldSettings) -> dict[Side, "_
 
 
 def _solved(
-    pair: HandPair, clip: Clip, starts: Mapping[Side, "_Start"], wishes: SolverSettings
+    pair: HandPair, clip: Clip, starts: Mapping[Side, "_Start"], wishes: SolverSettings, draw: Draw
 ) -> dict[Side, HandTrack]:
     """All hands of a clip, those that hold something corrected one after the other."""
     tracks = dict(clip.hands)
     for side, start in starts.items():
         opposite: Side = "right" if side == "left" else "left"
-        other = hand_capsules(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
-        tracks[side] = start.solved(other, wishes)
+        other = capsules_there(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
+        tracks[side] = start.solved(other, wishes, draw)
     return tracks
 
 
@@ -142,6 +155,8 @@ class _Load:
         if self.scene is None or not len(self.frames):
             return 1.0
         capsules, physics = joined(list(hands)), StandardUnits()
+        there = np.isfinite(capsules.start_m[..., 0])
+        capsules = Capsules(np.nan_to_num(capsules.start_m), np.nan_to_num(capsules.end_m), capsules.radius_m)
         along = np.linspace(0, 1, _ALONG)[:, None]
         axis = (capsules.end_m - capsules.start_m)[:, :, None]
         places = (capsules.start_m[:, :, None] + along * axis).reshape(len(self.frames), -1, 3)
@@ -150,7 +165,7 @@ class _Load:
         distance, slope, place = (array.reshape(*shape, -1) for array in (*found, places))
         deepest = distance.argmin(axis=2, keepdims=True)
         distance, slope, place = (np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, place))
-        frame, capsule = np.nonzero(distance[..., 0] < capsules.radius_m)
+        frame, capsule = np.nonzero(there & (distance[..., 0] < capsules.radius_m))
         depth, normal = (capsules.radius_m - distance[..., 0])[frame, capsule], slope[frame, capsule]
         point = (place - distance * slope)[frame, capsule]
         number = self.frames[frame]
@@ -169,12 +184,12 @@ class _Start:
     part_from_world: RigidTransform
     field: ObjectField
 
-    def solved(self, other: Capsules | None, settings: SolverSettings) -> HandTrack:
+    def solved(self, other: Capsules | None, settings: SolverSettings, draw: Draw) -> HandTrack:
         """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
         turn = self.part_from_world
         if other is not None:
             other = Capsules(turn @ other.start_m, turn @ other.end_m, other.radius_m)
-        pose = corrected(self.skin, self.field, self.pose, self.holds, self.track.valid, other, settings)
+        pose = corrected(self.skin, self.field, self.pose, self.holds, self.track.valid, other, settings, draw)
         track, valid = self.track, self.track.valid[:, None]
         made = pose.seen_from(self.part_from_world.inverse()).track(track.betas[0], track.valid, track.template_m)
         kept = {name: getattr(track, name) for name in ("wrist_m", "global_orient", "hand_pose")}
@@ -270,7 +285,8 @@ def _holds(
     slow = speed < np.where(moving, own.carried_m_s, own.still_m_s)
     held = touching & (np.append(slow, False) | np.append(False, slow))
     for start, stop in runs(~held):
-        if start > 0 and stop < len(held) and stop - start <= own.gap and valid[start:stop].all():
+        short = start > 0 and stop < len(held) and stop - start <= own.gap and valid[start:stop].all()
+        if short and np.linalg.norm(some[stop] - some[start - 1], axis=-1).mean() < own.same_m:
             held[start:stop] = True
     return [found for found in runs(held) if found.stop - found.start >= own.least], moving
 

@@ -36,10 +36,10 @@ def rest_object(clip: Clip, settings: RestSettings = RestSettings()) -> Clip:
     """
     if clip.gravity is None or clip.n_frames < 3:
         return clip
-    scene = object_scene(clip)
-    some = 1 + scene.vertices_m.shape[1] // _ENOUGH
-    speed = np.linalg.norm(np.diff(scene.vertices_m[:, ::some], axis=0), axis=-1).max(axis=1) * FPS
-    still, lowest_m = speed <= settings.still_m_s, scene.lowest_m
+    model, some = clip.object.model, slice(None, None, 1 + len(clip.object.model.vertices_m) // _ENOUGH)
+    places_m = clip.object.points_in_world(model.vertices_m[some], model.part[some])
+    speed = np.linalg.norm(np.diff(places_m, axis=0), axis=-1).max(axis=1) * FPS
+    still, lowest_m = speed <= settings.still_m_s, object_scene(clip).lowest_m
     first, last = (_resting(*ends, settings.drift_m) for ends in ((still, lowest_m), (still[::-1], lowest_m[::-1])))
     if not first:
         return clip

@@ -80,7 +80,7 @@ class _HandAtPart:
         near = (field.distances(points_m)[0] < settings.near_m) & track.valid[:, None]
         if not near.any():
             return None
-        part, _ = field.part_touched(points_m, near)
+        part, near = field.part_touched(points_m, near)
         part_from_world = world_from_part(thing, part).inverse()
         local = part_from_world @ points_m
         slip = np.linalg.norm(np.diff(local, axis=0), axis=-1) * FPS
@@ -110,7 +110,7 @@ def _moments(steps_m: np.ndarray, sweeps: np.ndarray, settings: WaitSettings) ->
     Least squares over the steps it takes: none where a hand sweeps over it, elsewhere its own, changes of speed spread
     out, and never far from where it was. So it makes up for what it misses near by, and where it moved already.
     """
-    own = steps_m / np.median(steps_m[steps_m > 0])
+    own = steps_m / np.median(steps_m[steps_m * FPS > settings.moving_m_s])  # of its usual speed while it moves
     weight = np.where(sweeps | (own < _AT_REST), _STANDS, 1.0)
     differences, sums = np.diff(np.eye(len(own)), axis=0), np.tri(len(own))
     matrix = np.diag(weight) + settings.even * differences.T @ differences + settings.keep * sums.T @ sums

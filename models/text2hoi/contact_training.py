@@ -91,7 +91,7 @@ def most_typical(maps: Tensor) -> Tensor:
 
 
 def contact_drawer(checkpoint: Checkpoint) -> DrawContact:
-    """Draws maps for the motions of a batch from a trained contact network, as sampling does."""
+    """Draws maps for the motions of a batch from a trained contact network: the first of each, as the paper does."""
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
     return lambda batch, text, generator: touched_maps(

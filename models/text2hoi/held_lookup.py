@@ -1,4 +1,7 @@
-"""Rivals that have all of `ours` but its networks: training clips of the prompt or the verb, held as ours are."""
+"""Rivals that have no networks: training clips of the prompt or the verb, held as the motions of `ours` are.
+
+They are not drawn again where they cannot carry, as those are.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -16,6 +16,7 @@ from torch import Tensor
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
+from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.refinement import HoldSettings, carried_share, hold_clip
 from models.common.checkpoints import Checkpoint, load_checkpoint
@@ -58,6 +59,11 @@ class SamplingConfig:
     precision: SamplingPrecision = "float32"
     contact_draws: int = 12
 
+    def __post_init__(self) -> None:
+        for name in ("draws", "contact_draws"):
+            if getattr(self, name) < 1:
+                raise BadInput(f"sample.text2hoi.{name}", "1 or more", str(getattr(self, name)), "correct params.yaml")
+
 
 @dataclass(frozen=True)
 class Text2HoiMotion:
@@ -75,8 +81,8 @@ class Text2HoiMotion:
 @dataclass(frozen=True)
 class Answer:
     """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
-    no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where nobody asked;
-    other_verb: whether that is not what was asked. draws: how many motions were drawn for it.
+    no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where that is not
+    known (``VerbCheck``); other_verb: whether it is not what was asked. draws: how many motions were drawn for it.
     """
 
     motion: Text2HoiMotion
@@ -218,7 +224,7 @@ class Text2Hoi:
 
     @torch.no_grad()
     def contact_maps(self, requests: Sequence[Request]) -> list[Tensor]:
-        """(2, N) by hand the contact map, 0 or 1, that each motion would be made for."""
+        """(2, N) by hand the contact map, 0 or 1, that the first motion drawn for each request would be made for."""
         batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
         return list(self._contact(batch, generators).cpu())

@@ -1,5 +1,6 @@
 """``hoidata generate``: a sentence and an object become motions."""
 
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -15,8 +16,11 @@ if TYPE_CHECKING:
 def generate(
     text: Annotated[str, typer.Argument(help="E.g. 'Lift a box with the right hand.'")],
     object: Annotated[str, typer.Option("--object", help="A mesh file (OBJ, PLY, STL, GLB), or a dataset's object.")],
-    out: Annotated[Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True)],
-    seed: Annotated[int, typer.Option(help="Same seed, same bytes.")] = 0,
+    out: Annotated[
+        Path,
+        typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True, file_okay=False),
+    ],
+    seed: Annotated[int, typer.Option(help="Same seed, same bytes.", min=0, max=2**63 - 1)] = 0,
     samples: Annotated[int, typer.Option(help="How many motions, side by side.", min=1, max=32)] = 1,
     hand: Annotated[Literal["left", "right", "both"] | None, typer.Option(help="Whatever the words say.")] = None,
     length: Annotated[float | None, typer.Option(help="Seconds, instead of the length network's answer.")] = None,
@@ -48,6 +52,7 @@ def generate(
     mesh = Path(object).resolve() if Path(object).is_file() else None
     root = enter_project() if models is None else None
     from hoidata.clips.clip import FPS
+    from hoidata.errors import BadInput
     from models.common.sampling import SamplerConfig
     from models.text2hoi.generation import Wish
     from pipelines.generation import Asked, generate_files
@@ -57,6 +62,8 @@ def generate(
     where: dict[str, Any] = {"models": _given_models(models)} if models else {}
     if root is not None:
         where = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
+    if length is not None and not isfinite(length):
+        raise BadInput("--length", "seconds", f"{length:g}", "leave it out for a length that the network chooses")
     wish = Wish(seed, samples, hand, None if length is None else round(length * FPS), hand_by)
     written = generate_files(
         Asked(

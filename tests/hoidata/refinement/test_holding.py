@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.realism import VARIANTS, score
 from hoidata.physics.scene import clip_scene
-from hoidata.refinement import HoldSettings, carried_share, hold_hands
+from hoidata.refinement import HoldSettings, carried_share, hold_clip, hold_hands
 from hoidata.refinement.hold_solver import spline_shares
 from tests.builders.clips import DOWN, clip_of
 from tests.builders.objects import box_model, two_parts
@@ -216,3 +218,92 @@ def test_a_hold_has_one_control_point_and_shares_add_up_to_one():
     assert shares[12:36].max(axis=1) == pytest.approx(1)
     assert len(set(shares[12:36].argmax(axis=1))) == 1
     assert (shares[:6].max(axis=1) < 0.9).all()
+
+
+def test_a_hand_that_goes_elsewhere_holds_there_not_between_both_places():
+    frames, still = np.arange(FRAMES), np.zeros((FRAMES, 3), np.float32)
+    turn = np.tile(np.eye(3), (FRAMES, 1, 1))
+    place = np.interp(frames, [0, 16, 22, FRAMES], [-0.1, -0.1, 0.1, 0.1])
+    track = pressed("right", np.stack((0 * place, place, 0.03 + 0 * place), 1), 0.001, 0.0, turn)
+    lifted = np.interp(frames, [0, 15, 19, 23, FRAMES], [0, 0, 0.02, 0, 0])
+    track = replace(track, wrist_m=(track.wrist_m + lifted[:, None] * [0, 0, 1]).astype(np.float32))
+    away = replace(track, wrist_m=track.wrist_m + 1)
+    clip = clip_of("toy/s1/e", ObjectTrack(BOX, still, still), {"left": away, "right": track})
+    made = hold_hands(PAIR, clip)["right"]
+    for start, stop in ((11, 15), (25, 36)):
+        assert abs(made.wrist_m - track.wrist_m)[start:stop, 1].max() < 0.01
+
+
+def test_one_blas_thread_whatever_the_process_has(pushed, monkeypatch):
+    """Several give other bits, and take many times as long."""
+    threads = []
+
+    def starts(*given):
+        threads.append(max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+        return {}
+
+    monkeypatch.setattr("hoidata.refinement.holding._starts", starts)
+    with threadpool_limits(2, user_api="blas"):
+        hold_clip(PAIR, pushed[0])
+    assert set(threads) == {1}
+
+
+def test_a_hold_is_drawn_out_once_not_at_every_try(pushed, monkeypatch):
+    clip, tries = pushed[0], []
+
+    def solved(pair, clip, starts, wishes, draw):
+        tries.append({side: start.holds for side, start in starts.items()})
+        return dict(clip.hands)
+
+    monkeypatch.setattr("hoidata.refinement.holding._solved", solved)
+    monkeypatch.setattr("hoidata.refinement.holding._Load.carried", lambda self, hands: 0.0)
+    hold_hands(PAIR, clip)
+    assert len(tries) == len(HoldSettings().reach_m)
+    wider = [sum(stop - start for start, stop in held["left"]) for held in tries[1:]]
+    assert len(set(wider)) == 1
+
+
+def test_frames_without_the_other_hand_do_not_push_this_one(pushed):
+    clip = pushed[0]
+    right, gone = clip.hands["right"], np.arange(FRAMES) < 22
+    made = []
+    for draw in (0, 1):
+        nonsense = np.random.default_rng(draw).normal(size=(FRAMES, 3)).astype(np.float32)
+        wrist = np.where(gone[:, None], clip.hands["left"].wrist_m + 0.02 * nonsense, right.wrist_m)
+        hands = {**clip.hands, "right": replace(right, wrist_m=wrist, valid=~gone)}
+        made.append(hold_hands(PAIR, replace(clip, hands=hands))["left"])
+        assert carried_share(PAIR, replace(clip, hands=hands)) <= 1
+    assert made[0].wrist_m.tobytes() == made[1].wrist_m.tobytes()
+    assert made[0].hand_pose.tobytes() == made[1].hand_pose.tobytes()
+
+
+def test_a_hand_that_is_not_there_carries_nothing():
+    """A slab in the air about the world's origin, where the numbers of an absent hand may lie."""
+    place = np.stack((0 * LIFT, 0 * LIFT, LIFT - 0.2), 1).astype(np.float32)
+    thing = ObjectTrack(box_model((0.1, 0.1, 0.02)), np.zeros_like(place), place)
+    hand = pressed("right", place, 0.0, 0.0, np.tile(np.eye(3), (FRAMES, 1, 1)))
+    for wrist in (hand.wrist_m, np.full_like(hand.wrist_m, np.nan)):
+        absent = replace(hand, wrist_m=wrist, valid=np.arange(FRAMES) < 3)
+        clip = clip_of("toy/s1/g", thing, {"left": replace(hand, valid=np.zeros(FRAMES, bool)), "right": absent})
+        assert carried_share(PAIR, clip) == 0
+
+
+def test_a_flat_lid_has_no_weight_and_stops_nothing():
+    base = box_model((0.1, 0.1, 0.04))
+    sheet = box_model((0.1, 0.1, 0.04))
+    sheet = replace(sheet, vertices_m=sheet.vertices_m * [1, 1, 0] + [0, 0, 0.02])
+    model = two_parts(base, sheet, (0, 1, 0))
+    place = np.stack((0 * LIFT, 0 * LIFT, LIFT), 1).astype(np.float32)
+    thing = ObjectTrack(model, np.zeros_like(place), place, np.zeros(FRAMES, np.float32))
+    hand = pressed("right", place + np.array([0, 0, 0.02]), 0.001, 0.0, np.tile(np.eye(3), (FRAMES, 1, 1)))
+    clip = clip_of("toy/s1/f", thing, {"left": replace(hand, wrist_m=hand.wrist_m + 1), "right": hand})
+    scene = clip_scene(clip, PAIR)
+    alone = clip_scene(replace(clip, object=ObjectTrack(base, thing.rotvec, place)), PAIR)
+    np.testing.assert_allclose(scene.wrench, alone.wrench, atol=1e-9)
+    assert 0 <= carried_share(PAIR, clip) <= 1
+
+
+@pytest.mark.parametrize("wrong", [{"reach_m": (0.003, 0.012)}, {"reach_m": (), "keypoint_m": ()}])
+def test_each_try_needs_a_reach_and_a_deviation(wrong):
+    with pytest.raises(BadInput, match="as many of each"):
+        HoldSettings(**wrong)

@@ -166,3 +166,39 @@ def test_a_hand_on_a_lid_goes_where_the_lid_goes():
             for one in (clip, made)
         )
         np.testing.assert_allclose(moved, own, atol=1e-5)
+
+
+def test_an_object_that_lies_stays_however_little_it_shakes(waited):
+    """Generated objects never lie quite still."""
+    clip, exact = waited
+    shake = np.random.default_rng(0).normal(size=(FRAMES, 3)) * 1e-6
+    shaken = replace(clip, object=replace(clip.object, translation_m=clip.object.translation_m + shake))
+    made = wait_for_hands(PAIR, shaken)
+    assert abs(made.object.translation_m - exact.object.translation_m).max() < 5e-4
+
+
+def test_skin_at_one_part_does_not_sweep_because_the_other_part_turns():
+    """A hand rests on the base while the lid opens a little, then goes to the lid and opens it."""
+    base, lid = (box_model((0.3, 0.3, 0.02), middle_m=(x, 0, 0)) for x in (-0.2, 0.2))
+    model = two_parts(base, lid, (0, 1, 0))
+    frames, still = np.arange(FRAMES), np.zeros((FRAMES, 3), np.float32)
+    angle = np.interp(frames, [0, 8, 14, 40, 54, FRAMES], [0, 0, -0.2, -0.2, -0.8, -0.8])
+    pose = RigidTransform(np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3)))
+    first = hand_at("right", np.interp(frames, [0, 22, 27], [0, 0, 0.3]), pose, np.array([-0.2, 0, 0.01]))
+    then = hand_at(
+        "right",
+        np.interp(frames, [28, 33], [0.3, 0]),
+        pose @ model.object_from_part(1, angle),
+        np.array([0.2, 0, 0.01]),
+    )
+    late = (frames > 27)[:, None]
+    hand = replace(
+        first,
+        wrist_m=np.where(late, then.wrist_m, first.wrist_m),
+        global_orient=np.where(late, then.global_orient, first.global_orient),
+    )
+    away = hand_at("left", np.full(FRAMES, 0.5), pose, np.array([-0.2, 0, 0.01]))
+    clip = clip_of(
+        "toy/s1/b", ObjectTrack(model, still, still, angle.astype(np.float32)), {"left": away, "right": hand}
+    )
+    assert wait_for_hands(PAIR, clip) is clip
