@@ -13,7 +13,8 @@ from hoidata.annotation.reference_mode import ACTIONS, JOINED
 _HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
     r"\b(?:(?:with|by|using)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
-    r"\b(?:with|by|using)\s+(?:only\s+|just\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b"
+    r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
+    r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
 )
 _RUN = re.compile(r"[\w-]+")
 

@@ -85,3 +85,24 @@ def test_forms_are_found_as_whole_words_wherever_a_search_for_each_finds_them(te
             places += [] if joined else [(number, start, stop)]
             start = start + 1 if joined else stop
         assert places == [match for match in matches if match[0] == number]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "Lift a mug with one hand.",
+        "Lift the mug with your hand.",
+        "Lift the mug by hand.",
+        "Lift the mug using one hand.",
+        "Using a single hand, lift the mug.",
+        "Lift a mug using only one hand.",
+    ],
+)
+def test_a_hand_of_no_side_is_neither_the_object_nor_a_verb(text: str) -> None:
+    found = read_prompt(text)
+    assert (found.verb, found.object_words) == ("lift", "mug")
+
+
+@pytest.mark.parametrize("text", ["Lift the hand with the right hand.", "Lift a hand.", "Lift the hand with one hand."])
+def test_a_hand_that_is_lifted_is_the_object(text: str) -> None:
+    assert read_prompt(text).object_words == "hand"
