@@ -111,7 +111,7 @@ def run_python(*words: str) -> subprocess.CompletedProcess:
     return subprocess.run([sys.executable, *words], cwd=PROJECT, env=environment, capture_output=True, text=True)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_short_run_of_fuzzing_finds_nothing(tmp_path: Path):
     options = ("--seconds", str(SECONDS_EACH), "--executions", "50000", "--seed", "1", "--folder", str(tmp_path))
     done = run_python("-m", "fuzz", *options)

@@ -82,7 +82,7 @@ def networks_in(folder: Path) -> list[str]:
     return sorted(path.name.rpartition("-")[0] for path in folder.iterdir() if path.is_dir())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rows_share_what_they_have_in_common_and_are_made_once(study: Study, capsys) -> None:
     jobs = [("ours", 0), ("no gate", 0), ("contact by a latent", 0), ("released", 0), ("paper: a diffusion refiner", 0)]
     assert fill(study, jobs) == []

@@ -217,7 +217,7 @@ def test_the_stage_writes_what_the_networks_reach_on_recorded_clips(trained):
     assert set(info["majority"]) == {"nothing", "object", "hand", "object and hand"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_equal_trainings_give_equal_bytes_and_another_seed_other_weights(annotated_root, tmp_path):
     def files(folder, seed, jobs=1):
         settings = EvaluatorSettings(("corrected", "paper"), seeds=(seed, seed + 2), most_steps=3)

@@ -24,6 +24,7 @@ def stages_run(output: str) -> list[str]:
     return re.findall(r"Running stage '([^']+)'", output)
 
 
+@pytest.mark.long
 def test_all_models_of_the_present_dataset_are_trained_and_those_of_the_others_are_empty(built):
     for model in MODELS:
         assert (built / "checkpoints/embedded/grab" / model / "model.safetensors").is_file()

@@ -105,7 +105,7 @@ def test_a_built_in_adapter_keeps_every_rule_on_its_embedded_corpus(name: str, s
     assert {item.rule for item in findings if item.outcome == "skip"} <= {"held objects turn with the hand"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif("HOIDATA_MANIPNET" not in os.environ, reason="HOIDATA_MANIPNET names the folder of real recordings")
 def test_manipnet_keeps_every_rule_on_its_recordings_but_shares_one_shape_among_them() -> None:
     findings = check_adapter(get_adapter("manipnet"), Path(os.environ["HOIDATA_MANIPNET"]), HANDS, sequences=2)

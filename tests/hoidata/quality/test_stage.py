@@ -204,7 +204,7 @@ def test_lag_planted_into_a_generated_corpus_is_found_within_a_frame(corpus, tmp
     assert (np.abs(found - late) <= 1).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not REAL, reason="needs HOIDATA_MANIPNET")
 def test_no_recording_of_manipnet_is_left_out_and_its_open_cup_is_named(tmp_path):
     convert_dataset(get_adapter("manipnet"), REAL, load_embedded_hands(), tmp_path / "clips", jobs=2, progress=False)

@@ -24,7 +24,7 @@ _MM = 1e3  # libigl leaves out triangles of less than 1e-6 square units, seen al
 EVERY = 20  # of those, for the 1,000 cells
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the recordings are not part of this repository")
 def test_all_sensors_agree_with_libigl_on_real_hands_and_meshes_within_a_micrometre():
     counts = Counter()

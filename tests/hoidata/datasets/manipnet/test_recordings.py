@@ -11,7 +11,7 @@ from hoidata.hands import load_embedded_hands
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not ROOT, reason="HOIDATA_MANIPNET is not set: the recordings are not part of this repository")
 def test_fitted_hands_keep_joints_tips_and_touch_in_all_five_sequences() -> None:
     figures = measure_fits(Path(ROOT), load_embedded_hands())
