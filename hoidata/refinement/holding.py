@@ -38,10 +38,11 @@ class HoldSettings:
     holds it, where the part is at rest, and where it moves by more than moving_m_s. least: frames of a hold. gap:
     frames between two holds that belong to one, if the hand is nearer than same_m, a hand's breadth, to where it was on
     the part. blend: in which a hand comes to its hold, and leaves it. carry: frames by which a hold is drawn out where
-    the part moves in no hand. reach_m, keypoint_m: from where skin is drawn to the surface, and the standard deviation of a vertex from
-    where it was: the first of each, then the next, on top of what came out, where those hands cannot carry the object
-    in some of air_frames frames in which it is in the air. solver: the other wishes. rest: of the object, before all
-    that. wait: of the object for hands that come and go, after it. Raises BadInput for more reaches than deviations.
+    the part moves in no hand. reach_m, keypoint_m: from where skin is drawn to the surface, and the standard deviation
+    of a vertex from where it was: the first of each, then the next, on top of what came out, where those hands cannot
+    carry the object in some of air_frames frames in which it is in the air. solver: the other wishes. rest: of the
+    object, before all that. wait: of the object for hands that come and go, after it. Raises BadInput for more reaches
+    than deviations.
     """
 
     near_m: float = 0.006
