@@ -257,8 +257,8 @@ def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Gr
     field = ObjectField(thing)
     touching: np.ndarray = (field.distances(points_m)[0] < settings.near_m) & track.valid[:, None]
     part, touching = field.part_touched(points_m, touching)
-    moved = world_from_part(thing, part)
-    holds, moving = _holds(points_m, touching.any(axis=1), moved, track.valid, settings)
+    moved, touched = world_from_part(thing, part), np.any(touching, axis=1)
+    holds, moving = _holds(points_m, touched, moved, track.valid, settings)
     object_from_part = thing.model.object_from_part(part, thing.hinge_rad)
     return _Grip(track, skin, world, holds, moving, object_from_part, moved) if holds else None
 
