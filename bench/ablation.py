@@ -1,11 +1,11 @@
 """What every switch of Text2HOI's preset `ours` is worth: trained without it, at equal steps, with the spread of seeds.
 
 ``python -m bench ablation`` in a project. HOIDATA_BENCH_DATA: a folder with clips, annotation, contact and splits
-(data/embedded/grab); HOIDATA_BENCH_STEPS: of every diffusion network (400); HOIDATA_BENCH_SEEDS: trainings of each row
+(data/embedded/grab); HOIDATA_BENCH_STEPS: of every diffusion network (320); HOIDATA_BENCH_SEEDS: trainings of each row
 (3); HOIDATA_BENCH_ROWS: some rows alone, by name with commas; HOIDATA_BENCH_MINUTES: no row is begun later than that
 (120). Sizes and all other settings are those of params.yaml, size `small`. What was computed is kept in
 .hoidata/ablation and taken up again while data, settings and code are the same: a run may be stopped at any time, and
-several started side by side share the rows. On `study` 400 steps teach nothing (`ours` does what the verb says in .05):
+several started side by side share the rows. On `study` so few teach nothing (`ours` does what the verb says in .05):
 take 1,200 or more there.
 
 Rows of `ours` are held, `paper` and `released` have their own refiner. Rows under `paper` are those of the paper's
@@ -163,7 +163,7 @@ class Study:
     def here(cls) -> "Study":
         """As the environment says, in the current project."""
         data = Path(os.environ.get("HOIDATA_BENCH_DATA", "data/embedded/grab"))
-        steps, root = int(os.environ.get("HOIDATA_BENCH_STEPS", "400")), Path(__file__).parents[1]
+        steps, root = int(os.environ.get("HOIDATA_BENCH_STEPS", "320")), Path(__file__).parents[1]
         read = [data / name for name in ("clips", "annotation", "contact", "splits")]
         made_from = value_digest([*(path_digest(path) for path in (*read, *(root / name for name in CODE)))])
         return cls(data, steps, read_params(Path())["train"], made_from)
