@@ -67,6 +67,11 @@ class Scene:
     def table_height_m(self) -> float:
         return float(np.percentile(self.lowest_m, TABLE_PERCENTILE)) if self.table_m is None else self.table_m
 
+    def lowest_of_m(self, hand: Capsules) -> float:
+        """Height of a hand's lowest skin in any frame in which it is there, against gravity."""
+        ends_m = np.stack((hand.start_m, hand.end_m)) @ -self.gravity
+        return float(np.nanmin(ends_m - hand.radius_m))
+
     @property
     def lifted(self) -> np.ndarray:
         """(frame,) bool: the lowest vertex is more than 1.5 cm above the table. Nothing but hands can hold it then."""

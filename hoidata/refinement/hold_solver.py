@@ -43,7 +43,8 @@ class SolverSettings:
     enough: float = 0.01
 
 
-class Draw(NamedTuple):
+@dataclass(frozen=True)
+class Draw:
     """How far skin is drawn to the surface: beyond reach_m it hardly is. keypoint_m: deviation of a vertex from the
     generated one.
     """
@@ -82,12 +83,12 @@ def spline_shares(n_frames: int, holds: Sequence[Interval], knot_frames: int) ->
     return shares @ np.eye(number[-1] + 1)[number]
 
 
-@dataclass(frozen=True)
-class _State:
-    """unknowns (control point, 51) and what they make of the frames looked at: pose, signed distances (frame, vertex)
-    of the skin from object and other hand, and their slopes."""
+class State(NamedTuple):
+    """step (frame, 51) from where a hand was, and what it makes of it: pose, signed distances (frame, vertex) of the
+    skin from object and other hand, and their slopes.
+    """
 
-    unknowns: np.ndarray
+    step: np.ndarray
     pose: HandPose
     distance_m: np.ndarray
     slope: np.ndarray
@@ -95,51 +96,30 @@ class _State:
     other_slope: np.ndarray
 
 
-class _Motion:
-    """frames: those looked at. weight: how many each stands for. trust: (frame, segment) whether it is to touch."""
+class Wishes:
+    """What is wished for the skin of one hand, frame by frame; the part's frame throughout.
+
+    own: the hand as it was, in frames (frame,) of the object. holding: (frame,) bool. other: capsules of the other hand
+    there. start: the hand as it was. trust: (frame, segment) how much the skin of each is to touch.
+    """
 
     def __init__(
         self,
         skin: Skin,
         field: ObjectField,
-        pose: HandPose,
-        holds: Sequence[Interval],
-        valid: np.ndarray,
+        own: HandPose,
+        frames: np.ndarray,
+        holding: np.ndarray,
         other: Capsules | None,
         settings: SolverSettings,
         draw: Draw,
     ) -> None:
-        self.skin, self.field, self.pose, self.settings, self.draw = skin, field, pose, settings, draw
-        self.all_shares = spline_shares(len(valid), holds, settings.knot_frames)
-        alike = 1 + 3 * (field.moves or other is not None)
-        self.frames, self.weight, holding = _looked_at(holds, valid, alike, settings.every)
-        self.other = None if other is None else other.taken(self.frames)
-        self.shares = self.all_shares[self.frames]
-        self.own = HandPose(*(array[self.frames] for array in pose))
-        bend = np.diff(np.eye(self.shares.shape[1]), n=2, axis=0)
-        self.bend = bend.T @ bend / settings.bend_m**2
+        self.skin, self.field, self.own, self.frames = skin, field, own, frames
+        self.other, self.settings, self.draw = other, settings, draw
         self.metric = self._metric()
-        self.start = self._see(np.zeros((self.shares.shape[1], N_UNKNOWNS)))
+        self.start = self.see(np.zeros((len(frames), N_UNKNOWNS)))
         near = np.maximum(skin.nearest_of_segments(self.start.distance_m)[1], 0)
         self.trust = np.exp(-0.5 * (near / draw.reach_m) ** 2) * holding[:, None]
-
-    def corrected(self) -> HandPose:
-        state, damping = self.start, 1e-3
-        cost = self._cost(state)
-        for _ in range(self.settings.steps):
-            blocks, vector = self._equations(state)
-            while True:
-                moved = self._see(state.unknowns + solve_damped(blocks, vector, damping))
-                cost_moved = self._cost(moved)
-                if cost_moved < cost or damping > _MOST_DAMPING:
-                    break
-                damping *= 10
-            if cost_moved >= cost:
-                break
-            gain, state, cost, damping = 1 - cost_moved / cost, moved, cost_moved, damping / 10
-            if gain < self.settings.enough:
-                break
-        return self.pose.moved(self.all_shares @ state.unknowns)
 
     def _metric(self) -> np.ndarray:
         """(frame, 51, 51) squares of how far every 16th vertex moves, in its standard deviations."""
@@ -151,42 +131,36 @@ class _Motion:
         metric = derivative.swapaxes(1, 2) @ derivative / len(vertex) + 1e-5 * np.eye(N_UNKNOWNS)
         return 16 * metric / self.draw.keypoint_m**2
 
-    def _see(self, unknowns: np.ndarray) -> _State:
-        pose = self.own.moved(self.shares @ unknowns)
+    def see(self, step: np.ndarray) -> State:
+        """The hand after a step (frame, 51)."""
+        pose = self.own.moved(step)
         points = self.skin.vertices_m(self.skin.chain(pose))
         distance, slope = self.field.distances(points, self.frames)
         other, other_slope = np.full(distance.shape, np.inf), np.zeros(points.shape)
         if self.other is not None:
             lower_capsules(*self.other, points, other, other_slope)
-        return _State(unknowns, pose, distance, slope, other, other_slope)
+        return State(step, pose, distance, slope, other, other_slope)
 
-    def _cost(self, state: _State) -> float:
-        own, step = self.settings, self.shares @ state.unknowns
+    def costs(self, state: State) -> np.ndarray:
+        """(frame,) what is left to wish for."""
+        own, step = self.settings, state.step
         each = ((self.metric @ step[..., None])[..., 0] * step).sum(axis=1)
         each += (self.trust * (self.skin.nearest_of_segments(state.distance_m)[1] + own.press_m) ** 2).sum(
             axis=1
         ) / own.surface_m**2
         for distance in (state.distance_m, state.other_m):
             each += (np.minimum(distance + own.press_m, 0) ** 2).sum(axis=1) / own.depth_m**2
-        bent = state.unknowns * _LEVER_M
-        return float(self.weight @ each + (bent * (self.bend @ bent)).sum())
+        return each
 
-    def _equations(self, state: _State) -> tuple[list[np.ndarray], np.ndarray]:
-        """Blocks and minus half the gradient, as ``solve_blocks`` takes them."""
-        step = self.shares @ state.unknowns
-        matrix, vector = np.zeros_like(self.metric), np.zeros_like(step)
+    def equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Normal equations (frame, 51, 51) of the next step, and minus half the gradient (frame, 51)."""
+        matrix, vector = np.zeros_like(self.metric), np.zeros_like(state.step)
         self._add_distances(state, matrix, vector)
         matrix += np.tril(matrix, -1).swapaxes(1, 2) + self.metric
-        vector -= (self.metric @ step[..., None])[..., 0]
-        matrix, blocks, count = matrix * self.weight[:, None, None], [], self.shares.shape[1]
-        for apart in range(min(4, count)):
-            shares = self.shares[:, : count - apart] * self.shares[:, apart:]
-            block = (shares.T @ matrix.reshape(len(matrix), -1)).reshape(-1, N_UNKNOWNS, N_UNKNOWNS)
-            blocks.append(block + np.diagonal(self.bend, apart)[:, None, None] * np.diag(_LEVER_M**2))
-        pulled = self.shares.T @ (vector * self.weight[:, None])
-        return blocks, pulled - self.bend @ state.unknowns * _LEVER_M**2
+        vector -= (self.metric @ state.step[..., None])[..., 0]
+        return matrix, vector
 
-    def _add_distances(self, state: _State, matrix: np.ndarray, vector: np.ndarray) -> None:
+    def _add_distances(self, state: State, matrix: np.ndarray, vector: np.ndarray) -> None:
         """Skin that is to touch, and skin that is too deep in the object or in the other hand."""
         own, chain = self.settings, self.skin.chain(state.pose, slopes=True)
         vertex, near = self.skin.nearest_of_segments(state.distance_m)
@@ -200,6 +174,99 @@ class _Motion:
         frame, chosen, distance, weight = (np.concatenate(column) for column in zip(*found, strict=True))
         derivative = self.skin.derivatives(chain, frame, chosen)
         add_squares(frame, np.concatenate(slopes), derivative, weight, distance + own.press_m, matrix, vector)
+
+
+def settled(wishes: Wishes, steps: int) -> HandPose:
+    """Every frame's hand by itself, after so many steps of Levenberg-Marquardt with a damping of its own."""
+    state, damping = wishes.start, np.full(len(wishes.frames), 1e-3)
+    cost, diagonal = wishes.costs(state), np.arange(N_UNKNOWNS)
+    for _ in range(steps):
+        matrix, vector = wishes.equations(state)
+        matrix[:, diagonal, diagonal] *= 1 + damping[:, None]
+        moved = wishes.see(state.step + np.linalg.solve(matrix, vector[..., None])[..., 0])
+        cost_moved = wishes.costs(moved)
+        better = cost_moved < cost
+        state = _chosen(better, moved, state)
+        cost, damping = np.where(better, cost_moved, cost), damping * np.where(better, 0.1, 10)
+    return state.pose
+
+
+def _chosen(moved: np.ndarray, one: State, other: State) -> State:
+    """Frame by frame ``one`` where ``moved (frame,)``, else the other."""
+
+    def either(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.where(moved.reshape(-1, *[1] * (a.ndim - 1)), a, b)
+
+    return State(
+        either(one.step, other.step),
+        one.pose.where(moved, other.pose),
+        either(one.distance_m, other.distance_m),
+        either(one.slope, other.slope),
+        either(one.other_m, other.other_m),
+        either(one.other_slope, other.other_slope),
+    )
+
+
+class _Motion:
+    """One hand through time. all_shares: of every frame; shares and weight, how many it stands for, of those looked at.
+    bend: of the control points' second differences.
+    """
+
+    def __init__(
+        self,
+        skin: Skin,
+        field: ObjectField,
+        pose: HandPose,
+        holds: Sequence[Interval],
+        valid: np.ndarray,
+        other: Capsules | None,
+        settings: SolverSettings,
+        draw: Draw,
+    ) -> None:
+        self.pose, self.settings = pose, settings
+        self.all_shares = spline_shares(len(valid), holds, settings.knot_frames)
+        alike = 1 + 3 * (field.moves or other is not None)
+        frames, self.weight, holding = _looked_at(holds, valid, alike, settings.every)
+        self.shares = self.all_shares[frames]
+        bend = np.diff(np.eye(self.shares.shape[1]), n=2, axis=0)
+        self.bend = bend.T @ bend / settings.bend_m**2
+        there = None if other is None else other.taken(frames)
+        self.wishes = Wishes(skin, field, pose.taken(frames), frames, holding, there, settings, draw)
+
+    def corrected(self) -> HandPose:
+        state, unknowns, damping = self.wishes.start, np.zeros((self.shares.shape[1], N_UNKNOWNS)), 1e-3
+        cost = self._cost(state, unknowns)
+        for _ in range(self.settings.steps):
+            blocks, vector = self._equations(state, unknowns)
+            while True:
+                further = unknowns + solve_damped(blocks, vector, damping)
+                moved = self.wishes.see(self.shares @ further)
+                cost_moved = self._cost(moved, further)
+                if cost_moved < cost or damping > _MOST_DAMPING:
+                    break
+                damping *= 10
+            if cost_moved >= cost:
+                break
+            gain, state, unknowns = 1 - cost_moved / cost, moved, further
+            cost, damping = cost_moved, damping / 10
+            if gain < self.settings.enough:
+                break
+        return self.pose.moved(self.all_shares @ unknowns)
+
+    def _cost(self, state: State, unknowns: np.ndarray) -> float:
+        bent = unknowns * _LEVER_M
+        return float(self.weight @ self.wishes.costs(state) + (bent * (self.bend @ bent)).sum())
+
+    def _equations(self, state: State, unknowns: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+        """Blocks and minus half the gradient, as ``solve_blocks`` takes them."""
+        matrix, vector = self.wishes.equations(state)
+        matrix, blocks, count = matrix * self.weight[:, None, None], [], self.shares.shape[1]
+        for apart in range(min(4, count)):
+            shares = self.shares[:, : count - apart] * self.shares[:, apart:]
+            block = (shares.T @ matrix.reshape(len(matrix), -1)).reshape(-1, N_UNKNOWNS, N_UNKNOWNS)
+            blocks.append(block + np.diagonal(self.bend, apart)[:, None, None] * np.diag(_LEVER_M**2))
+        pulled = self.shares.T @ (vector * self.weight[:, None])
+        return blocks, pulled - self.bend @ unknowns * _LEVER_M**2
 
 
 def _looked_at(

@@ -3,11 +3,14 @@ to carry it.
 
 A hand is looked at in the frame of the part it touches most, where a hand that holds on is one pose. That pose, and
 corrections of the frames around it, are found by ``hold_solver``; where the hands that come out cannot carry an object
-that is in the air, they are corrected again, with fingers drawn in from farther away.
+that is in the air, they are corrected again, with fingers drawn in from farther away; and where that does not help
+either, they take it otherwise (``regrasping``).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
+from types import MappingProxyType
 
 import numpy as np
 
@@ -16,7 +19,7 @@ from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, runs
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
-from hoidata.hands.model import HandPair
+from hoidata.hands.model import N_VERTICES, HandModel, HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.scene import Scene, capsules_there, object_scene
@@ -24,12 +27,15 @@ from hoidata.physics.standard_units import StandardUnits
 from hoidata.refinement.hold_solver import Draw, SolverSettings, corrected
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part
+from hoidata.refinement.regrasping import Held, RegraspSettings, grasps_that_carry
 from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
 from hoidata.refinement.waiting import WaitSettings, wait_for_hands
 from hoidata.workers import one_thread
 
 _ALONG = 9  # places along a capsule's axis at which it is looked at
+_SOME_SKIN = 3  # one of so many vertices is looked at in the search of another grasp
+_UNDER_M = 0.005  # so much lower than the table, or than before, a hand with another grasp may be
 
 
 @dataclass(frozen=True)
@@ -40,9 +46,9 @@ class HoldSettings:
     the part. blend: in which a hand comes to its hold, and leaves it. carry: frames by which a hold is drawn out where
     the part moves in no hand. reach_m, keypoint_m: from where skin is drawn to the surface, and the standard deviation
     of a vertex from where it was: the first of each, then the next, on top of what came out, where those hands cannot
-    carry the object in some of air_frames frames in which it is in the air. solver: the other wishes. rest: of the
-    object, before all that. wait: of the object for hands that come and go, after it. Raises BadInput for more reaches
-    than deviations.
+    carry the object in some of air_frames frames in which it is in the air. solver: the other wishes. regrasp: of hands
+    that cannot carry it then. rest: of the object, before all that. wait: of the object for hands that come and go,
+    after it. Raises BadInput for more reaches than deviations.
     """
 
     near_m: float = 0.006
@@ -58,6 +64,7 @@ class HoldSettings:
     keypoint_m: tuple[float, ...] = (0.006, 0.012, 0.02, 0.04)
     air_frames: int = 4
     solver: SolverSettings = field(default_factory=SolverSettings)
+    regrasp: RegraspSettings = field(default_factory=RegraspSettings)
     rest: RestSettings = field(default_factory=RestSettings)
     wait: WaitSettings = field(default_factory=WaitSettings)
 
@@ -108,7 +115,21 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
         clip = replace(clip, hands=tracks)
         if share == 1:
             break
+    if 0 <= most < 1 and settings.regrasp.tries:
+        best = _regrasped(pair, replace(clip, hands=best), load, settings)
     return best
+
+
+def _regrasped(pair: HandPair, clip: Clip, load: "_Load", settings: HoldSettings) -> dict[Side, HandTrack]:
+    """The hands of a clip, with another grasp in every hold that cannot carry and where one that can is found."""
+    tracks = dict(clip.hands)
+    for side in SIDES:
+        if (grip := _grip(pair, side, clip, settings)) is None:
+            continue
+        opposite: Side = "right" if side == "left" else "left"
+        other = capsules_there(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
+        tracks[side] = grip.regrasped(pair[side], load, other, settings)
+    return tracks
 
 
 def _starts(pair: HandPair, clip: Clip, settings: HoldSettings) -> dict[Side, "_Start"]:
@@ -150,6 +171,15 @@ class _Load:
         scene = object_scene(clip)
         air = np.flatnonzero(scene.lifted)
         return cls(clip, scene, air[((np.arange(count) + 0.5) * len(air) / count).astype(int)] if len(air) else air)
+
+    def within(self, hold: Interval) -> "_Load":
+        """Those frames of it that lie in a hold."""
+        return replace(self, frames=self.frames[(self.frames >= hold.start) & (self.frames < hold.stop)])
+
+    def carried_by(self, track: HandTrack, hand: HandModel, other: Capsules | None) -> bool:
+        """Whether a hand, with the capsules of the other where there is one, carries in all of the frames."""
+        hands = [capsules_there(track.take(self.frames), hand)]
+        return self.carried([*hands, *([] if other is None else [other.taken(self.frames)])]) == 1
 
     def carried(self, hands: Sequence[Capsules]) -> float:
         """Share of the frames in which friction at the contacts can give the object's motion; hands in those frames."""
@@ -233,10 +263,71 @@ class _Grip:
             holds.append(Interval(first, last))
         return replace(self, holds=holds)
 
-    def start(self, thing: ObjectTrack, blend: int) -> _Start:
-        """The hand in the part's frame, at rest in its holds."""
+    def regrasped(self, hand: HandModel, load: _Load, other: Capsules | None, settings: HoldSettings) -> HandTrack:
+        """The hand with another grasp in each hold that cannot carry and where one is found that can.
+
+        other: capsules of the other hand, world.
+        """
+        made, grasps = self.track, dict[int, HandPose]()
+        for number, hold in enumerate(self.holds):
+            load_there = load.within(hold)
+            for grasp in self._other_grasps(hand, hold, load_there, other, settings):
+                tried = {**grasps, number: grasp}
+                start = self.start(load.clip.object, settings.regrasp.blend, tried)
+                # Every frame is looked at: a hand that closes on its way to an edge is quickly in it.
+                track = start.solved(other, replace(settings.solver, every=1), settings.regrasp.holding)
+                if load_there.carried_by(track, hand, other):
+                    made, grasps = track, tried
+                    break
+        return made
+
+    def _other_grasps(
+        self, hand: HandModel, hold: Interval, load: _Load, other: Capsules | None, settings: HoldSettings
+    ) -> Iterator[HandPose]:
+        """Some for a hold that carry where the hand's own does not, one frame each in the part's frame.
+
+        load: in frames of the hold.
+        """
+        scene, ends = load.scene, np.array([hold.start, hold.stop - 1])
+        if scene is None or load.carried_by(self.track, hand, other):
+            return iter(())
+        floor_m = min(scene.table_height_m, scene.lowest_of_m(capsules_there(self.track.take(ends), hand)))
+
+        def carries(pose: HandPose) -> bool:
+            track = self._everywhere(pose)
+            lowest_m = scene.lowest_of_m(capsules_there(track.take(ends), hand))
+            return lowest_m > floor_m - _UNDER_M and load.carried_by(track, hand, other)
+
+        found = grasps_that_carry(self._held(hand, load, other), carries, settings.solver, settings.regrasp)
+        return islice(found, settings.regrasp.answers)
+
+    def _everywhere(self, pose: HandPose) -> HandTrack:
+        """The hand in one pose, one frame in the part's frame, all the time."""
+        moved = pose.taken(np.zeros(len(self.track.valid), int)).seen_from(self.world_from_part)
+        return moved.track(self.track.betas[0], self.track.valid, self.track.template_m)
+
+    def _held(self, hand: HandModel, load: _Load, other: Capsules | None) -> Held:
+        """The hand in the middle one of frames in which it has to carry."""
+        assert load.scene is not None
+        middle = load.frames[[len(load.frames) // 2]]
+        part_from_world = self.world_from_part.inverse()[middle]
+        if other is not None:
+            now = other.taken(middle)
+            other = Capsules(part_from_world @ now.start_m, part_from_world @ now.end_m, now.radius_m)
+        some = np.arange(0, N_VERTICES, _SOME_SKIN)
+        return Held(
+            Skin(hand, np.asarray(self.track.betas, np.float64)[0], self.track.template_m, some),
+            ObjectField(_in_part(load.clip.object, self.object_from_part)),
+            self.pose.taken(middle).seen_from(part_from_world),
+            int(middle[0]),
+            (part_from_world @ load.scene.motion.centre_m[middle][:, None])[0, 0],
+            other,
+        )
+
+    def start(self, thing: ObjectTrack, blend: int, grasps: Mapping[int, HandPose] = MappingProxyType({})) -> _Start:
+        """The hand in the part's frame, at rest in its holds: in the ones numbered in ``grasps`` in that pose."""
         part_from_world = self.world_from_part.inverse()
-        pose = _at_rest(self.pose.seen_from(part_from_world), self.holds, blend)
+        pose = _at_rest(self.pose.seen_from(part_from_world), self.holds, blend, grasps)
         field = ObjectField(_in_part(thing, self.object_from_part))
         return _Start(self.track, self.skin, pose, self.holds, part_from_world, field)
 
@@ -292,21 +383,31 @@ def _holds(
     return [found for found in runs(held) if found.stop - found.start >= own.least], moving
 
 
-def _at_rest(pose: HandPose, holds: Sequence[Interval], blend: int) -> HandPose:
-    """The mean pose of each hold in all its frames; the way to it is shared out over frames before and after."""
+def _at_rest(pose: HandPose, holds: Sequence[Interval], blend: int, grasps: Mapping[int, HandPose]) -> HandPose:
+    """One pose in all frames of each hold, its mean or that of ``grasps``; the way to it is shared out over frames
+    before and after.
+    """
     step, n_frames = np.zeros((len(pose.wrist_m), N_UNKNOWNS)), len(pose.wrist_m)
     for number, (start, stop) in enumerate(holds):
         own = HandPose(*(array[start:stop] for array in pose))
-        mean = HandPose(*(np.repeat(array[len(array) // 2][None], len(array), 0) for array in own))
-        for _ in range(2):
-            mean = mean.moved(np.repeat(mean.step_to(own).mean(axis=0)[None], stop - start, 0))
-        step[start:stop] = ways = own.step_to(mean)
+        everywhere = np.zeros(stop - start, int)
+        rest = grasps[number].taken(everywhere) if number in grasps else _mean(own).taken(everywhere)
+        step[start:stop] = ways = own.step_to(rest)
         # Two holds share the frames between them.
         before = min(blend, (start - holds[number - 1].stop) // 2 if number else start)
         after = min(blend, (holds[number + 1].start - stop) // 2 if number + 1 < len(holds) else n_frames - stop)
         step[start - before : start] = _ramp(before)[:, None] * ways[0]
         step[stop : stop + after] = _ramp(after)[::-1, None] * ways[-1]
     return pose.moved(step)
+
+
+def _mean(pose: HandPose) -> HandPose:
+    """One frame."""
+    mean = pose.taken(np.array([len(pose.wrist_m) // 2]))
+    for _ in range(2):
+        everywhere = mean.taken(np.zeros(len(pose.wrist_m), int))
+        mean = mean.moved(everywhere.step_to(pose).mean(axis=0)[None])
+    return mean
 
 
 def _ramp(count: int) -> np.ndarray:

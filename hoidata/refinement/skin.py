@@ -34,6 +34,10 @@ class HandPose(NamedTuple):
         orient = rotvec_to_rotmat(step[:, 3:6]) @ self.orient
         return HandPose(self.wrist_m + step[:, :3], orient, self.fingers + step[:, 6:].reshape(-1, 15, 3))
 
+    def taken(self, frames: np.ndarray) -> "HandPose":
+        """Of the chosen frames."""
+        return HandPose(*(array[frames] for array in self))
+
     def step_to(self, other: "HandPose") -> np.ndarray:
         """(frame, 51) the step that leads to the other pose."""
         turn = rotmat_to_rotvec(other.orient @ self.orient.swapaxes(-1, -2))

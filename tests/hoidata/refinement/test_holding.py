@@ -16,10 +16,12 @@ from hoidata.physics.realism import VARIANTS, score
 from hoidata.physics.scene import clip_scene
 from hoidata.refinement import HoldSettings, carried_share, hold_clip, hold_hands
 from hoidata.refinement.hold_solver import spline_shares
+from hoidata.refinement.regrasping import RegraspSettings
 from tests.builders.clips import DOWN, clip_of
 from tests.builders.objects import box_model, two_parts
 
 PAIR = load_embedded_hands()
+AS_GENERATED = HoldSettings(regrasp=RegraspSettings(tries=0))  # other grasps: test_regrasping.py
 FRAMES = 44
 BOX = box_model((0.06, 0.30, 0.06))
 HELD, LIFT = slice(12, 36), np.interp(np.arange(FRAMES), [0, 14, 30, FRAMES], [0, 0, 0.2, 0.2])
@@ -63,7 +65,7 @@ def pushed() -> tuple[Clip, dict[Side, HandTrack]]:
         top = place + (turn @ np.array([0, y, 0.03]))
         hands[side] = pressed(side, top, 0.012, 0.004, turn)
     clip = clip_of("toy/s1/a", thing, hands)
-    return clip, hold_hands(PAIR, clip)
+    return clip, hold_hands(PAIR, clip, AS_GENERATED)
 
 
 def in_object(clip: Clip, side: Side, track: HandTrack) -> np.ndarray:
@@ -193,7 +195,7 @@ def test_where_the_object_would_fall_hands_are_drawn_to_it_from_farther_away():
         hands[side] = pressed(side, place + np.array([0, sign * 0.05, 0]), -0.004, 0.0, turn)
     clip = clip_of("toy/s1/c", thing, hands)
     for reach in ((0.0005,), (0.0005, 0.03)):
-        made = hold_hands(PAIR, clip, HoldSettings(reach_m=reach, keypoint_m=(0.006, 0.02)[: len(reach)]))
+        made = hold_hands(PAIR, clip, replace(AS_GENERATED, reach_m=reach, keypoint_m=(0.006, 0.02)[: len(reach)]))
         shares.append(score(clip_scene(replace(clip, hands=made), PAIR, -0.05), VARIANTS["SI"]).share)
     assert shares[0] < 0.2
     assert shares[1] > 0.6
@@ -204,7 +206,7 @@ def test_told_twice_the_answer_is_the_same_and_what_has_no_weight_needs_no_carry
     corners, sheet = BOX.vertices_m * [1, 1, 0], clip.object
     paper = replace(clip, object=replace(sheet, model=replace(BOX, name="sheet", vertices_m=corners)))
     assert all(np.isfinite(track.wrist_m).all() for track in hold_hands(PAIR, paper).values())
-    again, floating = hold_hands(PAIR, clip), hold_hands(PAIR, replace(clip, gravity=None))
+    again, floating = hold_hands(PAIR, clip, AS_GENERATED), hold_hands(PAIR, replace(clip, gravity=None))
     for side in SIDES:
         assert again[side].wrist_m.tobytes() == made[side].wrist_m.tobytes()
         assert np.isfinite(floating[side].hand_pose).all()
@@ -257,7 +259,7 @@ def test_a_hold_is_drawn_out_once_not_at_every_try(pushed, monkeypatch):
 
     monkeypatch.setattr("hoidata.refinement.holding._solved", solved)
     monkeypatch.setattr("hoidata.refinement.holding._Load.carried", lambda self, hands: 0.0)
-    hold_hands(PAIR, clip)
+    hold_hands(PAIR, clip, AS_GENERATED)
     assert len(tries) == len(HoldSettings().reach_m)
     wider = [sum(stop - start for start, stop in held["left"]) for held in tries[1:]]
     assert len(set(wider)) == 1
@@ -271,7 +273,7 @@ def test_frames_without_the_other_hand_do_not_push_this_one(pushed):
         nonsense = np.random.default_rng(draw).normal(size=(FRAMES, 3)).astype(np.float32)
         wrist = np.where(gone[:, None], clip.hands["left"].wrist_m + 0.02 * nonsense, right.wrist_m)
         hands = {**clip.hands, "right": replace(right, wrist_m=wrist, valid=~gone)}
-        made.append(hold_hands(PAIR, replace(clip, hands=hands))["left"])
+        made.append(hold_hands(PAIR, replace(clip, hands=hands), AS_GENERATED)["left"])
         assert carried_share(PAIR, replace(clip, hands=hands)) <= 1
     assert made[0].wrist_m.tobytes() == made[1].wrist_m.tobytes()
     assert made[0].hand_pose.tobytes() == made[1].hand_pose.tobytes()
