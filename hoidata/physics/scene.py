@@ -68,7 +68,7 @@ class Scene:
         return float(np.percentile(self.lowest_m, TABLE_PERCENTILE)) if self.table_m is None else self.table_m
 
     def lowest_of_m(self, hand: Capsules) -> float:
-        """Height of a hand's lowest skin in any frame in which it is there, against gravity."""
+        """Height of a hand's lowest capsule in any frame in which it is there, against gravity."""
         ends_m = np.stack((hand.start_m, hand.end_m)) @ -self.gravity
         return float(np.nanmin(ends_m - hand.radius_m))
 

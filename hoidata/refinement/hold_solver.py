@@ -27,16 +27,18 @@ class SolverSettings:
     """Standard deviations, metres; a smaller one counts more.
 
     press_m: how deep skin lies that touches, for it gives way. surface_m: of the nearest skin of each of 16 segments of
-    a holding hand from there.
-    depth_m: of a vertex deeper than press_m in the object, or in the other hand. bend_m: of a control point from the
-    middle of its neighbours. knot_frames: of the spline. every: one of so many frames outside of holds is looked at.
-    steps: at most; fewer where one gains less than ``enough`` of the cost.
+    a holding hand from there. depth_m: of a vertex deeper than press_m in the object, or in the other hand. bend_m: of
+    a control point from the middle of its neighbours. finger_rad: radians, of each angle of the fingers from what it
+    was: without it skin that is drawn far is brought by fingers that nobody can bend so. knot_frames: of the spline.
+    every: one of so many frames outside of holds is looked at. steps: at most; fewer where one gains less than
+    ``enough`` of the cost.
     """
 
     press_m: float = 0.0015
     surface_m: float = 0.001
     depth_m: float = 0.0005
     bend_m: float = 0.004
+    finger_rad: float = 0.1
     knot_frames: int = 5
     every: int = 2
     steps: int = 6
@@ -45,8 +47,8 @@ class SolverSettings:
 
 @dataclass(frozen=True)
 class Draw:
-    """How far skin is drawn to the surface: beyond reach_m it hardly is. keypoint_m: deviation of a vertex from the
-    generated one.
+    """How far skin is drawn to the surface: beyond reach_m it hardly is. keypoint_m: deviation of a vertex from where
+    it was.
     """
 
     reach_m: float = 0.003
@@ -129,7 +131,10 @@ class Wishes:
         derivative = derivative.reshape(len(self.frames), -1, N_UNKNOWNS)
         # Of 16 points in all, and a little of each unknown, for fingers that move few of them.
         metric = derivative.swapaxes(1, 2) @ derivative / len(vertex) + 1e-5 * np.eye(N_UNKNOWNS)
-        return 16 * metric / self.draw.keypoint_m**2
+        metric *= 16 / self.draw.keypoint_m**2
+        fingers = np.arange(6, N_UNKNOWNS)
+        metric[:, fingers, fingers] += self.settings.finger_rad**-2
+        return metric
 
     def see(self, step: np.ndarray) -> State:
         """The hand after a step (frame, 51)."""

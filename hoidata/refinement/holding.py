@@ -27,7 +27,7 @@ from hoidata.physics.standard_units import StandardUnits
 from hoidata.refinement.hold_solver import Draw, SolverSettings, corrected
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part
-from hoidata.refinement.regrasping import Held, RegraspSettings, grasps_that_carry
+from hoidata.refinement.regrasping import Held, RegraspSettings, bends_rad, grasps_that_carry
 from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
 from hoidata.refinement.waiting import WaitSettings, wait_for_hands
@@ -116,7 +116,7 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
         if share == 1:
             break
     if 0 <= most < 1 and settings.regrasp.tries:
-        best = _regrasped(pair, replace(clip, hands=best), load, settings)
+        return _regrasped(pair, replace(clip, hands=best), load, settings)
     return best
 
 
@@ -268,18 +268,34 @@ class _Grip:
 
         other: capsules of the other hand, world.
         """
-        made, grasps = self.track, dict[int, HandPose]()
-        for number, hold in enumerate(self.holds):
-            load_there = load.within(hold)
-            for grasp in self._other_grasps(hand, hold, load_there, other, settings):
+        made, grasps, loads = self.track, dict[int, HandPose](), [load.within(hold) for hold in self.holds]
+        carrying = {number for number, own in enumerate(loads) if own.carried_by(made, hand, other)}
+        for number in sorted(set(range(len(loads))) - carrying):
+            for grasp in self._other_grasps(hand, self.holds[number], loads[number], other, settings):
                 tried = {**grasps, number: grasp}
                 start = self.start(load.clip.object, settings.regrasp.blend, tried)
                 # Every frame is looked at: a hand that closes on its way to an edge is quickly in it.
                 track = start.solved(other, replace(settings.solver, every=1), settings.regrasp.holding)
-                if load_there.carried_by(track, hand, other):
-                    made, grasps = track, tried
+                wanted = carrying | {number}
+                sound = self._sound(load.clip.object, track, settings.regrasp)
+                if sound and all(loads[own].carried_by(track, hand, other) for own in wanted):
+                    made, grasps, carrying = track, tried, wanted
                     break
         return made
+
+    def _sound(self, thing: ObjectTrack, track: HandTrack, settings: RegraspSettings) -> bool:
+        """Whether fingers, depth in the object and speed of a hand stay within what is allowed, or what they were."""
+        allowed = (settings.bent_rad, settings.way_deep_m, settings.step_m)
+        before, after = (self._extremes(thing, own) for own in (self.track, track))
+        return all(value <= max(most, own) for value, most, own in zip(after, allowed, before, strict=True))
+
+    def _extremes(self, thing: ObjectTrack, track: HandTrack) -> tuple[float, float, float]:
+        """Of a hand while it is there: the most bent finger joint, rad; depth in the object, m; way of a frame, m."""
+        pose = HandPose.of(track)
+        there = np.flatnonzero(track.valid)
+        depth_m = -ObjectField(thing).distances(self.skin.vertices_m(self.skin.chain(pose)))[0]
+        ways_m = np.linalg.norm(np.diff(pose.wrist_m, axis=0), axis=1)[track.valid[1:] & track.valid[:-1]]
+        return float(bends_rad(pose)[there].max()), float(depth_m[there].max()), float(ways_m.max(initial=0))
 
     def _other_grasps(
         self, hand: HandModel, hold: Interval, load: _Load, other: Capsules | None, settings: HoldSettings
@@ -288,14 +304,14 @@ class _Grip:
 
         load: in frames of the hold.
         """
-        scene, ends = load.scene, np.array([hold.start, hold.stop - 1])
-        if scene is None or load.carried_by(self.track, hand, other):
+        scene, every = load.scene, np.arange(hold.start, hold.stop)
+        if scene is None:
             return iter(())
-        floor_m = min(scene.table_height_m, scene.lowest_of_m(capsules_there(self.track.take(ends), hand)))
+        floor_m = min(scene.table_height_m, scene.lowest_of_m(capsules_there(self.track.take(every), hand)))
 
         def carries(pose: HandPose) -> bool:
             track = self._everywhere(pose)
-            lowest_m = scene.lowest_of_m(capsules_there(track.take(ends), hand))
+            lowest_m = scene.lowest_of_m(capsules_there(track.take(every), hand))
             return lowest_m > floor_m - _UNDER_M and load.carried_by(track, hand, other)
 
         found = grasps_that_carry(self._held(hand, load, other), carries, settings.solver, settings.regrasp)

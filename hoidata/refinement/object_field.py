@@ -27,6 +27,11 @@ class ObjectField:
         """The object has a part that a hinge moves."""
         return len(self._parts) > 1
 
+    @property
+    def most_depth_m(self) -> float:
+        """How deep inside of it a place can lie; 0 where it has no inside."""
+        return max(0.0, *(-float(grid.value.min()) for grid, _ in self._parts))
+
     def nearest_part(self, places_m: np.ndarray) -> np.ndarray:
         """(frame, place) number of the part whose surface is nearest to places (frame, place, 3), world."""
         each = []
