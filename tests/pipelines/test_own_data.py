@@ -246,6 +246,7 @@ def test_doctor_accepts_the_pythons_that_an_installation_does():
     assert [python for python in every if ".".join(map(str, python)) in accepted] == list(PYTHONS)
 
 
+@pytest.mark.slow
 def test_doctor_names_every_part(project, project_tools):
     result = project_tools.run(project, "hoidata", "doctor", COLUMNS="200")
     assert result.returncode == 0, result.stdout
