@@ -29,6 +29,10 @@ class Capsules(NamedTuple):
         """Some frames and some capsules only."""
         return Capsules(self.start_m[frames][:, capsules], self.end_m[frames][:, capsules], self.radius_m[capsules])
 
+    def seen_from(self, a_from_world: RigidTransform) -> "Capsules":
+        """In frame a, ``a_from_world`` (frame,) transforms."""
+        return Capsules(a_from_world @ self.start_m, a_from_world @ self.end_m, self.radius_m)
+
     def moved(self, shift_m: np.ndarray) -> "Capsules":
         """Shifted by (3,) or, frame by frame, (frame, 3)."""
         shift = np.broadcast_to(shift_m, (len(self.start_m), 3))[:, None]

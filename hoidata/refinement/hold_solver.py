@@ -55,20 +55,6 @@ class Draw:
     keypoint_m: float = 0.006
 
 
-def corrected(
-    skin: Skin,
-    field: ObjectField,
-    pose: HandPose,
-    holds: Sequence[Interval],
-    valid: np.ndarray,
-    other: Capsules | None,
-    settings: SolverSettings,
-    draw: Draw,
-) -> HandPose:
-    """The pose of every frame, corrected; the part's frame throughout. other: capsules of the other hand."""
-    return _Motion(skin, field, pose, holds, valid, other, settings, draw).corrected()
-
-
 def spline_shares(n_frames: int, holds: Sequence[Interval], knot_frames: int) -> np.ndarray:
     """(frame, control point) shares, that add up to one; the control points that a hold feels are one."""
     intervals = max(1, round((n_frames - 1) / knot_frames))
@@ -212,9 +198,11 @@ def _chosen(moved: np.ndarray, one: State, other: State) -> State:
     )
 
 
-class _Motion:
-    """One hand through time. all_shares: of every frame; shares and weight, how many it stands for, of those looked at.
-    bend: of the control points' second differences.
+class HandInTime:
+    """One hand through time, the part's frame throughout. valid: (frame,) bool. other: capsules of the other hand.
+
+    all_shares: of every frame; shares and weight, how many it stands for, of those looked at. bend: of the control
+    points' second differences.
     """
 
     def __init__(
@@ -239,6 +227,7 @@ class _Motion:
         self.wishes = Wishes(skin, field, pose.taken(frames), frames, holding, there, settings, draw)
 
     def corrected(self) -> HandPose:
+        """The pose of every frame."""
         state, unknowns, damping = self.wishes.start, np.zeros((self.shares.shape[1], N_UNKNOWNS)), 1e-3
         cost = self._cost(state, unknowns)
         for _ in range(self.settings.steps):

@@ -24,7 +24,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
 from hoidata.physics.scene import Scene, capsules_there, object_scene
 from hoidata.physics.standard_units import StandardUnits
-from hoidata.refinement.hold_solver import Draw, SolverSettings, corrected
+from hoidata.refinement.hold_solver import Draw, HandInTime, SolverSettings
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.regrasping import Held, RegraspSettings, bends_rad, grasps_that_carry
@@ -33,6 +33,7 @@ from hoidata.refinement.skin import HandPose, Skin
 from hoidata.refinement.waiting import WaitSettings, wait_for_hands
 from hoidata.workers import one_thread
 
+_OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left"}
 _ALONG = 9  # places along a capsule's axis at which it is looked at
 _SOME_SKIN = 3  # one of so many vertices is looked at in the search of another grasp
 _UNDER_M = 0.005  # so much lower than the table, or than before, a hand with another grasp may be
@@ -126,7 +127,7 @@ def _regrasped(pair: HandPair, clip: Clip, load: "_Load", settings: HoldSettings
     for side in SIDES:
         if (grip := _grip(pair, side, clip, settings)) is None:
             continue
-        opposite: Side = "right" if side == "left" else "left"
+        opposite = _OPPOSITE[side]
         other = capsules_there(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
         tracks[side] = grip.regrasped(pair[side], load, other, settings)
     return tracks
@@ -150,7 +151,7 @@ def _solved(
     """All hands of a clip, those that hold something corrected one after the other."""
     tracks = dict(clip.hands)
     for side, start in starts.items():
-        opposite: Side = "right" if side == "left" else "left"
+        opposite = _OPPOSITE[side]
         other = capsules_there(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
         tracks[side] = start.solved(other, wishes, draw)
     return tracks
@@ -217,10 +218,9 @@ class _Start:
 
     def solved(self, other: Capsules | None, settings: SolverSettings, draw: Draw) -> HandTrack:
         """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
-        turn = self.part_from_world
-        if other is not None:
-            other = Capsules(turn @ other.start_m, turn @ other.end_m, other.radius_m)
-        pose = corrected(self.skin, self.field, self.pose, self.holds, self.track.valid, other, settings, draw)
+        other = None if other is None else other.seen_from(self.part_from_world)
+        hand = HandInTime(self.skin, self.field, self.pose, self.holds, self.track.valid, other, settings, draw)
+        pose = hand.corrected()
         track, valid = self.track, self.track.valid[:, None]
         made = pose.seen_from(self.part_from_world.inverse()).track(track.betas[0], track.valid, track.template_m)
         kept = {name: getattr(track, name) for name in ("wrist_m", "global_orient", "hand_pose")}
@@ -268,34 +268,31 @@ class _Grip:
 
         other: capsules of the other hand, world.
         """
+        thing, own = load.clip.object, settings.regrasp
+        allowed = np.maximum((own.bent_rad, own.way_deep_m, own.step_m), self._extremes(thing, self.track))
         made, grasps, loads = self.track, dict[int, HandPose](), [load.within(hold) for hold in self.holds]
-        carrying = {number for number, own in enumerate(loads) if own.carried_by(made, hand, other)}
+        carrying = {number for number, there in enumerate(loads) if there.carried_by(made, hand, other)}
         for number in sorted(set(range(len(loads))) - carrying):
             for grasp in self._other_grasps(hand, self.holds[number], loads[number], other, settings):
                 tried = {**grasps, number: grasp}
-                start = self.start(load.clip.object, settings.regrasp.blend, tried)
+                start = self.start(thing, own.blend, tried)
                 # Every frame is looked at: a hand that closes on its way to an edge is quickly in it.
-                track = start.solved(other, replace(settings.solver, every=1), settings.regrasp.holding)
+                track = start.solved(other, replace(settings.solver, every=1), own.holding)
                 wanted = carrying | {number}
-                sound = self._sound(load.clip.object, track, settings.regrasp)
-                if sound and all(loads[own].carried_by(track, hand, other) for own in wanted):
+                if (self._extremes(thing, track) > allowed).any():
+                    continue
+                if all(loads[hold].carried_by(track, hand, other) for hold in wanted):
                     made, grasps, carrying = track, tried, wanted
                     break
         return made
 
-    def _sound(self, thing: ObjectTrack, track: HandTrack, settings: RegraspSettings) -> bool:
-        """Whether fingers, depth in the object and speed of a hand stay within what is allowed, or what they were."""
-        allowed = (settings.bent_rad, settings.way_deep_m, settings.step_m)
-        before, after = (self._extremes(thing, own) for own in (self.track, track))
-        return all(value <= max(most, own) for value, most, own in zip(after, allowed, before, strict=True))
-
-    def _extremes(self, thing: ObjectTrack, track: HandTrack) -> tuple[float, float, float]:
-        """Of a hand while it is there: the most bent finger joint, rad; depth in the object, m; way of a frame, m."""
+    def _extremes(self, thing: ObjectTrack, track: HandTrack) -> np.ndarray:
+        """(3,) of a hand while it is there: most bent finger joint, rad; depth in the object and way of a frame, m."""
         pose = HandPose.of(track)
         there = np.flatnonzero(track.valid)
         depth_m = -ObjectField(thing).distances(self.skin.vertices_m(self.skin.chain(pose)))[0]
         ways_m = np.linalg.norm(np.diff(pose.wrist_m, axis=0), axis=1)[track.valid[1:] & track.valid[:-1]]
-        return float(bends_rad(pose)[there].max()), float(depth_m[there].max()), float(ways_m.max(initial=0))
+        return np.array([bends_rad(pose)[there].max(), depth_m[there].max(), ways_m.max(initial=0)])
 
     def _other_grasps(
         self, hand: HandModel, hold: Interval, load: _Load, other: Capsules | None, settings: HoldSettings
@@ -327,9 +324,6 @@ class _Grip:
         assert load.scene is not None
         middle = load.frames[[len(load.frames) // 2]]
         part_from_world = self.world_from_part.inverse()[middle]
-        if other is not None:
-            now = other.taken(middle)
-            other = Capsules(part_from_world @ now.start_m, part_from_world @ now.end_m, now.radius_m)
         some = np.arange(0, N_VERTICES, _SOME_SKIN)
         return Held(
             Skin(hand, np.asarray(self.track.betas, np.float64)[0], self.track.template_m, some),
@@ -337,7 +331,7 @@ class _Grip:
             self.pose.taken(middle).seen_from(part_from_world),
             int(middle[0]),
             (part_from_world @ load.scene.motion.centre_m[middle][:, None])[0, 0],
-            other,
+            None if other is None else other.taken(middle).seen_from(part_from_world),
         )
 
     def start(self, thing: ObjectTrack, blend: int, grasps: Mapping[int, HandPose] = MappingProxyType({})) -> _Start:
@@ -405,7 +399,7 @@ def _at_rest(pose: HandPose, holds: Sequence[Interval], blend: int, grasps: Mapp
     """
     step, n_frames = np.zeros((len(pose.wrist_m), N_UNKNOWNS)), len(pose.wrist_m)
     for number, (start, stop) in enumerate(holds):
-        own = HandPose(*(array[start:stop] for array in pose))
+        own = pose.taken(np.arange(start, stop))
         everywhere = np.zeros(stop - start, int)
         rest = grasps[number].taken(everywhere) if number in grasps else _mean(own).taken(everywhere)
         step[start:stop] = ways = own.step_to(rest)
