@@ -41,7 +41,7 @@ class SolverSettings:
     finger_rad: float = 0.1
     knot_frames: int = 5
     every: int = 2
-    steps: int = 6
+    steps: int = 12
     enough: float = 0.01
 
 
