@@ -134,6 +134,8 @@ LESS: Mapping[str, Row] = {
     "the first contact map drawn": Row(sampled={"contact_draws": 1}),
     "a motion drawn once": Row(sampled={"draws": 1}),
     "an object that never waits": Row(sampled={"hold": {"wait": {"most": 0}}}),
+    "grasps as generated": Row(sampled={"hold": {"regrasp": {"tries": 0}}}),
+    "fingers free in the hold": Row(sampled={"hold": {"solver": {"finger_rad": 100.0}}}),
 }
 PAPERS: Mapping[str, Row] = {
     "paper: no codes": Row("paper", {"diffusion": {"network": {"codes": "none"}}}),
