@@ -26,7 +26,7 @@ def evaluate(
     reference: Reference,
     out: Annotated[Path | None, typer.Option(help="Also write the figures as JSON.", resolve_path=True)] = None,
     evaluators: Annotated[
-        Path | None, typer.Option(help="Its trained evaluator, such as evaluators/study/study.", exists=True)
+        Path | None, typer.Option(help="Its trained evaluator, such as evaluators/study/grab.", exists=True)
     ] = None,
     split: Annotated[str, typer.Option(help="Part of the chosen split: train, validation or test.")] = "test",
     metrics: Annotated[str, typer.Option(help="Further lists of metrics, comma between: bimart.")] = "",

@@ -42,7 +42,8 @@ def generate(
     hand_by: Annotated[
         Literal["rules", "similarity"],
         typer.Option(
-            help="rules: what the words say, else what is most common in training, named as such. "
+            help="rules: what the words say; if they name hand and side as no rule knows, the similarity of text "
+            "features; else what is most common in training, named as such. "
             "similarity: Text2HOI's own way, the most similar of three phrases, whatever the words say."
         ),
     ] = "rules",
