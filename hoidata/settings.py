@@ -31,6 +31,12 @@ def build_config(kind: type[Config], values: Mapping[str, Any] | None, where: st
     return kind(**built)
 
 
+def at_least(where: str, config: Any, name: str, least: float) -> None:
+    """Raise BadInput where the setting ``name`` of ``config`` is less than it may be."""
+    if getattr(config, name) < least:
+        raise BadInput(f"{where}.{name}", f"{least} or more", str(getattr(config, name)), "correct params.yaml")
+
+
 def refuse_unknown(values: Mapping[str, Any], known: Sequence[str], where: str) -> None:
     """Raise BadInput that names the keys that are not known and lists those that are."""
     if unknown := [str(name) for name in values if name not in known]:
@@ -57,6 +63,8 @@ def _value(hint: Any, value: Any, where: str, item: Field | None = None) -> Any:
         return _mapping(choices[1], value, where, item)
     if isinstance(value, list):
         return tuple(value)
+    if origin is tuple and not isinstance(value, tuple):
+        raise BadInput(where, "a list", repr(value), "write [...]")
     return _number_or_text(hint, value, where) if hint in (int, float, bool, str) else value
 
 

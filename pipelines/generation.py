@@ -1,37 +1,45 @@
 """A sentence and an object to motions, with the models of the dataset that knows its words best, as files."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.settings import AnnotationSettings
+from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
+from hoidata.settings import build_config
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.repeatable import make_repeatable
-from models.common.sampling import SamplerConfig
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
 from models.text2hoi.generation import GeneratedMotion, Generator, Wish
+from models.text2hoi.sampler import SamplingConfig
 from models.text2hoi.sentences import read_sentence
 from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.generation_page import write_generation
-from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings
+from pipelines.params import chosen_params, read_file
+from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
 
 @dataclass(frozen=True)
 class Models:
-    """Trained networks and what they were trained with. clips: the store whose objects may be asked for by name."""
+    """Trained networks and what they were trained with. clips: the store whose objects may be asked for by name.
+
+    sampling: how motions are made. points: sampled on an object.
+    """
 
     checkpoints: Path
     hands: HandPair
     encoder: TextEncoder
     clips: Path | None = None
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    points: int = ContactSettings.points
 
 
 @dataclass(frozen=True)
@@ -39,7 +47,7 @@ class Asked:
     """Everything ``hoidata generate`` is told. object: a mesh file, or the name of an object of the dataset.
 
     model: the dataset whose models to use, or "" for the one that knows the sentence's words best. models: these, in
-    place of a project's.
+    place of a project's. sampler: fields of a SamplerConfig, over those of the models.
     """
 
     text: str
@@ -50,7 +58,7 @@ class Asked:
     models: Models | None = None
     wish: Wish = field(default_factory=Wish)
     mesh: MeshWish = field(default_factory=MeshWish)
-    sampler: SamplerConfig = field(default_factory=SamplerConfig)
+    sampler: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,8 @@ def generate_files(asked: Asked, out: Path) -> Written:
     make_repeatable(threads=1)  # one motion is too small for two threads to agree on
     hands = models.hands
     model = user.model if user else _stored_object(str(asked.object), models)
-    generator = Generator.load(models.checkpoints, hands, models.encoder, sampler=asked.sampler)
+    sampling = replace(models.sampling, sampler=replace(models.sampling.sampler, **asked.sampler))
+    generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
     notes += [*_taken_for(verb, motions[0].evidence), *_moved_otherwise(motions)]
@@ -111,8 +120,12 @@ def _moved_otherwise(motions: Sequence[GeneratedMotion]) -> list[str]:
 def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Models, str]:
     """The models of the project that know the words best, and why these, in words."""
     paths, why = chosen_model(asked, verb, thing)
-    encoder = load_settings(AnnotationSettings, "annotate").encoder
-    return Models(paths.checkpoints, load_hands(paths.profile), load_encoder(encoder), paths.clips), why
+    params = chosen_params({**read_file(Path("params.yaml")), "profile": paths.profile})
+    encoder = build_config(AnnotationSettings, params.get("annotate"), "params.yaml: annotate").encoder
+    points = build_config(ContactSettings, params.get("contact"), "params.yaml: contact").points
+    sampling = build_config(SamplingConfig, params["sample"].get("text2hoi"), "params.yaml: sample.text2hoi")
+    hands, encoder = load_hands(paths.profile), load_encoder(encoder)
+    return Models(paths.checkpoints, hands, encoder, paths.clips, sampling, points), why
 
 
 def _stored_object(name: str, models: Models) -> ObjectModel:

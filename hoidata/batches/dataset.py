@@ -37,7 +37,7 @@ class ClipSample:
     valid (2, F): frames in which a side was tracked. active_hands (2,): the sides that take part in the interaction.
     contact (2, 1024): points that came within ``contact_threshold_m``, the contact stage's, of a joint of that side.
     text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
-    start: first frame within the clip. world_from_model (4, 4).
+    start: first frame within the clip. world_from_model (4, 4). gravity_known: whether the model's -z is down.
     """
 
     clip_id: str
@@ -63,6 +63,7 @@ class ClipSample:
     contact_threshold_m: float
     distances: DistanceEntries
     world_from_model: np.ndarray
+    gravity_known: bool = True
 
     @property
     def length(self) -> int:
@@ -185,6 +186,7 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
         contact_threshold_m=annotated.contact_threshold_m,
         distances=distances,
         world_from_model=_world_from_model(rotation, origin),
+        gravity_known=clip.gravity is not None,
     )
 
 

@@ -42,6 +42,7 @@ class Request:
     right. n_frames: at 30 fps. seed: of everything that is drawn. number: which of several motions asked for alike.
     betas: (2, 10) hand shapes; template_m: (2, 778, 3) personal rest meshes, or None.
     world_from_model: (4, 4) where the motion is to lie; models work z up, the object at the origin in the first frame.
+    gravity_known: whether model's -z is known to be where things fall.
     trajectories: of wrists and object, for families that only add the fingers; the others take nothing from there.
     """
 
@@ -58,6 +59,7 @@ class Request:
     betas: np.ndarray = field(default_factory=lambda: np.zeros((2, 10), np.float32))
     template_m: np.ndarray | None = None
     world_from_model: np.ndarray = field(default_factory=lambda: np.eye(4))
+    gravity_known: bool = True
     trajectories: Trajectories | None = None
 
 

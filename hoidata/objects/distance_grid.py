@@ -42,11 +42,12 @@ def no_grid() -> DistanceGrid:
 
 
 def distance_grid(tree: TriangleTree, solid: bool) -> DistanceGrid:
-    """64 cells along the longest axis of the surface and 1 cm around it. solid: the surface is closed, so that inside
-    (where a line leaves the surface oftener than it enters) is negative.
+    """As many cells as a cube of 64 x 64 x 64, over the surface and 1 cm around it, whatever its proportions.
+
+    solid: the surface is closed, so that inside (where a line leaves the surface oftener than it enters) is negative.
     """
     low, high = tree.box[0, :3] - MARGIN_M, tree.box[0, 3:] + MARGIN_M
-    cell = float((high - low).max()) / CELLS
+    cell = float(np.cbrt(np.prod(high - low))) / CELLS
     x, y, z = np.ceil((high - low) / cell - 1e-9).astype(int) + 1
     value = np.empty((z, y, x), np.float32)
     _fill(tree, low, cell, value)

@@ -6,8 +6,9 @@ Where thousands of points are asked at every step, exact answers would cost seco
 surface point, for losses: gradients flow to the points asked about and never into the grid. They differ beyond the
 grid: the search takes a lower bound, a loss needs a distance that goes on without a jump.
 
-Whoever needs exact answers asks ``hoidata.objects.surface_index``. Its ``distance_grid`` is no such look-up: it only
-decides which triangles need not be looked at, from bounds on what lies between its nodes.
+Whoever needs exact answers asks ``hoidata.objects.surface_index``, whose ``distance_grid`` only decides which triangles
+need not be looked at, from bounds on what lies between its nodes. The hold reads that grid as it is
+(``hoidata.refinement.object_field``).
 """
 
 from collections.abc import Iterable, Sequence

@@ -54,7 +54,8 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
     turn = _upright_from_file(UP_AXES[up])
     joint = _hinge(hinge, scale, turn) if hinge else None
     part = _second_piece(path, mesh) if joint else np.zeros(len(vertices), np.uint8)
-    return UserObject(ObjectModel(path.stem, vertices @ turn.T, mesh.faces, part, joint), tuple(notes))
+    name = path.stem.encode(errors="backslashreplace").decode()  # bytes that are no text stay legible
+    return UserObject(ObjectModel(name, vertices @ turn.T, mesh.faces, part, joint), tuple(notes))
 
 
 def found_up(vertices_m: np.ndarray) -> tuple[str, str]:

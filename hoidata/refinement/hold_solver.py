@@ -87,8 +87,8 @@ class State(NamedTuple):
 class Wishes:
     """What is wished for the skin of one hand, frame by frame; the part's frame throughout.
 
-    own: the hand as it was, in frames (frame,) of the object. holding: (frame,) bool. other: capsules of the other hand
-    there. start: the hand as it was. trust: (frame, segment) how much the skin of each is to touch.
+    own: the hand as it was. frames: (frame,) which of the object's each row is. holding: (frame,) bool. other: capsules
+    of the other hand there. start: what is seen of ``own``. trust: (frame, segment) how much skin of each is to touch.
     """
 
     def __init__(

@@ -36,6 +36,7 @@ from hoidata.workers import one_thread
 _OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left"}
 _ALONG = 9  # places along a capsule's axis at which it is looked at
 _SOME_SKIN = 3  # one of so many vertices is looked at in the search of another grasp
+_LEAST_SLOPE = 1e-6  # shorter ones say no direction
 _UNDER_M = 0.005  # so much lower than the table, or than before, a hand with another grasp may be
 
 
@@ -49,7 +50,7 @@ class HoldSettings:
     of a vertex from where it was: the first of each, then the next, on top of what came out, where those hands cannot
     carry the object in some of air_frames frames in which it is in the air. solver: the other wishes. regrasp: of hands
     that cannot carry it then. rest: of the object, before all that. wait: of the object for hands that come and go,
-    after it. Raises BadInput for more reaches than deviations.
+    after it. Raises BadInput where there is no reach, or not one deviation for each.
     """
 
     near_m: float = 0.006
@@ -90,11 +91,7 @@ def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings(
 @one_thread()
 def carried_share(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> float:
     """Share of some frames in the air in which the hands of a clip can carry its object; 1 where it never is there."""
-    load = _Load.of(clip, settings.air_frames)
-    hands: list[Side] = [side for side in SIDES if clip.hands[side].valid.any()]
-    if not hands:
-        return float(not len(load.frames))
-    return load.carried([capsules_there(clip.hands[side].take(load.frames), pair[side]) for side in hands])
+    return _Load.of(clip, settings.air_frames).carried_share(pair, clip.hands)
 
 
 @one_thread()
@@ -109,7 +106,7 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
         if not starts:
             break
         tracks = _solved(pair, clip, starts, settings.solver, Draw(reach, keypoint))
-        share = load.carried([capsules_there(tracks[side].take(load.frames), pair[side]) for side in starts])
+        share = load.carried_share(pair, tracks)
         # A try that carries no more than the best so far is no answer, but the next one goes on from it.
         if share > most:
             best, most = tracks, share
@@ -152,7 +149,7 @@ def _solved(
     tracks = dict(clip.hands)
     for side, start in starts.items():
         opposite = _OPPOSITE[side]
-        other = capsules_there(tracks[opposite], pair[opposite]) if len(starts) == 2 else None
+        other = capsules_there(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
         tracks[side] = start.solved(other, wishes, draw)
     return tracks
 
@@ -164,14 +161,17 @@ class _Load:
     clip: Clip
     scene: Scene | None
     frames: np.ndarray
+    field: ObjectField
 
     @classmethod
     def of(cls, clip: Clip, count: int) -> "_Load":
+        field = ObjectField(clip.object)
         if clip.gravity is None or clip.n_frames < 3 or not surface_index(clip.object.model).is_solid:
-            return cls(clip, None, np.zeros(0, int))
+            return cls(clip, None, np.zeros(0, int), field)
         scene = object_scene(clip)
         air = np.flatnonzero(scene.lifted)
-        return cls(clip, scene, air[((np.arange(count) + 0.5) * len(air) / count).astype(int)] if len(air) else air)
+        some = ((np.arange(count) + 0.5) * len(air) / count).astype(int)
+        return cls(clip, scene, air[some] if len(air) else air, field)
 
     def within(self, hold: Interval) -> "_Load":
         """Those frames of it that lie in a hold."""
@@ -179,30 +179,48 @@ class _Load:
 
     def carried_by(self, track: HandTrack, hand: HandModel, other: Capsules | None) -> bool:
         """Whether a hand, with the capsules of the other where there is one, carries in all of the frames."""
+        if not len(self.frames):
+            return True
         hands = [capsules_there(track.take(self.frames), hand)]
         return self.carried([*hands, *([] if other is None else [other.taken(self.frames)])]) == 1
+
+    def carried_share(self, pair: HandPair, tracks: Mapping[Side, HandTrack]) -> float:
+        """As ``carried``, by the hands that are there at all."""
+        there: list[Side] = [side for side in SIDES if tracks[side].valid.any()]
+        if not len(self.frames) or not there:
+            return float(not len(self.frames))
+        return self.carried([capsules_there(tracks[side].take(self.frames), pair[side]) for side in there])
 
     def carried(self, hands: Sequence[Capsules]) -> float:
         """Share of the frames in which friction at the contacts can give the object's motion; hands in those frames."""
         if self.scene is None or not len(self.frames):
             return 1.0
-        capsules, physics = joined(list(hands)), StandardUnits()
+        contacts, physics = self._contacts(joined(list(hands))), StandardUnits()
+        return float((physics.residuals(self.scene, contacts)[self.frames] < physics.limit).mean())
+
+    def _contacts(self, capsules: Capsules) -> CapsuleContacts:
+        """Where capsules, in the frames looked at, touch the object: at the deepest of some places along each axis.
+
+        Read from the distance grid, as all of the hold is: ``physics.capsule_contacts`` is exact and far slower.
+        """
         there = np.isfinite(capsules.start_m[..., 0])
         capsules = Capsules(np.nan_to_num(capsules.start_m), np.nan_to_num(capsules.end_m), capsules.radius_m)
         along = np.linspace(0, 1, _ALONG)[:, None]
         axis = (capsules.end_m - capsules.start_m)[:, :, None]
         places = (capsules.start_m[:, :, None] + along * axis).reshape(len(self.frames), -1, 3)
-        found = ObjectField(self.clip.object).distances(places, self.frames)
+        found = self.field.distances(places, self.frames)
         shape = (*capsules.start_m.shape[:2], _ALONG)
         distance, slope, place = (array.reshape(*shape, -1) for array in (*found, places))
         deepest = distance.argmin(axis=2, keepdims=True)
         distance, slope, place = (np.take_along_axis(a, deepest, 2)[:, :, 0] for a in (distance, slope, place))
-        frame, capsule = np.nonzero(there & (distance[..., 0] < capsules.radius_m))
+        # Slopes of what is interpolated are shorter than one at edges, and nothing in the middle of a thin thing.
+        length = np.linalg.norm(slope, axis=-1)
+        slope /= np.maximum(length, _LEAST_SLOPE)[..., None]
+        frame, capsule = np.nonzero(there & (distance[..., 0] < capsules.radius_m) & (length > _LEAST_SLOPE))
         depth, normal = (capsules.radius_m - distance[..., 0])[frame, capsule], slope[frame, capsule]
         point = (place - distance * slope)[frame, capsule]
         number = self.frames[frame]
-        contacts = CapsuleContacts(number, capsule, np.zeros_like(number), depth, point, normal, point, normal)
-        return float((physics.residuals(self.scene, contacts)[self.frames] < physics.limit).mean())
+        return CapsuleContacts(number, capsule, np.zeros_like(number), depth, point, normal, point, normal)
 
 
 @dataclass(frozen=True)
@@ -229,12 +247,13 @@ class _Start:
 
 @dataclass(frozen=True)
 class _Grip:
-    """Where one hand holds a part. pose: of the hand, world. moving: (frame - 1,) whether the part moves under it to
-    the next frame.
+    """Where one hand holds a part. part: its number. pose: of the hand, world. moving: (frame - 1,) whether the part
+    moves under it to the next frame.
     """
 
     track: HandTrack
     skin: Skin
+    part: int
     pose: HandPose
     holds: list[Interval]
     moving: np.ndarray
@@ -257,10 +276,11 @@ class _Grip:
         free = free & self.track.valid
         before, after = free & np.append(self.moving, False), free & np.append(False, self.moving)
         holds = []
-        for start, stop in self.holds:
-            first, last = start - _leading(before[:start][::-1], most), stop + _leading(after[stop:], most)
-            before[:last] = False
-            holds.append(Interval(first, last))
+        for number, (start, stop) in enumerate(self.holds):
+            # A third of the frames between two holds at most: the hand has to go from one to the other.
+            early = min(most, (start - self.holds[number - 1].stop) // 3) if number else most
+            late = min(most, (self.holds[number + 1].start - stop) // 3) if number + 1 < len(self.holds) else most
+            holds.append(Interval(start - _leading(before[:start][::-1], early), stop + _leading(after[stop:], late)))
         return replace(self, holds=holds)
 
     def regrasped(self, hand: HandModel, load: _Load, other: Capsules | None, settings: HoldSettings) -> HandTrack:
@@ -328,6 +348,7 @@ class _Grip:
         return Held(
             Skin(hand, np.asarray(self.track.betas, np.float64)[0], self.track.template_m, some),
             ObjectField(_in_part(load.clip.object, self.object_from_part)),
+            self.part,
             self.pose.taken(middle).seen_from(part_from_world),
             int(middle[0]),
             (part_from_world @ load.scene.motion.centre_m[middle][:, None])[0, 0],
@@ -361,7 +382,7 @@ def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Gr
     moved, touched = world_from_part(thing, part), np.any(touching, axis=1)
     holds, moving = _holds(points_m, touched, moved, track.valid, settings)
     object_from_part = thing.model.object_from_part(part, thing.hinge_rad)
-    return _Grip(track, skin, world, holds, moving, object_from_part, moved) if holds else None
+    return _Grip(track, skin, part, world, holds, moving, object_from_part, moved) if holds else None
 
 
 def _in_part(thing: ObjectTrack, object_from_part: RigidTransform) -> ObjectTrack:

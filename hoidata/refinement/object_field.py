@@ -9,17 +9,14 @@ from hoidata.refinement.kernels import lower_signed
 
 
 class ObjectField:
-    """The surface of one moving object. A part that bounds no solid has no inside: its distances are not negative.
-
-    solid_note: what was repaired of the mesh, or left without an inside, in words; None where there is nothing to say.
-    """
+    """The surface of one moving object. A part that bounds no solid has no inside: its distances are not negative."""
 
     def __init__(self, thing: ObjectTrack) -> None:
-        index, self.n_frames = surface_index(thing.model), thing.n_frames
-        self.solid_note = index.solid_note
         self._parts = [
             (surface.grid, _contiguous(world_from_part(thing, part).inverse()))
-            for part, surface in index.filled.items()  # one grid per part, whatever the frames and angles
+            for part, surface in surface_index(
+                thing.model
+            ).filled.items()  # one grid per part, whatever the frames and angles
         ]
 
     @property
@@ -27,10 +24,9 @@ class ObjectField:
         """The object has a part that a hinge moves."""
         return len(self._parts) > 1
 
-    @property
-    def most_depth_m(self) -> float:
-        """How deep inside of it a place can lie; 0 where it has no inside."""
-        return max(0.0, *(-float(grid.value.min()) for grid, _ in self._parts))
+    def most_depth_m(self, part: int) -> float:
+        """How deep inside of one part a place can lie; 0 where it has no inside."""
+        return max(0.0, -float(self._parts[part][0].value.min()))
 
     def nearest_part(self, places_m: np.ndarray) -> np.ndarray:
         """(frame, place) number of the part whose surface is nearest to places (frame, place, 3), world."""

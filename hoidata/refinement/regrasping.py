@@ -16,6 +16,7 @@ from hoidata.physics.capsules import Capsules
 from hoidata.refinement.hold_solver import Draw, SolverSettings, Wishes, settled
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, Skin
+from hoidata.settings import at_least
 
 _OPPOSED = [JOINT_NAMES.index(name) for name in ("index3", "middle3", "thumb3")]
 _MOST_OPEN = 1.1  # of its own fingers' bends a hand that closes again begins with up to so many
@@ -47,17 +48,21 @@ class RegraspSettings:
     step_m: float = 0.04
     blend: int = 16
 
+    def __post_init__(self) -> None:
+        at_least("hold.regrasp", self, "tries", 0)
+
 
 @dataclass(frozen=True)
 class Held:
     """One hand that holds a part, in one frame, in the part's frame. skin: some vertices of it are enough.
 
-    pose: one frame. frame: its number. centre_m: (3,) the object's centre of mass. other: capsules of the other hand in
-    that frame.
+    part: its number. pose: one frame. frame: its number. centre_m: (3,) the object's centre of mass. other: capsules of
+    the other hand in that frame.
     """
 
     skin: Skin
     field: ObjectField
+    part: int
     pose: HandPose
     frame: int
     centre_m: np.ndarray
@@ -74,7 +79,7 @@ def grasps_that_carry(
     hands = _hands_near(held, settings)
     own_m = held.skin.vertices_m(held.skin.chain(held.pose))
     # Half of the way into a thin thing is through it.
-    deepest_m = min(settings.deep_m, held.field.most_depth_m / 2)
+    deepest_m = min(settings.deep_m, held.field.most_depth_m(held.part) / 2)
     found: list[tuple[float, HandPose]] = []
     for first in range(0, settings.tries, _AT_ONCE):
         closed = _closed(held, hands.taken(np.arange(first, min(first + _AT_ONCE, settings.tries))), solver, settings)

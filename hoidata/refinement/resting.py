@@ -20,13 +20,15 @@ class RestSettings:
     """still_m_s, drift_m: an object that is slower at the clip's ends, and as high within this, is at rest.
     level_m: nearer than this to its first height it is meant to lie where it lay; farther, it was put down elsewhere,
     and if it was ever that far below, it stays there. fade: frames in which an object that was raised before it was
-    taken, and is put down elsewhere, comes back to its own height.
+    taken, and is put down elsewhere, comes back to its own height. through_m: an object that goes lower than this
+    below its first height, and ends at it, was held there at both ends and stays as it was.
     """
 
     still_m_s: float = 0.03
     drift_m: float = 0.01
     level_m: float = 0.03
     fade: int = 11
+    through_m: float = 0.08
 
 
 def rest_object(clip: Clip, settings: RestSettings = RestSettings()) -> Clip:
@@ -65,7 +67,7 @@ def _rises(lowest_m: np.ndarray, first: int, last: int, settings: RestSettings) 
     share = _smooth(np.arange(1, way + 1) / (way + 1))
     rises[first : first + way] = rises[first - 1] + share * (end - rises[first - 1])
     below = np.maximum(too_low - rises, 0)
-    return rises if not level and below.max() >= settings.level_m else rises + below
+    return rises if below.max() >= (settings.through_m if level else settings.level_m) else rises + below
 
 
 def _smooth(share: np.ndarray) -> np.ndarray:

@@ -12,8 +12,6 @@ from hoidata.hands.model import N_ROTATIONS, PARENTS, HandModel
 from hoidata.hands.solver import left_jacobian
 from hoidata.refinement.kernels import N_UNKNOWNS, vertex_derivatives
 
-_FINGERS = np.arange(1, N_ROTATIONS)
-
 
 class HandPose(NamedTuple):
     """wrist_m (frame, 3) world; orient (frame, 3, 3) world-from-hand; fingers (frame, 15, 3) axis-angles."""

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.files import atomic_folder, write_whole
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import AskedDistances, write_asked, write_asked_distances
-from hoidata.settings import build_config
+from hoidata.settings import at_least, build_config
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import write_store
 from models.common.checkpoints import FILE_NAME, empty_reason, write_empty
@@ -27,6 +27,7 @@ from models.common.family import Family, LeftOut, Sampler, Sources
 
 CLIPS_AT_ONCE = 32
 LEFT_OUT = "left_out.json"
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,10 @@ class PredictionConfig:
     samples: int = 8
     seed: int = 0
     clips: int = 0
+
+    def __post_init__(self) -> None:
+        at_least("sample", self, "samples", 1)
+        at_least("sample", self, "clips", 0)
 
 
 # (point,) bool, the sampled points to be touched; or how far hands are to be; or None where nothing was asked.
@@ -75,7 +80,7 @@ def sample_family(
     reason = _why_not(family, root, checkpoints)
     annotated = None if reason else load_annotated(root, hands)
     test = [] if annotated is None else list(HoiDataset(annotated, "test", crop="start"))
-    test = test[:: -(-len(test) // config.clips)] if config.clips and test else test
+    test = spread(test, config.clips)
     if annotated is None or not test:
         with atomic_folder(out) as partial:
             write_empty(partial, reason or "no test clips")
@@ -95,6 +100,12 @@ def sample_family(
         if left_out:
             _write(partial / LEFT_OUT, [asdict(item) for item in left_out])
     return counts
+
+
+def spread(items: Sequence[Item], count: int) -> list[Item]:
+    """So many of them, evenly spread; all where there are no more, or for 0."""
+    count = min(count or len(items), len(items))
+    return [items[number * len(items) // count] for number in range(count)]
 
 
 def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
@@ -118,6 +129,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             betas=sample.betas,
             template_m=sample.template_m,
             world_from_model=sample.world_from_model,
+            gravity_known=sample.gravity_known,
             trajectories=given,
         )
         for number in range(config.samples)

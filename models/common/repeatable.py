@@ -12,7 +12,7 @@ def make_repeatable(threads: int) -> None:
     """Fix, for the whole process, what could change bytes from run to run: threads and algorithms.
 
     For the entry of a process that trains or samples alone: a stage, a command, a worker. The library never calls it.
-    Matrix products may use bfloat16x3.
+    Matrix products may use bfloat16, where a processor computes with it.
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses deterministic products
     torch.set_num_threads(threads)

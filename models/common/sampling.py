@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
+from hoidata.errors import BadInput
 
 TRAIN_STEPS = 1000
 Motion = tuple[Tensor, Tensor]
@@ -27,12 +28,17 @@ Denoise = Callable[[Tensor, Tensor, Tensor], Motion]
 class SamplerConfig:
     """kind: "ddim" and "dpm++" are deterministic after the first noise, "ddpm" is not. steps: denoiser calls.
 
-    guidance: scale of classifier-free guidance; 1 is none.
+    guidance: scale of classifier-free guidance; 1 is none. Raises BadInput for steps that are not there.
     """
 
     kind: Kind = "ddim"
     steps: int = 20
     guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not (1 <= self.steps <= TRAIN_STEPS and math.isfinite(self.guidance)):
+            wanted, got = f"1 to {TRAIN_STEPS} steps, a finite guidance", f"{self.steps}, {self.guidance:g}"
+            raise BadInput("sampler", wanted, got, "correct steps, or guidance (--scale)")
 
 
 @cache

@@ -19,7 +19,7 @@ from hoidata.batches.dataset import ClipBatch
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, sha256_bytes, sha256_file
 from hoidata.hands import HandPair
-from hoidata.settings import build_config, plain_config
+from hoidata.settings import at_least, build_config, plain_config
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import (
     FILE_NAME,
@@ -67,6 +67,10 @@ class TrainingConfig:
     precision: Precision = "float32"
     parts: int = 1
     save_every: int = 500
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "validate_every", "parts", "save_every"):
+            at_least("training", self, name, 1)
 
 
 @dataclass(frozen=True)

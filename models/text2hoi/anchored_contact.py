@@ -17,7 +17,7 @@ from models.common.features import scaled_text
 from models.common.point_net import PointNet, normalised_points
 from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
 
-SIDES = 2
+N_SIDES = 2
 ANCHOR_FEATURES = 8
 WAVES = (1.0, 2.0, 4.0)
 REACHES = (0.1, 0.2, 0.4)
@@ -35,7 +35,7 @@ class AnchoredContact(nn.Module):
         local, _, overall = config.point_net.widths
         self.object_net = PointNet(3, config.point_net)
         first, second, third = config.decoder_widths
-        self.from_point = nn.Linear(local + 3 + 6 * len(WAVES) + SIDES * ANCHOR_FEATURES, first)
+        self.from_point = nn.Linear(local + 3 + 6 * len(WAVES) + N_SIDES * ANCHOR_FEATURES, first)
         self.from_clip = nn.Sequential(
             nn.Linear(overall + 1 + config.text + HAND_FLAGS, first), nn.GELU(), nn.Linear(first, first)
         )
@@ -46,7 +46,7 @@ class AnchoredContact(nn.Module):
             nn.GELU(),
             nn.Linear(second, third),
             nn.GELU(),
-            nn.Linear(third, 2 * SIDES),
+            nn.Linear(third, 2 * N_SIDES),
         )
 
     def see(self, points_m: Tensor, text: Tensor, active_hands: Tensor) -> Cloud:
@@ -68,7 +68,7 @@ class AnchoredContact(nn.Module):
         waves = [wave(points * (torch.pi * rate)) for rate in WAVES for wave in (torch.sin, torch.cos)]
         seen = (local, points, *waves, near.transpose(1, 2).flatten(2))
         mixed = self.from_point(torch.cat(seen, -1)) + clip[:, None]
-        touch, contact = self.rest(mixed).transpose(1, 2).split(SIDES, 1)
+        touch, contact = self.rest(mixed).transpose(1, 2).split(N_SIDES, 1)
         return touch, contact
 
     def losses(
@@ -81,8 +81,8 @@ class AnchoredContact(nn.Module):
         """
         cloud, count, device = self.see(points_m, text, batch.active_hands), self.config.anchors, contact.device
         there = contact.any(-1) & batch.active_hands
-        rows = picked(contact, torch.rand(len(contact), SIDES, count, generator=generator).to(device))
-        anchors = cloud[0][:, None].expand(-1, SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
+        rows = picked(contact, torch.rand(len(contact), N_SIDES, count, generator=generator).to(device))
+        anchors = cloud[0][:, None].expand(-1, N_SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
         draws = torch.rand(len(contact), 2, generator=generator).to(device)
         right = there[:, 1] & (~there[:, 0] | (draws[:, 0] < 0.5))
         next_one = (draws[:, 1] * count).long()
@@ -104,7 +104,7 @@ class AnchoredContact(nn.Module):
         for draw in latents:
             anchors = points_m.new_zeros(*draw.shape, 3)
             known = torch.zeros_like(draw, dtype=torch.bool)
-            for side, number in product(range(SIDES), range(self.config.anchors)):
+            for side, number in product(range(N_SIDES), range(self.config.anchors)):
                 touch = self.logits(some, anchors, known)[0][:, side].softmax(-1)
                 anchors[:, side, number] = some[0][clips, picked(touch, draw[:, side, number, None])[:, 0]]
                 known[:, side, number] = active_hands[:, side]
@@ -113,7 +113,7 @@ class AnchoredContact(nn.Module):
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
         """(count, clip, 2, A) draws that choose the touches."""
-        return torch.rand(count, n_clips, SIDES, self.config.anchors, generator=generator)
+        return torch.rand(count, n_clips, N_SIDES, self.config.anchors, generator=generator)
 
 
 def picked(weights: Tensor, draws: Tensor) -> Tensor:

@@ -17,17 +17,15 @@ from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import FPS, SIDES, Clip, HandType
-from hoidata.clips.features import OBJECT_POSITION, WRIST
 from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.sampling import SampledPoints, sample_points
+from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, Checkpoint
-from models.common.sampling import SamplerConfig
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
-from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi, Text2HoiMotion
+from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
 from models.text2hoi.sentences import read_sentence, unseen_words
 from models.text2hoi.understanding import understand
 from models.text2hoi.verb_check import read_verb
@@ -77,6 +75,7 @@ class Generator:
     encoder: TextEncoder
     vocabulary: Vocabulary
     checkpoints: dict[str, str]
+    points: int = POINT_COUNT
 
     @classmethod
     def load(
@@ -85,18 +84,20 @@ class Generator:
         hands: HandPair,
         encoder: TextEncoder,
         *,
-        sampler: SamplerConfig | None = None,
+        sampling: SamplingConfig | None = None,
+        points: int = POINT_COUNT,
         device: str = "cpu",
     ) -> "Generator":
         """From ``checkpoints/<network>``, with the hands and the encoder the networks were trained with.
 
-        Raises BadInput where a network is missing or was trained with other hands or another encoder.
+        points: sampled on an object, as many as in training. Raises BadInput where a network is missing or was trained
+        with other hands or another encoder.
         """
-        model = Text2Hoi.load(checkpoints, hands, SamplingConfig(sampler or SamplerConfig()), device)
+        model = Text2Hoi.load(checkpoints, hands, sampling, device)
         for checkpoint in model.trained.values():
             _refuse_others(checkpoint, hands, encoder, Path(checkpoints))
         digests = {name: sha256_file(Path(checkpoints) / name / FILE_NAME) for name in model.trained}
-        return cls(model, hands, encoder, Vocabulary.read(model.trained["contact"].facts), digests)
+        return cls(model, hands, encoder, Vocabulary.read(model.trained["contact"].facts), digests, points)
 
     def generate(
         self, text: str, object: ObjectModel, wish: Wish = Wish(), object_words: str | None = None
@@ -108,7 +109,7 @@ class Generator:
         verb, thing = read_sentence(text)
         choice = self._hand(text, wish)
         assert choice.hand is not None  # a prior decides last
-        points, read = sample_points(object), self._read_as
+        points, read = sample_points(object, self.points), self._read_as
         told = understand(text, verb, thing, choice.hand, self.vocabulary, self.encoder, read)
         first = Request(
             motion_id=f"generated/{object.name}",
@@ -136,7 +137,7 @@ class Generator:
             "refined_by": self.model.refined_by,
         }
         # One by one: the last bits of a matrix product depend on how many rows it has.
-        answers = [self.model.answers([request], placed=_started_at_origin)[0] for request in requests]
+        answers = [self.model.answers([request])[0] for request in requests]
         made = zip(requests, answers, strict=True)
         return [self._generated(request, answer, points, evidence) for request, answer in made]
 
@@ -159,7 +160,7 @@ class Generator:
         """The request of one sample, with a seed of its own for every sentence, object and number."""
         motion_id = first.motion_id if number == 0 else f"{first.motion_id}~{number}"
         drawn_from = f"{wish.seed} {number} {first.object.name} {text}"
-        seed = int.from_bytes(sha256(drawn_from.encode()).digest()[:7])
+        seed = int.from_bytes(sha256(drawn_from.encode(errors="backslashreplace")).digest()[:7])
         request = replace(first, motion_id=motion_id, seed=seed, number=number)
         n_frames = self._length(request) if wish.frames is None else wish.frames
         if not SHORTEST_FRAMES <= n_frames <= MAX_FRAMES:
@@ -194,13 +195,3 @@ def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder
         expected = f"hand {facts['hand']} {facts['hand_digest'][:12]}"
         raise BadInput(where, expected, f"{hands.name} {hands.digest[:12]}", remedy)
     refuse_other_encoder(where, facts["encoder"], encoder.identity)
-
-
-def _started_at_origin(motion: Text2HoiMotion) -> Text2HoiMotion:
-    """The whole motion moved so that the object's origin is exactly at zero in the first frame."""
-    shift = motion.object[0, OBJECT_POSITION].clone()
-    coarse, refined, thing = motion.coarse.clone(), motion.refined.clone(), motion.object.clone()
-    for hands in (coarse, refined):
-        hands[..., WRIST] -= shift
-    thing[..., OBJECT_POSITION] -= shift
-    return replace(motion, coarse=coarse, refined=refined, object=thing)

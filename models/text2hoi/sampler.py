@@ -3,7 +3,7 @@
 Everything a motion is drawn from comes from its request's seed, so it is the same in any company.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
@@ -16,9 +16,9 @@ from torch import Tensor
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
-from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.refinement import HoldSettings, carried_share, hold_clip
+from hoidata.settings import at_least
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import motion_clip
 from models.common.features import Hands
@@ -61,8 +61,7 @@ class SamplingConfig:
 
     def __post_init__(self) -> None:
         for name in ("draws", "contact_draws"):
-            if getattr(self, name) < 1:
-                raise BadInput(f"sample.text2hoi.{name}", "1 or more", str(getattr(self, name)), "correct params.yaml")
+            at_least("sample.text2hoi", self, name, 1)
 
 
 @dataclass(frozen=True)
@@ -154,22 +153,19 @@ class Text2Hoi:
         requests: Sequence[Request],
         refined: bool = True,
         contact_maps: Sequence[Tensor] | None = None,
-        placed: Callable[[Text2HoiMotion], Text2HoiMotion] = lambda motion: motion,
     ) -> list[Answer]:
         """Motions and their clips, drawn again where held hands cannot carry, or the object does as another verb says.
 
         Other arguments as in ``motions``.
-
-        placed: what is done to a motion before it becomes a clip.
         """
-        best = self._drawn(requests, refined, contact_maps, placed)
+        best = self._drawn(requests, refined, contact_maps)
         for draw in range(2, self.config.draws + 1):
             weak = [number for number, own in enumerate(best) if own.goodness[0] < 2]
             if not weak:
                 break
             again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
             given = None if contact_maps is None else [contact_maps[number] for number in weak]
-            for number, own in zip(weak, self._drawn(again, refined, given, placed), strict=True):
+            for number, own in zip(weak, self._drawn(again, refined, given), strict=True):
                 kept = own if own.goodness > best[number].goodness else best[number]
                 best[number] = replace(kept, draws=draw)
         return best
@@ -179,10 +175,9 @@ class Text2Hoi:
         requests: Sequence[Request],
         refined: bool,
         contact_maps: Sequence[Tensor] | None,
-        placed: Callable[[Text2HoiMotion], Text2HoiMotion],
     ) -> list[Answer]:
         """Every request answered once; what only holds can tell is 1 elsewhere."""
-        motions = [placed(motion) for motion in self.motions(requests, refined, contact_maps)]
+        motions = self.motions(requests, refined, contact_maps)
         clips = self.clips(requests, motions, refined)
         if not self._held(refined):
             return [Answer(motion, clip, 1.0) for motion, clip in zip(motions, clips, strict=True)]

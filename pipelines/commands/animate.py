@@ -1,5 +1,6 @@
 """``hoidata animate``: fingers for trajectories of wrists and an object, or anew for frames of a clip."""
 
+from os.path import isfile  # of a name that is too long it says no, where a Path raises
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -49,7 +50,7 @@ def animate(
     from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
-    paths = [str(here / name) if name and (here / name).is_file() else name for name in (what, object)]
+    paths = [str(here / name) if name and isfile(here / name) else name for name in (what, object)]
     sides = SIDES if fingers == "both" else (fingers,)
     wish = AnimateWish(
         sides, frames, model, rule, paths[1], trajectory_unit, wrist_axes, world_up, MeshWish(unit, "", hinge), way

@@ -1,6 +1,8 @@
 """``hoidata generate``: a sentence and an object become motions."""
 
+from collections.abc import Mapping
 from math import isfinite
+from os.path import isfile  # of a name that is too long it says no, where a Path raises
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -33,9 +35,12 @@ def generate(
         ),
     ] = None,
     model: Annotated[str, typer.Option(help="Dataset whose models to use; else what knows the words.")] = "",
-    sampler: Annotated[Literal["ddim", "ddpm", "dpm++"], typer.Option(help="How noise becomes motion.")] = "ddim",
-    steps: Annotated[int, typer.Option(help="Denoiser calls.", min=1, max=1000)] = 20,
-    scale: Annotated[float, typer.Option(help="Classifier-free guidance; 1 is none.")] = 1.0,
+    sampler: Annotated[
+        Literal["ddim", "ddpm", "dpm++"] | None,
+        typer.Option(help="How noise becomes motion; ddim by default."),
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Denoiser calls, 20 by default.", min=1, max=1000)] = None,
+    scale: Annotated[float | None, typer.Option(help="Classifier-free guidance; 1, the default, is none.")] = None,
     unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; metres when left out.")] = "",
     up: Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")] = "",
     hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
@@ -48,23 +53,30 @@ def generate(
         ),
     ] = "rules",
     profile: Annotated[str, typer.Option(help="embedded, study or own; the one in params.yaml when left out.")] = "",
+    encoder: Annotated[
+        str, typer.Option(help="Of --models that read CLIP's features: clip:FILE.safetensors or clip:openai.")
+    ] = "",
 ) -> None:
     """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
-    mesh = Path(object).resolve() if Path(object).is_file() else None
+    mesh = Path(object).resolve() if isfile(object) else None
+    _refuse_what_is_not_asked(
+        {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
+        | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge})
+    )
     root = enter_project() if models is None else None
     from hoidata.clips.clip import FPS
     from hoidata.errors import BadInput
-    from models.common.sampling import SamplerConfig
     from models.text2hoi.generation import Wish
     from pipelines.generation import Asked, generate_files
     from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
-    where: dict[str, Any] = {"models": _given_models(models)} if models else {}
+    where: dict[str, Any] = {"models": _given_models(models, encoder)} if models else {}
     if root is not None:
         where = {"profile": profile or current_profile(), "datasets": tuple(read_params(root)["datasets"])}
-    if length is not None and not isfinite(length):
+    if length is not None and not isfinite(length * FPS):
         raise BadInput("--length", "seconds", f"{length:g}", "leave it out for a length that the network chooses")
+    told = {"kind": sampler, "steps": steps, "guidance": scale}
     wish = Wish(seed, samples, hand, None if length is None else round(length * FPS), hand_by)
     written = generate_files(
         Asked(
@@ -73,7 +85,7 @@ def generate(
             model=model,
             wish=wish,
             mesh=MeshWish(unit, up, hinge),
-            sampler=SamplerConfig(sampler, steps, scale),
+            sampler={name: value for name, value in told.items() if value is not None},
             **where,
         ),
         out,
@@ -84,12 +96,23 @@ def generate(
         typer.echo(path)
 
 
-def _given_models(folder: Path) -> "Models":
-    """Networks of a folder, with the hand and the text encoder their headers name."""
+def _refuse_what_is_not_asked(given: Mapping[str, Any]) -> None:
+    """Raise BadInput for an option that would change nothing, in the place it was given."""
+    if idle := [name for name, value in given.items() if value]:
+        from hoidata.errors import BadInput
+
+        expected = (
+            "--model and --profile in a project, --encoder with --models, --unit, --up and --hinge with a mesh file"
+        )
+        raise BadInput(", ".join(idle), expected, "an option that changes nothing here", "leave it out")
+
+
+def _given_models(folder: Path, encoder: str) -> "Models":
+    """Networks of a folder, with the hand and the text encoder their headers name, or the encoder that was told."""
     from hoidata.annotation.encoders import load_encoder
     from models.common.checkpoints import FILE_NAME, read_info
     from pipelines.generation import Models
 
     facts = read_info(folder / "contact" / FILE_NAME)["facts"]
-    encoder = str(facts["encoder"]["name"])
+    encoder = encoder or str(facts["encoder"]["name"])
     return Models(folder, hands_of(facts["hand_digest"], str(folder)), load_encoder(encoder))

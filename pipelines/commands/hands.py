@@ -23,8 +23,8 @@ def hands_of(digest: str, what: str) -> "HandPair":
 
     Raises MissingResource where it is neither.
     """
-    embedded, own = chosen_hands("embedded"), chosen_hands("")
-    found = next((hands for hands in (embedded, own) if hands.digest == digest), None)
+    each = (chosen_hands(choice) for choice in ("embedded", ""))  # the second is not looked for where the first fits
+    found = next((hands for hands in each if hands.digest == digest), None)
     if found is None:
         raise MissingResource(
             f"{what} was made with a hand ({digest[:12]}) that is not here; name the folder of the MANO files in "

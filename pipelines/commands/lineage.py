@@ -54,7 +54,7 @@ def of(
     ] = False,
     clips: Annotated[bool, typer.Option("--clips", help="List the ids of the clips it was trained on.")] = False,
 ) -> None:
-    """What a file was made from (no need to type ``of``). Exit code 0 when all of it is the same today, or only recorded; else 1."""
+    """What a file was made from (no need to type ``of``). Exit code 0 when all is the same or only recorded, else 1."""
     root, here = _project()
     from pipelines.lineage.raw import raw_sources
     from pipelines.lineage.targets import find_target

@@ -1,5 +1,6 @@
 """``hoidata hands``: both hands for any motion of an object."""
 
+from os.path import isfile  # of a name that is too long it says no, where a Path raises
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -42,7 +43,7 @@ def hands(
     from pipelines.params import read_params
 
     def found(name: str) -> str:
-        return str(here / name) if name and len(name) < 250 and "\n" not in name and (here / name).is_file() else name
+        return str(here / name) if name and isfile(here / name) else name
 
     wish = HandsWish(
         found(object),

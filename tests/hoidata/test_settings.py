@@ -7,7 +7,7 @@ from typing import Any, Literal
 import pytest
 
 from hoidata.errors import BadInput
-from hoidata.settings import build_config, plain_config
+from hoidata.settings import at_least, build_config, plain_config
 
 
 @dataclass(frozen=True)
@@ -78,3 +78,14 @@ def test_a_wrong_value_is_named_with_what_was_expected(values: dict, words: str)
 def test_a_setting_without_default_has_to_be_given():
     with pytest.raises(BadInput, match="bound: expected a value for high"):
         build_config(Bound, {"low": 1}, "bound")
+
+
+def test_a_number_in_the_place_of_a_list_is_named():
+    with pytest.raises(BadInput, match=r"example.inner.widths: expected a list, got 0.003; write \[...\]"):
+        built(inner={"widths": 0.003})
+
+
+def test_less_than_a_setting_may_be_is_named():
+    at_least("here", Example(), "count", 3)
+    with pytest.raises(BadInput, match=r"here\.count: expected 4 or more, got 3"):
+        at_least("here", Example(), "count", 4)

@@ -4,12 +4,13 @@ import json
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample, HoiDataset, load_sample
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
@@ -19,7 +20,7 @@ from hoidata.refinement import HoldSettings, hold_hands
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.common.family import Sources, motion_clip
-from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family
+from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
 from models.text2hoi.family import other_prompts
@@ -74,6 +75,34 @@ def test_features_of_a_recorded_clip_give_it_back(annotated: AnnotatedStore) -> 
             if sample.active_hands[row]:
                 expected = track_joints(recorded.hands[side], HANDS[side])
                 np.testing.assert_allclose(track_joints(made.hands[side], HANDS[side]), expected, atol=2e-5)
+
+
+def test_a_motion_for_a_clip_of_unknown_gravity_claims_none(annotated: AnnotatedStore) -> None:
+    """Else a hold would ask what falls along an axis that means nothing."""
+    sample = samples_of(annotated, "train")[0]
+    request = requests_for(replace(sample, gravity_known=False), PredictionConfig())[0]
+    made = motion_clip(request, torch.from_numpy(sample.hands), torch.from_numpy(sample.object), True)
+    assert sample.gravity_known
+    assert made.gravity is None
+    assert "not known" in made.gravity_note
+    clip = annotated.clip(sample.clip_id)
+    store = SimpleNamespace(**{name: getattr(annotated, name) for name in dir(annotated) if not name.startswith("__")})
+    store.clip = lambda clip_id: replace(clip, gravity=None, gravity_note="the source does not say")
+    assert not load_sample(store, sample.clip_id).gravity_known
+
+
+@pytest.mark.parametrize(("wanted", "found"), [(0, 12), (5, 5), (7, 7), (12, 12), (40, 12)])
+def test_as_many_test_clips_as_are_asked_for_spread_evenly(wanted: int, found: int) -> None:
+    chosen = spread(list(range(12)), wanted)
+    assert len(chosen) == found
+    assert chosen == sorted(set(chosen))
+    assert max(np.diff(chosen)) - min(np.diff(chosen)) <= 1
+
+
+@pytest.mark.parametrize(("settings", "named"), [({"samples": 0}, "sample.samples"), ({"clips": -1}, "sample.clips")])
+def test_a_sampling_of_nothing_is_refused(settings: dict, named: str) -> None:
+    with pytest.raises(BadInput, match=named):
+        PredictionConfig(**settings)
 
 
 def test_ground_truth_is_the_recorded_clip(sources: Sources) -> None:

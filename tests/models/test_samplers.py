@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.errors import BadInput
 from models.common import sampling
 from models.common.sampling import (
     SamplerConfig,
@@ -175,3 +176,11 @@ def test_hands_that_take_no_part_and_padding_are_cut_not_masked(batch: ClipBatch
     assert tokens == [1 + 2 * alone.counts[0], 1 + 3 * both.counts[0]]
     hands, _ = model(alone.hands, alone.object, torch.zeros(1, dtype=torch.long), condition_of(alone, model))
     assert not hands[:, 1].any()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"steps": 1001}, {"guidance": float("nan")}, {"guidance": float("inf")}]
+)
+def test_steps_and_a_guidance_that_do_not_exist_are_refused(wrong: dict) -> None:
+    with pytest.raises(BadInput, match="1 to 1000 steps, a finite guidance"):
+        sampling.SamplerConfig(**wrong)

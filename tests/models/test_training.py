@@ -1,8 +1,10 @@
 """Training and generation on the toy dataset, and what their files promise."""
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,14 +18,16 @@ from hoidata.batches.dataset import ClipBatch, HoiDataset
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import _config, load_checkpoint, save_checkpoint
 from models.common.corpus import Corpus, batches
+from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, fit, learning_rate_factor, train_network
 from models.registry import load_network
 from models.text2hoi.diffusion import DiffusionModel
-from models.text2hoi.generation import GeneratedMotion, Generator, Wish, _started_at_origin
-from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
+from models.text2hoi.generation import GeneratedMotion, Generator, Wish
+from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
 from pipelines.generation import Asked, Models, generate_files
 from tests.models.toy import PARAMS, train
@@ -168,6 +172,31 @@ def test_what_is_asked_for_beside_the_sentence_counts_before_its_words(trained: 
         generator(trained).generate("Lift a box.", user_box(), Wish(frames=151))
 
 
+def test_motions_are_made_as_the_models_say_but_for_what_is_told(
+    trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
+    given, load = dict[str, Any](), Generator.load
+    monkeypatch.setattr(Generator, "load", lambda *where, **options: given.update(options) or load(*where, **options))
+    sampling = SamplingConfig(SamplerConfig("dpm++", 3), draws=1)
+    models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling, points=256)
+    asked = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=8), sampler={"steps": 2})
+    generate_files(asked, tmp_path / "out")
+    assert given == {"sampling": replace(sampling, sampler=SamplerConfig("dpm++", 2)), "points": 256}
+    made = load(trained, models.hands, models.encoder, **given).generate("Lift a box.", user_box(), Wish(frames=8))[0]
+    assert made.contact.shape == (256,)
+
+
+def test_a_mesh_file_whose_name_is_no_text_is_read_and_its_name_stays_legible(trained: Path, tmp_path: Path) -> None:
+    mesh = Path(os.fsdecode(os.fsencode(tmp_path) + b"/b\xffx.stl"))
+    trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
+    (tmp_path / "box.stl").rename(mesh)
+    models = Models(trained, load_embedded_hands(), load_encoder("hash"))
+    generate_files(Asked("Lift a box.", mesh, models=models, wish=Wish(frames=8)), tmp_path / "out")
+    assert (tmp_path / "out/index.html").is_file()
+    assert read_user_object(mesh).model.name == "b\\udcffx"
+
+
 def test_what_training_never_had_is_said(trained: Path) -> None:
     said = generator(trained).generate("Juggle three oranges with both hands.", user_box(), Wish(frames=8))[0]
     assert "the verb 'juggle' was never in training" in said.evidence["unseen"][0]
@@ -224,14 +253,10 @@ def test_a_generated_clip_is_finite_and_starts_with_the_object_at_the_origin(tra
     assert len(made.clip.source_frames) == made.evidence["frames"] >= 8
 
 
-def test_a_motion_that_is_moved_to_the_origin_keeps_its_hands_at_the_object() -> None:
-    draws = torch.Generator().manual_seed(0)
-    parts = [torch.randn(shape, generator=draws) for shape in ((2, 4, 99), (2, 4, 99), (4, 10), (9,))]
-    given, found = Text2HoiMotion(*parts), _started_at_origin(Text2HoiMotion(*parts))
-    assert not found.object[0, :3].any()
-    for name in ("coarse", "refined"):
-        before, after = (getattr(own, name)[..., :3] - own.object[:, :3] for own in (given, found))
-        torch.testing.assert_close(after, before)
+@pytest.mark.parametrize("name", ["steps", "batch", "validate_every", "parts", "save_every"])
+def test_a_budget_of_nothing_is_refused(name: str) -> None:
+    with pytest.raises(BadInput, match=f"training.{name}: expected 1 or more"):
+        TrainingConfig(**{name: 0})
 
 
 def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:

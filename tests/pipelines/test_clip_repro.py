@@ -97,7 +97,7 @@ def test_nothing_is_left_to_do_and_the_models_generate_with_their_own_encoder_al
     assert project_tools.run(folder, "dvc", "repro").stdout.count("Running stage") == 1  # code, which always runs
     params = (folder / "params.yaml").read_text()
     thing = str(pd.read_parquet(folder / "data/embedded/grab/clips/meta/objects.parquet")["object"][0])
-    generate = (*GENERATE, thing, "--dataset", "grab")
+    generate = (*GENERATE, thing, "--model", "grab")
     made = project_tools.run(folder, *generate, "--out", str(tmp_path / "made"))
     assert made.returncode == 0, made.stdout + made.stderr
     assert "left (decided by rule" in (tmp_path / "made" / "index.html").read_text()

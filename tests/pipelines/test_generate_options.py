@@ -3,11 +3,11 @@
 import pytest
 from typer.testing import CliRunner
 
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
 
 
-@pytest.mark.parametrize("length", ["nan", "inf", "-inf"])
+@pytest.mark.parametrize("length", ["nan", "inf", "-inf", "1e308"])
 def test_a_length_that_is_no_number_of_seconds(length: str, tmp_path) -> None:
     words = ["generate", "Lift a box.", "--object", "box", "--out", str(tmp_path / "out"), f"--length={length}"]
     found = CliRunner().invoke(app, words)
@@ -25,3 +25,25 @@ def test_a_seed_no_array_holds_and_a_file_in_the_place_of_the_folder(option: str
     assert found.exit_code == 2
     assert file.read_text() == "mine"
     assert not (tmp_path / "new").exists()
+
+
+IDLE = [
+    (["--unit=cm"], "--unit"),
+    (["--up=y", "--hinge=0,0,0 0,0,1"], "--up, --hinge"),
+    (["--encoder=use"], "--encoder"),
+    (["--models={folder}", "--model=grab"], "--model"),
+    (["--models={folder}", "--profile=own"], "--profile"),
+]
+
+
+@pytest.mark.parametrize(("options", "named"), IDLE)
+def test_an_option_that_would_change_nothing_is_refused(options, named, tmp_path) -> None:
+    words = ["generate", "Lift a box.", "--object", "box", "--out", str(tmp_path / "out")]
+    found = CliRunner().invoke(app, [*words, *(option.format(folder=tmp_path) for option in options)])
+    assert isinstance(found.exception, BadInput)
+    assert str(found.exception).startswith(f"{named}: expected")
+
+
+def test_an_object_with_a_name_longer_than_a_file_may_have(tmp_path) -> None:
+    found = CliRunner().invoke(app, ["generate", "Lift a box.", "--object", "b" * 300, "--out", str(tmp_path / "out")])
+    assert isinstance(found.exception, (BadInput, MissingResource))

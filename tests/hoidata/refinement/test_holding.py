@@ -13,9 +13,11 @@ from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.realism import VARIANTS, score
-from hoidata.physics.scene import clip_scene
+from hoidata.physics.scene import capsules_there, clip_scene
 from hoidata.refinement import HoldSettings, carried_share, hold_clip, hold_hands
 from hoidata.refinement.hold_solver import spline_shares
+from hoidata.refinement.holding import _Load
+from hoidata.refinement.kernels import lower_capsules
 from hoidata.refinement.regrasping import RegraspSettings
 from tests.builders.clips import DOWN, clip_of
 from tests.builders.objects import box_model, two_parts
@@ -236,6 +238,76 @@ def test_a_hand_that_goes_elsewhere_holds_there_not_between_both_places():
     made = hold_hands(PAIR, clip)["right"]
     for start, stop in ((11, 15), (25, 36)):
         assert abs(made.wrist_m - track.wrist_m)[start:stop, 1].max() < 0.01
+
+
+def test_between_two_holds_on_a_moving_object_the_hand_takes_the_frames_it_has():
+    """It lifts off, and comes down 20 cm farther on: drawn out up to one another, both holds would be one jump."""
+    frames = np.arange(FRAMES)
+    turn, still = np.tile(np.eye(3), (FRAMES, 1, 1)), np.zeros((FRAMES, 3), np.float32)
+    place = np.stack((0.012 * frames, 0.0 * frames, 0.0 * frames), 1)
+    along = np.interp(frames, [0, 16, 24, FRAMES], [-0.1, -0.1, 0.1, 0.1])
+    lift = np.interp(frames, [0, 16, 18, 22, 24, FRAMES], [0, 0, 0.02, 0.02, 0, 0])
+    top = place + np.stack((0 * along, along, 0.03 + lift), 1)
+    track = pressed("right", top, 0.001, 0.0, turn)
+    away = replace(track, wrist_m=track.wrist_m + 1)
+    clip = clip_of("toy/s1/e", ObjectTrack(BOX, still, place.astype(np.float32)), {"left": away, "right": track})
+    made = hold_hands(PAIR, clip, AS_GENERATED)["right"].wrist_m - place
+    own = track.wrist_m - place
+    step, own_step = (np.linalg.norm(np.diff(one[12:36], axis=0), axis=1).max() for one in (made, own))
+    assert own_step < 0.03
+    assert step < 2.5 * own_step
+
+
+def test_a_hand_that_is_only_near_is_not_pushed_through():
+    """The right one hovers over the place the left one is drawn to, and moves too fast to hold."""
+    place, turn = np.zeros((FRAMES, 3)), np.tile(np.eye(3), (FRAMES, 1, 1))
+    left = pressed("left", place + np.array([0, 0, 0.03]), -0.004, 0.0, turn)
+    over = 0.02 * np.sin(np.arange(FRAMES))[:, None] * [1.0, 0, 0] + [0, 0, 0.018]
+    right = replace(pressed("right", place + np.array([0, 0, 0.03]), -0.01, 0.0, turn))
+    right = replace(right, wrist_m=(right.wrist_m + over).astype(np.float32))
+    still = np.zeros((FRAMES, 3), np.float32)
+    depths_mm = []
+    for hands in ({"left": left, "right": right}, {"left": left, "right": replace(right, wrist_m=right.wrist_m + 1)}):
+        clip = clip_of("toy/s1/h", ObjectTrack(BOX, still, still), hands)
+        made = hold_hands(PAIR, clip, AS_GENERATED)["left"]
+        between = np.full((FRAMES, 778), np.inf)
+        skin = track_vertices(made, PAIR["left"]).astype(np.float64)
+        lower_capsules(*capsules_there(right, PAIR["right"]), skin, between, np.zeros((FRAMES, 778, 3)))
+        depths_mm.append(-1000 * between[HELD].min(axis=1).mean())
+    assert depths_mm[0] < depths_mm[1] - 1
+
+
+def test_normals_of_contacts_are_unit_ones_and_the_middle_of_a_thin_thing_has_none():
+    """A capsule's axis along the middle of a slab, where what is interpolated has no slope, or a short one."""
+    for thick_m in (0.006, 0.012, 0.03):
+        slab = box_model((0.12, 0.12, thick_m))
+        place = np.stack((0 * LIFT, 0 * LIFT, LIFT), 1).astype(np.float32)
+        turn = np.tile(np.eye(3), (FRAMES, 1, 1))
+        hand = pressed("right", place + np.array([0, 0, thick_m / 2]), thick_m / 2 + 0.008, 0.0, turn)
+        thing = ObjectTrack(slab, np.zeros_like(place), place)
+        clip = clip_of("toy/s1/i", thing, {"left": replace(hand, wrist_m=hand.wrist_m + 1), "right": hand})
+        load = _Load.of(clip, 4)
+        found = load._contacts(capsules_there(hand.take(load.frames), PAIR["right"]))
+        assert len(found.frame)
+        np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1, atol=1e-9)
+        assert np.isfinite(load.carried([capsules_there(hand.take(load.frames), PAIR["right"])]))
+
+
+def test_a_hand_whose_shape_is_told_in_every_frame():
+    clip = clip_of_box_at_rest()
+    tracks = {side: replace(track, betas=np.repeat(track.betas, FRAMES, 0)) for side, track in clip.hands.items()}
+    assert carried_share(PAIR, replace(clip, hands=tracks)) == 1
+    made = hold_hands(PAIR, replace(clip, hands=tracks), AS_GENERATED)
+    same = hold_hands(PAIR, clip, AS_GENERATED)
+    np.testing.assert_allclose(made["right"].wrist_m, same["right"].wrist_m, atol=1e-6)
+
+
+def clip_of_box_at_rest() -> Clip:
+    """A hand on it, nothing in the air."""
+    still, turn = np.zeros((FRAMES, 3), np.float32), np.tile(np.eye(3), (FRAMES, 1, 1))
+    hand = pressed("right", still + np.array([0, 0, 0.03]), 0.004, 0.002, turn)
+    away = replace(pressed("left", still + np.array([0, 0, 0.03]), 0.0, 0.0, turn), wrist_m=hand.wrist_m + 1)
+    return clip_of("toy/s1/j", ObjectTrack(BOX, still, still), {"left": away, "right": hand})
 
 
 def test_one_blas_thread_whatever_the_process_has(pushed, monkeypatch):

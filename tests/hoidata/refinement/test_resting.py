@@ -90,6 +90,11 @@ def test_nothing_passes_through_what_it_lay_on():
     assert np.abs(height(made)[-8:]).max() < 1e-6
 
 
+def test_what_is_held_in_the_air_and_put_down_in_between_is_put_down():
+    clip = lifted(0.0, middle_m=-0.15)
+    np.testing.assert_array_equal(height(rest_object(clip)), height(clip))
+
+
 def test_without_gravity_or_a_rest_to_start_from_nothing_is_changed():
     clip = lifted(0.02)
     for other in (replace(clip, gravity=None), lifted(0.02, start=-6)):
