@@ -1,10 +1,14 @@
 """Options of ``hoidata generate`` that cannot be meant are refused before anything is generated."""
 
 import pytest
+import yaml
 from typer.testing import CliRunner
 
 from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
+from pipelines.generation import Asked, _of_project
+from pipelines.stages.base import StagePaths
+from tests.pipelines.conftest import PROJECT
 
 
 @pytest.mark.parametrize("length", ["nan", "inf", "-inf", "1e308"])
@@ -47,3 +51,19 @@ def test_an_option_that_would_change_nothing_is_refused(options, named, tmp_path
 def test_an_object_with_a_name_longer_than_a_file_may_have(tmp_path) -> None:
     found = CliRunner().invoke(app, ["generate", "Lift a box.", "--object", "b" * 300, "--out", str(tmp_path / "out")])
     assert isinstance(found.exception, (BadInput, MissingResource))
+
+
+def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(tmp_path, monkeypatch) -> None:
+    values = yaml.safe_load((PROJECT / "params.yaml").read_text())
+    own = {"annotate": {"encoder": "hash"}, "contact": {"points": 512}, "sample": {"text2hoi": {"draws": 1}}}
+    values |= {"profile": "embedded", "profiles": {"own": own}}
+    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("pipelines.generation.load_hands", lambda profile: profile)
+    monkeypatch.setattr("pipelines.generation.load_encoder", lambda name: name)
+    found = []
+    for profile in ("embedded", "own"):
+        monkeypatch.setattr("pipelines.generation.chosen_model", lambda *_, own=profile: (StagePaths(own, "grab"), ""))
+        models = _of_project(Asked("Lift a box.", "box", profile=profile), "lift", "box")[0]
+        found.append((models.hands, models.encoder, models.points, models.sampling.draws))
+    assert found == [("embedded", "use", 1024, 3), ("own", "hash", 512, 1)]
