@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from os.path import isfile  # of a name that is too long it says no, where a Path raises
 from pathlib import Path
 from typing import Any, Literal
 
@@ -127,7 +128,7 @@ def animate(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...
     """The same without files. Raises BadInput or MissingResource that says what cannot be, and what to do."""
     make_repeatable(threads=1)  # one hand is too small for two threads to agree on
     hands = load_hands(profile)
-    if Path(what).suffix.lower() in (*ENDINGS, ".gz") or Path(what).is_file():
+    if Path(what).suffix.lower() in (*ENDINGS, ".gz") or isfile(what):
         return _from_file(Path(what), wish, profile, datasets, hands)
     return _from_clip(what, wish, profile, datasets, hands)
 
@@ -232,7 +233,7 @@ def _object(
     wish: AnimateWish, unit: str, profile: str, datasets: tuple[str, ...], hands: HandPair
 ) -> tuple[ObjectModel, list[str]]:
     """A mesh file in its own axes, or an object of the dataset; and what is to be said of it."""
-    if Path(wish.object).is_file():
+    if isfile(wish.object):
         # Trajectories say how the mesh lies: it is not turned upright.
         user = read_user_object(Path(wish.object), unit, "z", wish.mesh.hinge)
         return user.model, list(user.notes)

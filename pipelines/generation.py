@@ -123,7 +123,9 @@ def _of_project(asked: Asked, verb: str | None, thing: str | None) -> tuple[Mode
     params = chosen_params({**read_file(Path("params.yaml")), "profile": paths.profile})
     encoder = build_config(AnnotationSettings, params.get("annotate"), "params.yaml: annotate").encoder
     points = build_config(ContactSettings, params.get("contact"), "params.yaml: contact").points
-    sampling = build_config(SamplingConfig, params["sample"].get("text2hoi"), "params.yaml: sample.text2hoi")
+    told = (params.get("sample") or {}).get("text2hoi")
+    # Half precision is for GPUs, and this runs on the CPU.
+    sampling = replace(build_config(SamplingConfig, told, "params.yaml: sample.text2hoi"), precision="float32")
     hands, encoder = load_hands(paths.profile), load_encoder(encoder)
     return Models(paths.checkpoints, hands, encoder, paths.clips, sampling, points), why
 

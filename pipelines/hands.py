@@ -2,6 +2,7 @@
 
 import difflib
 from dataclasses import dataclass, field, replace
+from os.path import isfile  # of a name that is too long it says no, where a Path raises
 from pathlib import Path
 from typing import NamedTuple
 
@@ -193,7 +194,7 @@ def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Han
     if not wish.object:
         raise BadInput("object", "a mesh file (.obj, .ply, .stl, .glb) or a dataset's object", "none", "name it first")
     limits = hinge_range(wish.hinge_range) if wish.hinge_range else None
-    if Path(wish.object).is_file():
+    if isfile(wish.object):
         user = read_user_object(Path(wish.object), wish.mesh.unit, wish.mesh.up, wish.mesh.hinge)
         notes = list(user.notes)
         if user.model.is_articulated and limits is None:
@@ -256,7 +257,7 @@ def _script_text(script: str) -> str:
     """A script, or that of the file it names."""
     if "\n" in script or len(script) >= 250:
         return script
-    if Path(script).is_file():
+    if isfile(script):
         return Path(script).read_text(encoding="utf-8", errors="replace")
     if Path(script).suffix.lower() in SCRIPT_FILES or ("/" in script and " " not in script):
         raise BadInput("--script", "steps, or a file of them", f"{script}, which is not there", "correct the path")

@@ -201,7 +201,8 @@ class _Load:
     def _contacts(self, capsules: Capsules) -> CapsuleContacts:
         """Where capsules, in the frames looked at, touch the object: at the deepest of some places along each axis.
 
-        Read from the distance grid, as all of the hold is: ``physics.capsule_contacts`` is exact and far slower.
+        Read from the distance grid, as all of the hold is: ``hoidata.physics.capsules.capsule_contacts`` is exact
+        and far slower.
         """
         there = np.isfinite(capsules.start_m[..., 0])
         capsules = Capsules(np.nan_to_num(capsules.start_m), np.nan_to_num(capsules.end_m), capsules.radius_m)

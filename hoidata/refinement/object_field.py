@@ -12,11 +12,9 @@ class ObjectField:
     """The surface of one moving object. A part that bounds no solid has no inside: its distances are not negative."""
 
     def __init__(self, thing: ObjectTrack) -> None:
-        self._parts = [
-            (surface.grid, _contiguous(world_from_part(thing, part).inverse()))
-            for part, surface in surface_index(
-                thing.model
-            ).filled.items()  # one grid per part, whatever the frames and angles
+        surfaces = surface_index(thing.model).filled
+        self._parts = [  # one grid per part, whatever the frames and angles
+            (surface.grid, _contiguous(world_from_part(thing, part).inverse())) for part, surface in surfaces.items()
         ]
 
     @property

@@ -59,6 +59,8 @@ def _rises(lowest_m: np.ndarray, first: int, last: int, settings: RestSettings) 
     n_frames, too_low = len(lowest_m), lowest_m[0] - lowest_m
     rises, stop = np.zeros(n_frames), n_frames - last
     level = last > 0 and np.abs(too_low[stop:]).max() < settings.level_m
+    if level and too_low.max() >= settings.through_m:
+        return rises
     rises[:first] = too_low[:first]
     if level:
         rises[stop:] = too_low[stop:]
@@ -67,7 +69,7 @@ def _rises(lowest_m: np.ndarray, first: int, last: int, settings: RestSettings) 
     share = _smooth(np.arange(1, way + 1) / (way + 1))
     rises[first : first + way] = rises[first - 1] + share * (end - rises[first - 1])
     below = np.maximum(too_low - rises, 0)
-    return rises if below.max() >= (settings.through_m if level else settings.level_m) else rises + below
+    return rises if not level and below.max() >= settings.level_m else rises + below
 
 
 def _smooth(share: np.ndarray) -> np.ndarray:

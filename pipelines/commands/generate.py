@@ -37,10 +37,12 @@ def generate(
     model: Annotated[str, typer.Option(help="Dataset whose models to use; else what knows the words.")] = "",
     sampler: Annotated[
         Literal["ddim", "ddpm", "dpm++"] | None,
-        typer.Option(help="How noise becomes motion; ddim by default."),
+        typer.Option(help="How noise becomes motion; else params.yaml's, ddim."),
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Denoiser calls, 20 by default.", min=1, max=1000)] = None,
-    scale: Annotated[float | None, typer.Option(help="Classifier-free guidance; 1, the default, is none.")] = None,
+    steps: Annotated[int | None, typer.Option(help="Denoiser calls; else params.yaml's, 20.", min=1, max=1000)] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Classifier-free guidance; 1 is none; else params.yaml's.")
+    ] = None,
     unit: Annotated[str, typer.Option(help="Of a mesh file: m, cm, mm, dm or inch; metres when left out.")] = "",
     up: Annotated[str, typer.Option(help="Axis of a mesh file that points up, like y or -z; found if left out.")] = "",
     hinge: Annotated[str, typer.Option(help="Of a two-piece mesh: 'px,py,pz dx,dy,dz', in the file's unit.")] = "",
@@ -61,6 +63,7 @@ def generate(
     mesh = Path(object).resolve() if isfile(object) else None
     _refuse_what_is_not_asked(
         {"--model": models and model, "--profile": models and profile, "--encoder": not models and encoder}
+        | {"--hand-by": hand and hand_by != "rules"}
         | ({} if mesh or Path(object).suffix else {"--unit": unit, "--up": up, "--hinge": hinge})
     )
     root = enter_project() if models is None else None
@@ -102,7 +105,8 @@ def _refuse_what_is_not_asked(given: Mapping[str, Any]) -> None:
         from hoidata.errors import BadInput
 
         expected = (
-            "--model and --profile in a project, --encoder with --models, --unit, --up and --hinge with a mesh file"
+            "--model and --profile in a project, --encoder with --models, --hand-by without --hand, --unit, --up and "
+            "--hinge with a mesh file that is there"
         )
         raise BadInput(", ".join(idle), expected, "an option that changes nothing here", "leave it out")
 

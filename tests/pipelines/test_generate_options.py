@@ -37,6 +37,7 @@ IDLE = [
     (["--encoder=use"], "--encoder"),
     (["--models={folder}", "--model=grab"], "--model"),
     (["--models={folder}", "--profile=own"], "--profile"),
+    (["--hand=left", "--hand-by=similarity"], "--hand-by"),
 ]
 
 
@@ -48,9 +49,22 @@ def test_an_option_that_would_change_nothing_is_refused(options, named, tmp_path
     assert str(found.exception).startswith(f"{named}: expected")
 
 
-def test_an_object_with_a_name_longer_than_a_file_may_have(tmp_path) -> None:
-    found = CliRunner().invoke(app, ["generate", "Lift a box.", "--object", "b" * 300, "--out", str(tmp_path / "out")])
-    assert isinstance(found.exception, (BadInput, MissingResource))
+LONG = "b" * 300
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["generate", "Lift a box.", "--object", LONG],
+        ["animate", LONG],
+        ["hands", LONG],
+        ["hands", "box", "--script", LONG],
+    ],
+    ids=["generate", "animate", "hands", "script"],
+)
+def test_a_name_longer_than_a_file_may_have(words, tmp_path) -> None:
+    found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
+    assert isinstance(found.exception, BadInput | MissingResource), found.output
 
 
 def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(tmp_path, monkeypatch) -> None:

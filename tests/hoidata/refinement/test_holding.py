@@ -263,7 +263,7 @@ def test_a_hand_that_is_only_near_is_not_pushed_through():
     place, turn = np.zeros((FRAMES, 3)), np.tile(np.eye(3), (FRAMES, 1, 1))
     left = pressed("left", place + np.array([0, 0, 0.03]), -0.004, 0.0, turn)
     over = 0.02 * np.sin(np.arange(FRAMES))[:, None] * [1.0, 0, 0] + [0, 0, 0.018]
-    right = replace(pressed("right", place + np.array([0, 0, 0.03]), -0.01, 0.0, turn))
+    right = pressed("right", place + np.array([0, 0, 0.03]), -0.01, 0.0, turn)
     right = replace(right, wrist_m=(right.wrist_m + over).astype(np.float32))
     still = np.zeros((FRAMES, 3), np.float32)
     depths_mm = []
@@ -275,6 +275,13 @@ def test_a_hand_that_is_only_near_is_not_pushed_through():
         lower_capsules(*capsules_there(right, PAIR["right"]), skin, between, np.zeros((FRAMES, 778, 3)))
         depths_mm.append(-1000 * between[HELD].min(axis=1).mean())
     assert depths_mm[0] < depths_mm[1] - 1
+
+
+class NoWayOut:
+    """Depth without a slope, as half-way between two faces."""
+
+    def distances(self, places_m: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return np.full(places_m.shape[:2], -0.003), np.zeros(places_m.shape)
 
 
 def test_normals_of_contacts_are_unit_ones_and_the_middle_of_a_thin_thing_has_none():
@@ -291,6 +298,8 @@ def test_normals_of_contacts_are_unit_ones_and_the_middle_of_a_thin_thing_has_no
         assert len(found.frame)
         np.testing.assert_allclose(np.linalg.norm(found.normal, axis=1), 1, atol=1e-9)
         assert np.isfinite(load.carried([capsules_there(hand.take(load.frames), PAIR["right"])]))
+        nowhere = replace(load, field=NoWayOut())
+        assert not len(nowhere._contacts(capsules_there(hand.take(load.frames), PAIR["right"])).frame)
 
 
 def test_a_hand_whose_shape_is_told_in_every_frame():

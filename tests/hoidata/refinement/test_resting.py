@@ -90,8 +90,9 @@ def test_nothing_passes_through_what_it_lay_on():
     assert np.abs(height(made)[-8:]).max() < 1e-6
 
 
-def test_what_is_held_in_the_air_and_put_down_in_between_is_put_down():
-    clip = lifted(0.0, middle_m=-0.15)
+@pytest.mark.parametrize("end_m", [0.0, 0.02, -0.02])
+def test_what_is_held_in_the_air_and_put_down_in_between_is_put_down(end_m):
+    clip = lifted(end_m, middle_m=-0.15)
     np.testing.assert_array_equal(height(rest_object(clip)), height(clip))
 
 
