@@ -1,4 +1,4 @@
-"""The drawings of docs/concepts, made from the data of `make demo`: python docs/make/drawings.py PROJECT."""
+"""The drawings of docs/concepts, made from the data of `make demo`: python -m docs.make.drawings PROJECT."""
 
 import json
 import sys

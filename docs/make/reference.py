@@ -1,4 +1,4 @@
-"""Pages of docs/reference that are printed from tables: python docs/make/reference.py writes them, a test compares."""
+"""Pages of docs/reference that are printed from tables: python -m docs.make.reference writes them, a test compares."""
 
 from pathlib import Path
 from typing import Any

@@ -1,4 +1,4 @@
-"""Pictures of the pages of `make demo`, taken in headless Chromium: python docs/make/screens.py PROJECT.
+"""Pictures of the pages of `make demo`, taken in headless Chromium: python -m docs.make.screens PROJECT.
 
 A generated motion as an animated WebP, the page of one, the report on a wide and a narrow screen, and its intervals.
 """

@@ -81,7 +81,7 @@ def test_reference_pages_are_printed_from_the_tables():
     reference = module_from_spec(spec)
     spec.loader.exec_module(reference)
     for name, text in reference.PAGES.items():
-        assert (reference.FOLDER / name).read_text() == text(), "run: python docs/make/reference.py"
+        assert (reference.FOLDER / name).read_text() == text(), "run: python -m docs.make.reference"
 
 
 @pytest.mark.slow
