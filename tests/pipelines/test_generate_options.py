@@ -7,6 +7,7 @@ from typer.testing import CliRunner
 from hoidata.errors import BadInput, MissingResource
 from pipelines.cli import app
 from pipelines.generation import Asked, _of_project
+from pipelines.hands import _script_text
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
 
@@ -50,6 +51,7 @@ def test_an_option_that_would_change_nothing_is_refused(options, named, tmp_path
 
 
 LONG = "b" * 300
+LONG_IN_BYTES = "ü" * 200  # fewer than 250 characters, more bytes than a name may have
 
 
 @pytest.mark.parametrize(
@@ -58,13 +60,17 @@ LONG = "b" * 300
         ["generate", "Lift a box.", "--object", LONG],
         ["animate", LONG],
         ["hands", LONG],
-        ["hands", "box", "--script", LONG],
+        ["hands", "box", "--script", LONG_IN_BYTES],
     ],
     ids=["generate", "animate", "hands", "script"],
 )
 def test_a_name_longer_than_a_file_may_have(words, tmp_path) -> None:
     found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
     assert isinstance(found.exception, BadInput | MissingResource), found.output
+
+
+def test_steps_longer_than_a_name_are_no_file() -> None:
+    assert _script_text(LONG_IN_BYTES) == LONG_IN_BYTES
 
 
 def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(tmp_path, monkeypatch) -> None:
