@@ -1,12 +1,15 @@
 """Options of ``hoidata generate`` that cannot be meant are refused before anything is generated."""
 
+from collections.abc import Callable
+
 import pytest
 import yaml
 from typer.testing import CliRunner
 
 from hoidata.errors import BadInput, MissingResource
+from models.text2hoi.sampler import SamplingConfig
 from pipelines.cli import app
-from pipelines.generation import Asked, _of_project
+from pipelines.generation import Asked, Models, _of_project
 from pipelines.hands import _script_text
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
@@ -73,17 +76,39 @@ def test_steps_longer_than_a_name_are_no_file() -> None:
     assert _script_text(LONG_IN_BYTES) == LONG_IN_BYTES
 
 
-def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(tmp_path, monkeypatch) -> None:
-    values = yaml.safe_load((PROJECT / "params.yaml").read_text())
-    own = {"annotate": {"encoder": "hash"}, "contact": {"points": 512}, "sample": {"text2hoi": {"draws": 1}}}
-    values |= {"profile": "embedded", "profiles": {"own": own}}
-    (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+@pytest.fixture
+def models_of(tmp_path, monkeypatch) -> Callable[..., Models]:
+    """What a project with such a params.yaml generates with; its hands and encoder are their names."""
+
+    def found(profile: str, values: dict) -> Models:
+        (tmp_path / "params.yaml").write_text(yaml.safe_dump(values))
+        monkeypatch.setattr("pipelines.generation.chosen_model", lambda *_: (StagePaths(profile, "grab"), ""))
+        return _of_project(Asked("Lift a box.", "box", profile=profile), "lift", "box")[0]
+
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("pipelines.generation.load_hands", lambda profile: profile)
     monkeypatch.setattr("pipelines.generation.load_encoder", lambda name: name)
-    found = []
-    for profile in ("embedded", "own"):
-        monkeypatch.setattr("pipelines.generation.chosen_model", lambda *_, own=profile: (StagePaths(own, "grab"), ""))
-        models = _of_project(Asked("Lift a box.", "box", profile=profile), "lift", "box")[0]
-        found.append((models.hands, models.encoder, models.points, models.sampling.draws))
-    assert found == [("embedded", "use", 1024, 3), ("own", "hash", 512, 1)]
+    return found
+
+
+PARAMS = yaml.safe_load((PROJECT / "params.yaml").read_text())
+
+
+def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(models_of) -> None:
+    """But for half precision, which is slow on a CPU."""
+    own = {
+        "annotate": {"encoder": "hash"},
+        "contact": {"points": 512},
+        "sample": {"text2hoi": {"draws": 1, "precision": "float16"}},
+    }
+    values = {**PARAMS, "profile": "embedded", "profiles": {"own": own}}
+    found = [models_of(profile, values) for profile in ("embedded", "own")]
+    assert [(one.hands, one.encoder, one.points) for one in found] == [("embedded", "use", 1024), ("own", "hash", 512)]
+    assert [one.sampling.draws for one in found] == [3, 1]
+    assert {one.sampling.precision for one in found} == {"float32"}
+
+
+@pytest.mark.parametrize("sample", [{"sample": None}, {}])
+def test_a_section_sample_that_says_nothing(sample, models_of) -> None:
+    values = {name: value for name, value in PARAMS.items() if name not in ("sample", "profiles")}
+    assert models_of("embedded", values | sample).sampling == SamplingConfig()
