@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 import torch
@@ -31,6 +31,7 @@ from tests.models.conftest import BOX, make_clip
 from tests.models.conftest import Plan as ToyPlan
 
 DELIVERED = load_settings(TrainParams, "train")
+Preset = Literal["paper", "released", "ours"]
 STEPS = {"contact": (400, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
 
 
@@ -46,23 +47,29 @@ class Learnt:
 
 
 @pytest.fixture(scope="module")
-def learnt(tmp_path_factory: pytest.TempPathFactory) -> Learnt:
+def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Corpus, Hands]:
     plans = [ToyPlan("s1", "lift", BOX, False, True, 48), ToyPlan("s1", "pass", BOX, False, True, 90)]
     made = [make_clip(number, plan) for number, plan in enumerate(plans)]
     annotated = load_annotated(write_annotated(tmp_path_factory.mktemp("two"), made))
     clips = HoiDataset(annotated, "train", crop="start")
-    corpus, hands = Corpus(annotated, clips, clips), Hands(annotated.store.hand_pair())
-    networks, normaliser = dict[str, nn.Module](), None
+    return Corpus(annotated, clips, clips), Hands(annotated.store.hand_pair())
+
+
+@pytest.fixture(scope="module")
+def learnt(two: tuple[Corpus, Hands]) -> Learnt:
+    (corpus, hands), networks, normaliser = two, dict[str, nn.Module](), None
     for name in STEPS:
         networks[name], normaliser = learn(load_network(name), corpus, hands, networks)
     assert normaliser is not None
     generator = MotionGenerator(networks["diffusion"], normaliser)  # pyright: ignore[reportArgumentType]
-    return Learnt(corpus, list(clips), networks, generator, hands)
+    return Learnt(corpus, list(corpus.train), networks, generator, hands)
 
 
-def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module]) -> tuple[nn.Module, Any]:
+def learn(
+    network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module], preset: Preset = "ours"
+) -> tuple[nn.Module, Any]:
     """The network with the delivered settings but for its budget, and without dropout, which is against knowing."""
-    plan = Plan.of(network, DELIVERED.of(network.name))
+    plan = Plan.of(network, replace(DELIVERED, preset=preset).of(network.name))
     config = replace(plan.network, dropout=0.0) if hasattr(plan.network, "dropout") else plan.network
     steps, size, rate = STEPS[network.name]
     trained = {name: SimpleNamespace(network=own) for name, own in before.items()}
@@ -77,13 +84,24 @@ def learn(network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, n
 
 @pytest.mark.long
 def test_contact_and_length_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
-    batch, maps = collate(learnt.clips), true_maps(learnt.clips)
-    found = contact_probabilities(learnt.networks["contact"], learnt.clips, 16, 0)  # pyright: ignore[reportArgumentType]
+    assert_are_known(learnt.networks, learnt.clips)
+
+
+@pytest.mark.long
+def test_the_papers_contact_and_length_networks_know_two_clips_by_heart(two: tuple[Corpus, Hands]) -> None:
+    own = {name: learn(load_network(name), *two, {}, "paper")[0] for name in ("contact", "length")}
+    assert_are_known(own, list(two[0].train))
+
+
+def assert_are_known(networks: Mapping[str, nn.Module], clips: list[ClipSample]) -> None:
+    """Contact maps and lengths are those of the clips, and exchanged sentences exchange the lengths."""
+    batch, maps = collate(clips), true_maps(clips)
+    found = contact_probabilities(networks["contact"], clips, 16, 0)  # pyright: ignore[reportArgumentType]
     threshold = best_threshold(found, maps)
     assert min(f1_score(own >= threshold, true) for own, true in zip(found, maps, strict=True)) >= 0.95
-    frames = learnt.networks["length"].expected_frames(batch.text[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
+    frames = networks["length"].expected_frames(batch.text[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(frames, batch.lengths.float(), atol=1.0, rtol=0)
-    exchanged = learnt.networks["length"].expected_frames(batch.text.flip(0)[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
+    exchanged = networks["length"].expected_frames(batch.text.flip(0)[:, 0], batch.active_hands)  # pyright: ignore[reportCallIssue]
     torch.testing.assert_close(exchanged, frames.flip(0))
 
 

@@ -16,8 +16,6 @@ from models.common.features import Hands, Normaliser
 from models.common.point_net import PointNetConfig
 from models.common.sampling import add_noise, alphas_cumprod
 from models.common.transformer import Block, Encoder, TransformerConfig, packed
-from models.text2hoi.contact import ContactModel, contact_loss
-from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 from models.text2hoi.diffusion import SAME_OBJECT, Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.diffusion_training import DiffusionObjective
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
@@ -416,32 +414,6 @@ def fitted(parameters, loss, steps: int = 150, rate: float = 3e-3) -> float:
 
 def two_clips(batch: ClipBatch) -> ClipBatch:
     return collate(list(batch.samples[:2]))
-
-
-@pytest.mark.slow
-def test_the_contact_model_overfits_two_clips(batch: ClipBatch) -> None:
-    torch.manual_seed(0)
-    two = two_clips(batch)
-    model = ContactModel(ContactConfig(POINT_NET, (32, 32, 16), 4))
-    noise = torch.randn(2, 4, generator=torch.Generator().manual_seed(0))
-
-    def loss() -> Tensor:
-        logits, mean, spread = model(two.points_m, two.text[:, 0], two.contact_map, noise)
-        return contact_loss(logits, two.contact_map, mean, spread, ContactLossConfig())["total"]
-
-    fitted(model.parameters(), loss, 60, 1e-2)
-    model.eval()
-    probability = (
-        model.sample(
-            two.points_m,
-            two.text[:, 0],
-            two.active_hands,
-            model.draw_latents(8, len(two), torch.Generator().manual_seed(1)),
-        )
-        .amax(2)
-        .mean(1)
-    )
-    assert ((probability > 0.5) == (two.contact_map > 0.5)).float().mean() > 0.95
 
 
 def test_the_length_model_overfits_two_clips_and_keeps_its_noise(batch: ClipBatch) -> None:
