@@ -44,12 +44,13 @@ class DiffusionConfig:
     motion: what a token stands for. normalised: rows by mean and spread of the training clips, not metres and numbers
     as they are. codes: of frames and agents, or (for an ablation) less. first_code: number of the first frame's code.
     contact_input: "map", the paper's raw numbers, "tokens", ``contact_tokens`` of each kind, or "none". scale_input,
-    centroid: the object's size, and where its points lie, are told. hand_head: a hand is read from its own token, or
-    from the object's as well (released). object_feature: whether F_obj, the point network's summary of the object, is
-    told; of few objects it is a name. object_dropout: share of the steps in which it is not; if any, it is told of the
-    objects in training alone (their number, ``objects``, is set by training). text_input: a linear layer, or "verbs", a
-    hidden layer that is told which of ``verbs`` verbs (set by training too) the sentence means. frames_to_go: tokens
-    know how far it is to the end.
+    centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
+    is read from its own token, or from the object's as well (released). object_feature: whether F_obj, the point
+    network's summary of the object, is told; of few objects it is a name. object_dropout: share of the steps in which
+    it is not; if any, it is told of the objects in training alone (their number, ``objects``, is set by training).
+    text_input: a linear layer, or "verbs", a hidden layer that is told which of ``verbs`` verbs (set by training too)
+    the sentence means. condition_everywhere: the condition is added to every token instead of being one. frames_to_go:
+    tokens know how far it is to the end.
     signal_scale: spread of normalised rows beside the noise's 1; the smaller, the longer only the words can tell what
     is to happen (Chen 2023). input_gate: how much of the noised rows is let in depends on the timestep.
     """
@@ -67,9 +68,11 @@ class DiffusionConfig:
     object_feature: bool = True
     scale_input: bool = True
     centroid: bool = False
+    told: bool = False
     hand_head: Literal["hand", "hand and object"] = "hand"
     text_input: Literal["linear", "verbs"] = "linear"
     verbs: int = 1
+    condition_everywhere: bool = False
     frames_to_go: bool = False
     signal_scale: float = 1.0
     input_gate: bool = False
@@ -107,13 +110,14 @@ class Condition:
 class _Prepared:
     """A condition as the Transformer takes it, the same at every timestep.
 
-    text, object (B, width). points (B, C, width) contact tokens with their mask (B, C). hand_rows (B, 2, K),
+    text, object, extent (B, width). points (B, C, width) contact tokens with their mask (B, C). hand_rows (B, 2, K),
     object_rows (B, L) bool: the rows of a motion that are there. lengths (B,). sides: which hands are in any motion;
     the others' tokens are left out.
     """
 
     text: Tensor
     object: Tensor
+    extent: Tensor
     points: Tensor
     points_mask: Tensor
     hand_rows: Tensor
@@ -123,7 +127,7 @@ class _Prepared:
 
     def twice(self) -> "_Prepared":
         """Every motion two times, one whole batch after the other."""
-        own = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        own = {name: value for name, value in vars(self).items() if isinstance(value, Tensor) and value.ndim}
         return replace(self, **{name: torch.cat((value, value)) for name, value in own.items()})
 
 
@@ -157,6 +161,7 @@ class DiffusionModel(nn.Module):
         known = torch.zeros(config.objects, summary)
         self.known_objects = nn.Parameter(known, requires_grad=False) if config.objects else None
         self.points_in = _hidden_layer(TOKEN_FEATURES, width) if config.contact_input == "tokens" else None
+        self.extent_in = nn.Linear(3, width) if config.told else None
         self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
         self.encoder = Encoder(config.transformer, has_condition=True)
         head = width * (2 if config.hand_head == "hand and object" else 1)
@@ -182,7 +187,7 @@ class DiffusionModel(nn.Module):
         return self.denoise(hands, objects, timesteps, self.prepare(condition), keep)
 
     def prepare(self, condition: Condition) -> _Prepared:
-        """The part of ``forward`` that is the same at every timestep (Text2HOI eq. 2)."""
+        """The part of ``forward`` that is the same at every timestep (Text2HOI eq. 2, plus hand flags and length)."""
         lengths = condition.lengths
         hand_rows, object_rows = self.code.rows(condition.counts, lengths.device)
         contact = condition.contact.bool() & condition.active_hands[..., None]
@@ -192,9 +197,11 @@ class DiffusionModel(nn.Module):
             shape = condition.points_m, condition.normals, condition.part
             points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
             points = self.points_in(points)
+        extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
         return _Prepared(
             self.text_in(condition.text),
             self._body(condition, contact),
+            self.extent_in(extent) if self.extent_in is not None else points.new_zeros(()),
             points,
             points_mask,
             condition.active_hands[:, :, None] & hand_rows[:, None],
@@ -261,6 +268,8 @@ class DiffusionModel(nn.Module):
         masks.append(attention_mask_of(known.object_rows, wide))
         first, points = self._condition(time, known, keep)
         moving = torch.cat(tokens, 1)
+        if self.config.condition_everywhere:
+            moving = moving + first
         x = torch.cat((moving, first, points), 1)
         points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:2] > 0)
         mask = torch.cat((*masks, masks[-1].new_ones(len(x), 1), points_mask), 1)
@@ -294,7 +303,7 @@ class DiffusionModel(nn.Module):
         text, body, points = known.text, known.object, known.points
         if keep is not None:
             text, body = text * keep[:, :1], body * keep[:, 2:]
-        return (time + text + body)[:, None], points
+        return (time + text + body + known.extent)[:, None], points
 
 
 def _text_layers(config: DiffusionConfig) -> nn.Module:

@@ -31,7 +31,7 @@ POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16))
 
 def diffusion_model(**changes) -> DiffusionModel:
     torch.manual_seed(0)
-    config = DiffusionConfig(SMALL, POINT_NET, contact_input="tokens", frames_to_go=True)
+    config = DiffusionConfig(SMALL, POINT_NET, contact_input="tokens", frames_to_go=True, told=True)
     return DiffusionModel(replace(config, **changes)).eval()
 
 
@@ -55,10 +55,12 @@ SWITCHES = {
     "verbs": {"text_input": "verbs", "verbs": 5},
     "object's feature untold": {"object_feature": False},
     "nothing told of the object": {"object_feature": False, "contact_input": "tokens", "scale_input": False},
+    "condition everywhere": {"condition_everywhere": True},
     "frames to go": {"frames_to_go": True},
     "signal scale": {"signal_scale": 0.2},
     "gate": {"input_gate": True},
     "modulated": {"transformer": replace(SMALL, modulated=True)},
+    "told": {"told": True},
     "released": {"hand_head": "hand and object", "centroid": True, "first_code": 1},
     "no codes": {"codes": "none"},
     "no contact, no scale": {"contact_input": "none", "scale_input": False},
@@ -104,10 +106,12 @@ def test_each_switch_changes_its_part_of_the_weights_only() -> None:
         "verbs": {"text_in"},
         "object's feature untold": {"object_net", "object_condition_in"},
         "nothing told of the object": {"object_net", "object_condition_in", "points_in"},
+        "condition everywhere": set(),
         "frames to go": {"to_go_in"},
         "signal scale": set(),
         "gate": {"gate_in"},
         "modulated": {"encoder"},
+        "told": {"extent_in"},
         "released": {"hands_out", "object_condition_in"},
         "no codes": set(),
         "no contact, no scale": {"object_condition_in"},

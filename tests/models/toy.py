@@ -26,6 +26,7 @@ PARAMS = {
             "text_input": "verbs",
             "motion": {"knot_frames": 4},
             "normalised": True,
+            "told": True,
             "object_dropout": 0.5,
             "scale_input": False,
         },
