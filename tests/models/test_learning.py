@@ -5,11 +5,13 @@ from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any, Literal
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
+from hoidata.clips.features import WRIST
 from hoidata.contact.agreement import f1_score
 from hoidata.store.annotated import load_annotated
 from models.common.corpus import Corpus
@@ -20,8 +22,8 @@ from models.common.training import Plan, fit
 from models.registry import load_network
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
-from models.text2hoi.refiner import RefinerModel, refine
-from models.text2hoi.refiner_training import RefinerObjective
+from models.text2hoi.refiner import RefinerModel
+from models.text2hoi.refiner_training import RefinerObjective, _Comparison
 from models.text2hoi.surface import Surface
 from models.text2hoi.thresholds import best_threshold, contact_probabilities, true_maps
 from pipelines.stages.base import load_settings
@@ -151,7 +153,7 @@ def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
 
 
 @pytest.mark.long
-def test_the_refiner_takes_more_than_half_of_planted_noise_away(learnt: Learnt) -> None:
+def test_the_refiner_takes_four_fifths_of_planted_noise_away(learnt: Learnt) -> None:
     network, clips = load_network("refiner"), learnt.clips
     plan = Plan.of(network, DELIVERED.of("refiner"))
     # Eq. 9 alone: touch and depth pull at fingers as well, and would be right with the wrist anywhere.
@@ -162,20 +164,27 @@ def test_the_refiner_takes_more_than_half_of_planted_noise_away(learnt: Learnt) 
     given = loss, learnt.corpus, generator, surface, torch.device("cpu"), 0
     objective = RefinerObjective(RefinerModel(plan.network), *given)
     draws = torch.Generator().manual_seed(1)
-    pools = [objective._make(clips, "once", draws) for _ in range(60)]
+    pools = [objective._make(clips, "once", draws) for _ in range(1000)]  # with 60 it learns their noise by heart
     objective.pool = {clip.clip_id: [pool[row] for pool in pools] for row, clip in enumerate(clips)}
     objective.weights = replace(loss, samples=len(pools))
-    training = replace(plan.training, steps=800, batch=2, validate_every=800, keep_best=False, learning_rate=2e-3)
+    training = replace(plan.training, steps=2400, batch=2, validate_every=2400, keep_best=False, learning_rate=2e-3)
     refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
     assert isinstance(refiner, RefinerModel)
-    batch = collate(clips)
-    coarse = planted(batch.hands, torch.Generator().manual_seed(2))
-    seen = surface.coarse(batch, coarse, batch.object, batch.contact_map, batch.present)
-    refined = refine(refiner, seen)
-    apart = [(hands - batch.hands)[..., :3].norm(dim=-1) for hands in (coarse, refined)]
-    off = [float(distance[batch.present].mean()) for distance in apart]
-    assert off[0] == pytest.approx(0.01, rel=1e-3)
-    assert off[1] <= 0.5 * off[0]
+    batch, fresh = collate(clips), torch.Generator().manual_seed(2)
+    off = np.mean(
+        [wrists_off_m(refiner, objective._batch(batch, objective._make(clips, "once", fresh))) for _ in range(16)],
+        axis=0,
+    )
+    assert off[0] == pytest.approx(0.01, rel=0.03)  # 10 mm, and what the code of motions leaves of a clip
+    assert off[1] <= 0.2 * off[0]
+
+
+@torch.no_grad()
+def wrists_off_m(refiner: RefinerModel, seen: _Comparison) -> list[float]:
+    """How far wrists are from the clips', before and after refinement, in the frame they are seen in."""
+    before, after = refiner.seen(seen.coarse.hands, seen.coarse.object), refiner.corrected(seen.coarse)
+    apart = [(hands - seen.target)[..., WRIST].norm(dim=-1) for hands in (before, after)]
+    return [float(distance[seen.coarse.present].mean()) for distance in apart]
 
 
 def condition(learnt: Learnt, batch: ClipBatch, text: Tensor) -> Condition:

@@ -1,5 +1,6 @@
 """What the networks promise: masks shut things out, everything learns, the sampler does what its equations say."""
 
+import math
 from dataclasses import replace
 from typing import Literal
 
@@ -15,7 +16,15 @@ from hoidata.store.annotated import AnnotatedStore
 from models.common.features import Hands, Normaliser
 from models.common.point_net import PointNetConfig
 from models.common.sampling import add_noise, alphas_cumprod
-from models.common.transformer import Block, Encoder, TransformerConfig, packed
+from models.common.transformer import (
+    Block,
+    Encoder,
+    TransformerConfig,
+    agent_codes,
+    attention_mask_of,
+    packed,
+    sinusoid,
+)
 from models.text2hoi.diffusion import SAME_OBJECT, Condition, DiffusionConfig, DiffusionModel
 from models.text2hoi.diffusion_training import DiffusionObjective
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
@@ -247,6 +256,30 @@ def test_an_objects_summary_is_left_out_in_a_share_of_the_steps(
     assert kept[:, 1].mean() == pytest.approx(0.9, abs=0.02)
     assert least <= kept[:, 2].mean() <= most
     assert not (kept[:, 2] > kept[:, 1]).any()  # who is told of no touched points is told of no object
+
+
+def test_positions_are_told_by_sines_from_one_a_frame_down_to_a_ten_thousandth() -> None:
+    """Vaswani et al. 2017, Sec. 3.5, number by number; the agents' codes are rows far apart of the same table."""
+    found, width = sinusoid(torch.tensor([0, 7, 1666]), 6), 6
+    for row, position in enumerate((0, 7, 1666)):
+        angles = [position / 10_000 ** (2 * pair / width) for pair in range(width // 2)]
+        expected = [math.sin(angle) for angle in angles] + [math.cos(angle) for angle in angles]
+        assert found[row].tolist() == pytest.approx(expected, abs=1e-4)
+    torch.testing.assert_close(agent_codes(6, torch.device("cpu"))[1], found[2])
+    assert (torch.pdist(agent_codes(32, torch.device("cpu"))) > 1).all()
+
+
+def test_a_token_is_attended_to_if_any_of_its_frames_is_there() -> None:
+    there = torch.arange(7) < torch.tensor([[0], [1], [4], [7]])
+    assert attention_mask_of(there, 3).tolist() == [[False] * 3, [True, False, False], [True, True, False], [True] * 3]
+
+
+def test_normalised_rows_have_no_mean_and_come_back(batch: ClipBatch) -> None:
+    own = Normaliser.of(list(zip(batch.hands, batch.object, batch.present, strict=True)))
+    hands, objects = own.encode(batch.hands, batch.object)
+    assert float(hands.transpose(0, 1)[batch.present.transpose(0, 1)].mean(0).abs().max()) < 1e-3
+    for found, given in zip(own.decode(hands, objects), (batch.hands, batch.object), strict=True):
+        torch.testing.assert_close(found, given, atol=1e-5, rtol=1e-4)
 
 
 def test_tokens_nobody_attends_to_change_nothing_when_they_are_left_out() -> None:
