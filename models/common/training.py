@@ -43,7 +43,9 @@ class TrainingConfig:
     """Budget and optimiser (AdamW). The defaults are Text2HOI's released ones, but for ``steps``.
 
     schedule: "constant", or "cosine" to zero after ``warmup`` steps. ema_decay: of the running average of the weights
-    that is kept (0: the weights themselves). keep_best: keep the step with the lowest validation loss, not the last.
+    that is kept (0: the weights themselves). adam_beta2: of AdamW's running mean of squared gradients; at .999 the
+    large gradients of the first steps slow a thousand more, which a short training does not have. keep_best: keep the
+    step with the lowest validation loss, not the last.
     patience: stop after so many validations without a lower loss (0: never). balance: draw clips evenly, or verbs.
     mirror: every other clip is seen in a mirror, where the other hand is known to do the same (``batches.mirror``).
     precision: of Transformers and point networks, where the time is; all else stays float32. parts: of a batch, whose
@@ -58,6 +60,7 @@ class TrainingConfig:
     schedule: Literal["constant", "cosine"] = "constant"
     warmup: int = 0
     ema_decay: float = 0.0
+    adam_beta2: float = 0.999
     clip_norm: float = 0.0
     keep_best: bool = False
     patience: int = 0
@@ -176,7 +179,8 @@ def fit(
     """Run the steps; the network to keep, in evaluation mode, and one log row per validation."""
     team, network = Team.joined(), objective.network.train()
     learnt = [parameter for parameter in network.parameters() if parameter.requires_grad]
-    optimiser = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay)
+    betas, decay = (0.9, config.adam_beta2), config.weight_decay
+    optimiser = torch.optim.AdamW(learnt, lr=config.learning_rate, betas=betas, weight_decay=decay, fused=True)
     state = State(network, copy.deepcopy(network).eval().requires_grad_(False), optimiser)
     compute_in(network, config.precision)
     if progress:

@@ -29,6 +29,8 @@ class Plan:
     left: bool
     right: bool
     frames: int
+    height_m: float = GRASP_HEIGHT_M
+    eased: bool = False
 
 
 PLANS = (
@@ -42,14 +44,22 @@ PLANS = (
 )
 
 
+def eased(share: np.ndarray) -> np.ndarray:
+    """From 0 to 1 as ``share`` does, with no speed at either end."""
+    return (1 - np.cos(np.pi * share.clip(0, 1))) / 2
+
+
 def make_clip(number: int, plan: Plan) -> Clip:
-    """Acting hands rest above the object in the middle of the clip; others stay a metre away."""
+    """Acting hands rest ``height_m`` above the object in the middle of the clip, or, eased, in the half of it in which
+    the object moves, without jerks; others stay a metre away."""
     frames = plan.frames
-    away = np.abs(np.linspace(-1, 1, frames)) * 0.1
-    path = np.zeros((frames, 3))
-    path[:, 2 if plan.verb == "lift" else 0] = np.linspace(0, 0.2, frames)
+    away, done = np.abs(np.linspace(-1, 1, frames)), np.linspace(0, 1, frames)
+    if plan.eased:
+        away, done = eased(2 * away - 1), eased(2 * done - 0.5)
+    away, path = 0.1 * away, np.zeros((frames, 3))
+    path[:, 2 if plan.verb == "lift" else 0] = 0.2 * done
     start = np.array([0.3, -0.2, 0.9])
-    top = float(plan.model.vertices_m[:, 2].max()) + GRASP_HEIGHT_M
+    top = float(plan.model.vertices_m[:, 2].max()) + plan.height_m
     hands = {}
     for side, active_hands, shift in (("left", plan.left, -0.04), ("right", plan.right, 0.04)):
         wrist = path + start + np.array([shift, 0, top]) + away[:, None] * np.array([0, 0, 1.0])

@@ -18,7 +18,7 @@ from models.common.corpus import Corpus
 from models.common.family import Network, Setup
 from models.common.features import Hands
 from models.common.sampling import Motion, SamplerConfig, draw_motion
-from models.common.training import Plan, fit
+from models.common.training import Plan, TrainingConfig, fit
 from models.registry import load_network
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
@@ -34,13 +34,30 @@ from tests.models.conftest import Plan as ToyPlan
 
 DELIVERED = load_settings(TrainParams, "train")
 Preset = Literal["paper", "released", "ours"]
-STEPS = {"contact": (400, 4, 2e-3), "length": (1500, 2, 2e-3), "diffusion": (500, 2, 1e-3)}
+PRESETS: tuple[Preset, ...] = ("ours", "paper", "released")
+# Steps, clips in a batch, and learning rate. In the paper's rows, which are not normalised, the first hundred steps
+# find the mean, with gradients that a beta2 of .999 divides by for a thousand steps more.
+BUDGETS: Mapping[tuple[str, Preset], tuple[int, int, float]] = {
+    ("contact", "ours"): (400, 4, 2e-3),
+    ("contact", "paper"): (400, 4, 2e-3),
+    ("contact", "released"): (2000, 4, 1e-3),
+    ("length", "ours"): (1500, 2, 2e-3),
+    ("length", "paper"): (1500, 2, 2e-3),
+    ("length", "released"): (1500, 2, 2e-3),
+    ("diffusion", "ours"): (600, 2, 1e-3),
+    ("diffusion", "paper"): (1000, 2, 2e-3),
+    ("diffusion", "released"): (2900, 2, 1.4e-3),
+    ("refiner", "ours"): (1500, 2, 2e-3),
+    ("refiner", "paper"): (1500, 2, 1e-3),
+    ("refiner", "released"): (1500, 2, 1e-3),
+}
 
 
 @dataclass(frozen=True)
 class Learnt:
     """What was learnt of two clips of one box and one hand that differ in verb, length and path."""
 
+    preset: Preset
     corpus: Corpus
     clips: list[ClipSample]
     networks: dict[str, nn.Module]
@@ -50,53 +67,55 @@ class Learnt:
 
 @pytest.fixture(scope="module")
 def two(tmp_path_factory: pytest.TempPathFactory) -> tuple[Corpus, Hands]:
-    plans = [ToyPlan("s1", "lift", BOX, False, True, 48), ToyPlan("s1", "pass", BOX, False, True, 90)]
-    made = [make_clip(number, plan) for number, plan in enumerate(plans)]
+    plans = [("lift", 24), ("pass", 36)]
+    made = [
+        make_clip(number, ToyPlan("s1", verb, BOX, False, True, frames, height_m=-0.01, eased=True))
+        for number, (verb, frames) in enumerate(plans)
+    ]
     annotated = load_annotated(write_annotated(tmp_path_factory.mktemp("two"), made))
     clips = HoiDataset(annotated, "train", crop="start")
     return Corpus(annotated, clips, clips), Hands(annotated.store.hand_pair())
 
 
-@pytest.fixture(scope="module")
-def learnt(two: tuple[Corpus, Hands]) -> Learnt:
-    (corpus, hands), networks, normaliser = two, dict[str, nn.Module](), None
-    for name in STEPS:
-        networks[name], normaliser = learn(load_network(name), corpus, hands, networks)
+@pytest.fixture(scope="module", params=PRESETS)
+def learnt(two: tuple[Corpus, Hands], request: pytest.FixtureRequest) -> Learnt:
+    (corpus, hands), trained, normaliser = two, dict[str, Any](), None
+    for name in ("contact", "length", "diffusion"):
+        network = load_network(name)
+        own, normaliser = learn(network, corpus, hands, trained, request.param)
+        trained[name] = SimpleNamespace(network=own, info={"results": network.results(own, corpus)})
     assert normaliser is not None
-    generator = MotionGenerator(networks["diffusion"], normaliser)  # pyright: ignore[reportArgumentType]
-    return Learnt(corpus, list(corpus.train), networks, generator, hands)
+    networks = {name: own.network for name, own in trained.items()}
+    generator = MotionGenerator(networks["diffusion"], normaliser)
+    return Learnt(request.param, corpus, list(corpus.train), networks, generator, hands)
 
 
 def learn(
-    network: Network, corpus: Corpus, hands: Hands, before: Mapping[str, nn.Module], preset: Preset = "ours"
+    network: Network, corpus: Corpus, hands: Hands, trained: Mapping[str, Any], preset: Preset
 ) -> tuple[nn.Module, Any]:
     """The network with the delivered settings but for its budget, and without dropout, which is against knowing."""
     plan = Plan.of(network, replace(DELIVERED, preset=preset).of(network.name))
-    config = replace(plan.network, dropout=0.0) if hasattr(plan.network, "dropout") else plan.network
-    steps, size, rate = STEPS[network.name]
-    trained = {name: SimpleNamespace(network=own) for name, own in before.items()}
+    dropouts = {name: 0.0 for name in ("dropout", "encoder_dropout") if hasattr(plan.network, name)}
     torch.manual_seed(0)
     loss = replace(plan.loss, points=1024) if network.name == "contact" else plan.loss
-    setup = Setup(config, loss, 0, corpus, hands, torch.device("cpu"), trained)
+    setup = Setup(replace(plan.network, **dropouts), loss, 0, corpus, hands, torch.device("cpu"), dict(trained))
     objective, normaliser = network.objective(setup)
-    budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 20, "validate_every": steps}
-    training = replace(plan.training, **budget, ema_decay=0.98, weight_decay=0.0, keep_best=False)
+    training = by_heart(plan.training, network.name, preset)
     return fit(objective, corpus, training, 0, torch.device("cpu"))[0], normaliser
+
+
+def by_heart(training: TrainingConfig, network: str, preset: Preset) -> TrainingConfig:
+    """The settings of a training with the budget to know two clips."""
+    steps, size, rate = BUDGETS[network, preset]
+    budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 100, "validate_every": steps}
+    return replace(
+        training, **budget, schedule="cosine", adam_beta2=0.95, ema_decay=0.98, weight_decay=0.0, keep_best=False
+    )
 
 
 @pytest.mark.long
 def test_contact_and_length_of_two_clips_are_known_by_heart(learnt: Learnt) -> None:
-    assert_are_known(learnt.networks, learnt.clips)
-
-
-@pytest.mark.long
-def test_the_papers_contact_and_length_networks_know_two_clips_by_heart(two: tuple[Corpus, Hands]) -> None:
-    own = {name: learn(load_network(name), *two, {}, "paper")[0] for name in ("contact", "length")}
-    assert_are_known(own, list(two[0].train))
-
-
-def assert_are_known(networks: Mapping[str, nn.Module], clips: list[ClipSample]) -> None:
-    """Contact maps and lengths are those of the clips, and exchanged sentences exchange the lengths."""
+    networks, clips = learnt.networks, learnt.clips
     batch, maps = collate(clips), true_maps(clips)
     found = contact_probabilities(networks["contact"], clips, 16, 0)  # pyright: ignore[reportArgumentType]
     threshold = best_threshold(found, maps)
@@ -145,9 +164,9 @@ class Planted(MotionGenerator):
 
 
 def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
-    """Hands (B, 2, F, 99) with wrists moved 10 mm in a direction that turns slowly."""
+    """Hands (B, 2, F, 99) with wrists moved 10 mm in a direction that turns to another one within 64 frames."""
     first, last = torch.randn(2, *hands.shape[:2], 1, 3, generator=generator)
-    share = torch.linspace(0, 1, hands.shape[2])[:, None]
+    share = torch.arange(hands.shape[2])[:, None] / 64
     away = torch.nn.functional.normalize(first + (last - first) * share, dim=-1)
     return torch.cat((hands[..., :3] + 0.01 * away, hands[..., 3:]), -1)
 
@@ -155,7 +174,10 @@ def planted(hands: Tensor, generator: torch.Generator) -> Tensor:
 @pytest.mark.long
 def test_the_refiner_takes_four_fifths_of_planted_noise_away(learnt: Learnt) -> None:
     network, clips = load_network("refiner"), learnt.clips
-    plan = Plan.of(network, DELIVERED.of("refiner"))
+    plan = Plan.of(network, replace(DELIVERED, preset=learnt.preset).of("refiner"))
+    if learnt.preset == "released":
+        # Its residual of hands in metres takes nothing away in this time (docs/decisions/text2hoi-presets.md).
+        plan = replace(plan, network=replace(plan.network, output="hands"))
     # Eq. 9 alone: touch and depth pull at fingers as well, and would be right with the wrist anywhere.
     loss = replace(plan.loss, samples=1, penetration_weight=0.0, contact_weight=0.0, field_resolution=24)
     generator = Planted(learnt.generator.network, learnt.generator.normaliser)
@@ -164,10 +186,11 @@ def test_the_refiner_takes_four_fifths_of_planted_noise_away(learnt: Learnt) -> 
     given = loss, learnt.corpus, generator, surface, torch.device("cpu"), 0
     objective = RefinerObjective(RefinerModel(plan.network), *given)
     draws = torch.Generator().manual_seed(1)
-    pools = [objective._make(clips, "once", draws) for _ in range(1000)]  # with 60 it learns their noise by heart
-    objective.pool = {clip.clip_id: [pool[row] for pool in pools] for row, clip in enumerate(clips)}
-    objective.weights = replace(loss, samples=len(pools))
-    training = replace(plan.training, steps=2400, batch=2, validate_every=2400, keep_best=False, learning_rate=2e-3)
+    # With 60 draws it learns their noise by heart.
+    made = [motion for _ in range(64) for motion in objective._make(clips * 16, "once", draws)]
+    objective.pool = {clip.clip_id: made[row :: len(clips)] for row, clip in enumerate(clips)}
+    objective.weights = replace(loss, samples=len(made) // len(clips))
+    training = by_heart(plan.training, "refiner", learnt.preset)
     refiner, _ = fit(objective, learnt.corpus, training, 0, torch.device("cpu"))
     assert isinstance(refiner, RefinerModel)
     batch, fresh = collate(clips), torch.Generator().manual_seed(2)
