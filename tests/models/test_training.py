@@ -308,7 +308,7 @@ class Flattening(Downhill):
 
 @pytest.mark.parametrize("beta2", [0.999, 0.8])
 def test_first_gradients_are_forgotten_as_beta2_says(annotated: AnnotatedStore, beta2: float) -> None:
-    """A step goes down by 0.1 x the mean of the gradients / the root of their mean square, recent ones counting more."""
+    """A step goes 0.1 x the mean of gradients / the root of their mean square, recent ones counting more."""
     config = TrainingConfig(10, 2, 0.1, weight_decay=0.0, adam_beta2=beta2, validate_every=10)
     kept, _ = fit(Flattening(), Corpus.of(annotated, 0), config, 0, torch.device("cpu"))
     slopes, expected = np.array([1.0] + [0.01] * 9), 2.0
