@@ -4,6 +4,7 @@ Each capsule is fitted to the skin it stands for in the rest shape and then move
 corpora search grasps with 21 other capsules (``synthetic.hand_capsules``), tuned for speed and kept as they are.
 """
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -54,12 +55,27 @@ def fit_capsules(model: HandModel, betas: np.ndarray, template_m: np.ndarray | N
 
 def hand_capsules(track: HandTrackLike, model: HandModel) -> Capsules:
     """World capsules (frame, 19) of a recorded hand; its shape is that of the first frame."""
-    local = fit_capsules(model, np.asarray(track.betas, dtype=np.float64)[0], track.template_m)
+    template_m = None if track.template_m is None else _float64_bytes(track.template_m)
+    local = _capsules_of(model, _float64_bytes(track.betas[0]), template_m)
     positions = track_joints(track, model)[:, local.joint].astype(np.float64)
     rotmats = world_rotmats(track)[:, local.joint]
     start = positions + np.einsum("fcij,cj->fci", rotmats, local.start_m)
     end = positions + np.einsum("fcij,cj->fci", rotmats, local.end_m)
     return Capsules(start, end, local.radius_m)
+
+
+@lru_cache(maxsize=64)
+def _capsules_of(model: HandModel, betas: bytes, template_m: bytes | None) -> LocalCapsules:
+    """``fit_capsules`` of a shape, fitted once: a hand is asked about again and again while it is corrected."""
+    template = None if template_m is None else np.frombuffer(template_m).reshape(-1, 3)
+    fitted = fit_capsules(model, np.frombuffer(betas), template)
+    for array in fitted:
+        array.flags.writeable = False
+    return fitted
+
+
+def _float64_bytes(array: np.ndarray) -> bytes:
+    return np.asarray(array, dtype=np.float64).tobytes()
 
 
 def world_rotmats(track: HandTrackLike) -> np.ndarray:

@@ -13,6 +13,52 @@ _PARENT = np.array((-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14))
 
 
 @njit(cache=True)
+def place_joints(turns, bone, rotation, position):  # pragma: no cover (compiled)
+    """Set ``rotation (frame, 16, 3, 3)`` and ``position (frame, 16, 3)`` of all joints after the wrist, which are set.
+
+    turns: (frame, 15, 3, 3) local rotations. bone: (15, 3) from each joint's parent to it, at rest.
+    """
+    for f in range(len(turns)):
+        for j in range(1, 16):
+            p = _PARENT[j]
+            for a in range(3):
+                position[f, j, a] = position[f, p, a]
+                for b in range(3):
+                    position[f, j, a] += rotation[f, p, a, b] * bone[j - 1, b]
+                for c in range(3):
+                    total = 0.0
+                    for b in range(3):
+                        total += rotation[f, p, a, b] * turns[f, j - 1, b, c]
+                    rotation[f, j, a, c] = total
+
+
+@njit(cache=True)
+def skin_vertices(weight, rest_joint, rotation, position, rested, out):  # pragma: no cover (compiled)
+    """Set ``out (frame, vertex, 3)`` to where joints put vertices ``rested (frame, vertex, 3)``.
+
+    weight: (vertex, 16). rest_joint: (16, 3). rotation, position: of the joints, (frame, 16, 3, 3) and (frame, 16, 3).
+    """
+    shift = np.empty((16, 3))
+    for f in range(len(rested)):
+        for j in range(16):
+            for a in range(3):
+                shift[j, a] = position[f, j, a]
+                for b in range(3):
+                    shift[j, a] -= rotation[f, j, a, b] * rest_joint[j, b]
+        for v in range(len(weight)):
+            x, y, z = rested[f, v, 0], rested[f, v, 1], rested[f, v, 2]
+            to_x, to_y, to_z = 0.0, 0.0, 0.0
+            for j in range(16):
+                w = weight[v, j]
+                if w != 0.0:
+                    turn = rotation[f, j]
+                    to_x += w * (turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z + shift[j, 0])
+                    to_y += w * (turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z + shift[j, 1])
+                    to_z += w * (turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z + shift[j, 2])
+            out[f, v, 0], out[f, v, 1], out[f, v, 2] = to_x, to_y, to_z
+
+
+@njit(cache=True)
 def vertex_derivatives(frame, vertex, skin, chain, out):  # pragma: no cover (compiled)
     """Set ``out (pair, 3, 51)`` to the derivatives of the vertices ``vertex (pair,)`` in the frames ``frame (pair,)``.
 

@@ -10,7 +10,7 @@ from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import N_ROTATIONS, PARENTS, HandModel
 from hoidata.hands.solver import left_jacobian
-from hoidata.refinement.kernels import N_UNKNOWNS, vertex_derivatives
+from hoidata.refinement.kernels import N_UNKNOWNS, place_joints, skin_vertices, vertex_derivatives
 
 
 class HandPose(NamedTuple):
@@ -102,10 +102,7 @@ class Skin:
         n_frames, turns = len(pose.wrist_m), rotvec_to_rotmat(pose.fingers)
         rotation, position = np.empty((n_frames, N_ROTATIONS, 3, 3)), np.empty((n_frames, N_ROTATIONS, 3))
         rotation[:, 0], position[:, 0] = pose.orient, pose.wrist_m
-        bones = self.rest_joints_m[1:] - self.rest_joints_m[list(PARENTS[1:])]
-        for joint, parent in enumerate(PARENTS[1:], 1):
-            position[:, joint] = position[:, parent] + rotation[:, parent] @ bones[joint - 1]
-            rotation[:, joint] = rotation[:, parent] @ turns[:, joint - 1]
+        place_joints(turns, self.rest_joints_m[1:] - self.rest_joints_m[list(PARENTS[1:])], rotation, position)
         bends = (turns - np.eye(3)).reshape(n_frames, 135)
         flat = self.pose_directions.reshape(-1, self.pose_directions.shape[-1])
         rested = self.shaped_m + (bends @ flat.T).reshape(n_frames, len(self.shaped_m), 3)
@@ -120,10 +117,9 @@ class Skin:
 
     def vertices_m(self, chain: Chain) -> np.ndarray:
         """(frame, vertex, 3) world."""
-        shift = chain.position_m - (chain.rotation @ self.rest_joints_m[..., None])[..., 0]
-        moves = np.concatenate((chain.rotation, shift[..., None]), -1).reshape(len(shift), N_ROTATIONS, 12)
-        blended = (self.weights @ moves).reshape(len(shift), len(self.shaped_m), 3, 4)
-        return (blended[..., :3] @ chain.rested_m[..., None])[..., 0] + blended[..., 3]
+        out = np.empty(chain.rested_m.shape)
+        skin_vertices(self.weights, self.rest_joints_m, chain.rotation, chain.position_m, chain.rested_m, out)
+        return out
 
     def nearest_of_segments(self, distance_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(frame, 16) of each joint's skin the vertex with the least of distances (frame, vertex), and its distance."""

@@ -96,16 +96,30 @@ class AnchoredContact(nn.Module):
         return touch, self.logits(cloud, anchors, there[..., None].expand_as(known))[1]
 
     @torch.no_grad()
-    def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2, A), even draws from 0 to 1."""
+    def sample(
+        self,
+        points_m: Tensor,
+        text: Tensor,
+        active_hands: Tensor,
+        latents: Tensor,
+        acting: tuple[bool, bool] = (True, True),
+    ) -> Tensor:
+        """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2, A), even draws from 0 to 1.
+
+        acting: whether each hand acts in any clip of the batch; one that does not costs nothing.
+        """
         cloud, maps = self.see(points_m, text, active_hands), []
+        sides = [side for side in range(N_SIDES) if acting[side]]
         some = cloud[0][:, ::ANCHOR_STRIDE], cloud[1][:, ::ANCHOR_STRIDE], cloud[2]
         clips = torch.arange(len(points_m), device=points_m.device)
+        nothing = latents.new_zeros(latents.shape[1:], dtype=torch.bool)
+        nowhere = points_m.new_zeros(*nothing.shape, 3)
+        first = self.logits(some, nowhere, nothing)[0]  # the same for every draw
         for draw in latents:
-            anchors = points_m.new_zeros(*draw.shape, 3)
-            known = torch.zeros_like(draw, dtype=torch.bool)
-            for side, number in product(range(N_SIDES), range(self.config.anchors)):
-                touch = self.logits(some, anchors, known)[0][:, side].softmax(-1)
+            anchors, known = nowhere.clone(), nothing.clone()
+            for turn, (side, number) in enumerate(product(sides, range(self.config.anchors))):
+                touches = self.logits(some, anchors, known)[0] if turn else first
+                touch = touches[:, side].softmax(-1)
                 anchors[:, side, number] = some[0][clips, picked(touch, draw[:, side, number, None])[:, 0]]
                 known[:, side, number] = active_hands[:, side]
             maps.append(self.logits(cloud, anchors, known)[1].sigmoid() * active_hands[..., None])

@@ -66,8 +66,19 @@ class ContactModel(nn.Module):
         return self.decode(points_m, text, latent), mean, log_variance
 
     @torch.no_grad()
-    def sample(self, points_m: Tensor, text: Tensor, active_hands: Tensor, latents: Tensor) -> Tensor:
-        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I)."""
+    def sample(
+        self,
+        points_m: Tensor,
+        text: Tensor,
+        active_hands: Tensor,
+        latents: Tensor,
+        acting: tuple[bool, bool] = (True, True),
+    ) -> Tensor:
+        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I).
+
+        acting: one map stands for both hands, so that it saves nothing here.
+        """
+        del acting
         maps = torch.stack([self.decode(points_m, text, z).sigmoid() for z in latents], 1)
         return maps[:, :, None] * active_hands[:, None, :, None]
 

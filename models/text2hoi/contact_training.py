@@ -73,7 +73,7 @@ def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, late
     """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
-    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device))
+    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device), batch.sides)
     limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
     return ((probability >= limit) & batch.active_hands[:, None, :, None]).float()
 

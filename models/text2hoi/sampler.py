@@ -6,6 +6,7 @@ Everything a motion is drawn from comes from its request's seed, so it is the sa
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from hashlib import sha256
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,7 +36,7 @@ from models.text2hoi.surface import Surface
 from models.text2hoi.thresholds import ContactNetwork
 from models.text2hoi.verb_check import VerbCheck
 
-AT_ONCE = 256
+AT_ONCE = 64  # requests of the same hands and of like length: what is cut off for all is not computed
 ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
 
 
@@ -208,14 +209,15 @@ class Text2Hoi:
 
         contact_maps: (2, N) by hand, or (N,) for either, 0 or 1, per request: in the place of what would be drawn.
         """
-        made: list[Text2HoiMotion] = []
         models = {request.object.name: request.object for request in requests}.values()
         seen = refined and self.refined_by == "network"
         surface = Surface.of(self.hands, models, self.config.field_resolution, self.device) if seen else None
-        for start in range(0, len(requests), AT_ONCE):
-            part = slice(start, start + AT_ONCE)
-            made += self._batch_motions(requests[part], surface, None if contact_maps is None else contact_maps[part])
-        return made
+        made: dict[int, Text2HoiMotion] = {}
+        for numbers in alike(requests):
+            given = None if contact_maps is None else [contact_maps[number] for number in numbers]
+            found = self._batch_motions([requests[number] for number in numbers], surface, given)
+            made.update(zip(numbers, found, strict=True))
+        return [made[number] for number in range(len(requests))]
 
     @torch.no_grad()
     def contact_maps(self, requests: Sequence[Request]) -> list[Tensor]:
@@ -265,6 +267,14 @@ class Text2Hoi:
         count = self.config.contact_draws if isinstance(network, AnchoredContact) else 1
         latents = torch.cat([network.draw_latents(count, 1, generator) for generator in generators], 1)
         return most_typical(touched_maps(self.trained["contact"], batch, batch.text, latents))
+
+
+def alike(requests: Sequence[Request]) -> list[list[int]]:
+    """Numbers of the requests in batches: of the same hands, and of like length."""
+    keys = [(tuple(request.active_hands.tolist()), request.n_frames) for request in requests]
+    ordered = sorted(range(len(requests)), key=keys.__getitem__)
+    same = [list(numbers) for _, numbers in groupby(ordered, key=lambda number: keys[number][0])]
+    return [own[start : start + AT_ONCE] for own in same for start in range(0, len(own), AT_ONCE)]
 
 
 def _next_seed(seed: int, draw: int) -> int:

@@ -83,6 +83,17 @@ def test_a_clips_maps_do_not_depend_on_the_others_in_the_batch(batch: ClipBatch)
     torch.testing.assert_close(many[1:2], one, atol=1e-5, rtol=1e-4)
 
 
+def test_a_hand_known_to_act_in_no_clip_is_not_drawn_and_changes_nothing(batch: ClipBatch) -> None:
+    model, right = network().eval(), torch.tensor([[False, True]] * 3)
+    latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
+    given = batch.points_m, batch.text[:, 0], right, latents
+    asked = list[int]()
+    model.from_point.register_forward_hook(lambda *_: asked.append(1))
+    whole, after = model.sample(*given), len(asked)
+    torch.testing.assert_close(model.sample(*given, acting=(False, True)), whole)
+    assert len(asked) - after < after
+
+
 def test_the_most_typical_map_agrees_best_with_all_others() -> None:
     generator = torch.Generator().manual_seed(3)
     maps = (torch.rand(20, 7, 2, 40, generator=generator) < torch.rand(20, 7, 1, 1, generator=generator)).float()

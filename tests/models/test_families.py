@@ -25,7 +25,7 @@ from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
 from models.text2hoi.family import other_prompts
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
-from models.text2hoi.sampler import Text2Hoi, Text2HoiMotion
+from models.text2hoi.sampler import AT_ONCE, Text2Hoi, Text2HoiMotion, alike
 from models.text2hoi.thresholds import best_threshold, mean_f1
 from models.text2hoi.verb_check import VerbCheck
 from tests.models.toy import FAST
@@ -224,6 +224,21 @@ def test_a_hold_takes_the_refiners_place_where_told_or_where_hands_are_given_in_
     in_object = MotionCode(MotionCodeConfig(4, hand_frame="object"))
     monkeypatch.setattr(usual.trained["diffusion"].network, "code", in_object)
     assert usual.refined_by == "hold"
+
+
+def test_requests_share_a_batch_with_those_of_the_same_hands_and_of_like_length(sources: Sources) -> None:
+    (request,) = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))
+    flags, draws = ((True, False), (False, True), (True, True)), np.random.default_rng(0)
+    asked = [
+        replace(request, active_hands=np.array(flags[draws.integers(3)]), n_frames=int(draws.integers(8, 151)))
+        for _ in range(4 * AT_ONCE)
+    ]
+    batches = alike(asked)
+    assert sorted(number for own in batches for number in own) == list(range(len(asked)))
+    assert all(len(own) <= AT_ONCE and len({tuple(asked[n].active_hands) for n in own}) == 1 for own in batches)
+    lengths = [[asked[number].n_frames for number in own] for own in batches]
+    assert all(own == sorted(own) for own in lengths)
+    assert len(batches) <= 4 + len(flags)
 
 
 @pytest.mark.parametrize(

@@ -172,6 +172,17 @@ def test_both_sides_have_the_same_radii():
     np.testing.assert_allclose(left, right, atol=2e-4)
 
 
+def test_every_shape_and_personal_mesh_has_capsules_of_its_own_whatever_came_before():
+    model, track = load_embedded_hands().right, random_hand(2, seed=2)
+    wide = (model.template_m * 1.2).astype(np.float32)
+    shapes = [(track.betas, None), (track.betas + 1, None), (track.betas, wide), (track.betas, None)]
+    for betas, template_m in shapes:
+        found = hand_capsules(replace(track, betas=betas, template_m=template_m), model)
+        np.testing.assert_array_equal(found.radius_m, fit_capsules(model, betas[0], template_m).radius_m)
+    with pytest.raises(ValueError, match="read-only"):
+        found.radius_m[0] = 1
+
+
 def _signed_gaps(points: np.ndarray, capsules: Capsules) -> np.ndarray:
     """(frame, point) signed distance to the union of capsules, by the formula of a segment."""
     axis = (capsules.end_m - capsules.start_m)[:, None]
