@@ -96,20 +96,13 @@ class AnchoredContact(nn.Module):
         return touch, self.logits(cloud, anchors, there[..., None].expand_as(known))[1]
 
     @torch.no_grad()
-    def sample(
-        self,
-        points_m: Tensor,
-        text: Tensor,
-        active_hands: Tensor,
-        latents: Tensor,
-        acting: tuple[bool, bool] = (True, True),
-    ) -> Tensor:
-        """Contact probabilities (B, count, 2, N) by hand for latents (count, B, 2, A), even draws from 0 to 1.
-
-        acting: whether each hand acts in any clip of the batch; one that does not costs nothing.
+    def sample(self, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
+        """Contact probabilities (B, count, 2, N) by hand for sentences (B, text) and latents (count, B, 2, A), even
+        draws from 0 to 1. A hand that acts in no clip of the batch costs nothing.
         """
+        points_m, active_hands = batch.points_m, batch.active_hands
         cloud, maps = self.see(points_m, text, active_hands), []
-        sides = [side for side in range(N_SIDES) if acting[side]]
+        sides = [side for side in range(N_SIDES) if batch.sides[side]]
         some = cloud[0][:, ::ANCHOR_STRIDE], cloud[1][:, ::ANCHOR_STRIDE], cloud[2]
         clips = torch.arange(len(points_m), device=points_m.device)
         nothing = latents.new_zeros(latents.shape[1:], dtype=torch.bool)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hoidata.batches.dataset import ClipBatch
+from hoidata.batches.requests import RequestBatch
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from models.common.point_net import PointLayer, PointNet, normalised_points
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
@@ -66,21 +67,10 @@ class ContactModel(nn.Module):
         return self.decode(points_m, text, latent), mean, log_variance
 
     @torch.no_grad()
-    def sample(
-        self,
-        points_m: Tensor,
-        text: Tensor,
-        active_hands: Tensor,
-        latents: Tensor,
-        acting: tuple[bool, bool] = (True, True),
-    ) -> Tensor:
-        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I).
-
-        acting: one map stands for both hands, so that it saves nothing here.
-        """
-        del acting
-        maps = torch.stack([self.decode(points_m, text, z).sigmoid() for z in latents], 1)
-        return maps[:, :, None] * active_hands[:, None, :, None]
+    def sample(self, batch: RequestBatch, text: Tensor, latents: Tensor) -> Tensor:
+        """Contact probabilities (B, count, 2, N), alike for hands that act; latents (count, B, latent) from N(0, I)."""
+        maps = torch.stack([self.decode(batch.points_m, text, z).sigmoid() for z in latents], 1)
+        return maps[:, :, None] * batch.active_hands[:, None, :, None]
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
         """(count, clip, latent) draws from N(0, I)."""

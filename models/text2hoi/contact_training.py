@@ -46,7 +46,7 @@ class ContactObjective:
         assert isinstance(network, ContactModel | AnchoredContact)
         held = self.held_out
         latents = network.draw_latents(4, len(held), torch.Generator().manual_seed(0)).to(self.device)
-        probability = network.sample(held.points_m, held.text[:, 0], held.active_hands, latents).amax(2).mean(1)
+        probability = network.sample(held, held.text[:, 0], latents).amax(2).mean(1)
         return nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map)
 
 
@@ -73,7 +73,7 @@ def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, late
     """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
-    probability = network.sample(batch.points_m, text, batch.active_hands, latents.to(text.device), batch.sides)
+    probability = network.sample(batch, text, latents.to(text.device))
     limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
     return ((probability >= limit) & batch.active_hands[:, None, :, None]).float()
 

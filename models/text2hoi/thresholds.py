@@ -35,7 +35,7 @@ def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], co
     """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
     batch = collate(samples)
     latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(seed))
-    return network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2).mean(1).numpy()
+    return network.sample(batch, batch.text[:, 0], latents).amax(2).mean(1).numpy()
 
 
 def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]) -> float:
@@ -48,6 +48,6 @@ def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], c
     """The threshold at which single samples touch as large a share of an object as held-out clips do."""
     batch = collate(held_out)
     latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(0))
-    found = network.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents).amax(2)
+    found = network.sample(batch, batch.text[:, 0], latents).amax(2)
     share = float(batch.contact.any(1).float().mean())
     return min(THRESHOLDS, key=lambda threshold: abs(float((found >= threshold).float().mean()) - share))

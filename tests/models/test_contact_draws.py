@@ -67,30 +67,31 @@ def test_draws_fall_in_proportion_to_their_weights() -> None:
 def test_a_hand_that_does_not_act_has_no_map_and_flags_change_the_maps(batch: ClipBatch) -> None:
     model = network().eval()
     latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
-    found = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents)
+    found = model.sample(batch, batch.text[:, 0], latents)
     assert found.shape == (3, 2, 2, batch.points_m.shape[1])
     idle = ~batch.active_hands[:, None].expand(-1, 2, -1)
     assert not found[idle].any()
-    other = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands.flip(1), latents)
+    other = model.sample(replace(batch, active_hands=batch.active_hands.flip(1)), batch.text[:, 0], latents)
     assert not torch.allclose(found.amax(2)[0], other.amax(2)[0])
 
 
 def test_a_clips_maps_do_not_depend_on_the_others_in_the_batch(batch: ClipBatch) -> None:
     model = network().eval()
     latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
-    many = model.sample(batch.points_m, batch.text[:, 0], batch.active_hands, latents)
-    one = model.sample(batch.points_m[1:2], batch.text[1:2, 0], batch.active_hands[1:2], latents[:, 1:2])
+    many = model.sample(batch, batch.text[:, 0], latents)
+    own = replace(batch, points_m=batch.points_m[1:2], active_hands=batch.active_hands[1:2])
+    one = model.sample(own, batch.text[1:2, 0], latents[:, 1:2])
     torch.testing.assert_close(many[1:2], one, atol=1e-5, rtol=1e-4)
 
 
 def test_a_hand_known_to_act_in_no_clip_is_not_drawn_and_changes_nothing(batch: ClipBatch) -> None:
     model, right = network().eval(), torch.tensor([[False, True]] * 3)
     latents = model.draw_latents(2, 3, torch.Generator().manual_seed(0))
-    given = batch.points_m, batch.text[:, 0], right, latents
+    given = replace(batch, active_hands=right, sides=(True, True)), batch.text[:, 0], latents
     asked = list[int]()
     model.from_point.register_forward_hook(lambda *_: asked.append(1))
     whole, after = model.sample(*given), len(asked)
-    torch.testing.assert_close(model.sample(*given, acting=(False, True)), whole)
+    torch.testing.assert_close(model.sample(replace(given[0], sides=(False, True)), *given[1:]), whole)
     assert len(asked) - after < after
 
 
@@ -137,7 +138,8 @@ def test_an_anchored_network_learns_two_regions_as_two_answers(batch: ClipBatch)
         ].backward()
         optimiser.step()
     latents = model.eval().draw_latents(16, 1, torch.Generator().manual_seed(1))
-    maps = model.sample(points[:1], text[:1], active_hands[:1], latents)[0, :, 1] > 0.5
+    one = replace(batch, points_m=points[:1], active_hands=active_hands[:1])
+    maps = model.sample(one, text[:1], latents)[0, :, 1] > 0.5
     kinds = [best_of(contact_map, contact[:2, 1] > 0) for contact_map in maps]
     assert {place for place, _ in kinds} == {0, 1}
     assert sum(f1 for _, f1 in kinds) / len(kinds) > 0.8
