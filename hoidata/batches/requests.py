@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.objects.model import ObjectModel
 
@@ -100,7 +101,9 @@ class RequestBatch:
     def to(self, device: torch.device | str) -> Self:
         """The batch with every tensor on ``device``."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return replace(self, **{name: value.to(device) for name, value in values.items() if isinstance(value, Tensor)})
+        return replace(
+            self, **{name: send(value, device) for name, value in values.items() if isinstance(value, Tensor)}
+        )
 
 
 def collate_requests(requests: Sequence[Request]) -> RequestBatch:

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hoidata.devices import send
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
@@ -111,7 +112,7 @@ class DistanceFields:
 
         rows (B,), points_m (B, F, P, 3) in the object frame, hinge_rad (B, F).
         """
-        rows = rows.to(points_m.device)
+        rows = send(rows, points_m.device)
         turn = rotvec_to_rotmat(self.axis[rows][:, None] * hinge_rad[..., None])
         origin = self.origin[rows][:, None, None]
         base = self._read(rows, 0, points_m)

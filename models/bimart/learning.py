@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch
+from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair
@@ -56,7 +57,7 @@ class Targets:
     mapped: Tensor
 
     def to(self, device: torch.device | str) -> "Targets":
-        return Targets(*(getattr(self, item.name).to(device) for item in fields(self)))
+        return Targets(*(send(getattr(self, item.name), device) for item in fields(self)))
 
 
 def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:
@@ -130,7 +131,7 @@ class Objective:
         clean, total = normalised(network, held), torch.zeros((), device=self.device)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(clean),), step, device=self.device)
-            noise = torch.randn(clean.shape, generator=generator).to(self.device)
+            noise = send(torch.randn(clean.shape, generator=generator), self.device)
             made = network(add_noise(clean, noise, steps, network.signal), steps, held.windows)
             total += masked_mean((made - clean).square(), held.known)
         return total / len(VALIDATION_STEPS) / network.config.signal_scale**2
@@ -153,10 +154,10 @@ def window_losses(network: Denoiser, target: Targets, loss: LossConfig, generato
     clean, device = normalised(network, target), target.clean.device
     batch, count = len(clean), network.config.diffusion_steps
     number = torch.randint(count, (batch,), generator=generator)
-    steps = ((number + 1) * (TRAIN_STEPS // count) - 1).to(device)
+    steps = send((number + 1) * (TRAIN_STEPS // count) - 1, device)
     drop = torch.rand(batch, generator=generator) < loss.contact_dropout
-    drop = (drop if loss.dropout_of == "window" else drop[:1].expand(batch)).to(device)
-    noise = torch.randn(clean.shape, generator=generator).to(device)
+    drop = send(drop if loss.dropout_of == "window" else drop[:1].expand(batch), device)
+    noise = send(torch.randn(clean.shape, generator=generator), device)
     made = network(add_noise(clean, noise, steps, network.signal), steps, target.windows, drop)
     wrong = (made - clean) / network.config.signal_scale
     size = wrong.square() if loss.error == "square" else wrong.abs()

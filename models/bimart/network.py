@@ -11,6 +11,7 @@ from typing import Literal, Self
 import torch
 from torch import Tensor, nn
 
+from hoidata.devices import send
 from models.bimart.scene import FeatureConfig
 from models.common.sampling import TRAIN_STEPS, alphas_cumprod
 from models.common.spline import projected
@@ -64,7 +65,7 @@ class Windows:
         return len(self.scale)
 
     def to(self, device: torch.device | str) -> Self:
-        found = {name: value.to(device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        found = {name: send(value, device) for name, value in vars(self).items() if isinstance(value, Tensor)}
         return replace(self, **found)
 
 

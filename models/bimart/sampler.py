@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import distance_map
@@ -171,7 +172,7 @@ class BimArt:
         frames, size = len(paths[0].scene), len(network.mean)
         layout = layout_of(frames, network.config.features.window, self.config.overlapping)
         known = network.prepare(self._windows(network, paths, layout, contact_m))
-        noise = torch.stack([torch.randn(frames, size, generator=own) for own in generators]).to(self.device)
+        noise = send(torch.stack([torch.randn(frames, size, generator=own) for own in generators]), self.device)
         if contact_m is None:
             denoise = _plain(network, known, layout)
         else:

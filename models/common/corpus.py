@@ -15,6 +15,7 @@ from torch import Tensor
 from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
 from hoidata.batches.mirror import Mirror
 from hoidata.batches.sight import Sight
+from hoidata.devices import send
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
@@ -161,4 +162,4 @@ def _split(items: list[Item], size: int) -> list[list[Item]]:
 def any_form(batch: ClipBatch, generator: torch.Generator) -> Tensor:
     """(B, 512) features of one of the four sentences of each clip, drawn evenly."""
     form = torch.randint(batch.text.shape[1], (len(batch),), generator=generator)
-    return batch.text[torch.arange(len(batch)), form.to(batch.text.device)]
+    return batch.text[torch.arange(len(batch), device=batch.text.device), send(form, batch.text.device)]

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
+from hoidata.devices import send
 from hoidata.errors import BadInput
 
 TRAIN_STEPS = 1000
@@ -168,8 +169,8 @@ def _half_log_ratio(share: float) -> float:
 
 def _drawn(x: Tensor, generator: torch.Generator | list[torch.Generator]) -> Tensor:
     if isinstance(generator, list):
-        return torch.stack([torch.randn(x.shape[1:], generator=own) for own in generator]).to(x)
-    return torch.randn(x.shape, generator=generator).to(x)
+        return send(torch.stack([torch.randn(x.shape[1:], generator=own) for own in generator]), x.device)
+    return send(torch.randn(x.shape, generator=generator), x.device)
 
 
 def _unflatten(x: Tensor, hands_shape: tuple[int, ...], object_shape: tuple[int, ...]) -> Motion:

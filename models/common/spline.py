@@ -10,6 +10,8 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from hoidata.devices import send
+
 # Keeps control points determined where few frames, or none, say what they are.
 STIFFNESS = 1e-6
 # How much more neighbours at rest are held together than each is held to its own place.
@@ -54,7 +56,7 @@ def stacked_bases(lengths: list[int], intervals: list[int], n_frames: int, devic
         own = spline_basis(length, count)
         bases[row, :length, : count + 3] = own
         bases[row, length:, : count + 3] = own[-1]
-    return bases.to(device)
+    return send(bases, device)
 
 
 def settled(points: Tensor, there: Tensor, reach: Tensor, rounds: int = 8) -> Tensor:
@@ -79,7 +81,7 @@ def projected(x: Tensor, lengths: list[int], knot_frames: int) -> Tensor:
     onto = torch.zeros(len(x), x.shape[-2], x.shape[-2])
     for row, (length, count) in enumerate(zip(lengths, counts, strict=True)):
         onto[row, :length, :length] = _projection(length, count)
-    return spline_values(x, onto.to(x.device))
+    return spline_values(x, send(onto, x.device))
 
 
 @lru_cache(maxsize=1024)

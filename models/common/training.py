@@ -156,7 +156,7 @@ def train_network(
         "facts": facts,
         "training": plain_config(plan.training),
         "loss": plain_config(plan.loss) if plan.loss else {},
-        "results": {"validation_loss": log[-1]["validation"], **network.results(kept.cpu(), corpus)},
+        "results": {"validation_loss": log[-1]["validation"], **network.results(kept, corpus)},
         "provenance": provenance(facts) if provenance else {},
     }
     if not team.writes:
@@ -277,7 +277,6 @@ def learning_rate_factor(step: int, config: TrainingConfig) -> float:
 @torch.no_grad()
 def _follow(kept: nn.Module, network: nn.Module, decay: float) -> None:
     """Running average of the weights; buffers (batch-norm statistics) are copied."""
-    for target, source in zip(kept.parameters(), network.parameters(), strict=True):
-        target.lerp_(source, 1 - decay)
+    torch._foreach_lerp_(list(kept.parameters()), list(network.parameters()), 1 - decay)  # one call on a GPU
     for target, source in zip(kept.buffers(), network.buffers(), strict=True):
         target.copy_(source)

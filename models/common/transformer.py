@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.attention import SDPBackend, sdpa_kernel
 
+from hoidata.devices import send
 from hoidata.errors import BadInput
 
 NARROW = 4  # times narrower than the tokens
@@ -152,7 +153,7 @@ AGENT_POSITIONS = (1, 1666, 3333)
 
 def agent_codes(width: int, device: torch.device) -> Tensor:
     """(3, width) agent-wise position codes: left hand, right hand, object."""
-    return sinusoid(torch.tensor(AGENT_POSITIONS).to(device), width)
+    return sinusoid(send(torch.tensor(AGENT_POSITIONS), device), width)
 
 
 def to_tokens(x: Tensor, frames_per_token: int) -> Tensor:

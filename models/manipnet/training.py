@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.clip import FPS, SIDES
+from hoidata.devices import send
 from hoidata.hands import HandPair
 from hoidata.objects.surface_index import surface_index
 from models.common.family import Losses, Network, Setup
@@ -92,7 +93,7 @@ class FingersObjective:
         drawn = [pair for sample in batch.samples for pair in self._drawn(sample, generator)]
         if not drawn:  # clips in which no hand is seen twice in a row
             return {"total": self.network.decoder.bias.sum() * 0}
-        inputs, made = (torch.from_numpy(np.stack(rows)).to(self.device) for rows in zip(*drawn, strict=True))
+        inputs, made = (send(torch.from_numpy(np.stack(rows)), self.device) for rows in zip(*drawn, strict=True))
         return {"total": step_loss(self.network, inputs, made)}
 
     def _drawn(self, sample: ClipSample, generator: torch.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -113,7 +114,7 @@ class FingersObjective:
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ManipNet)
-        inputs, made = (torch.from_numpy(rows).to(self.device) for rows in self.held_out)
+        inputs, made = (send(torch.from_numpy(rows), self.device) for rows in self.held_out)
         return step_loss(network, inputs, made)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hoidata.batches.requests import RequestBatch
+from hoidata.devices import send
 from models.common.features import scaled_text
 from models.common.point_net import PointNet, normalised_points
 from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
@@ -81,9 +82,9 @@ class AnchoredContact(nn.Module):
         """
         cloud, count, device = self.see(points_m, text, batch.active_hands), self.config.anchors, contact.device
         there = contact.any(-1) & batch.active_hands
-        rows = picked(contact, torch.rand(len(contact), N_SIDES, count, generator=generator).to(device))
+        rows = picked(contact, send(torch.rand(len(contact), N_SIDES, count, generator=generator), device))
         anchors = cloud[0][:, None].expand(-1, N_SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
-        draws = torch.rand(len(contact), 2, generator=generator).to(device)
+        draws = send(torch.rand(len(contact), 2, generator=generator), device)
         right = there[:, 1] & (~there[:, 0] | (draws[:, 0] < 0.5))
         next_one = (draws[:, 1] * count).long()
         some = torch.arange(count, device=device) < next_one[:, None]

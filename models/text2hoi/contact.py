@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.batches.requests import RequestBatch
+from hoidata.devices import send
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from models.common.point_net import PointLayer, PointNet, normalised_points
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
@@ -95,6 +96,6 @@ def turned_and_scaled(batch: ClipBatch, generator: torch.Generator) -> Tensor:
     Augmentation of Text2HOI's released training.
     """
     device = batch.points_m.device
-    drawn = torch.rand(len(batch), 4, generator=generator).to(device)
+    drawn = send(torch.rand(len(batch), 4, generator=generator), device)
     turn = rotvec_to_rotmat((drawn[:, :3] * 2 - 1) * torch.pi / 12)
     return batch.points_m @ turn.transpose(1, 2) * (0.8 + 0.4 * drawn[:, 3])[:, None, None]

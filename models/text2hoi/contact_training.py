@@ -7,6 +7,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
 from hoidata.batches.requests import RequestBatch
+from hoidata.devices import send
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
@@ -29,7 +30,7 @@ class ContactObjective:
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
-        some = torch.randperm(points.shape[1], generator=generator)[: self.weights.points].to(self.device)
+        some = send(torch.randperm(points.shape[1], generator=generator)[: self.weights.points], self.device)
         points, text, network = points[:, some], any_form(batch, generator), self.network
         if isinstance(network, AnchoredContact):
             contact = batch.contact[..., some].float()
@@ -37,7 +38,7 @@ class ContactObjective:
             return by_hand_loss(touch, logits, contact, batch.active_hands, self.weights)
         assert isinstance(network, ContactModel)
         contact_map = batch.contact_map[:, some]
-        noise = torch.randn(len(batch), network.config.latent, generator=generator).to(self.device)
+        noise = send(torch.randn(len(batch), network.config.latent, generator=generator), self.device)
         logits, mean, log_variance = network(points, text, contact_map, noise)
         return contact_loss(logits, contact_map, mean, log_variance, self.weights)
 
@@ -45,7 +46,7 @@ class ContactObjective:
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ContactModel | AnchoredContact)
         held = self.held_out
-        latents = network.draw_latents(4, len(held), torch.Generator().manual_seed(0)).to(self.device)
+        latents = send(network.draw_latents(4, len(held), torch.Generator().manual_seed(0)), self.device)
         probability = network.sample(held, held.text[:, 0], latents).amax(2).mean(1)
         return nn.functional.binary_cross_entropy(probability.clamp(1e-4, 1 - 1e-4), held.contact_map)
 
@@ -73,7 +74,7 @@ def touched_maps(checkpoint: Checkpoint, batch: RequestBatch, text: Tensor, late
     """
     network = checkpoint.network
     assert isinstance(network, ContactNetwork)
-    probability = network.sample(batch, text, latents.to(text.device))
+    probability = network.sample(batch, text, send(latents, text.device))
     limit = probability.amax(-1, keepdim=True).clamp_max(draw_threshold(checkpoint))
     return ((probability >= limit) & batch.active_hands[:, None, :, None]).float()
 

@@ -35,7 +35,7 @@ def contact_figures(
     sources: Sources, train: list[ClipSample], held_out: list[ClipSample], test: list[ClipSample]
 ) -> dict[str, float]:
     """F1 of the mean of samples at the checkpoint's threshold, beside mean maps at thresholds chosen alike."""
-    checkpoint = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT)
+    checkpoint = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
     assert isinstance(checkpoint.network, ContactNetwork)
     threshold = contact_threshold(checkpoint)
     f1 = mean_f1(contact_probabilities(checkpoint.network, test, CONTACT_SAMPLES, 0), true_maps(test), threshold)

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES, OBJECT_POSITION, WRIST
+from hoidata.devices import send
 from hoidata.errors import BadInput
 from models.common.features import Normaliser, proper_hands, proper_object
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
@@ -358,7 +359,7 @@ class MotionGenerator:
         """
         denoise = guided(self.network, condition, sampler.guidance)
         device = condition.text.device
-        coded = sample_motion(denoise, (noise[0].to(device), noise[1].to(device)), sampler, generator)
+        coded = sample_motion(denoise, (send(noise[0], device), send(noise[1], device)), sampler, generator)
         hands, objects = self._features(coded, condition)
         shift = objects[:, :1, OBJECT_POSITION].clone()
         hands[..., WRIST] -= shift[:, None]

@@ -20,6 +20,7 @@ from hoidata.clips.features import (
     OBJECT_ROTATION_6D,
     WRIST,
 )
+from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat
 from models.common import losses
 from models.common.checkpoints import Checkpoint
@@ -108,7 +109,7 @@ class Targets:
 
     def _padded(self, rows: Sequence[Tensor], axis: int) -> Tensor:
         if not axis:
-            return pad_sequence(list(rows), batch_first=True).to(self.device)
+            return send(pad_sequence(list(rows), batch_first=True), self.device)
         return self._padded([row.transpose(0, axis) for row in rows], 0).transpose(1, axis + 1)
 
 
@@ -138,12 +139,12 @@ class DiffusionObjective:
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         weights, target = self.weights, self.targets.of(batch)
-        steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=generator).to(self.device)
+        steps = send(torch.randint(TRAIN_STEPS, (len(batch),), generator=generator), self.device)
         keep = self.kept(len(batch), generator)
         text = any_form(batch, generator)
         contact = self._shown(batch, text, generator)
         if weights.thin_contact:
-            contact = contact.bool() & thinned(contact.shape, generator).to(self.device)
+            contact = contact.bool() & send(thinned(contact.shape, generator), self.device)
         predicted = self._denoised(self.network, batch, target, text, contact, steps, generator, keep.float())
         found = {"simple": self._simple(predicted, target)}
         factors = {"simple": 1.0, "velocity": weights.velocity_weight, "joints": weights.joint_weight}
@@ -192,10 +193,10 @@ class DiffusionObjective:
         keep: Tensor | None,
     ) -> Motion:
         clean = target.hands, target.object
-        noise = [torch.randn(part.shape, generator=generator).to(self.device) for part in clean]
+        noise = [send(torch.randn(part.shape, generator=generator), self.device) for part in clean]
         noised = [add_noise(part, add, steps, self.signal) for part, add in zip(clean, noise, strict=True)]
         condition = Condition.of(batch, self._object_features(network, batch), text, contact)
-        return network(noised[0], noised[1], steps, condition, None if keep is None else keep.to(self.device))
+        return network(noised[0], noised[1], steps, condition, None if keep is None else send(keep, self.device))
 
     def _object_features(self, network: DiffusionModel, batch: ClipBatch) -> Tensor:
         """F_obj of every clip; computed once per object, since the point network is frozen."""

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import MAX_FRAMES
+from hoidata.devices import send
 from models.text2hoi.verb_reading import VerbReading
 
 SHORTEST_FRAMES = 8
@@ -112,4 +113,4 @@ def length_loss(mean: Tensor, log_spread: Tensor, frames: Tensor) -> dict[str, T
 def jittered_frames(lengths: Tensor, share: float, generator: torch.Generator) -> Tensor:
     """Lengths times a factor drawn from 1 - ``share`` to 1 + ``share``."""
     factor = 1 + share * (2 * torch.rand(len(lengths), generator=generator) - 1)
-    return lengths * factor.to(lengths.device)
+    return lengths * send(factor, lengths.device)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.devices import send
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.text2hoi.length import (
@@ -30,7 +31,7 @@ class LengthObjective:
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         frames = jittered_frames(batch.lengths, self.loss.jitter, generator)
-        noise = self.network.draw(len(batch), generator).to(self.device)
+        noise = send(self.network.draw(len(batch), generator), self.device)
         mean, log_spread = self.network.moments(any_form(batch, generator), batch.active_hands, noise)
         spread = self.network.config.drawn_by == "spread"
         return length_loss(mean, log_spread, frames) if spread else length_error(mean, frames)

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
 from hoidata.clips.features import HAND_POSE_6D, OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION
+from hoidata.devices import send
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from models.common.features import (
     OBJECT_START_6D,
@@ -93,7 +94,7 @@ class MotionCode:
     def rows(self, counts: Sequence[int], device: torch.device) -> tuple[Tensor, Tensor]:
         """(B, K) and (B, L) bool: the rows that motions of so many frames have."""
         sizes = np.array([self.sizes(n) for n in counts])
-        hand, thing = (torch.from_numpy(np.arange(own.max()) < own[:, None]).to(device) for own in sizes.T)
+        hand, thing = (send(torch.from_numpy(np.arange(own.max()) < own[:, None]), device) for own in sizes.T)
         return hand, thing
 
     def encode(self, sample: ClipSample) -> CodedClip:

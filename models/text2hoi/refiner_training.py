@@ -10,6 +10,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.batches.sight import Sight
+from hoidata.devices import send
 from models.common import losses
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup
@@ -126,8 +127,8 @@ class RefinerObjective:
         """What a refiner that is a diffusion model learns to bring back to ``target`` (eq. 1)."""
         if not network.config.noise_steps:
             return None
-        steps = torch.randint(network.config.noise_steps, (len(target),), generator=generator).to(self.device)
-        noise = torch.randn(target.shape, generator=generator).to(self.device)
+        steps = send(torch.randint(network.config.noise_steps, (len(target),), generator=generator), self.device)
+        noise = send(torch.randn(target.shape, generator=generator), self.device)
         return NoisedHands(add_noise(target, noise, steps, alphas_cumprod(self.device)), steps)
 
     def _losses(self, network: RefinerModel, seen: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
@@ -195,10 +196,10 @@ class RefinerObjective:
         for sample in batch.samples:
             alike = self.alike.get((sample.object_key, sample.hand_type)) or [sample.contact]
             chosen.append(torch.from_numpy(alike[int(torch.randint(len(alike), (), generator=draws))]))
-        return torch.stack(chosen).to(self.device)
+        return send(torch.stack(chosen), self.device)
 
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
-        form = torch.randint(batch.text.shape[1], (len(batch),), generator=draws).to(self.device)
+        form = send(torch.randint(batch.text.shape[1], (len(batch),), generator=draws), self.device)
         text = batch.text[torch.arange(len(batch), device=form.device), form]
         network = self.generator.network
         condition = Condition.of(batch, network.object_feature(batch.points_m), text, batch.contact)
@@ -209,7 +210,7 @@ class RefinerObjective:
             sampler = SamplerConfig(steps=self.weights.sampler_steps)
             noise = draw_motion(rows.hands.shape, rows.object.shape, draws)
             return self.generator.sample(condition, sampler, noise, draws)
-        steps = torch.randint(TRAIN_STEPS, (len(batch),), generator=draws).to(self.device)
+        steps = send(torch.randint(TRAIN_STEPS, (len(batch),), generator=draws), self.device)
         return self.generator.denoise_once(rows.hands, rows.object, steps, condition, draws)
 
 

@@ -2,9 +2,11 @@
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from hoidata.batches.dataset import ClipSample, collate
+from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.contact.agreement import f1_score
+from hoidata.devices import send
 from models.text2hoi.anchored_contact import AnchoredContact
 from models.text2hoi.contact import ContactModel
 
@@ -33,9 +35,8 @@ def true_maps(samples: list[ClipSample]) -> np.ndarray:
 @torch.no_grad()
 def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
     """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
-    batch = collate(samples)
-    latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(seed))
-    return network.sample(batch, batch.text[:, 0], latents).amax(2).mean(1).numpy()
+    batch, latents = _asked(network, samples, count, seed)
+    return network.sample(batch, batch.text[:, 0], latents).amax(2).mean(1).cpu().numpy()
 
 
 def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]) -> float:
@@ -46,8 +47,14 @@ def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]
 @torch.no_grad()
 def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
     """The threshold at which single samples touch as large a share of an object as held-out clips do."""
-    batch = collate(held_out)
-    latents = network.draw_latents(count, len(batch), torch.Generator().manual_seed(0))
+    batch, latents = _asked(network, held_out, count, seed=0)
     found = network.sample(batch, batch.text[:, 0], latents).amax(2)
     share = float(batch.contact.any(1).float().mean())
     return min(THRESHOLDS, key=lambda threshold: abs(float((found >= threshold).float().mean()) - share))
+
+
+def _asked(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> tuple[ClipBatch, Tensor]:
+    """The clips, and so many draws for each, where the network is."""
+    device = next(network.parameters()).device
+    latents = network.draw_latents(count, len(samples), torch.Generator().manual_seed(seed))
+    return collate(samples).to(device), send(latents, device)

@@ -3,12 +3,13 @@
 ``python -m tests.models.fake_device ANNOTATED CHECKPOINTS`` prints a line of JSON per path: its name, what it raised.
 torch's FakeTensorMode knows shape and device of every tensor but no value: a host that waits for one (``float``,
 ``tolist``, ``nonzero``) and tensors of two devices in one operation are errors there, as they are slow or wrong on a
-GPU.
+GPU. So is, within a step of training, a copy for which the host waits (``hoidata.devices.send`` gives others).
 """
 
 import json
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ BACKEND = "nodata"
 _setup_privateuseone_for_python_backend(BACKEND)
 DEVICE = torch.device(f"{BACKEND}:0")
 TO = torch.Tensor.to
+IN_STEP = [False]
 # The paper's way of everything, at the toy's sizes.
 PAPER: dict[str, dict[str, Any]] = {
     "contact": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8]},
@@ -63,6 +65,8 @@ def sent(tensor: torch.Tensor, *given: Any, **named: Any) -> torch.Tensor:
     there = any(isinstance(own, torch.device | torch.Tensor) and _device(own) == DEVICE for own in given)
     if not there or tensor.device.type != "cpu" or tensor.requires_grad:
         return TO(tensor, *given, **named)
+    if IN_STEP[0] and not named.get("non_blocking"):
+        raise RuntimeError("a copy that is waited for")
     dtype = next((own.dtype for own in given if isinstance(own, torch.Tensor)), tensor.dtype)
     return torch.empty(tensor.shape, dtype=dtype, device=DEVICE)
 
@@ -109,13 +113,30 @@ def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Che
     objective, _ = network.objective(Setup(config, weights, 0, corpus, hands, DEVICE, on_device(stored)))
     clips = list(corpus.train)
     sight = Sight.drawn([c.length for c in clips], objective.frames, objective.entries, np.random.default_rng(0))
-    batch = collate(clips, sight if objective.frames else None).to(DEVICE)
     optimiser = torch.optim.AdamW([weight for weight in objective.network.parameters() if weight.requires_grad])
-    found = objective.losses(batch, torch.Generator().manual_seed(0))
-    assert all(value.device == DEVICE for value in found.values())
-    found["total"].backward()
-    optimiser.step()
+    with step():
+        batch = collate(clips, sight if objective.frames else None).to(DEVICE)
+        found = objective.losses(batch, torch.Generator().manual_seed(0))
+        assert all(value.device == DEVICE for value in found.values())
+        found["total"].backward()
+        optimiser.step()
     assert objective.validation(objective.network.eval()).device == DEVICE
+
+
+@contextmanager
+def step() -> Iterator[None]:
+    """Inside, a copy that is waited for is an error."""
+    IN_STEP[0] = True
+    try:
+        yield
+    finally:
+        IN_STEP[0] = False
+
+
+def copied() -> None:
+    """A copy that is waited for, in a step."""
+    with step():
+        torch.zeros(2).to(DEVICE)
 
 
 def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: list[Request]) -> None:
@@ -140,6 +161,7 @@ def main() -> None:
     # Read from the clips' values, on the host, once before the first step.
     setattr(Normaliser, "of", lambda clips: Normaliser.nothing())  # noqa: B010
     every = [("a value that is waited for", lambda: float(torch.zeros((), device=DEVICE))),
+             ("a copy that is waited for", copied),
              ("tensors of two devices", lambda: torch.zeros(2, device=DEVICE) + torch.zeros(2))]  # fmt: skip
     every += paths(*map(Path, sys.argv[1:]))
     for name, work in every:

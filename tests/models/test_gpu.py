@@ -10,6 +10,7 @@ from safetensors.torch import load_file
 from hoidata.hands import load_embedded_hands
 from hoidata.metrics.evaluate import evaluate_store
 from models.common.predicting import sample_family
+from models.common.repeatable import make_repeatable
 from models.registry import load_family
 from tests.models.toy import FAST, PARAMS, train
 
@@ -33,6 +34,22 @@ def test_every_network_trains_on_the_gpu_and_its_weights_are_finite(on_gpu: Path
         weights = load_file(on_gpu / name / "model.safetensors")
         assert weights
         assert all(torch.isfinite(weight).all() for weight in weights.values())
+
+
+def test_same_seed_same_bytes_on_the_gpu(annotated_root: Path, tmp_path: Path) -> None:
+    """As a stage trains: with every operation in an order of its own."""
+    repeatable = [torch.are_deterministic_algorithms_enabled(), torch.get_num_threads()]
+    make_repeatable(threads=1)
+    try:
+        for out in ("once", "twice"):
+            for name in PARAMS:
+                train(name, annotated_root, tmp_path / out, device="cuda")
+    finally:
+        torch.use_deterministic_algorithms(bool(repeatable[0]))
+        torch.set_num_threads(repeatable[1])
+    for name in PARAMS:
+        once, twice = (load_file(tmp_path / out / name / "model.safetensors") for out in ("once", "twice"))
+        assert all(torch.equal(weight, twice[key]) for key, weight in once.items()), name
 
 
 def test_motions_are_sampled_and_measured_on_the_gpu(annotated_root: Path, on_gpu: Path, tmp_path: Path) -> None:
