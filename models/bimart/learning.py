@@ -57,7 +57,8 @@ class Targets:
     mapped: Tensor
 
     def to(self, device: torch.device | str) -> "Targets":
-        return Targets(*(send(getattr(self, item.name), device) for item in fields(self)))
+        told, *others = (getattr(self, item.name) for item in fields(self))
+        return Targets(told.to(device), *(send(own, device) for own in others))
 
 
 def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:

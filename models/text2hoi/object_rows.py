@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from hoidata.clips.features import OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION
+from hoidata.devices import send
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from models.common.features import OBJECT_START_6D, object_rotmat
 
@@ -43,15 +44,20 @@ def turned_from(rows: Tensor, start: Tensor) -> Tensor:
 
 def whiten(rows: Tensor, reach: float) -> Tensor:
     """Rows (..., L, 10 or 16) as what is new in each. reach: rows over which a path is alike."""
-    moved = rows[..., :OBJECT_FEATURES] - UNMOVED.to(rows)
-    new = torch.linalg.solve_triangular(smooth_root(rows.shape[-2], reach).to(rows), moved, upper=False)
+    moved = rows[..., :OBJECT_FEATURES] - _as(UNMOVED, rows)
+    new = torch.linalg.solve_triangular(_as(smooth_root(rows.shape[-2], reach), rows), moved, upper=False)
     return torch.cat((new, rows[..., OBJECT_FEATURES:]), -1)
 
 
 def unwhiten(rows: Tensor, reach: float) -> Tensor:
     """The inverse of :func:`whiten`."""
-    moved = smooth_root(rows.shape[-2], reach).to(rows) @ rows[..., :OBJECT_FEATURES]
-    return torch.cat((moved + UNMOVED.to(rows), rows[..., OBJECT_FEATURES:]), -1)
+    moved = _as(smooth_root(rows.shape[-2], reach), rows) @ rows[..., :OBJECT_FEATURES]
+    return torch.cat((moved + _as(UNMOVED, rows), rows[..., OBJECT_FEATURES:]), -1)
+
+
+def _as(known: Tensor, rows: Tensor) -> Tensor:
+    """What is known beforehand, of the device and kind of ``rows``."""
+    return send(known, rows.device).to(rows.dtype)
 
 
 @lru_cache(maxsize=256)

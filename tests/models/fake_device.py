@@ -33,6 +33,7 @@ from models.common.predicting import PredictionConfig, requests_for
 from models.common.sampling import SamplerConfig
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
+from pipelines.params import laid_over, read_params
 from tests.models.toy import PARAMS, POINT_NET, TRANSFORMER
 
 BACKEND = "nodata"
@@ -40,6 +41,7 @@ _setup_privateuseone_for_python_backend(BACKEND)
 DEVICE = torch.device(f"{BACKEND}:0")
 TO = torch.Tensor.to
 IN_STEP = [False]
+ROOT = Path(__file__).parents[2]
 # The paper's way of everything, at the toy's sizes.
 PAPER: dict[str, dict[str, Any]] = {
     "contact": {"point_net": POINT_NET, "decoder_widths": [32, 16, 8]},
@@ -105,10 +107,15 @@ def on_device(stored: dict[str, Checkpoint]) -> dict[str, Checkpoint]:
 
 def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Checkpoint]) -> None:
     """An objective, the losses of a batch, their gradients, a step of the optimiser, and the validation loss."""
-    given = {**PARAMS[network.name].get("network", {})} if preset == "ours" else PAPER[network.name]
+    given, loss = PAPER[network.name], {}
+    if preset == "ours":  # all of its switches, at the toy's sizes
+        ours = read_params(ROOT)["train"]["ours"][network.name]
+        given, loss = laid_over(ours.get("network", {}), PARAMS[network.name]["network"]), ours.get("loss", {})
     config = build_config(network.config, given, network.name)
-    loss = {"samples": 2, "sampler_steps": 2, "field_resolution": 16} if network.name == "refiner" else {}
-    weights = build_config(network.loss, loss, network.name) if network.loss else None
+    # A clip whose contact is exchanged is chosen by a value, on the host, once before the first step.
+    fast = {"samples": 2, "sampler_steps": 2, "field_resolution": 16, "exchanged": False}
+    fast = fast if network.name == "refiner" else {}
+    weights = build_config(network.loss, {**loss, **fast}, network.name) if network.loss else None
     hands = Hands(load_embedded_hands())
     objective, _ = network.objective(Setup(config, weights, 0, corpus, hands, DEVICE, on_device(stored)))
     clips = list(corpus.train)
@@ -159,7 +166,7 @@ def main() -> None:
     setattr(nn.Module, "to", moved)  # noqa: B010 (pyright knows it as a method)
     setattr(torch.Tensor, "to", sent)  # noqa: B010
     # Read from the clips' values, on the host, once before the first step.
-    setattr(Normaliser, "of", lambda clips: Normaliser.nothing())  # noqa: B010
+    setattr(Normaliser, "of", lambda clips: Normaliser.nothing(clips[0][1].shape[-1]))  # noqa: B010
     every = [("a value that is waited for", lambda: float(torch.zeros((), device=DEVICE))),
              ("a copy that is waited for", copied),
              ("tensors of two devices", lambda: torch.zeros(2, device=DEVICE) + torch.zeros(2))]  # fmt: skip
