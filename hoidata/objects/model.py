@@ -1,12 +1,14 @@
 """The canonical object: a triangle mesh in metres, its parts, and the hinge between them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import IDENTITY, RigidTransform
+from hoidata.objects.mesh import MassProperties, mass_properties
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,11 @@ class ObjectModel:
     def faces_of(self, part: int) -> np.ndarray:
         """(face, 3) those of one part."""
         return self.faces[self.face_part == part] if self.is_articulated else self.faces
+
+    @cached_property
+    def masses(self) -> tuple[MassProperties, ...]:
+        """Of each of the parts."""
+        return tuple(mass_properties(self.vertices_m, self.faces_of(part)) for part in self.parts)
 
     def object_from_part(self, part: int, hinge_rad: np.ndarray | None) -> RigidTransform:
         """Where a part lies in the object frame, seen from its rest position (hinge angle 0), in which its mesh is.

@@ -43,7 +43,7 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
     pieces of which the second in the file moves.
     Raises BadInput for a size that cannot be meant, naming the unit that may be, and for a hinge that does not fit.
     """
-    mesh = read_mesh_file(path)
+    mesh = read_mesh_file(path, joined=not hinge)
     scale, notes = _scale(path, mesh, unit), list[str]()
     vertices = mesh.vertices * scale
     if not up:
@@ -91,10 +91,11 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
     return ObjectModel(model.name, model.vertices_m[first], faces[apart], model.part[first], model.hinge)
 
 
-def read_mesh_file(path: Path) -> Mesh:
+def read_mesh_file(path: Path, joined: bool = True) -> Mesh:
     """Vertices and triangles of an OBJ, PLY, STL or GLB file in its own unit and axes.
 
-    Of STL and GLB, vertices in the same place become one; a GLB's nodes stand where its scene puts them.
+    Of STL and GLB, vertices in the same place become one, of different nodes only where ``joined``; a GLB's nodes stand
+    where its scene puts them.
     Raises BadInput for a file that holds no finite triangle mesh.
     """
     if path.suffix.lower() not in (".stl", ".glb"):
@@ -108,12 +109,24 @@ def read_mesh_file(path: Path) -> Mesh:
     try:
         # From bytes and without a resolver: a GLB cannot make the reader open another file.
         scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower())
-        mesh = scene.to_mesh()
-        mesh.merge_vertices(merge_tex=True, merge_norm=True)
+        pieces = [scene.to_mesh()] if joined else _in_order(scene)
+        for piece in pieces:
+            piece.merge_vertices(merge_tex=True, merge_norm=True)
+        # One after the other; vertices of each come after those of all before it.
+        starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
+        vertices = np.concatenate([piece.vertices for piece in pieces])
+        faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)])
     except Exception as error:  # whatever a foreign parser raises on a damaged file
         got = f"{type(error).__name__}: {str(error)[:200]}"
         raise BadInput(path, "a readable mesh", got, "export it anew") from error
-    return checked_mesh(path, Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)))
+    return checked_mesh(path, Mesh(vertices.astype(np.float64), faces.astype(np.int64)))
+
+
+def _in_order(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
+    """The scene's meshes where it puts them, in the order of the file; trimesh walks its nodes the other way round."""
+    order = {name: number for number, name in enumerate(scene.geometry)}
+    meshes = [own for own in scene.dump() if isinstance(own, trimesh.Trimesh)]
+    return sorted(meshes, key=lambda own: order[own.metadata["name"]])
 
 
 def _check_glb(path: Path) -> None:
@@ -194,20 +207,27 @@ def _hinge(text: str, scale: float, turn: np.ndarray) -> Hinge:
 
 
 def _second_piece(path: Path, mesh: Mesh) -> np.ndarray:
-    """(vertex,) 1 for the second of two pieces that share no vertex, in the order of the file."""
-    # Vertices are joined where they coincide: many files repeat them along seams.
+    """(vertex,) 1 for the second of two pieces that share no vertex, in the order of the file.
+
+    Vertices are joined where they coincide, as many files repeat them along seams; if that makes one piece of all, as
+    of a lid that lies on its box, only those that the file itself has as one.
+    """
     _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    faces = same.reshape(-1)[mesh.faces]
-    count = int(same.max()) + 1
+    ways = [_pieces(mesh.faces, own) for own in (same.reshape(-1), np.arange(len(mesh.vertices)))]
+    found = [list(dict.fromkeys(piece[mesh.faces[:, 0]].tolist())) for piece in ways]
+    way = 1 if len(found[0]) == 1 else 0
+    if len(found[way]) != 2:
+        remedy = "give a mesh of a base and one moving piece that share no vertex"
+        raise BadInput(path, "two separate pieces for --hinge", f"{len(found[0])}", remedy)
+    return (ways[way] == found[way][1]).astype(np.uint8)
+
+
+def _pieces(faces: np.ndarray, same: np.ndarray) -> np.ndarray:
+    """(vertex,) number of the piece each is of. same: (vertex,), equal for those that are one."""
+    faces, count = same[faces], int(same.max()) + 1
     rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    _, piece = connected_components(links, directed=False)
-    piece = piece[same.reshape(-1)]
-    used = list(dict.fromkeys(piece[mesh.faces[:, 0]].tolist()))
-    if len(used) != 2:
-        remedy = "give a mesh of a base and one moving piece that do not touch"
-        raise BadInput(path, "two separate pieces for --hinge", f"{len(used)}", remedy)
-    return (piece == used[1]).astype(np.uint8)
+    return connected_components(links, directed=False)[1][same]
 
 
 def _hull_area(points: np.ndarray) -> float:

@@ -11,7 +11,6 @@ import numpy as np
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import HandModel
 from hoidata.objects.distance import signed_distance
-from hoidata.objects.mesh import mass_properties
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import BodyMotion
 
@@ -104,7 +103,7 @@ def body_motion(
 ) -> BodyMotion:
     """Centre of mass and inertia of 1 kg in the world at each frame; a hinged object is one body at its angle."""
     n_frames = len(rotmats)
-    parts = [mass_properties(model.vertices_m, model.faces_of(part)) for part in model.parts]
+    parts = model.masses
     total = sum(part.volume_m3 for part in parts)
     shares, centres, inertias = [part.volume_m3 / total for part in parts], [], []
     for index, part in enumerate(parts):

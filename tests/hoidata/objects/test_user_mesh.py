@@ -72,6 +72,18 @@ def test_the_second_of_two_pieces_turns_about_the_hinge(tmp_path):
     assert model.vertices_m[model.part == 0, 2].max() == pytest.approx(0.02)
 
 
+@pytest.mark.parametrize("name", ["box.obj", "box.glb"])
+def test_a_lid_may_lie_on_its_box(tmp_path, name):
+    """Their corners coincide; the file has two pieces all the same."""
+    base, lid = trimesh.creation.box((0.2, 0.15, 0.04)), trimesh.creation.box((0.2, 0.15, 0.02))
+    lid.apply_translation([0, 0, 0.03])
+    trimesh.Scene({"bottom": base, "lid": lid}).export(tmp_path / name)
+    model = read_user_object(tmp_path / name, up="z", hinge="0,0.075,0.02 1,0,0").model
+    assert len(model.faces) == 24
+    assert model.vertices_m[model.part == 1, 2].min() == pytest.approx(0.02, abs=1e-6)
+    assert model.vertices_m[model.part == 0, 2].max() == pytest.approx(0.02, abs=1e-6)
+
+
 @pytest.mark.parametrize("hinge", ["0,0,0", "0,0,0 0,0,0", "a,b,c 1,0,0", "0,0,0 1,0,nan"])
 def test_a_hinge_that_is_none_is_refused_with_an_example(tmp_path, hinge):
     with pytest.raises(BadInput, match="--hinge"):
