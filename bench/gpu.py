@@ -9,9 +9,10 @@ import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,9 @@ from models.common.training import train_network
 from models.registry import load_network
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
-from pipelines.params import laid_over, read_params
+from pipelines.params import laid_over
+from pipelines.stages.base import load_settings
+from pipelines.stages.train import TrainParams
 
 PRESETS = ("paper", "ours")
 BRIEFLY, WARM_UP = 10, 20  # steps
@@ -117,7 +120,7 @@ def main() -> None:
         return
     make_repeatable(threads=1)
     data = Path(os.environ.get("HOIDATA_BENCH_DATA", "data/embedded/grab"))
-    seconds, train = float(os.environ.get("HOIDATA_BENCH_SECONDS", "8")), read_params(Path())["train"]
+    seconds, train = float(os.environ.get("HOIDATA_BENCH_SECONDS", "8")), load_settings(TrainParams, "train")
     annotated = load_annotated(data, load_embedded_hands())
     longest = max(HoiDataset(annotated, "train", crop="start"), key=lambda sample: sample.length)
     asked = replace(requests_for(longest, PredictionConfig())[0], active_hands=np.ones(2, bool), n_frames=MAX_FRAMES)
@@ -125,7 +128,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         for preset in PRESETS:
             trained = Path(folder, preset)
-            rows = list(told(training_rows(data, trained, train, preset, seconds)))
+            rows = list(told(training_rows(data, trained, replace(train, preset=preset, size="full"), seconds)))
             columns = ["network", "precision", "steps/s", "busy", "GiB", "validation s", "steps", "hours"]
             show(f"Training of `{preset}` at full size", columns, rows)
         rows = [row for preset in PRESETS for row in told(motion_rows(Path(folder, preset), preset, asked))]
@@ -140,34 +143,24 @@ def told(rows: Iterator[Sequence[str]]) -> Iterator[Sequence[str]]:
         yield row
 
 
-def settings_of(train: Mapping[str, Any], preset: str, network: str, **training: Any) -> dict[str, Any]:
-    """Of one network at full size."""
-    own, full = (train[name].get(network) or {} for name in (preset, "full"))
-    return {**laid_over(laid_over(own, full), {"training": training}), "seed": 0}
-
-
-def training_rows(
-    data: Path, trained: Path, train: Mapping[str, Any], preset: str, seconds: float
-) -> Iterator[Sequence[str]]:
+def training_rows(data: Path, trained: Path, train: TrainParams, seconds: float) -> Iterator[Sequence[str]]:
     """One row per network and precision; ``trained`` is filled with networks of a few steps, on which others build."""
     for network in NETWORKS:
-        needed = {load_network(name): trained / name for name in network.needs}
-
-        def fitted(network: Network, out: Path, settings: dict[str, Any]) -> None:
-            train_network(network, data, out, settings, needed=needed, device="cuda")  # noqa: B023
-
-        fitted(network, trained / network.name, settings_of(train, preset, network.name, steps=BRIEFLY))
+        needed, settings = {load_network(name): trained / name for name in network.needs}, train.of(network.name)
+        fit = partial(train_network, annotated_root=data, needed=needed, device="cuda")
+        brief = laid_over(settings, {"training": {"steps": BRIEFLY}})
+        fit(network, out_folder=trained / network.name, params=brief)
         for precision in ("float32", "bfloat16") if network.name == "diffusion" else ("float32",):
-            settings = settings_of(train, preset, network.name, precision=precision)
-            watch = watched(network, lambda own: fitted(own, trained / "none", settings), seconds)  # noqa: B023
-            training = settings["training"]
+            own = laid_over(settings, {"training": {"precision": precision}})
+            watch = watched(network, partial(fit, out_folder=trained / "none", params=own), seconds)
+            training = own["training"]
             steps, validations = training["steps"], training["steps"] / training.get("validate_every", 500)
             hours = (steps * watch.step_s + validations * watch.validation_s) / 3600
             figures = [1 / watch.step_s, watch.busy, watch.memory_gib, watch.validation_s]
             yield [network.name, precision, *(f"{figure:.2f}" for figure in figures), f"{steps:,}", f"{hours:.2f}"]
 
 
-def watched(network: Network, fit: Callable[[Network], None], seconds: float) -> Watch:
+def watched(network: Network, fit: Callable[[Network], object], seconds: float) -> Watch:
     """What was seen of a training of ``network``, which ``fit`` begins."""
     watches: list[Watch] = []
 

@@ -57,7 +57,7 @@ class ObjectModel:
 
     @cached_property
     def masses(self) -> tuple[MassProperties, ...]:
-        """Of each of the parts."""
+        """Mass, centre and inertia of each of ``parts``, worked out once."""
         return tuple(mass_properties(self.vertices_m, self.faces_of(part)) for part in self.parts)
 
     def object_from_part(self, part: int, hinge_rad: np.ndarray | None) -> RigidTransform:

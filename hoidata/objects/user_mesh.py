@@ -112,14 +112,12 @@ def read_mesh_file(path: Path, joined: bool = True) -> Mesh:
         pieces = [scene.to_mesh()] if joined else _in_order(scene)
         for piece in pieces:
             piece.merge_vertices(merge_tex=True, merge_norm=True)
-        # One after the other; vertices of each come after those of all before it.
-        starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
-        vertices = np.concatenate([piece.vertices for piece in pieces])
-        faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)])
+        mesh = trimesh.util.concatenate(pieces)
+        assert isinstance(mesh, trimesh.Trimesh)
     except Exception as error:  # whatever a foreign parser raises on a damaged file
         got = f"{type(error).__name__}: {str(error)[:200]}"
         raise BadInput(path, "a readable mesh", got, "export it anew") from error
-    return checked_mesh(path, Mesh(vertices.astype(np.float64), faces.astype(np.int64)))
+    return checked_mesh(path, Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)))
 
 
 def _in_order(scene: trimesh.Scene) -> list[trimesh.Trimesh]:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import torch
 from rich.progress import track
 from torch import nn
+from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.errors import BadInput
@@ -277,6 +278,6 @@ def learning_rate_factor(step: int, config: TrainingConfig) -> float:
 @torch.no_grad()
 def _follow(kept: nn.Module, network: nn.Module, decay: float) -> None:
     """Running average of the weights; buffers (batch-norm statistics) are copied."""
-    torch._foreach_lerp_(list(kept.parameters()), list(network.parameters()), 1 - decay)  # one call on a GPU
+    get_ema_multi_avg_fn(decay)(list(kept.parameters()), list(network.parameters()), None)  # one call on a GPU
     for target, source in zip(kept.buffers(), network.buffers(), strict=True):
         target.copy_(source)

@@ -12,7 +12,7 @@ from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.batches.sight import Sight
 from hoidata.devices import send
 from models.common import losses
-from models.common.corpus import Corpus
+from models.common.corpus import Corpus, any_form
 from models.common.family import Network, Objective, Setup
 from models.common.sampling import TRAIN_STEPS, SamplerConfig, add_noise, alphas_cumprod, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
@@ -199,8 +199,7 @@ class RefinerObjective:
         return send(torch.stack(chosen), self.device)
 
     def _generate(self, batch: ClipBatch, kind: str, draws: torch.Generator) -> tuple[Tensor, Tensor]:
-        form = send(torch.randint(batch.text.shape[1], (len(batch),), generator=draws), self.device)
-        text = batch.text[torch.arange(len(batch), device=form.device), form]
+        text = any_form(batch, draws)
         network = self.generator.network
         condition = Condition.of(batch, network.object_feature(batch.points_m), text, batch.contact)
         rows = self.targets.of(batch)

@@ -112,10 +112,10 @@ def trained(network: Network, preset: str, corpus: Corpus, stored: dict[str, Che
         ours = read_params(ROOT)["train"]["ours"][network.name]
         given, loss = laid_over(ours.get("network", {}), PARAMS[network.name]["network"]), ours.get("loss", {})
     config = build_config(network.config, given, network.name)
-    # A clip whose contact is exchanged is chosen by a value, on the host, once before the first step.
-    fast = {"samples": 2, "sampler_steps": 2, "field_resolution": 16, "exchanged": False}
-    fast = fast if network.name == "refiner" else {}
-    weights = build_config(network.loss, {**loss, **fast}, network.name) if network.loss else None
+    if network.name == "refiner":
+        # A clip whose contact is exchanged is chosen by a value, on the host, once before the first step.
+        loss = {**loss, "samples": 2, "sampler_steps": 2, "field_resolution": 16, "exchanged": False}
+    weights = build_config(network.loss, loss, network.name) if network.loss else None
     hands = Hands(load_embedded_hands())
     objective, _ = network.objective(Setup(config, weights, 0, corpus, hands, DEVICE, on_device(stored)))
     clips = list(corpus.train)
