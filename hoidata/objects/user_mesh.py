@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from hoidata.errors import BadInput
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, checked_mesh, load_mesh
-from hoidata.objects.model import Hinge, ObjectModel
+from hoidata.objects.model import Hinge, ObjectModel, articulate
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "dm": 0.1, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.005, 2.0
@@ -24,6 +24,7 @@ UP_AXES = {
 LARGEST_GLB_JSON, MOST_SHOWN = 4 << 20, 5_000_000
 METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
 NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
+SLIGHTLY_RAD, NEARER = 0.3, 0.01  # a turn that shows where a hinge leads, and how much nearer is meant
 CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
 
 
@@ -55,7 +56,17 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
     joint = _hinge(hinge, scale, turn) if hinge else None
     part = _second_piece(path, mesh) if joint else np.zeros(len(vertices), np.uint8)
     name = path.stem.encode(errors="backslashreplace").decode()  # bytes that are no text stay legible
-    return UserObject(ObjectModel(name, vertices @ turn.T, mesh.faces, part, joint), tuple(notes))
+    model = ObjectModel(name, vertices @ turn.T, mesh.faces, part, joint)
+    if joint and closes(model):
+        notes.append("a growing angle brings the two pieces together; if it is to open them, turn its direction round")
+    return UserObject(model, tuple(notes))
+
+
+def closes(model: ObjectModel) -> bool:
+    """Whether the middle of an articulated object's moving part comes nearer to that of its base as its angle grows."""
+    base, moving = (masses.centre_m for masses in model.masses)
+    before, after = articulate(moving[None], np.ones(1), model.hinge, np.array([-SLIGHTLY_RAD, SLIGHTLY_RAD]))[:, 0]
+    return bool(np.linalg.norm(after - base) < (1 - NEARER) * np.linalg.norm(before - base))
 
 
 def found_up(vertices_m: np.ndarray) -> tuple[str, str]:

@@ -84,6 +84,16 @@ def test_a_lid_may_lie_on_its_box(tmp_path, name):
     assert model.vertices_m[model.part == 0, 2].max() == pytest.approx(0.02, abs=1e-6)
 
 
+@pytest.mark.parametrize(("direction", "told"), [("-1,0,0", False), ("1,0,0", True), ("0,0,1", False)])
+def test_a_hinge_that_turns_the_lid_into_its_box_is_told(tmp_path, direction, told):
+    """Turned the other way, or aside like the lid of a tin, nothing is said."""
+    base, lid = trimesh.creation.box((0.2, 0.15, 0.04)), trimesh.creation.box((0.2, 0.15, 0.02))
+    lid.apply_translation([0, 0, 0.031])
+    path = saved(trimesh.util.concatenate([base, lid]), tmp_path / "box.obj")
+    notes = read_user_object(path, up="z", hinge=f"0,0.075,0.02 {direction}").notes
+    assert any("turn its direction round" in note for note in notes) == told
+
+
 @pytest.mark.parametrize("hinge", ["0,0,0", "0,0,0 0,0,0", "a,b,c 1,0,0", "0,0,0 1,0,nan"])
 def test_a_hinge_that_is_none_is_refused_with_an_example(tmp_path, hinge):
     with pytest.raises(BadInput, match="--hinge"):
