@@ -7,6 +7,7 @@ by default: what stands for a motion (``motion_code``), contact as points to att
 the masks.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -112,8 +113,8 @@ class _Prepared:
     """A condition as the Transformer takes it, the same at every timestep.
 
     text, object, extent (B, width). points (B, C, width) contact tokens with their mask (B, C). hand_rows (B, 2, K),
-    object_rows (B, L) bool: the rows of a motion that are there. lengths (B,). sides: which hands are in any motion;
-    the others' tokens are left out.
+    object_rows (B, L) bool: the rows of a motion that are there. sides: which hands are in any motion; the others'
+    tokens are left out. codes (B, token, width), mask (B, token): of the tokens of hands and object, in this order.
     """
 
     text: Tensor
@@ -123,8 +124,9 @@ class _Prepared:
     points_mask: Tensor
     hand_rows: Tensor
     object_rows: Tensor
-    lengths: Tensor
     sides: tuple[int, ...]
+    codes: Tensor
+    mask: Tensor
 
     def twice(self) -> "_Prepared":
         """Every motion two times, one whole batch after the other."""
@@ -199,16 +201,21 @@ class DiffusionModel(nn.Module):
             points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
             points = self.points_in(points)
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
+        hand_rows = condition.active_hands[:, :, None] & hand_rows[:, None]
+        sides = tuple(side for side in range(2) if condition.sides[side])
+        masks = [attention_mask_of(hand_rows[:, side], self.hand_rows) for side in sides]
+        masks.append(attention_mask_of(object_rows, self.object_rows))
         return _Prepared(
             self.text_in(condition.text),
             self._body(condition, contact),
             self.extent_in(extent) if self.extent_in is not None else points.new_zeros(()),
             points,
             points_mask,
-            condition.active_hands[:, :, None] & hand_rows[:, None],
+            hand_rows,
             object_rows,
-            lengths,
-            tuple(side for side in range(2) if condition.sides[side]),
+            sides,
+            self._codes(lengths, [mask.shape[1] for mask in masks], sides),
+            torch.cat(masks, 1),
         )
 
     def _body(self, condition: Condition, contact: Tensor) -> Tensor:
@@ -261,19 +268,13 @@ class DiffusionModel(nn.Module):
         time = self._time(timesteps)
         if self.gate_in is not None:
             agents = [x * (1 + self.gate_in(time)[:, None]) for x in agents]
-        codes = agent_codes(self.config.transformer.width, hands.device)
-        codes = torch.stack([codes[agent] for agent in (*known.sides, 2)])
-        codes = codes if self.config.codes == "frames and agents" else torch.zeros_like(codes)
-        tokens = [x + code + self._codes(known.lengths, x.shape[1]) for x, code in zip(agents, codes, strict=True)]
-        masks = [attention_mask_of(known.hand_rows[:, side], k) for side in known.sides]
-        masks.append(attention_mask_of(known.object_rows, wide))
         first, points = self._condition(time, known, keep)
-        moving = torch.cat(tokens, 1)
+        moving = torch.cat(agents, 1) + known.codes
         if self.config.condition_everywhere:
             moving = moving + first
         x = torch.cat((moving, first, points), 1)
         points_mask = known.points_mask if keep is None else known.points_mask & (keep[:, 1:2] > 0)
-        mask = torch.cat((*masks, masks[-1].new_ones(len(x), 1), points_mask), 1)
+        mask = torch.cat((known.mask, known.mask.new_ones(len(x), 1), points_mask), 1)
         *own, body = self.encoder(x, mask, first)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
         found = [hands.new_zeros(hands[:, 0].shape)] * 2
         for side, token in zip(known.sides, own, strict=True):
@@ -281,19 +282,20 @@ class DiffusionModel(nn.Module):
             found[side] = to_frames(self.hands_out[side](seen), hands.shape[2], k)
         return torch.stack(found, 1), to_frames(self.object_out(body), objects.shape[1], wide)
 
-    def _codes(self, lengths: Tensor, n_tokens: int) -> Tensor:
-        """Position codes (B or 1, token, width): by frame, and by frames to go and the share that is done."""
-        width = self.config.transformer.width
-        place = torch.arange(n_tokens, device=lengths.device) * (
-            self.hand_rows * max(1, self.config.motion.knot_frames)
-        )
-        codes = sinusoid(place + self.config.first_code, width)[None]
-        codes = torch.zeros_like(codes) if self.config.codes == "none" else codes
+    def _codes(self, lengths: Tensor, n_tokens: Sequence[int], sides: Sequence[int]) -> Tensor:
+        """Position codes (B, token, width) of all tokens: agent, frame, frames to go and the share that is done."""
+        config, width = self.config, self.config.transformer.width
+        every = self.hand_rows * max(1, config.motion.knot_frames)
+        place = torch.arange(max(n_tokens), device=lengths.device) * every
+        codes = lengths.new_zeros(len(lengths), len(place), width, dtype=torch.float32)
+        if config.codes != "none":
+            codes = codes + sinusoid(place + config.first_code, width)
         if self.to_go_in is not None:
             to_go = (lengths[:, None] - place).clamp_min(0)
             done = place * MAX_FRAMES / lengths[:, None]
             codes = codes + self.to_go_in(torch.cat((sinusoid(to_go, width), sinusoid(done, width)), -1))
-        return codes
+        own = agent_codes(width, lengths.device) * (config.codes == "frames and agents")
+        return torch.cat([codes[:, :n] + own[agent] for agent, n in zip((*sides, 2), n_tokens, strict=True)], 1)
 
     def _time(self, timesteps: Tensor) -> Tensor:
         """(B, width) what is told of timesteps (B,)."""
