@@ -119,6 +119,7 @@ LESS: Mapping[str, Row] = {
     "end not told": _network(frames_to_go=False),
     "signal as large as noise": _network(signal_scale=1.0),
     "constant learning rate": Row(changed={"diffusion": {"training": {"schedule": "constant"}}}),
+    "clips as recorded": Row(changed={"diffusion": {"training": {"augmented_copies": 0}}}),
     "gradients not clipped": Row(changed={"diffusion": {"training": {"clip_norm": 0.0}}}),
     "contact drawn in training": _loss(contact="estimated"),
     "with eq. 6": _loss(distance_weight=1.0),

@@ -19,6 +19,7 @@ from hoidata.devices import send
 from hoidata.files import canonical_json, sha256_bytes
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
+from models.common.augmentation import Augmentation
 from models.common.vocabulary import Vocabulary
 
 BUCKET_BATCHES = 4
@@ -32,7 +33,8 @@ class Wanted:
     """What of every batch is asked for. frames, entries: of each clip and in all, for losses of geometry (``Sight``).
 
     parts: those of ``of`` equal parts of a batch that this process computes. balance: clips drawn evenly, or verbs.
-    mirror: every other clip in a mirror, where that can be (``Mirror``).
+    mirror: every other clip in a mirror, where that can be (``Mirror``). augmented_copies: of every clip,
+    beside it (``Augmentation``).
     """
 
     frames: int = 0
@@ -41,6 +43,7 @@ class Wanted:
     of: int = 1
     balance: Balance = "none"
     mirror: bool = False
+    augmented_copies: int = 0
 
 
 @dataclass(frozen=True)
@@ -110,22 +113,30 @@ def batches(
     lengths = [min(dataset.whole(clip_id).length, dataset.max_frames) for clip_id in dataset.ids]
     weights = _verb_weights(dataset) if wanted.balance == "verb" else None
     mirror = Mirror.of(map(dataset.whole, dataset.ids)) if wanted.mirror else None
+    augmentation = Augmentation(wanted.augmented_copies)
     for step, (epoch, rows) in enumerate(_plan(lengths, size, seed, weights), 1):
         if step > start:
             dataset.set_epoch(epoch)
             parts = {part: rows[part :: wanted.of] or rows[:1] for part in wanted.parts}
             yield [
-                (part, _collated([dataset[row] for row in own], wanted, (seed, step, part), mirror))
+                (part, _collated([dataset[row] for row in own], wanted, (seed, step, part), mirror, augmentation))
                 for part, own in parts.items()
             ]
 
 
 def _collated(
-    samples: list[ClipSample], wanted: Wanted, drawn_from: tuple[int, int, int], mirror: Mirror | None
+    samples: list[ClipSample],
+    wanted: Wanted,
+    drawn_from: tuple[int, int, int],
+    mirror: Mirror | None,
+    augmentation: Augmentation,
 ) -> ClipBatch:
     if mirror is not None:
         turned = np.random.default_rng([*drawn_from, 1]).random(len(samples)) < 0.5
         samples = [(turn and mirror.mirrored(one)) or one for one, turn in zip(samples, turned, strict=True)]
+    if augmentation.count:
+        numbers = np.random.default_rng([*drawn_from, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()
+        samples = [augmentation.copy_of(one, n) if n else one for one, n in zip(samples, numbers, strict=True)]
     random = np.random.default_rng(drawn_from)
     lengths = [sample.length for sample in samples]
     sight = Sight.drawn(lengths, wanted.frames, wanted.entries, random) if wanted.frames else None

@@ -49,6 +49,8 @@ class TrainingConfig:
     step with the lowest validation loss, not the last.
     patience: stop after so many validations without a lower loss (0: never). balance: draw clips evenly, or verbs.
     mirror: every other clip is seen in a mirror, where the other hand is known to do the same (``batches.mirror``).
+    augmented_copies: how many copies of every clip are seen beside it, with other paths, turns and moments
+    (``common.augmentation``); they are kept in memory, each as large as its clip.
     precision: of Transformers and point networks, where the time is; all else stays float32. parts: of a batch, whose
     gradients (and statistics of batch norms) are averaged; they take turns, or are shared by ``train.processes``.
     save_every: steps after which all is written down that a killed training needs to go on.
@@ -68,6 +70,7 @@ class TrainingConfig:
     validate_every: int = 500
     balance: Balance = "none"
     mirror: bool = False
+    augmented_copies: int = 0
     precision: Precision = "float32"
     parts: int = 1
     save_every: int = 500
@@ -75,6 +78,7 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "validate_every", "parts", "save_every"):
             at_least("training", self, name, 1)
+        at_least("training", self, "augmented_copies", 0)
 
 
 @dataclass(frozen=True)
@@ -187,7 +191,9 @@ def fit(
     if progress:
         progress.load(state)
     shared = team.own_parts(config.parts), config.parts
-    wanted = Wanted(objective.frames, objective.entries, *shared, config.balance, config.mirror)
+    wanted = Wanted(
+        objective.frames, objective.entries, *shared, config.balance, config.mirror, config.augmented_copies
+    )
     stream = batches(corpus.train, config.batch, seed, wanted, state.step)
     remaining = range(state.step + 1, config.steps + 1)
     for step in track(remaining, description=type(network).__name__, transient=True, disable=not team.writes):

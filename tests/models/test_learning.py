@@ -108,9 +108,8 @@ def by_heart(training: TrainingConfig, network: str, preset: Preset) -> Training
     """The settings of a training with the budget to know two clips."""
     steps, size, rate = BUDGETS[network, preset]
     budget = {"steps": steps, "batch": size, "learning_rate": rate, "warmup": 100, "validate_every": steps}
-    return replace(
-        training, **budget, schedule="cosine", adam_beta2=0.95, ema_decay=0.98, weight_decay=0.0, keep_best=False
-    )
+    usual = {"schedule": "cosine", "adam_beta2": 0.95, "ema_decay": 0.98, "weight_decay": 0.0, "keep_best": False}
+    return replace(training, **budget, **usual, augmented_copies=0)
 
 
 @pytest.mark.long

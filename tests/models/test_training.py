@@ -260,6 +260,11 @@ def test_a_budget_of_nothing_is_refused(name: str) -> None:
         TrainingConfig(**{name: 0})
 
 
+def test_fewer_augmented_copies_than_none_are_refused() -> None:
+    with pytest.raises(BadInput, match="augmented_copies: expected 0 or more, got -1"):
+        TrainingConfig(augmented_copies=-1)
+
+
 def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
     pair, encoder = load_embedded_hands(), load_encoder("hash")
     other = replace(pair, left=replace(pair.left, template_m=pair.left.template_m * 1.1))

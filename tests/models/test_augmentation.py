@@ -1,0 +1,125 @@
+"""An augmented copy is the clip on another path and at other moments: hands hold what they held, where they held it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
+from hoidata.geometry.rotations import rotation_angle, rotmat_to_rot6d, rotvec_to_rotmat
+from hoidata.hands import load_embedded_hands
+from hoidata.store.annotated import AnnotatedStore
+from models.common.augmentation import Augmentation, augment, entries_at, warped_moments
+from models.common.corpus import Wanted, batches
+from models.common.features import Hands, object_rotmat, to_object_frame
+
+NUMBERS = range(1, 6)
+
+
+@pytest.fixture
+def clips(annotated: AnnotatedStore) -> list[ClipSample]:
+    return list(HoiDataset(annotated, "train"))
+
+
+def rotations(sample: ClipSample) -> np.ndarray:
+    return object_rotmat(torch.from_numpy(sample.object)).numpy()
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_joints_of_its_angles_are_its_joints(clips: list[ClipSample], number: int) -> None:
+    hands = Hands(load_embedded_hands())
+    for clip in clips:
+        own = Augmentation(5).copy_of(clip, number)
+        template = None if own.template_m is None else torch.from_numpy(own.template_m.astype(np.float32))[None]
+        joints = hands.joints(torch.from_numpy(own.hands)[None], torch.from_numpy(own.betas)[None], template)[0].numpy()
+        # Between two frames joints are on a line, and angles turn: less than a millimetre apart.
+        np.testing.assert_allclose(joints[own.valid], own.joints_m[own.valid], atol=1e-3)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_hands_hold_the_object_where_they_held_it(clips: list[ClipSample], number: int) -> None:
+    """At every moment of a copy its joints lie in the object's frame as at some moment of the clip."""
+    for clip in clips:
+        own = Augmentation(5).copy_of(clip, number)
+        local, before = (
+            to_object_frame(torch.from_numpy(one.joints_m), torch.from_numpy(one.object).expand(2, -1, -1)).numpy()
+            for one in (own, clip)
+        )
+        fine = np.linspace(0, clip.length - 1, 40 * clip.length)
+        frame = fine.astype(int).clip(max=clip.length - 2)
+        dense = before[:, frame] + (fine - frame)[:, None, None] * (before[:, frame + 1] - before[:, frame])
+        apart = np.abs(local[:, :, None] - dense[:, None]).max((0, 3, 4)).min(1)
+        assert apart.max() < 1e-3
+        assert not np.allclose(own.object, clip.object) or np.ptp(clip.object, axis=0).max() < 1e-6
+
+
+def test_what_stands_still_stands_still_and_it_all_begins_where_it_began(clips: list[ClipSample]) -> None:
+    for clip in clips:
+        own = augment(clip, np.random.default_rng(3), 1)
+        for part in (slice(0, 2), slice(2, 3), slice(3, 9), slice(OBJECT_HINGE, OBJECT_HINGE + 1)):
+            if np.ptp(clip.object[:, part], axis=0).max() < 1e-7:
+                np.testing.assert_allclose(own.object[:, part], clip.object[:, part], atol=1e-6)
+        np.testing.assert_allclose(own.object[0], clip.object[0], atol=1e-6)
+        assert np.ptp(own.object[:, OBJECT_HINGE]) == pytest.approx(np.ptp(clip.object[:, OBJECT_HINGE]), abs=1e-6)
+        ends = [np.linalg.norm(one.object[-1, OBJECT_POSITION]) for one in (own, clip)]
+        assert 0.74 * ends[1] <= ends[0] <= 1.35 * ends[1]
+
+
+def test_a_turn_grows_by_one_factor_about_its_own_axis(clips: list[ClipSample]) -> None:
+    turning = turned(clips[0], 1.0)
+    own = augment(turning, np.random.default_rng(4), 1)
+    start, end = rotations(own)[[0, -1]]
+    angle = float(rotation_angle((end @ start.T)[None])[0])
+    assert 0.8 < angle < 1.23
+    assert abs(angle - 1) > 0.01
+    np.testing.assert_allclose((end @ start.T) @ [0, 1, 0], [0, 1, 0], atol=1e-5)
+    # Nearly half a circle: no turn is told from its opposite beyond it, so it stays.
+    start, end = rotations(augment(turned(clips[0], 2.9), np.random.default_rng(4), 1))[[0, -1]]
+    assert float(rotation_angle((end @ start.T)[None])[0]) == pytest.approx(2.9, abs=1e-4)
+
+
+def test_distances_are_those_of_the_frames_that_are_shown(clips: list[ClipSample]) -> None:
+    entries = clips[0].distances
+    frames = np.array([0, 3, 3, 7, clips[0].length - 1])
+    found = entries_at(entries, frames)
+    for number, frame in enumerate(frames):
+        for name in ("side", "joint", "point", "distance_m"):
+            expected = getattr(entries, name)[entries.frame == frame]
+            np.testing.assert_array_equal(getattr(found, name)[found.frame == number], expected)
+    assert (np.diff(found.frame) >= 0).all()
+
+
+def test_moments_go_forward_from_the_first_frame_to_the_last() -> None:
+    for seed in range(50):
+        moments = warped_moments(90, np.random.default_rng(seed))
+        assert moments[[0, -1]] == pytest.approx([0, 89])
+        speed = np.diff(moments)
+        assert 0.55 < speed.min() < 1 < speed.max() < 1.45
+
+
+def test_a_training_meets_every_copy_and_the_clip_itself_alike_and_goes_on_where_it_was(
+    annotated: AnnotatedStore,
+) -> None:
+    dataset = HoiDataset(annotated, "train")
+    stream = batches(dataset, 3, 0, Wanted(augmented_copies=3))
+    drawn = [one.clip_id for _ in range(300) for one in next(stream)[0][1].samples]
+    for name in dataset.ids:
+        shares = [drawn.count(own) / 300 for own in (name, *(f"{name} copy {number}" for number in (1, 2, 3)))]
+        assert sum(shares) == pytest.approx(sum(own.startswith(name) for own in drawn) / 300)
+        assert all(0.15 < share < 0.35 for share in shares), shares
+    again = batches(dataset, 3, 0, Wanted(augmented_copies=3), start=299)
+    once, twice = (next(one)[0][1] for one in (again, batches(dataset, 3, 0, Wanted(augmented_copies=3), start=299)))
+    assert [one.clip_id for one in once.samples] == drawn[-3:]
+    assert torch.equal(once.hands, twice.hands)
+    plain = next(batches(dataset, 3, 0))[0][1]
+    assert all(one.clip_id in dataset.ids for one in plain.samples)
+
+
+def turned(clip: ClipSample, angle_rad: float) -> ClipSample:
+    """The clip with an object that turns evenly about the y axis; its hands are not looked at."""
+    rotvec = np.linspace(0, angle_rad, clip.length)[:, None] * [0.0, 1.0, 0.0]
+    thing = clip.object.copy()
+    thing[:, OBJECT_ROTATION_6D] = rotmat_to_rot6d(rotvec_to_rotmat(rotvec) @ rotations(clip)[0])
+    return replace(clip, object=thing)
