@@ -70,6 +70,17 @@ class ClipSample:
         return len(self.object)
 
     @property
+    def key(self) -> tuple[str, int, int]:
+        """What tells it from all other samples of a dataset: its clip and which of its frames."""
+        return self.clip_id, self.start, self.length
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of what it has for each frame, which is nearly all."""
+        frames = self.hands, self.object, self.joints_m, self.valid, self.contact
+        return sum(array.nbytes for array in (*frames, *vars(self.distances).values()))
+
+    @property
     def contact_map(self) -> np.ndarray:
         """(1024,) bool contact map of Text2HOI: the points touched by any active hand."""
         return np.logical_or(self.contact[0], self.contact[1])

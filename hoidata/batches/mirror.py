@@ -9,12 +9,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from cachetools import LRUCache, cachedmethod
 
 from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.features import HAND_ROTATIONS_6D, OBJECT_POSITION, OBJECT_ROTATION_6D, WRIST
 from hoidata.objects.model import Hinge, ObjectModel
 
+MOST_BYTES = 1 << 30  # of a long clip every window is a sample of its own
 PLACE = np.array([-1.0, 1.0, 1.0], np.float32)
 # Two columns of a rotation, row by row, as ``rotmat_to_rot6d`` flattens them: entry (i, j) has sign S_i S_j.
 ROTATION_6D = (PLACE[:, None] * PLACE[:2]).reshape(6)
@@ -25,24 +27,19 @@ HANDED_VERBS = frozenset({"screw", "unscrew", "screw in", "screw on", "tighten",
 
 @dataclass(frozen=True)
 class Mirror:
-    """Makes mirrored samples, each once. text: features (512,) of every sentence that is known."""
+    """Makes mirrored samples and keeps the last. text: features (512,) of every sentence that is known."""
 
     text: dict[str, np.ndarray]
-    made: dict[tuple[str, int, int], ClipSample | None] = field(default_factory=dict)
+    made: LRUCache = field(default_factory=lambda: LRUCache(MOST_BYTES, _bytes))
 
     @classmethod
     def of(cls, samples: Iterable[ClipSample]) -> "Mirror":
         """The sentences of these clips; a clip of the one hand can be mirrored where the other hand does the same."""
         return cls({words: row for sample in samples for words, row in zip(sample.sentences, sample.text, strict=True)})
 
+    @cachedmethod(lambda self: self.made, key=lambda self, sample: sample.key)
     def mirrored(self, sample: ClipSample) -> ClipSample | None:
         """The sample in the mirror; None where the other hand is not known to do the same."""
-        key = sample.clip_id, sample.start, sample.length
-        if key not in self.made:
-            self.made[key] = self._make(sample)
-        return self.made[key]
-
-    def _make(self, sample: ClipSample) -> ClipSample | None:
         sentences = tuple(map(swap_hands, sample.sentences))
         if sample.verb in HANDED_VERBS or not all(words in self.text for words in sentences):
             return None
@@ -72,6 +69,10 @@ class Mirror:
             contact=sample.contact[::-1].copy(),
             distances=replace(near, side=1 - near.side),
         )
+
+
+def _bytes(sample: ClipSample | None) -> int:
+    return sample.nbytes if sample else 1
 
 
 def mirrored_object(model: ObjectModel) -> ObjectModel:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from cachetools import LRUCache, cachedmethod
 
 from hoidata.batches.dataset import ClipSample, contact_of
 from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION
@@ -25,27 +26,30 @@ from models.common.features import (
 
 # Logarithms of how much longer paths and turns become, radians of where paths lead, changes of speed: at most.
 PATH, TURN, SIDE_RAD, SPEED = 0.2, 0.15, 0.35, 0.1
+MOST_BYTES = 2 << 30  # of a long clip every window is a sample of its own
 # A turn that comes near to half a circle is left as it is: beyond that its axis is another one.
 LARGEST_TURN_RAD = 2.4
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Makes ``count`` augmented copies of every clip, each once.
+    """Makes ``count`` augmented copies of every clip and keeps the last that were asked for.
 
     A copy has the clip's length, hands, contact and hinge angles. Hands go with the object as they did.
     """
 
     count: int
-    made: dict[tuple[str, int, int, int], ClipSample] = field(default_factory=dict)
+    made: LRUCache = field(default_factory=lambda: LRUCache(MOST_BYTES, _bytes))
 
+    @cachedmethod(lambda self: self.made, key=lambda self, sample, number: (*sample.key, number))
     def copy_of(self, sample: ClipSample, number: int) -> ClipSample:
         """The augmented copy of that number, from 1."""
-        key = sample.clip_id, sample.start, sample.length, number
-        if key not in self.made:
-            seed = [number, sample.start, *sample.clip_id.encode()]
-            self.made[key] = augment(sample, np.random.default_rng(seed), number)
-        return self.made[key]
+        seed = [number, sample.start, *sample.clip_id.encode()]
+        return augment(sample, np.random.default_rng(seed), number)
+
+
+def _bytes(sample: ClipSample) -> int:
+    return sample.nbytes
 
 
 def augment(sample: ClipSample, random: np.random.Generator, number: int) -> ClipSample:

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from cachetools import LRUCache, cachedmethod
 from torch import Tensor, nn
 from torch.nn.utils.rnn import pad_sequence
 
@@ -35,6 +36,7 @@ from models.text2hoi.thresholds import ContactNetwork
 from models.text2hoi.verb_check import action_results
 from models.text2hoi.verb_reading import Sentences, learn_verbs
 
+MOST_CLIPS = 8192  # whose rows are kept: at most some 150 kB each
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
 HAND_GROUPS = (WRIST, GLOBAL_ORIENT_6D, HAND_POSE_6D)
 OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT_HINGE + 1), OBJECT_START_6D)
@@ -81,11 +83,11 @@ class _Target:
 
 
 class Targets:
-    """The rows of clips, worked out once for each; of a clip longer than a batch takes, once for each window."""
+    """The rows of clips, worked out once for each as long as there is room; of a long clip once for each window."""
 
     def __init__(self, code: MotionCode, normaliser: Normaliser, device: torch.device) -> None:
         self.code, self.normaliser, self.device = code, normaliser, device
-        self.kept: dict[tuple[str, int, int], tuple[CodedClip, Tensor, Tensor]] = {}
+        self.made = LRUCache(MOST_CLIPS)
 
     def of(self, batch: ClipBatch) -> _Target:
         """Of a batch's clips, padded."""
@@ -96,16 +98,13 @@ class Targets:
         present, there = self._padded([own.present for own in coded], 1), self.code.rows(batch.counts, self.device)[1]
         return _Target(hands, objects, present, there, self._padded(joints, 1), self._padded(touching, 1))
 
+    @cachedmethod(lambda self: self.made, key=lambda self, sample: sample.key)
     def _clip(self, sample: ClipSample) -> tuple[CodedClip, Tensor, Tensor]:
-        key = sample.clip_id, sample.start, sample.length
-        if key not in self.kept:
-            joints, thing = torch.from_numpy(sample.joints_m), torch.from_numpy(sample.object)
-            touching = torch.zeros(joints.shape[:3], dtype=torch.bool)
-            near = (sample.distances.side, sample.distances.frame, sample.distances.joint)
-            touching[tuple(torch.from_numpy(column).long() for column in near)] = True
-            local = to_object_frame(joints, thing[None].expand(2, -1, -1))
-            self.kept[key] = self.code.encode(sample), local, touching
-        return self.kept[key]
+        joints, thing = torch.from_numpy(sample.joints_m), torch.from_numpy(sample.object)
+        touching = torch.zeros(joints.shape[:3], dtype=torch.bool)
+        near = (sample.distances.side, sample.distances.frame, sample.distances.joint)
+        touching[tuple(torch.from_numpy(column).long() for column in near)] = True
+        return self.code.encode(sample), to_object_frame(joints, thing[None].expand(2, -1, -1)), touching
 
     def _padded(self, rows: Sequence[Tensor], axis: int) -> Tensor:
         if not axis:

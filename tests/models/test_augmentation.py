@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from cachetools import LRUCache
 
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
@@ -115,6 +116,30 @@ def test_a_training_meets_every_copy_and_the_clip_itself_alike_and_goes_on_where
     assert torch.equal(once.hands, twice.hands)
     plain = next(batches(dataset, 3, 0))[0][1]
     assert all(one.clip_id in dataset.ids for one in plain.samples)
+
+
+def test_a_hand_is_there_where_it_was_in_both_frames_that_are_shown(clips: list[ClipSample]) -> None:
+    valid = clips[0].valid.copy()
+    valid[:, 5] = False
+    moments = warped_moments(clips[0].length, np.random.default_rng(2))
+    own = augment(replace(clips[0], valid=valid), np.random.default_rng(2), 1)
+    lost = (4 < moments) & (moments < 6)
+    assert lost.sum() >= 2
+    np.testing.assert_array_equal(own.valid, clips[0].valid[:, :1] & ~lost)
+
+
+def test_copies_take_no_more_memory_than_is_allowed_and_come_back_alike(clips: list[ClipSample]) -> None:
+    """Of a long clip every window is a sample of its own: a training would meet new ones for ever."""
+    small = Augmentation(1, LRUCache(3 * clips[0].nbytes, lambda own: own.nbytes))
+    windows = [clips[0].crop(start, 12) for start in range(10)]
+    first = small.copy_of(windows[0], 1)
+    assert small.copy_of(windows[0], 1) is first
+    for window in windows:
+        small.copy_of(window, 1)
+        assert sum(own.nbytes for own in small.made.values()) <= 3 * clips[0].nbytes
+    again = small.copy_of(windows[0], 1)
+    assert again is not first
+    np.testing.assert_array_equal(again.hands, first.hands)
 
 
 def turned(clip: ClipSample, angle_rad: float) -> ClipSample:
