@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from cachetools import LRUCache, cachedmethod
 
-from hoidata.batches.dataset import ClipSample, contact_of
+from hoidata.batches.dataset import ClipSample, HoiDataset, contact_of
 from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.store.distances import DistanceEntries
@@ -26,25 +26,31 @@ from models.common.features import (
 
 # Logarithms of how much longer paths and turns become, radians of where paths lead, changes of speed: at most.
 PATH, TURN, SIDE_RAD, SPEED = 0.2, 0.15, 0.35, 0.1
-MOST_BYTES = 2 << 30  # of a long clip every window is a sample of its own
+MOST_BYTES = 4 << 30  # some 10,000 copies of 150 frames, what eight of each of GRAB's clips are
 # A turn that comes near to half a circle is left as it is: beyond that its axis is another one.
 LARGEST_TURN_RAD = 2.4
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Makes ``count`` augmented copies of every clip and keeps the last that were asked for.
+    """Makes ``count`` augmented copies of every clip of ``dataset`` and keeps the last that were asked for.
 
-    A copy has the clip's length, hands, contact and hinge angles. Hands go with the object as they did.
+    A copy has the clip's hands, contact, hinge angles and length; of a clip longer than a batch takes, it has a window
+    of its own, so that a training meets the same copies again. Hands go with the object as they did.
     """
 
+    dataset: HoiDataset
     count: int
     made: LRUCache = field(default_factory=lambda: LRUCache(MOST_BYTES, _bytes))
 
-    @cachedmethod(lambda self: self.made, key=lambda self, sample, number: (*sample.key, number))
-    def copy_of(self, sample: ClipSample, number: int) -> ClipSample:
+    @cachedmethod(lambda self: self.made, key=lambda self, clip_id, number: (clip_id, number))
+    def copy_of(self, clip_id: str, number: int) -> ClipSample:
         """The augmented copy of that number, from 1."""
-        seed = [number, sample.start, *sample.clip_id.encode()]
+        sample, seed = self.dataset.whole(clip_id), [number, 0, *clip_id.encode()]
+        spare = sample.length - self.dataset.max_frames
+        if spare > 0:
+            start = np.random.default_rng([*seed, 1]).integers(0, spare + 1) if self.dataset.crop == "random" else 0
+            sample = sample.crop(int(start), self.dataset.max_frames)
         return augment(sample, np.random.default_rng(seed), number)
 
 

@@ -113,7 +113,7 @@ def batches(
     lengths = [min(dataset.whole(clip_id).length, dataset.max_frames) for clip_id in dataset.ids]
     weights = _verb_weights(dataset) if wanted.balance == "verb" else None
     mirror = Mirror.of(map(dataset.whole, dataset.ids)) if wanted.mirror else None
-    augmentation = Augmentation(wanted.augmented_copies)
+    augmentation = Augmentation(dataset, wanted.augmented_copies)
     for step, (epoch, rows) in enumerate(_plan(lengths, size, seed, weights), 1):
         if step > start:
             dataset.set_epoch(epoch)
@@ -131,12 +131,12 @@ def _collated(
     mirror: Mirror | None,
     augmentation: Augmentation,
 ) -> ClipBatch:
+    if augmentation.count:
+        numbers = np.random.default_rng([*drawn_from, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()
+        samples = [augmentation.copy_of(one.clip_id, n) if n else one for one, n in zip(samples, numbers, strict=True)]
     if mirror is not None:
         turned = np.random.default_rng([*drawn_from, 1]).random(len(samples)) < 0.5
         samples = [(turn and mirror.mirrored(one)) or one for one, turn in zip(samples, turned, strict=True)]
-    if augmentation.count:
-        numbers = np.random.default_rng([*drawn_from, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()
-        samples = [augmentation.copy_of(one, n) if n else one for one, n in zip(samples, numbers, strict=True)]
     random = np.random.default_rng(drawn_from)
     lengths = [sample.length for sample in samples]
     sight = Sight.drawn(lengths, wanted.frames, wanted.entries, random) if wanted.frames else None

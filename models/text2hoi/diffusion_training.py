@@ -36,7 +36,7 @@ from models.text2hoi.thresholds import ContactNetwork
 from models.text2hoi.verb_check import action_results
 from models.text2hoi.verb_reading import Sentences, learn_verbs
 
-MOST_CLIPS = 8192  # whose rows are kept: at most some 150 kB each
+MOST_CLIPS = 16_384  # whose rows are kept: at most some 150 kB each
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
 HAND_GROUPS = (WRIST, GLOBAL_ORIENT_6D, HAND_POSE_6D)
 OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT_HINGE + 1), OBJECT_START_6D)

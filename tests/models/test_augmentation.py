@@ -24,15 +24,20 @@ def clips(annotated: AnnotatedStore) -> list[ClipSample]:
     return list(HoiDataset(annotated, "train"))
 
 
+@pytest.fixture
+def copies(annotated: AnnotatedStore) -> Augmentation:
+    return Augmentation(HoiDataset(annotated, "train"), 5)
+
+
 def rotations(sample: ClipSample) -> np.ndarray:
     return object_rotmat(torch.from_numpy(sample.object)).numpy()
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_joints_of_its_angles_are_its_joints(clips: list[ClipSample], number: int) -> None:
+def test_joints_of_its_angles_are_its_joints(clips: list[ClipSample], copies: Augmentation, number: int) -> None:
     hands = Hands(load_embedded_hands())
     for clip in clips:
-        own = Augmentation(5).copy_of(clip, number)
+        own = copies.copy_of(clip.clip_id, number)
         template = None if own.template_m is None else torch.from_numpy(own.template_m.astype(np.float32))[None]
         joints = hands.joints(torch.from_numpy(own.hands)[None], torch.from_numpy(own.betas)[None], template)[0].numpy()
         # Between two frames joints are on a line, and angles turn: less than a millimetre apart.
@@ -40,10 +45,10 @@ def test_joints_of_its_angles_are_its_joints(clips: list[ClipSample], number: in
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_hands_hold_the_object_where_they_held_it(clips: list[ClipSample], number: int) -> None:
+def test_hands_hold_the_object_where_they_held_it(clips: list[ClipSample], copies: Augmentation, number: int) -> None:
     """At every moment of a copy its joints lie in the object's frame as at some moment of the clip."""
     for clip in clips:
-        own = Augmentation(5).copy_of(clip, number)
+        own = copies.copy_of(clip.clip_id, number)
         local, before = (
             to_object_frame(torch.from_numpy(one.joints_m), torch.from_numpy(one.object).expand(2, -1, -1)).numpy()
             for one in (own, clip)
@@ -123,21 +128,34 @@ def test_a_hand_is_there_where_it_was_in_both_frames_that_are_shown(clips: list[
     valid[:, 5] = False
     moments = warped_moments(clips[0].length, np.random.default_rng(2))
     own = augment(replace(clips[0], valid=valid), np.random.default_rng(2), 1)
-    lost = (4 < moments) & (moments < 6)
+    lost = (moments > 4) & (moments < 6)
     assert lost.sum() >= 2
     np.testing.assert_array_equal(own.valid, clips[0].valid[:, :1] & ~lost)
 
 
-def test_copies_take_no_more_memory_than_is_allowed_and_come_back_alike(clips: list[ClipSample]) -> None:
-    """Of a long clip every window is a sample of its own: a training would meet new ones for ever."""
-    small = Augmentation(1, LRUCache(3 * clips[0].nbytes, lambda own: own.nbytes))
-    windows = [clips[0].crop(start, 12) for start in range(10)]
-    first = small.copy_of(windows[0], 1)
-    assert small.copy_of(windows[0], 1) is first
-    for window in windows:
-        small.copy_of(window, 1)
-        assert sum(own.nbytes for own in small.made.values()) <= 3 * clips[0].nbytes
-    again = small.copy_of(windows[0], 1)
+def test_copies_of_a_long_clip_have_a_window_each_that_stays(annotated: AnnotatedStore) -> None:
+    dataset = HoiDataset(annotated, "train", max_frames=12)
+    copies = [Augmentation(dataset, 8).copy_of(dataset.ids[0], number) for number in range(1, 9)]
+    assert {one.length for one in copies} == {12}
+    assert len({one.start for one in copies}) > 3
+    assert all(np.abs(one.object[0, OBJECT_POSITION]).max() < 1e-6 for one in copies)
+    again = Augmentation(dataset, 8).copy_of(dataset.ids[0], 2)
+    assert again.start == copies[1].start
+    np.testing.assert_array_equal(again.hands, copies[1].hands)
+    first = Augmentation(HoiDataset(annotated, "train", max_frames=12, crop="start"), 8)
+    assert {first.copy_of(dataset.ids[0], number).start for number in range(1, 9)} == {0}
+
+
+def test_copies_take_no_more_memory_than_is_allowed_and_come_back_alike(annotated: AnnotatedStore) -> None:
+    dataset = HoiDataset(annotated, "train")
+    most = 3 * dataset[0].nbytes
+    small = Augmentation(dataset, 9, LRUCache(most, lambda own: own.nbytes))
+    first = small.copy_of(dataset.ids[0], 1)
+    assert small.copy_of(dataset.ids[0], 1) is first
+    for number in range(2, 10):
+        small.copy_of(dataset.ids[0], number)
+        assert sum(own.nbytes for own in small.made.values()) <= most
+    again = small.copy_of(dataset.ids[0], 1)
     assert again is not first
     np.testing.assert_array_equal(again.hands, first.hands)
 
