@@ -59,7 +59,10 @@ def _bytes(sample: ClipSample) -> int:
 
 
 def augment(sample: ClipSample, random: np.random.Generator, number: int) -> ClipSample:
-    """One augmented copy, drawn from ``random``; ``number`` becomes part of its name."""
+    """One augmented copy, drawn from ``random``; ``number`` becomes part of its name.
+
+    Between two frames all is on straight lines, but for distances to points, which are those of the nearer frame.
+    """
     moments = warped_moments(sample.length, random)
     thing = torch.from_numpy(sample.object)
     hands = hands_in_object_frame(torch.from_numpy(sample.hands)[None], thing[None])[0]
