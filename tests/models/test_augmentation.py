@@ -12,7 +12,7 @@ from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATIO
 from hoidata.geometry.rotations import rotation_angle, rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
-from models.common.augmentation import Augmentation, augment, entries_at, warped_moments
+from models.common.augmentation import Augmentation, augment, augmented_path, entries_at, warped_moments
 from models.common.corpus import Wanted, batches
 from models.common.features import Hands, object_rotmat, to_object_frame
 
@@ -73,6 +73,20 @@ def test_what_stands_still_stands_still_and_it_all_begins_where_it_began(clips: 
         assert 0.74 * ends[1] <= ends[0] <= 1.35 * ends[1]
 
 
+def test_a_path_grows_alike_in_the_plane_otherwise_upwards_and_turns_about_the_vertical() -> None:
+    thing = torch.zeros(4, 10)
+    thing[1:, OBJECT_POSITION] = torch.eye(3)
+    thing[:, OBJECT_ROTATION_6D] = torch.tensor([1.0, 0, 0, 1, 0, 0])
+    for seed in range(20):
+        x, y, z = augmented_path(thing, np.random.default_rng(seed))[1:, OBJECT_POSITION].numpy()
+        assert np.linalg.norm(x) == pytest.approx(np.linalg.norm(y), abs=1e-6)
+        assert (x[2], y[2], x @ y) == pytest.approx((0, 0, 0), abs=1e-6)
+        assert z == pytest.approx([0, 0, z[2]], abs=1e-6)
+        assert all(0.81 < length < 1.23 for length in (np.linalg.norm(x), z[2]))
+        assert abs(np.linalg.norm(x) - z[2]) > 1e-4
+        assert abs(np.arctan2(x[1], x[0])) < 0.36
+
+
 def test_a_turn_grows_by_one_factor_about_its_own_axis(clips: list[ClipSample]) -> None:
     turning = turned(clips[0], 1.0)
     own = augment(turning, np.random.default_rng(4), 1)
@@ -102,7 +116,7 @@ def test_moments_go_forward_from_the_first_frame_to_the_last() -> None:
         moments = warped_moments(90, np.random.default_rng(seed))
         assert moments[[0, -1]] == pytest.approx([0, 89])
         speed = np.diff(moments)
-        assert 0.55 < speed.min() < 1 < speed.max() < 1.45
+        assert 0.78 < speed.min() < 1 < speed.max() < 1.22
 
 
 def test_a_training_meets_every_copy_and_the_clip_itself_alike_and_goes_on_where_it_was(
@@ -164,5 +178,6 @@ def turned(clip: ClipSample, angle_rad: float) -> ClipSample:
     """The clip with an object that turns evenly about the y axis; its hands are not looked at."""
     rotvec = np.linspace(0, angle_rad, clip.length)[:, None] * [0.0, 1.0, 0.0]
     thing = clip.object.copy()
-    thing[:, OBJECT_ROTATION_6D] = rotmat_to_rot6d(rotvec_to_rotmat(rotvec) @ rotations(clip)[0])
+    start = rotvec_to_rotmat(np.array([0.7, 0.0, 0.2]))
+    thing[:, OBJECT_ROTATION_6D] = rotmat_to_rot6d(rotvec_to_rotmat(rotvec) @ start)
     return replace(clip, object=thing)
