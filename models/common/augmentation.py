@@ -26,7 +26,7 @@ from models.common.features import (
 
 # Logarithms of how much longer paths and turns become, radians of where paths lead, changes of speed: at most.
 PATH, TURN, SIDE_RAD, SPEED = 0.2, 0.15, 0.35, 0.1
-MOST_BYTES = 4 << 30  # some 10,000 copies of 150 frames, what eight of each of GRAB's clips are
+MOST_BYTES = 4 << 30  # some 9,000 copies of 150 frames
 # A turn that comes near to half a circle is left as it is: beyond that its axis is another one.
 LARGEST_TURN_RAD = 2.4
 

@@ -70,7 +70,7 @@ def test_what_stands_still_stands_still_and_it_all_begins_where_it_began(clips: 
         np.testing.assert_allclose(own.object[0], clip.object[0], atol=1e-6)
         assert np.ptp(own.object[:, OBJECT_HINGE]) == pytest.approx(np.ptp(clip.object[:, OBJECT_HINGE]), abs=1e-6)
         ends = [np.linalg.norm(one.object[-1, OBJECT_POSITION]) for one in (own, clip)]
-        assert 0.74 * ends[1] <= ends[0] <= 1.35 * ends[1]
+        assert 0.81 * ends[1] <= ends[0] <= 1.23 * ends[1]
 
 
 def test_a_path_grows_alike_in_the_plane_otherwise_upwards_and_turns_about_the_vertical() -> None:
