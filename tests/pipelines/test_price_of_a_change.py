@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from pipelines.lineage.graph import Stage, read_graph
-from pipelines.params import read_params
+from pipelines.params import read_file, read_params
 from pipelines.side_by_side import CODE
 
 PROJECT = Path(__file__).parents[2]
@@ -79,6 +79,11 @@ def set_adapter(project: Path) -> None:
     set_params(project, convert={**params["convert"], "adapters": {"grab": {"margin_frames": 3}}})
 
 
+def set_in_embedded(project: Path) -> None:
+    profiles = read_file(project / "params.yaml")["profiles"]
+    set_params(project, profiles={**profiles, "embedded": {**profiles["embedded"], "sample": {"samples": 3}}})
+
+
 @dataclass(frozen=True)
 class Change:
     """An edit in words and as a function of the project, and the stages DVC must name (as in ``stages_in_words``)."""
@@ -109,7 +114,7 @@ CHANGES = (
     Change("its settings: `convert.adapters.grab`", set_adapter, "convert of grab"),
     Change(
         "a setting of one profile: `profiles.embedded.sample`",
-        lambda project: set_params(project, profiles={"embedded": {"sample": {"samples": 3}}}),
+        set_in_embedded,
         "controls, sample",
     ),
     Change(
