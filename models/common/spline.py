@@ -15,7 +15,7 @@ from hoidata.devices import send
 # Keeps control points determined where few frames, or none, say what they are.
 STIFFNESS = 1e-6
 # How much more neighbours at rest are held together than each is held to its own place.
-REST = 30.0
+REST = 300.0
 
 
 def intervals_of(n_frames: int, knot_frames: int) -> int:
@@ -59,18 +59,25 @@ def stacked_bases(lengths: list[int], intervals: list[int], n_frames: int, devic
     return send(bases, device)
 
 
-def settled(points: Tensor, there: Tensor, reach: Tensor, rounds: int = 8) -> Tensor:
-    """Control points (..., K, D) of which neighbours that hardly differ are drawn together, and no others.
+def settled(points: Tensor, there: Tensor, reach: Tensor, around: int, rounds: int = 8) -> Tensor:
+    """Control points (..., K, D) drawn together where they stay in one place; those that move keep theirs.
 
-    there (..., K) bool: the points there are. reach (D,): differences well below it are noise, well above it movement.
-    Least squares with the weights of Geman and McClure (1987), found by reweighting: points that move keep their place.
+    there (..., K) bool: the points there are. reach (D,): points that differ by less stay in one place, by twice that
+    they move. around: how many points on either side of the gap between two say which. The difference of the two alone
+    would not: a slow way would come out as steps, and a shake of some centimetres as rest in its middle.
+    Least squares with Tukey's biweight (Beaton and Tukey 1974), found by reweighting.
     """
-    diff = torch.eye(points.shape[-2], device=points.device).diff(dim=0)
+    places = torch.arange(points.shape[-2], device=points.device)
+    diff = torch.eye(len(places), device=points.device).diff(dim=0)
+    gaps = places[:-1, None] + 0.5
+    beside = ((places - gaps).abs() < around).to(points) * there[..., None, :]
+    beside = beside / beside.sum(-1, keepdim=True).clamp_min(1)
     both, found = there[..., 1:] & there[..., :-1], points
     for _ in range(rounds):
-        apart = (found.diff(dim=-2) / reach).square().sum(-1)
-        weight = REST * both / (1 + apart).square()
-        normal = torch.eye(points.shape[-2], device=points.device) + diff.T @ (weight[..., None] * diff)
+        spread = (beside @ found.square() - (beside @ found).square()).clamp_min(0)
+        apart = (spread / (2 * reach).square()).sum(-1)
+        weight = REST * both * (1 - apart).clamp_min(0).square()
+        normal = torch.eye(len(places), device=points.device) + diff.T @ (weight[..., None] * diff)
         found = torch.linalg.solve(normal, points)
     return found
 

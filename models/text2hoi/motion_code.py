@@ -5,7 +5,6 @@ frame the object has at the same moment, where a hand that holds still on a movi
 stand for frames, as control points of B-splines (``models.common.spline``).
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -15,7 +14,7 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
-from hoidata.clips.features import HAND_POSE_6D, OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION
+from hoidata.clips.features import HAND_POSE_6D, OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
 from hoidata.devices import send
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from models.common.features import (
@@ -29,17 +28,19 @@ from models.common.sampling import Motion
 from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
 from models.text2hoi.object_rows import mean_start, turned_from, turned_since_start, unwhiten, whiten
 
-# What is like a metre of movement: 0.1 of a rotation's numbers per centimetre; fingers, of which there are many, more.
-# How an object lay at first is one rotation, the mean of its rows, which need not be alike.
-OBJECT_REACH = torch.tensor([1.0] * 3 + [10.0] * 7 + [math.inf] * 6)
+# What is like a metre of movement: 0.1 of a rotation's numbers per centimetre, a hinge's angle at 20 cm from it, and
+# fingers, of which there are many, more. Place, turn and hinge of an object come to rest each for itself.
+OBJECT_REACH = (OBJECT_POSITION, 1.0), (OBJECT_ROTATION_6D, 10.0), (slice(OBJECT_HINGE, OBJECT_FEATURES), 5.0)
 HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
+REST_FRAMES = 8  # before and after, in which what is at rest stays where it is
 
 
 @dataclass(frozen=True)
 class MotionCodeConfig:
     """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
     per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
-    object, or a hand on it, that is generated with knots nearer than this to each other stands still (0: as generated).
+    object, or a hand on it, that is generated within about this of one place for half a second stands still there
+    (0: as generated).
 
     object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
     lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many
@@ -132,11 +133,15 @@ class MotionCode:
         if not (self.config.rest_m and self.config.knot_frames):
             return hands, objects
         present, there = self.rows(counts, hands.device)
+        around = max(1, round(REST_FRAMES / self.config.knot_frames))
         if self.config.hand_frame == "object":
             reach = self.config.rest_m * HAND_REACH.to(hands)
-            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach)
-        reach = self.config.rest_m * OBJECT_REACH[: objects.shape[-1]].to(objects)
-        return hands, self._whitened(settled(self._course(objects), there, reach))
+            hands = settled(hands, present[:, None].expand(-1, 2, -1), reach, around)
+        course, around = self._course(objects).clone(), around * self.config.object_knots
+        for numbers, like_a_metre in OBJECT_REACH:
+            reach = course.new_tensor([self.config.rest_m * like_a_metre])
+            course[..., numbers] = settled(course[..., numbers], there, reach, around)
+        return hands, self._whitened(course)
 
     def _whitened(self, objects: Tensor) -> Tensor:
         return whiten(objects, self._reach) if self.config.whitening_frames else objects

@@ -142,3 +142,16 @@ def test_a_wobble_of_millimetres_comes_to_rest(batch: ClipBatch) -> None:
     before = CODE.curves(shaky.hands[None], rows[None], counts)[1][0, :, :3]
     after = CODE.curves(*CODE.settled(shaky.hands[None], rows[None], counts), counts)[1][0, :, :3]
     assert after.diff(dim=0).norm(dim=-1).max() < 0.5 * before.diff(dim=0).norm(dim=-1).max()
+
+
+def test_a_hinge_comes_to_rest_though_the_object_moves(batch: ClipBatch) -> None:
+    sample = next(own for own in batch.samples if own.object[:, :3].std(0).max() > 0.01)
+    rows, counts = CODE.encode(sample).object, [sample.length]
+    wobble = 0.005 * torch.randn(len(rows), generator=torch.Generator().manual_seed(0))
+    shaky = torch.cat((rows[:, :9], (rows[:, 9] + wobble)[:, None], rows[:, 10:]), 1)
+    hands = CODE.encode(sample).hands[None]
+    before, after = (
+        CODE.curves(*both, counts)[1][0] for both in ((hands, shaky[None]), CODE.settled(hands, shaky[None], counts))
+    )
+    assert after[:, 9].diff(dim=0).abs().max() < 0.2 * before[:, 9].diff(dim=0).abs().max()
+    assert float((after - before)[:, :3].norm(dim=-1).max()) < 0.004
