@@ -29,8 +29,9 @@ class SolverSettings:
     press_m: how deep skin lies that touches, for it gives way. surface_m: of the nearest skin of each of 16 segments of
     a holding hand from there. depth_m: of a vertex deeper than press_m in the object, or in the other hand. bend_m: of
     a control point from the middle of its neighbours. finger_rad: radians, of each angle of the fingers from what it
-    was: without it skin that is drawn far is brought by fingers that nobody can bend so. knot_frames: of the spline.
-    every: one of so many frames outside of holds is looked at. steps: at most; fewer where one gains less than
+    was: without it skin that is drawn far is brought by fingers that nobody can bend so. clear_m, clear_deviation_m:
+    how far a holding hand stays from a part that passes it, and of a vertex nearer than that. knot_frames: of the
+    spline. every: one of so many frames outside of holds is looked at. steps: at most; fewer where one gains less than
     ``enough`` of the cost.
     """
 
@@ -39,6 +40,8 @@ class SolverSettings:
     depth_m: float = 0.0005
     bend_m: float = 0.004
     finger_rad: float = 0.1
+    clear_m: float = 0.012
+    clear_deviation_m: float = 0.004
     knot_frames: int = 5
     every: int = 2
     steps: int = 12
@@ -73,13 +76,17 @@ def spline_shares(n_frames: int, holds: Sequence[Interval], knot_frames: int) ->
 
 class State(NamedTuple):
     """step (frame, 51) from where a hand was, and what it makes of it: pose, signed distances (frame, vertex) of the
-    skin from object and other hand, and their slopes.
+    skin from the object, from what of it is held, what passes the hand and the other hand, and their slopes.
     """
 
     step: np.ndarray
     pose: HandPose
     distance_m: np.ndarray
     slope: np.ndarray
+    held_m: np.ndarray
+    held_slope: np.ndarray
+    passing_m: np.ndarray
+    passing_slope: np.ndarray
     other_m: np.ndarray
     other_slope: np.ndarray
 
@@ -88,7 +95,8 @@ class Wishes:
     """What is wished for the skin of one hand, frame by frame; the part's frame throughout.
 
     own: the hand as it was. frames: (frame,) which of the object's each row is. holding: (frame,) bool. other: capsules
-    of the other hand there. start: what is seen of ``own``. trust: (frame, segment) how much skin of each is to touch.
+    of the other hand there. held: number of the part that is held while the other one passes the hand, None where none
+    does. start: what is seen of ``own``. trust: (frame, segment) how much skin of each is to touch.
     """
 
     def __init__(
@@ -101,12 +109,13 @@ class Wishes:
         other: Capsules | None,
         settings: SolverSettings,
         draw: Draw,
+        held: int | None = None,
     ) -> None:
-        self.skin, self.field, self.own, self.frames = skin, field, own, frames
-        self.other, self.settings, self.draw = other, settings, draw
+        self.skin, self.field, self.own, self.frames, self.holding = skin, field, own, frames, holding
+        self.other, self.settings, self.draw, self.held = other, settings, draw, held
         self.metric = self._metric()
         self.start = self.see(np.zeros((len(frames), N_UNKNOWNS)))
-        near = np.maximum(skin.nearest_of_segments(self.start.distance_m)[1], 0)
+        near = np.maximum(skin.nearest_of_segments(self.start.held_m)[1], 0)
         self.trust = np.exp(-0.5 * (near / draw.reach_m) ** 2) * holding[:, None]
 
     def _metric(self) -> np.ndarray:
@@ -126,22 +135,37 @@ class Wishes:
         """The hand after a step (frame, 51)."""
         pose = self.own.moved(step)
         points = self.skin.vertices_m(self.skin.chain(pose))
-        distance, slope = self.field.distances(points, self.frames)
-        other, other_slope = np.full(distance.shape, np.inf), np.zeros(points.shape)
+        other, passing = ((np.full(points.shape[:2], np.inf), np.zeros(points.shape)) for _ in range(2))
         if self.other is not None:
-            lower_capsules(*self.other, points, other, other_slope)
-        return State(step, pose, distance, slope, other, other_slope)
+            lower_capsules(*self.other, points, *other)
+        if self.held is None:
+            object = held = self.field.distances(points, self.frames)
+        else:
+            held, beside = (self.field.distances_to(own, points, self.frames) for own in (self.held, 1 - self.held))
+            first = held[0] <= beside[0]
+            object = np.where(first, held[0], beside[0]), np.where(first[..., None], held[1], beside[1])
+            passing = np.where(self.holding[:, None], beside[0], np.inf), beside[1]
+        return State(step, pose, *object, *held, *passing, *other)
 
     def costs(self, state: State) -> np.ndarray:
         """(frame,) what is left to wish for."""
         own, step = self.settings, state.step
         each = ((self.metric @ step[..., None])[..., 0] * step).sum(axis=1)
-        each += (self.trust * (self.skin.nearest_of_segments(state.distance_m)[1] + own.press_m) ** 2).sum(
+        each += (self.trust * (self.skin.nearest_of_segments(state.held_m)[1] + own.press_m) ** 2).sum(
             axis=1
         ) / own.surface_m**2
-        for distance in (state.distance_m, state.other_m):
-            each += (np.minimum(distance + own.press_m, 0) ** 2).sum(axis=1) / own.depth_m**2
+        for distance, _, least_m, deviation_m in self._outside(state):
+            each += (np.minimum(distance - least_m, 0) ** 2).sum(axis=1) / deviation_m**2
         return each
+
+    def _outside(self, state: State) -> list[tuple[np.ndarray, np.ndarray, float, float]]:
+        """Distances and slopes of what skin is to stay outside of, by how much, and the deviation from that, metres."""
+        own = self.settings
+        return [
+            (state.distance_m, state.slope, -own.press_m, own.depth_m),
+            (state.other_m, state.other_slope, -own.press_m, own.depth_m),
+            (state.passing_m, state.passing_slope, own.clear_m, own.clear_deviation_m),
+        ]
 
     def equations(self, state: State) -> tuple[np.ndarray, np.ndarray]:
         """Normal equations (frame, 51, 51) of the next step, and minus half the gradient (frame, 51)."""
@@ -154,17 +178,18 @@ class Wishes:
     def _add_distances(self, state: State, matrix: np.ndarray, vector: np.ndarray) -> None:
         """Skin that is to touch, and skin that is too deep in the object or in the other hand."""
         own, chain = self.settings, self.skin.chain(state.pose, slopes=True)
-        vertex, near = self.skin.nearest_of_segments(state.distance_m)
+        vertex, near = self.skin.nearest_of_segments(state.held_m)
         row, segment = np.nonzero(self.trust > 1e-3)
-        found = [(row, vertex[row, segment], near[row, segment], self.trust[row, segment] / own.surface_m**2)]
-        slopes = [state.slope[row, vertex[row, segment]]]
-        for distance, slope in ((state.distance_m, state.slope), (state.other_m, state.other_slope)):
-            row, deep = np.nonzero(distance < -own.press_m)
-            found.append((row, deep, distance[row, deep], np.full(len(row), own.depth_m**-2)))
+        too_far = near[row, segment] + own.press_m
+        found = [(row, vertex[row, segment], too_far, self.trust[row, segment] / own.surface_m**2)]
+        slopes = [state.held_slope[row, vertex[row, segment]]]
+        for distance, slope, least_m, deviation_m in self._outside(state):
+            row, deep = np.nonzero(distance < least_m)
+            found.append((row, deep, distance[row, deep] - least_m, np.full(len(row), deviation_m**-2)))
             slopes.append(slope[row, deep])
-        frame, chosen, distance, weight = (np.concatenate(column) for column in zip(*found, strict=True))
+        frame, chosen, off_m, weight = (np.concatenate(column) for column in zip(*found, strict=True))
         derivative = self.skin.derivatives(chain, frame, chosen)
-        add_squares(frame, np.concatenate(slopes), derivative, weight, distance + own.press_m, matrix, vector)
+        add_squares(frame, np.concatenate(slopes), derivative, weight, off_m, matrix, vector)
 
 
 def settled(wishes: Wishes, steps: int) -> HandPose:
@@ -193,6 +218,10 @@ def _chosen(moved: np.ndarray, one: State, other: State) -> State:
         one.pose.where(moved, other.pose),
         either(one.distance_m, other.distance_m),
         either(one.slope, other.slope),
+        either(one.held_m, other.held_m),
+        either(one.held_slope, other.held_slope),
+        either(one.passing_m, other.passing_m),
+        either(one.passing_slope, other.passing_slope),
         either(one.other_m, other.other_m),
         either(one.other_slope, other.other_slope),
     )
@@ -215,6 +244,7 @@ class HandInTime:
         other: Capsules | None,
         settings: SolverSettings,
         draw: Draw,
+        held: int | None,
     ) -> None:
         self.pose, self.settings = pose, settings
         self.all_shares = spline_shares(len(valid), holds, settings.knot_frames)
@@ -224,7 +254,7 @@ class HandInTime:
         bend = np.diff(np.eye(self.shares.shape[1]), n=2, axis=0)
         self.bend = bend.T @ bend / settings.bend_m**2
         there = None if other is None else other.taken(frames)
-        self.wishes = Wishes(skin, field, pose.taken(frames), frames, holding, there, settings, draw)
+        self.wishes = Wishes(skin, field, pose.taken(frames), frames, holding, there, settings, draw, held)
 
     def corrected(self) -> HandPose:
         """The pose of every frame."""

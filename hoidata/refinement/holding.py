@@ -37,6 +37,7 @@ _OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left"}
 _ALONG = 9  # places along a capsule's axis at which it is looked at
 _SOME_SKIN = 3  # one of so many vertices is looked at in the search of another grasp
 _LEAST_SLOPE = 1e-6  # shorter ones say no direction
+_PASSING_RAD = 0.05  # a lid that opens by this much moves past a hand on the base
 _UNDER_M = 0.005  # so much lower than the table, or than before, a hand with another grasp may be
 
 
@@ -101,10 +102,14 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
     A frame in which a hand is not valid is not changed. Without known gravity, or an inside, nothing has to be carried.
     """
     load, best, most = _Load.of(clip, settings.air_frames), dict(clip.hands), -1.0
+    parts: dict[Side, int] = {}  # what each hand holds at first: to the next try it may seem to hold the other one
     for number, (reach, keypoint) in enumerate(zip(settings.reach_m, settings.keypoint_m, strict=True)):
-        starts = _starts(pair, clip, settings if not number else replace(settings, carry=0))  # once drawn out is enough
+        # Once drawn out is enough.
+        starts = _starts(pair, clip, settings if not number else replace(settings, carry=0), parts)
         if not starts:
             break
+        for side, start in starts.items():
+            parts.setdefault(side, start.part)
         tracks = _solved(pair, clip, starts, settings.solver, Draw(reach, keypoint))
         share = load.carried_share(pair, tracks)
         # A try that carries no more than the best so far is no answer, but the next one goes on from it.
@@ -114,15 +119,20 @@ def hold_hands(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings
         if share == 1:
             break
     if 0 <= most < 1 and settings.regrasp.tries:
-        return _regrasped(pair, replace(clip, hands=best), load, settings)
+        return _regrasped(pair, replace(clip, hands=best), load, settings, parts)
     return best
 
 
-def _regrasped(pair: HandPair, clip: Clip, load: "_Load", settings: HoldSettings) -> dict[Side, HandTrack]:
-    """The hands of a clip, with another grasp in every hold that cannot carry and where one that can is found."""
+def _regrasped(
+    pair: HandPair, clip: Clip, load: "_Load", settings: HoldSettings, parts: Mapping[Side, int]
+) -> dict[Side, HandTrack]:
+    """The hands of a clip, with another grasp in every hold that cannot carry and where one that can is found.
+
+    parts: what each hand holds, by number.
+    """
     tracks = dict(clip.hands)
     for side in SIDES:
-        if (grip := _grip(pair, side, clip, settings)) is None:
+        if (grip := _grip(pair, side, clip, settings, parts.get(side))) is None:
             continue
         opposite = _OPPOSITE[side]
         other = capsules_there(tracks[opposite], pair[opposite]) if tracks[opposite].valid.any() else None
@@ -130,11 +140,11 @@ def _regrasped(pair: HandPair, clip: Clip, load: "_Load", settings: HoldSettings
     return tracks
 
 
-def _starts(pair: HandPair, clip: Clip, settings: HoldSettings) -> dict[Side, "_Start"]:
-    """The hands that hold something."""
+def _starts(pair: HandPair, clip: Clip, settings: HoldSettings, parts: Mapping[Side, int]) -> dict[Side, "_Start"]:
+    """The hands that hold something; of ``parts`` that one, where a hand has one there."""
     grips: dict[Side, _Grip] = {}
     for side in SIDES:
-        if (grip := _grip(pair, side, clip, settings)) is not None:
+        if (grip := _grip(pair, side, clip, settings, parts.get(side))) is not None:
             grips[side] = grip
     free = ~np.any([grip.held for grip in grips.values()], axis=0) if grips else np.zeros(0, bool)
     return {
@@ -226,7 +236,9 @@ class _Load:
 
 @dataclass(frozen=True)
 class _Start:
-    """One hand in the frame of the part it holds, at rest in its holds."""
+    """One hand in the frame of the part it holds, at rest in its holds. part: its number. passed: whether the other one
+    moves past the hand meanwhile.
+    """
 
     track: HandTrack
     skin: Skin
@@ -234,16 +246,21 @@ class _Start:
     holds: list[Interval]
     part_from_world: RigidTransform
     field: ObjectField
+    part: int
+    passed: bool
 
     def solved(self, other: Capsules | None, settings: SolverSettings, draw: Draw) -> HandTrack:
         """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
         other = None if other is None else other.seen_from(self.part_from_world)
-        hand = HandInTime(self.skin, self.field, self.pose, self.holds, self.track.valid, other, settings, draw)
+        held, valid = self.part if self.passed else None, self.track.valid
+        hand = HandInTime(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, held)
         pose = hand.corrected()
-        track, valid = self.track, self.track.valid[:, None]
+        track = self.track
         made = pose.seen_from(self.part_from_world.inverse()).track(track.betas[0], track.valid, track.template_m)
         kept = {name: getattr(track, name) for name in ("wrist_m", "global_orient", "hand_pose")}
-        return replace(track, **{name: np.where(valid, getattr(made, name), own) for name, own in kept.items()})
+        return replace(
+            track, **{name: np.where(valid[:, None], getattr(made, name), own) for name, own in kept.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -361,7 +378,14 @@ class _Grip:
         part_from_world = self.world_from_part.inverse()
         pose = _at_rest(self.pose.seen_from(part_from_world), self.holds, blend, grasps)
         field = ObjectField(_in_part(thing, self.object_from_part))
-        return _Start(self.track, self.skin, pose, self.holds, part_from_world, field)
+        passed = _passes(thing, self.holds)
+        return _Start(self.track, self.skin, pose, self.holds, part_from_world, field, self.part, passed)
+
+
+def _passes(thing: ObjectTrack, holds: Sequence[Interval]) -> bool:
+    """Whether in a hold one part of an object moves past the other."""
+    hinge_rad = thing.hinge_rad
+    return hinge_rad is not None and any(np.ptp(hinge_rad[start:stop]) > _PASSING_RAD for start, stop in holds)
 
 
 def _leading(wanted: np.ndarray, most: int) -> int:
@@ -369,8 +393,8 @@ def _leading(wanted: np.ndarray, most: int) -> int:
     return int(np.append(wanted[:most], False).argmin())
 
 
-def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Grip | None:
-    """None for a hand that holds nothing."""
+def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings, part: int | None = None) -> _Grip | None:
+    """None for a hand that holds nothing. part: the one it is to hold, else the one it touches most."""
     track, thing = clip.hands[side], clip.object
     if not track.valid.any():
         return None
@@ -379,7 +403,7 @@ def _grip(pair: HandPair, side: Side, clip: Clip, settings: HoldSettings) -> _Gr
     points_m = skin.vertices_m(skin.chain(world))
     field = ObjectField(thing)
     touching: np.ndarray = (field.distances(points_m)[0] < settings.near_m) & track.valid[:, None]
-    part, touching = field.part_touched(points_m, touching)
+    part, touching = field.part_touched(points_m, touching, part)
     moved, touched = world_from_part(thing, part), np.any(touching, axis=1)
     holds, moving = _holds(points_m, touched, moved, track.valid, settings)
     object_from_part = thing.model.object_from_part(part, thing.hinge_rad)

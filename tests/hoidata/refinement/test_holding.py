@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
@@ -18,6 +19,7 @@ from hoidata.refinement import HoldSettings, carried_share, hold_clip, hold_hand
 from hoidata.refinement.hold_solver import spline_shares
 from hoidata.refinement.holding import _Load
 from hoidata.refinement.kernels import lower_capsules
+from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.regrasping import RegraspSettings
 from tests.builders.clips import DOWN, clip_of
 from tests.builders.objects import box_model, two_parts
@@ -168,23 +170,64 @@ def test_hands_that_touch_nothing_and_frames_without_a_hand_keep_their_numbers(p
         assert not np.array_equal(track.hand_pose[12:30], clip.hands[side].hand_pose[12:30])
 
 
-def test_a_hand_on_a_lid_stays_still_on_the_lid_while_it_opens():
+def opening(middle_m: float) -> tuple[Clip, RigidTransform]:
+    """A right hand pressed on a lid so far from the hinge while it opens, and the lid's motion."""
     base, lid = (box_model((0.4, 0.4, 0.01), middle_m=(x, 0, 0)) for x in (-0.2, 0.2))
     model = two_parts(base, lid, (0, 1, 0))
     angle = np.interp(np.arange(FRAMES), [0, 14, 34, FRAMES], [0, 0, -0.8, -0.8])
     still = np.zeros((FRAMES, 3), np.float32)
     thing = ObjectTrack(model, still, still, angle.astype(np.float32))
     world_from_lid = model.object_from_part(1, angle)
-    top = (world_from_lid @ np.tile([0.2, 0, 0.005], (FRAMES, 1, 1)))[:, 0]
+    top = (world_from_lid @ np.tile([middle_m, 0, 0.005], (FRAMES, 1, 1)))[:, 0]
     hands: dict[Side, HandTrack] = {
         "left": pressed("left", top + 1.0, 0.0, 0.0, np.tile(np.eye(3), (FRAMES, 1, 1))),
         "right": pressed("right", top, 0.006, 0.003, world_from_lid.rotation),
     }
-    made = hold_hands(PAIR, clip_of("toy/s1/b", thing, hands))["right"]
+    return clip_of("toy/s1/b", thing, hands), world_from_lid
+
+
+def test_a_hand_on_a_lid_stays_still_on_the_lid_while_it_opens():
+    clip, world_from_lid = opening(0.2)
+    made = hold_hands(PAIR, clip)["right"]
     on_lid = world_from_lid.inverse() @ track_vertices(made, PAIR.right).astype(np.float64)
     assert np.linalg.norm(np.diff(on_lid[14:33], axis=0), axis=-1).max() < 1e-6
     on_base = track_vertices(made, PAIR.right)[HELD]
     assert np.linalg.norm(np.diff(on_base, axis=0), axis=-1).max() > 0.001
+
+
+def test_a_hand_across_the_hinge_gives_way_to_the_part_it_does_not_hold(monkeypatch):
+    clip, world_from_lid = opening(0.04)
+
+    def skin_near_base(track: HandTrack) -> float:
+        skin = track_vertices(track, PAIR.right)[HELD].astype(np.float64)
+        field, frames = ObjectField(clip.object), np.arange(FRAMES)[HELD]
+        return float((field.distances_to(0, skin, frames)[0] < 0.01).mean())
+
+    gives_way = hold_hands(PAIR, clip)["right"]
+    monkeypatch.setattr("hoidata.refinement.holding._passes", lambda thing, holds: False)
+    stays = hold_hands(PAIR, clip)["right"]
+    assert skin_near_base(stays) > 0.03
+    assert skin_near_base(gives_way) < 0.3 * skin_near_base(stays)
+    on_lid = world_from_lid.inverse() @ track_vertices(gives_way, PAIR.right).astype(np.float64)
+    assert np.linalg.norm(np.diff(on_lid[14:33], axis=0), axis=-1).max() < 1e-6
+    assert -0.002 < on_lid[20, :, 2].min() - 0.005 < 0.001
+
+
+def test_a_hand_keeps_to_the_part_it_holds_at_first(monkeypatch):
+    """A try may push it off that part and nearer to the other one."""
+    clip, asked = opening(0.07)[0], []
+    touched = ObjectField.part_touched
+
+    def part_touched(self, places_m, touching, part=None):
+        asked.append(part)
+        return touched(self, places_m, touching, part)
+
+    monkeypatch.setattr(ObjectField, "part_touched", part_touched)
+    monkeypatch.setattr("hoidata.refinement.holding._Load.carried_share", lambda self, pair, hands: 0.0)
+    hold_hands(PAIR, clip, AS_GENERATED)
+    rights = [part for part in asked if part is not None]
+    assert set(rights) == {1}
+    assert len(rights) == len(HoldSettings().reach_m) - 1
 
 
 def test_where_the_object_would_fall_hands_are_drawn_to_it_from_farther_away():
