@@ -15,7 +15,7 @@ from hoidata.devices import send
 # Keeps control points determined where few frames, or none, say what they are.
 STIFFNESS = 1e-6
 # How much more neighbours at rest are held together than each is held to its own place.
-REST = 300.0
+REST = 100.0
 
 
 def intervals_of(n_frames: int, knot_frames: int) -> int:
@@ -59,27 +59,32 @@ def stacked_bases(lengths: list[int], intervals: list[int], n_frames: int, devic
     return send(bases, device)
 
 
-def settled(points: Tensor, there: Tensor, reach: Tensor, around: int, rounds: int = 8) -> Tensor:
+def settled(points: Tensor, there: Tensor, reach: Tensor, around: int) -> Tensor:
     """Control points (..., K, D) drawn together where they stay in one place; those that move keep theirs.
 
-    there (..., K) bool: the points there are. reach (D,): points that differ by less stay in one place, by twice that
-    they move. around: how many points on either side of the gap between two say which. The difference of the two alone
-    would not: a slow way would come out as steps, and a shake of some centimetres as rest in its middle.
-    Least squares with Tukey's biweight (Beaton and Tukey 1974), found by reweighting.
+    there (..., K) bool: the points there are. reach (D,): half of how far points lie apart that surely move: those on
+    one side of a gap from those on its other side, in the mean, and each from the mean of both. around: how many points
+    a side has. The two at the gap alone would not tell: a slow way would come out as steps, and a shake of some
+    centimetres as rest in its middle. Weighted least squares, once: weights (Tukey's biweight) found again from what
+    came out would make steps, too.
     """
     places = torch.arange(points.shape[-2], device=points.device)
-    diff = torch.eye(len(places), device=points.device).diff(dim=0)
-    gaps = places[:-1, None] + 0.5
-    beside = ((places - gaps).abs() < around).to(points) * there[..., None, :]
-    beside = beside / beside.sum(-1, keepdim=True).clamp_min(1)
-    both, found = there[..., 1:] & there[..., :-1], points
-    for _ in range(rounds):
-        spread = (beside @ found.square() - (beside @ found).square()).clamp_min(0)
-        apart = (spread / (2 * reach).square()).sum(-1)
-        weight = REST * both * (1 - apart).clamp_min(0).square()
-        normal = torch.eye(len(places), device=points.device) + diff.T @ (weight[..., None] * diff)
-        found = torch.linalg.solve(normal, points)
-    return found
+    way = places - places[:-1, None] - 0.5
+    sides = (way < 0) & (way > -around), (way > 0) & (way < around)
+    before, after = (_means(side.to(points) * there[..., None, :]) for side in sides)
+    both = (before + after) / 2
+    moved = (after @ points - before @ points).square()
+    spread = (both @ points.square() - (both @ points).square()).clamp_min(0)
+    apart = ((moved + spread) / (2 * reach).square()).sum(-1)
+    weight = REST * (there[..., 1:] & there[..., :-1]) * (1 - apart).clamp_min(0).square()
+    own = torch.eye(len(places), device=points.device)
+    diff = own.diff(dim=0)
+    return torch.linalg.solve(own + diff.T @ (weight[..., None] * diff), points)
+
+
+def _means(shares: Tensor) -> Tensor:
+    """Rows (..., K) of ones and zeros that give the mean of the points they name; none of nothing."""
+    return shares / shares.sum(-1, keepdim=True).clamp_min(1)
 
 
 def projected(x: Tensor, lengths: list[int], knot_frames: int) -> Tensor:

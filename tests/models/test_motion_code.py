@@ -154,16 +154,19 @@ def test_rows_that_stay_in_one_place_come_to_rest_and_a_path_keeps_its_way() -> 
     torch.testing.assert_close(everywhere[:12], brought_to_rest((path + noise)[:12]))
 
 
-def test_a_slow_way_does_not_come_out_as_steps() -> None:
-    """A lid's 50 degrees a second are 3.3 degrees a row; with differences of neighbours it went in jerks of 150."""
-    way = torch.linspace(0, 25, 9)
-    angle = torch.deg2rad(torch.cat((torch.zeros(12), way, torch.full((12,), 25.0))))[:, None]
-    noise = 0.002 * torch.randn(angle.shape, generator=torch.Generator().manual_seed(0))
-    found = brought_to_rest(angle + noise, 0.02)
-    assert float(found.diff(dim=0).max()) < 1.2 * float(angle.diff(dim=0).max())
+@pytest.mark.parametrize("cm_s", [1, 2, 3, 4, 5, 6, 8, 12, 30])
+def test_a_slow_way_does_not_come_out_as_steps(cm_s: float) -> None:
+    """Two seconds of it, a row every fifteenth of a second. With differences of neighbours 5 cm/s came out as 15."""
+    step = cm_s / 1500
+    way = torch.cat((torch.zeros(15), torch.arange(1, 31) * step, torch.full((15,), 30 * step)))[:, None]
+    found = brought_to_rest(way)
+    speed = found.diff(dim=0)[20:40]
+    assert 0.65 * step < float(speed.min())
+    assert float(speed.max()) < 1.05 * step
+    assert float((found - way).abs().max()) < 0.004
 
 
 def test_a_shake_keeps_its_size() -> None:
     """3.5 Hz, 3 cm from end to end, a row every fifteenth of a second."""
     rows = 0.015 * torch.sin(2 * torch.pi * 3.5 / 15 * torch.arange(60))[:, None]
-    torch.testing.assert_close(brought_to_rest(rows), rows, atol=1e-5, rtol=0)
+    torch.testing.assert_close(brought_to_rest(rows)[2:-2], rows[2:-2], atol=1e-3, rtol=0)

@@ -155,3 +155,13 @@ def test_a_hinge_comes_to_rest_though_the_object_moves(batch: ClipBatch) -> None
     )
     assert after[:, 9].diff(dim=0).abs().max() < 0.2 * before[:, 9].diff(dim=0).abs().max()
     assert float((after - before)[:, :3].norm(dim=-1).max()) < 0.004
+
+
+def test_an_object_that_is_pushed_slowly_does_not_go_in_steps(batch: ClipBatch) -> None:
+    sample = batch.samples[0]
+    way_m = np.interp(np.arange(sample.length), [6, sample.length - 6], [0, 0.05 * (sample.length - 12) / 30])
+    thing = np.repeat(sample.object[:1], sample.length, 0)
+    thing[:, 0] += way_m.astype(np.float32)
+    coded, counts = CODE.encode(replace(sample, object=thing)), [sample.length]
+    after = CODE.curves(*CODE.settled(coded.hands[None], coded.object[None], counts), counts)[1][0, :, 0]
+    assert after.diff().max() < 1.3 * np.diff(way_m).max()

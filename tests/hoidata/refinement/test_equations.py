@@ -9,6 +9,7 @@ from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, load_embedded_hands
 from hoidata.objects.distance import signed_distance
 from hoidata.refinement.banded import acceleration_equations, second_differences, solve_blocks
+from hoidata.refinement.hold_solver import Draw, SolverSettings, Wishes
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, Skin
@@ -90,6 +91,31 @@ def test_the_banded_system_is_the_dense_one_of_the_same_residuals():
     blocks[0] = blocks[0] + np.eye(n)
     assert own.ravel() == pytest.approx(vector)
     assert solve_blocks(blocks, own).ravel() == pytest.approx(np.linalg.solve(matrix, vector))
+
+
+@pytest.mark.parametrize("held", [None, 0, 1])
+def test_the_step_of_a_hand_goes_down_its_cost(held):
+    """Minus half the slope of what is left to wish for, the hand partly in both parts of a hinged box."""
+    model, hand = hinged_box(), load_embedded_hands().right
+    still = np.zeros((FRAMES, 3), np.float32)
+    thing = ObjectTrack(model, still, still, np.linspace(0, -0.6, FRAMES, dtype=np.float32))
+    skin = Skin(hand, np.zeros(10), None)
+    flat = HandPose(np.zeros((1, 3)), np.eye(3)[None], hand.mean_pose.reshape(1, 15, 3).astype(np.float64))
+    middle = skin.vertices_m(skin.chain(flat))[0].mean(axis=0)
+    own = flat._replace(wrist_m=np.array([[0.013, -0.007, 0.021]]) - middle).taken(np.zeros(FRAMES, int))
+    holding = np.array([True, True, False])
+    wishes = Wishes(skin, ObjectField(thing), own, np.arange(FRAMES), holding, None, SolverSettings(), Draw(0.01), held)
+    if held is not None:
+        near = wishes.start.passing_m < SolverSettings().clear_m
+        assert near[holding].any(axis=1).all()
+        assert not near[~holding].any()
+    vector, step = wishes.equations(wishes.start)[1], 1e-7
+    way = np.eye(N_UNKNOWNS)[:6] * step
+    ahead, behind = (
+        np.stack([wishes.costs(wishes.see(np.tile(sign * own, (FRAMES, 1)))) for own in way], 1) for sign in (1, -1)
+    )
+    slope = (ahead - behind) / (2 * step)
+    assert np.abs(vector[:, :6] + slope / 2).max() < 0.03 * np.abs(slope).max()
 
 
 def test_squares_of_scattered_residuals_add_up_as_their_products_do():
