@@ -5,6 +5,7 @@ frame the object has at the same moment, where a hand that holds still on a movi
 stand for frames, as control points of B-splines (``models.common.spline``).
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -32,6 +33,7 @@ from models.text2hoi.object_rows import mean_start, turned_from, turned_since_st
 # fingers, of which there are many, more. Place, turn and hinge of an object come to rest each for itself.
 OBJECT_REACH = (OBJECT_POSITION, 1.0), (OBJECT_ROTATION_6D, 10.0), (slice(OBJECT_HINGE, OBJECT_FEATURES), 5.0)
 HAND_REACH = torch.tensor([1.0] * 3 + [10.0] * 6 + [40.0] * 90)
+STILL_HINGE_RAD = 0.05  # a hinge that nowhere moves by more stands still
 REST_FRAMES = 8  # before and after, in which what is at rest stays where it is
 
 
@@ -141,6 +143,7 @@ class MotionCode:
         for numbers, like_a_metre in OBJECT_REACH:
             reach = course.new_tensor([self.config.rest_m * like_a_metre])
             course[..., numbers] = settled(course[..., numbers], there, reach, around)
+        course[..., OBJECT_HINGE] = _still_hinge(course[..., OBJECT_HINGE], there)
         return hands, self._whitened(course)
 
     def _whitened(self, objects: Tensor) -> Tensor:
@@ -175,3 +178,11 @@ class MotionCode:
     def in_object_frame(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the object's frame."""
         return hands if self.config.hand_frame == "object" else hands_in_object_frame(hands, objects)
+
+
+def _still_hinge(angle: Tensor, there: Tensor) -> Tensor:
+    """Angles (B, L), radians, at their mean where all of ``there`` (B, L) lie close together."""
+    most, least = (angle.masked_fill(~there, bound) for bound in (-math.inf, math.inf))
+    moves = most.amax(-1) - least.amin(-1) > STILL_HINGE_RAD
+    mean = (angle * there).sum(-1) / there.sum(-1)
+    return torch.where(moves[:, None], angle, mean[:, None])

@@ -165,3 +165,14 @@ def test_an_object_that_is_pushed_slowly_does_not_go_in_steps(batch: ClipBatch) 
     coded, counts = CODE.encode(replace(sample, object=thing)), [sample.length]
     after = CODE.curves(*CODE.settled(coded.hands[None], coded.object[None], counts), counts)[1][0, :, 0]
     assert after.diff().max() < 1.3 * np.diff(way_m).max()
+
+
+def test_a_hinge_that_hardly_moves_stands_still_and_one_that_opens_opens(batch: ClipBatch) -> None:
+    sample = batch.samples[0]
+    for range_rad, still in ((0.03, True), (0.4, False)):
+        thing = sample.object.copy()
+        thing[:, 9] = np.linspace(0.2, 0.2 + range_rad, len(thing))
+        coded, counts = CODE.encode(replace(sample, object=thing)), [sample.length]
+        angle = CODE.curves(*CODE.settled(coded.hands[None], coded.object[None], counts), counts)[1][0, :, 9]
+        assert float(angle.max() - angle.min()) == pytest.approx(0 if still else range_rad, abs=0.01 * range_rad + 1e-6)
+        assert float(angle.mean()) == pytest.approx(0.2 + range_rad / 2, abs=0.002)
