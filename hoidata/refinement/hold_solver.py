@@ -95,8 +95,8 @@ class Wishes:
     """What is wished for the skin of one hand, frame by frame; the part's frame throughout.
 
     own: the hand as it was. frames: (frame,) which of the object's each row is. holding: (frame,) bool. other: capsules
-    of the other hand there. held: number of the part that is held while the other one passes the hand, None where none
-    does. start: what is seen of ``own``. trust: (frame, segment) how much skin of each is to touch.
+    of the other hand there. part: number of the one that is held. passed: (frame,) bool, the other part moves past the
+    hand; None: nowhere. start: what is seen of ``own``. trust: (frame, segment) how much skin of each is to touch.
     """
 
     def __init__(
@@ -109,10 +109,11 @@ class Wishes:
         other: Capsules | None,
         settings: SolverSettings,
         draw: Draw,
-        held: int | None = None,
+        part: int = 0,
+        passed: np.ndarray | None = None,
     ) -> None:
-        self.skin, self.field, self.own, self.frames, self.holding = skin, field, own, frames, holding
-        self.other, self.settings, self.draw, self.held = other, settings, draw, held
+        self.skin, self.field, self.own, self.frames = skin, field, own, frames
+        self.other, self.settings, self.draw, self.part, self.passed = other, settings, draw, part, passed
         self.metric = self._metric()
         self.start = self.see(np.zeros((len(frames), N_UNKNOWNS)))
         near = np.maximum(skin.nearest_of_segments(self.start.held_m)[1], 0)
@@ -138,14 +139,15 @@ class Wishes:
         other, passing = ((np.full(points.shape[:2], np.inf), np.zeros(points.shape)) for _ in range(2))
         if self.other is not None:
             lower_capsules(*self.other, points, *other)
-        if self.held is None:
-            object = held = self.field.distances(points, self.frames)
+        if self.passed is None:
+            nearest = held = self.field.distances(points, self.frames)
         else:
-            held, beside = (self.field.distances_to(own, points, self.frames) for own in (self.held, 1 - self.held))
-            first = held[0] <= beside[0]
-            object = np.where(first, held[0], beside[0]), np.where(first[..., None], held[1], beside[1])
-            passing = np.where(self.holding[:, None], beside[0], np.inf), beside[1]
-        return State(step, pose, *object, *held, *passing, *other)
+            own, beside = (self.field.distances_to(part, points, self.frames) for part in (self.part, 1 - self.part))
+            first, passed = own[0] <= beside[0], self.passed[:, None]
+            nearest = np.where(first, own[0], beside[0]), np.where(first[..., None], own[1], beside[1])
+            held = np.where(passed, own[0], nearest[0]), np.where(passed[..., None], own[1], nearest[1])
+            passing = np.where(passed, beside[0], np.inf), beside[1]
+        return State(step, pose, *nearest, *held, *passing, *other)
 
     def costs(self, state: State) -> np.ndarray:
         """(frame,) what is left to wish for."""
@@ -176,7 +178,7 @@ class Wishes:
         return matrix, vector
 
     def _add_distances(self, state: State, matrix: np.ndarray, vector: np.ndarray) -> None:
-        """Skin that is to touch, and skin that is too deep in the object or in the other hand."""
+        """Skin that is to touch, and skin that is too deep in object or other hand, or too near to what passes."""
         own, chain = self.settings, self.skin.chain(state.pose, slopes=True)
         vertex, near = self.skin.nearest_of_segments(state.held_m)
         row, segment = np.nonzero(self.trust > 1e-3)
@@ -230,8 +232,8 @@ def _chosen(moved: np.ndarray, one: State, other: State) -> State:
 class HandInTime:
     """One hand through time, the part's frame throughout. valid: (frame,) bool. other: capsules of the other hand.
 
-    all_shares: of every frame; shares and weight, how many it stands for, of those looked at. bend: of the control
-    points' second differences.
+    part, passed: as in ``Wishes``, of every frame. all_shares: of every frame; shares and weight, how many it stands
+    for, of those looked at. bend: of the control points' second differences.
     """
 
     def __init__(
@@ -244,7 +246,8 @@ class HandInTime:
         other: Capsules | None,
         settings: SolverSettings,
         draw: Draw,
-        held: int | None,
+        part: int = 0,
+        passed: np.ndarray | None = None,
     ) -> None:
         self.pose, self.settings = pose, settings
         self.all_shares = spline_shares(len(valid), holds, settings.knot_frames)
@@ -254,7 +257,8 @@ class HandInTime:
         bend = np.diff(np.eye(self.shares.shape[1]), n=2, axis=0)
         self.bend = bend.T @ bend / settings.bend_m**2
         there = None if other is None else other.taken(frames)
-        self.wishes = Wishes(skin, field, pose.taken(frames), frames, holding, there, settings, draw, held)
+        passed = None if passed is None else passed[frames]
+        self.wishes = Wishes(skin, field, pose.taken(frames), frames, holding, there, settings, draw, part, passed)
 
     def corrected(self) -> HandPose:
         """The pose of every frame."""

@@ -236,8 +236,8 @@ class _Load:
 
 @dataclass(frozen=True)
 class _Start:
-    """One hand in the frame of the part it holds, at rest in its holds. part: its number. passed: whether the other one
-    moves past the hand meanwhile.
+    """One hand in the frame of the part it holds, at rest in its holds. part: its number. passed: (frame,) bool, holds
+    in which the other one moves past the hand; None: there are none.
     """
 
     track: HandTrack
@@ -247,13 +247,13 @@ class _Start:
     part_from_world: RigidTransform
     field: ObjectField
     part: int
-    passed: bool
+    passed: np.ndarray | None
 
     def solved(self, other: Capsules | None, settings: SolverSettings, draw: Draw) -> HandTrack:
         """The corrected hand; frames without it stay as they were. other: capsules of the other, world frame."""
         other = None if other is None else other.seen_from(self.part_from_world)
-        held, valid = self.part if self.passed else None, self.track.valid
-        hand = HandInTime(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, held)
+        valid, held = self.track.valid, (self.part, self.passed)
+        hand = HandInTime(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, *held)
         pose = hand.corrected()
         track = self.track
         made = pose.seen_from(self.part_from_world.inverse()).track(track.betas[0], track.valid, track.template_m)
@@ -349,7 +349,8 @@ class _Grip:
             lowest_m = scene.lowest_of_m(capsules_there(track.take(every), hand))
             return lowest_m > floor_m - _UNDER_M and load.carried_by(track, hand, other)
 
-        found = grasps_that_carry(self._held(hand, load, other), carries, settings.solver, settings.regrasp)
+        held = self._held(hand, load, other, _passed(load.clip.object, [hold]) is not None)
+        found = grasps_that_carry(held, carries, settings.solver, settings.regrasp)
         return islice(found, settings.regrasp.answers)
 
     def _everywhere(self, pose: HandPose) -> HandTrack:
@@ -357,7 +358,7 @@ class _Grip:
         moved = pose.taken(np.zeros(len(self.track.valid), int)).seen_from(self.world_from_part)
         return moved.track(self.track.betas[0], self.track.valid, self.track.template_m)
 
-    def _held(self, hand: HandModel, load: _Load, other: Capsules | None) -> Held:
+    def _held(self, hand: HandModel, load: _Load, other: Capsules | None, passed: bool) -> Held:
         """The hand in the middle one of frames in which it has to carry."""
         assert load.scene is not None
         middle = load.frames[[len(load.frames) // 2]]
@@ -367,6 +368,7 @@ class _Grip:
             Skin(hand, np.asarray(self.track.betas, np.float64)[0], self.track.template_m, some),
             ObjectField(_in_part(load.clip.object, self.object_from_part)),
             self.part,
+            passed,
             self.pose.taken(middle).seen_from(part_from_world),
             int(middle[0]),
             (part_from_world @ load.scene.motion.centre_m[middle][:, None])[0, 0],
@@ -378,14 +380,16 @@ class _Grip:
         part_from_world = self.world_from_part.inverse()
         pose = _at_rest(self.pose.seen_from(part_from_world), self.holds, blend, grasps)
         field = ObjectField(_in_part(thing, self.object_from_part))
-        passed = _passes(thing, self.holds)
+        passed = _passed(thing, self.holds)
         return _Start(self.track, self.skin, pose, self.holds, part_from_world, field, self.part, passed)
 
 
-def _passes(thing: ObjectTrack, holds: Sequence[Interval]) -> bool:
-    """Whether in a hold one part of an object moves past the other."""
-    hinge_rad = thing.hinge_rad
-    return hinge_rad is not None and any(np.ptp(hinge_rad[start:stop]) > _PASSING_RAD for start, stop in holds)
+def _passed(thing: ObjectTrack, holds: Sequence[Interval]) -> np.ndarray | None:
+    """(frame,) bool: holds in which one part of an object moves past the other; None where there are none."""
+    hinge_rad, passed = thing.hinge_rad, np.zeros(thing.n_frames, bool)
+    for start, stop in holds:
+        passed[start:stop] = hinge_rad is not None and np.ptp(hinge_rad[start:stop]) > _PASSING_RAD
+    return passed if passed.any() else None
 
 
 def _leading(wanted: np.ndarray, most: int) -> int:

@@ -56,13 +56,14 @@ class RegraspSettings:
 class Held:
     """One hand that holds a part, in one frame, in the part's frame. skin: some vertices of it are enough.
 
-    part: its number. pose: one frame. frame: its number. centre_m: (3,) the object's centre of mass. other: capsules of
-    the other hand in that frame.
+    part: its number. passed: whether the other one moves past the hand meanwhile. pose: one frame. frame: its number.
+    centre_m: (3,) the object's centre of mass. other: capsules of the other hand in that frame.
     """
 
     skin: Skin
     field: ObjectField
     part: int
+    passed: bool
     pose: HandPose
     frame: int
     centre_m: np.ndarray
@@ -102,7 +103,9 @@ def _closed(held: Held, hands: HandPose, solver: SolverSettings, settings: Regra
     frames = np.full(len(hands.wrist_m), held.frame)
     other = None if held.other is None else held.other.taken(np.zeros_like(frames))
     there = np.ones(len(frames), bool)
-    return settled(Wishes(held.skin, held.field, hands, frames, there, other, solver, settings.closing), settings.steps)
+    passed = there if held.passed else None
+    wishes = Wishes(held.skin, held.field, hands, frames, there, other, solver, settings.closing, held.part, passed)
+    return settled(wishes, settings.steps)
 
 
 def _hands_near(held: Held, settings: RegraspSettings) -> HandPose:

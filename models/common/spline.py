@@ -59,25 +59,26 @@ def stacked_bases(lengths: list[int], intervals: list[int], n_frames: int, devic
     return send(bases, device)
 
 
-def settled(points: Tensor, there: Tensor, reach: Tensor, around: int) -> Tensor:
+def settled(points: Tensor, there: Tensor, reach: Tensor | float, around: int) -> Tensor:
     """Control points (..., K, D) drawn together where they stay in one place; those that move keep theirs.
 
-    there (..., K) bool: the points there are. reach (D,): half of how far points lie apart that surely move: those on
-    one side of a gap from those on its other side, in the mean, and each from the mean of both. around: how many points
-    a side has. The two at the gap alone would not tell: a slow way would come out as steps, and a shake of some
-    centimetres as rest in its middle. Weighted least squares, once: weights (Tukey's biweight) found again from what
-    came out would make steps, too.
+    there (..., K) bool: the points there are. reach (D,) or for all: half of how far points lie apart that surely move:
+    those on one side of a gap from those on its other side, in the mean, and each from the mean of both. around: how
+    many points a side has. The two at the gap alone would not tell: a slow way would come out as steps, and a shake of
+    some centimetres as rest in its middle. Weighted least squares, once: weights (Tukey's biweight) found again from
+    what came out would make steps, too.
     """
     places = torch.arange(points.shape[-2], device=points.device)
     way = places - places[:-1, None] - 0.5
     sides = (way < 0) & (way > -around), (way > 0) & (way < around)
     before, after = (_means(side.to(points) * there[..., None, :]) for side in sides)
     both = (before + after) / 2
-    moved = (after @ points - before @ points).square()
-    spread = (both @ points.square() - (both @ points).square()).clamp_min(0)
-    apart = ((moved + spread) / (2 * reach).square()).sum(-1)
-    weight = REST * (there[..., 1:] & there[..., :-1]) * (1 - apart).clamp_min(0).square()
     own = torch.eye(len(places), device=points.device)
+    centred = points - _means(there.to(points)[..., None, :]) @ points  # squares of large numbers would not differ
+    moved = (after @ centred - before @ centred).square()
+    spread = (both @ centred.square() - (both @ centred).square()).clamp_min(0)
+    apart = ((moved + spread) / (2 * reach) ** 2).sum(-1)
+    weight = REST * (there[..., 1:] & there[..., :-1]) * (1 - apart).clamp_min(0).square()
     diff = own.diff(dim=0)
     return torch.linalg.solve(own + diff.T @ (weight[..., None] * diff), points)
 

@@ -42,7 +42,8 @@ class MotionCodeConfig:
     """knot_frames: of the hands' splines; 0: a row for every frame, as in the paper. object_knots: knots of the object
     per knot of the hands; it may shake while the hands on it keep still. hand_frame: where hands are given. rest_m: an
     object, or a hand on it, that is generated within about this of one place for half a second stands still there
-    (0: as generated).
+    (0: as generated), and so does a hinge that nowhere moves by three degrees. What moves by twice as much keeps its
+    way: a shake of 2 cm from end to end is at rest, one of 2.5 cm is not.
 
     object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
     lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many
@@ -137,12 +138,11 @@ class MotionCode:
         present, there = self.rows(counts, hands.device)
         around = max(1, round(REST_FRAMES / self.config.knot_frames))
         if self.config.hand_frame == "object":
-            reach = self.config.rest_m * HAND_REACH.to(hands)
+            reach = self.config.rest_m * send(HAND_REACH, hands.device)
             hands = settled(hands, present[:, None].expand(-1, 2, -1), reach, around)
         course, around = self._course(objects).clone(), around * self.config.object_knots
         for numbers, like_a_metre in OBJECT_REACH:
-            reach = course.new_tensor([self.config.rest_m * like_a_metre])
-            course[..., numbers] = settled(course[..., numbers], there, reach, around)
+            course[..., numbers] = settled(course[..., numbers], there, self.config.rest_m * like_a_metre, around)
         course[..., OBJECT_HINGE] = _still_hinge(course[..., OBJECT_HINGE], there)
         return hands, self._whitened(course)
 

@@ -31,6 +31,7 @@ from models.common.family import Network, Setup
 from models.common.features import Hands, Normaliser
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.sampling import SamplerConfig
+from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 from pipelines.params import laid_over, read_params
@@ -91,6 +92,7 @@ def paths(root: Path, checkpoints: Path) -> Iterator[tuple[str, Callable[[], obj
             name = f"sample and refine by {kind}, guidance {guidance:g}"
             config = SamplerConfig(kind, 3, guidance)
             yield name, lambda c=config: sampled(stored, c, requests)
+    yield "generate rows of ours", rows_of_ours
     yield "sample lengths", lambda: lengths(stored, requests)
 
 
@@ -152,6 +154,18 @@ def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: lis
     made = Text2Hoi(on_device(stored), Hands(pair), config, DEVICE, pair).motions(requests)
     assert len(made) == len(requests)
     assert made[0].refined.shape == (2, requests[0].n_frames, 99)
+
+
+def rows_of_ours() -> None:
+    """What comes out of the sampler, at rest and as features; no copy in it is waited for."""
+    motion = read_params(ROOT)["train"]["ours"]["diffusion"]["network"]["motion"]
+    code, counts = MotionCode(build_config(MotionCodeConfig, motion, "motion")), [24, 40]
+    of_hand, of_object = code.sizes(max(counts))
+    hands = torch.zeros(2, 2, of_hand, 99, device=DEVICE)
+    objects = torch.zeros(2, of_object, code.object_features, device=DEVICE)
+    with step():
+        hands, objects = code.curves(*code.settled(hands, objects, counts), counts)
+    assert (hands.shape, objects.shape) == ((2, 2, 40, 99), (2, 40, 10))
 
 
 def lengths(stored: dict[str, Checkpoint], requests: list[Request]) -> None:

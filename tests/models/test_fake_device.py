@@ -14,6 +14,7 @@ NAMES = [
         for name in ("contact", "length", "diffusion", "refiner")
     ),
     *(f"sample and refine by {kind}, guidance {scale}" for kind in ("ddim", "ddpm", "dpm++") for scale in (1, 2)),
+    "generate rows of ours",
     "sample lengths",
 ]
 

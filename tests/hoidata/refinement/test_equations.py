@@ -104,11 +104,11 @@ def test_the_step_of_a_hand_goes_down_its_cost(held):
     middle = skin.vertices_m(skin.chain(flat))[0].mean(axis=0)
     own = flat._replace(wrist_m=np.array([[0.013, -0.007, 0.021]]) - middle).taken(np.zeros(FRAMES, int))
     holding = np.array([True, True, False])
-    wishes = Wishes(skin, ObjectField(thing), own, np.arange(FRAMES), holding, None, SolverSettings(), Draw(0.01), held)
-    if held is not None:
-        near = wishes.start.passing_m < SolverSettings().clear_m
-        assert near[holding].any(axis=1).all()
-        assert not near[~holding].any()
+    passed = None if held is None else np.array([False, True, False])
+    given = skin, ObjectField(thing), own, np.arange(FRAMES), holding, None, SolverSettings(), Draw(0.01)
+    wishes = Wishes(*given, held or 0, passed)
+    near = wishes.start.passing_m < SolverSettings().clear_m
+    assert near.any(axis=1).tolist() == [False, held is not None, False]
     vector, step = wishes.equations(wishes.start)[1], 1e-7
     way = np.eye(N_UNKNOWNS)[:6] * step
     ahead, behind = (

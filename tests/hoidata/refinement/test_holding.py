@@ -8,6 +8,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.errors import BadInput
+from hoidata.geometry.intervals import Interval
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import load_embedded_hands, track_vertices
@@ -17,7 +18,7 @@ from hoidata.physics.realism import VARIANTS, score
 from hoidata.physics.scene import capsules_there, clip_scene
 from hoidata.refinement import HoldSettings, carried_share, hold_clip, hold_hands
 from hoidata.refinement.hold_solver import spline_shares
-from hoidata.refinement.holding import _Load
+from hoidata.refinement.holding import _Load, _passed
 from hoidata.refinement.kernels import lower_capsules
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.regrasping import RegraspSettings
@@ -204,7 +205,7 @@ def test_a_hand_across_the_hinge_gives_way_to_the_part_it_does_not_hold(monkeypa
         return float((field.distances_to(0, skin, frames)[0] < 0.01).mean())
 
     gives_way = hold_hands(PAIR, clip)["right"]
-    monkeypatch.setattr("hoidata.refinement.holding._passes", lambda thing, holds: False)
+    monkeypatch.setattr("hoidata.refinement.holding._passed", lambda thing, holds: None)
     stays = hold_hands(PAIR, clip)["right"]
     assert skin_near_base(stays) > 0.03
     assert skin_near_base(gives_way) < 0.3 * skin_near_base(stays)
@@ -435,3 +436,15 @@ def test_a_flat_lid_has_no_weight_and_stops_nothing():
 def test_each_try_needs_a_reach_and_a_deviation(wrong):
     with pytest.raises(BadInput, match="as many of each"):
         HoldSettings(**wrong)
+
+
+def test_only_holds_in_which_the_hinge_moves_are_passed():
+    still = np.zeros((FRAMES, 3), np.float32)
+    angle = np.interp(np.arange(FRAMES), [0, 24, 40, FRAMES], [0, 0, -0.8, -0.8]).astype(np.float32)
+    thing = ObjectTrack(two_parts(BOX, BOX, (0, 1, 0)), still, still, angle)
+    holds = [Interval(4, 14), Interval(20, 40)]
+    passed = _passed(thing, holds)
+    assert passed is not None
+    assert np.flatnonzero(passed).tolist() == list(range(20, 40))
+    assert _passed(thing, holds[:1]) is None
+    assert _passed(ObjectTrack(BOX, still, still), holds) is None

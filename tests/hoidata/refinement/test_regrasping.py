@@ -126,6 +126,7 @@ def held(model: ObjectModel) -> Held:
         Skin(PAIR["right"], np.zeros(10), None, np.arange(0, 778, 3)),
         ObjectField(replace(clip.object, model=model, translation_m=np.zeros((FRAMES, 3), np.float32))),
         0,
+        False,
         HandPose.of(track.take(slice(24, 25))).moved(np.r_[0, 0, -RISE[24] - 0.03, np.zeros(48)][None]),
         24,
         np.zeros(3),
