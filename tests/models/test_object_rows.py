@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch
 from models.common.features import OBJECT_START_6D, Normaliser
-from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
+from models.text2hoi.motion_code import MotionCode, MotionCodeConfig, _still_hinge
 from models.text2hoi.object_rows import (
     mean_start,
     smooth_root,
@@ -176,3 +176,9 @@ def test_a_hinge_that_hardly_moves_stands_still_and_one_that_opens_opens(batch: 
         angle = CODE.curves(*CODE.settled(coded.hands[None], coded.object[None], counts), counts)[1][0, :, 9]
         assert float(angle.max() - angle.min()) == pytest.approx(0 if still else range_rad, abs=0.01 * range_rad + 1e-6)
         assert float(angle.mean()) == pytest.approx(0.2 + range_rad / 2, abs=0.002)
+
+
+def test_padding_does_not_keep_a_hinge_from_standing_still() -> None:
+    there = torch.tensor([[True, True, True, False]])
+    found = _still_hinge(torch.tensor([[0.20, 0.22, 0.21, 9.0]]), there)
+    torch.testing.assert_close(found[0, :3], torch.full((3,), 0.21))
