@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch
 from models.common.features import OBJECT_START_6D, Normaliser
+from models.common.spline import fit_spline, intervals_of
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig, _still_hinge
 from models.text2hoi.object_rows import (
     mean_start,
@@ -157,14 +158,17 @@ def test_a_hinge_comes_to_rest_though_the_object_moves(batch: ClipBatch) -> None
     assert float((after - before)[:, :3].norm(dim=-1).max()) < 0.004
 
 
-def test_an_object_that_is_pushed_slowly_does_not_go_in_steps(batch: ClipBatch) -> None:
-    sample = batch.samples[0]
-    way_m = np.interp(np.arange(sample.length), [6, sample.length - 6], [0, 0.05 * (sample.length - 12) / 30])
-    thing = np.repeat(sample.object[:1], sample.length, 0)
-    thing[:, 0] += way_m.astype(np.float32)
-    coded, counts = CODE.encode(replace(sample, object=thing)), [sample.length]
-    after = CODE.curves(*CODE.settled(coded.hands[None], coded.object[None], counts), counts)[1][0, :, 0]
-    assert after.diff().max() < 1.3 * np.diff(way_m).max()
+def test_an_object_that_is_pushed_slowly_keeps_its_way() -> None:
+    """Three seconds, 4 cm/s in the middle; asked of fewer frames it counts half as rest, and is off by 4 mm."""
+    way_m = np.interp(np.arange(90), [20, 70], [0, 50 * 0.04 / 30])
+    still = np.zeros(90)
+    thing, _ = features(Rotation.identity(90), np.column_stack((way_m, still, still)), still)
+    knots = intervals_of(90, 4)
+    rows = CODE._whitened(fit_spline(turned_since_start(thing), torch.ones(90), knots * CODE.config.object_knots))
+    hands = torch.zeros(1, 2, knots + 3, 99)
+    after = CODE.curves(*CODE.settled(hands, rows[None], [90]), [90])[1][0, :, 0].numpy()
+    assert np.abs(after - way_m).max() < 0.0015
+    assert np.diff(after).max() < 1.5 * np.diff(way_m).max()
 
 
 def test_a_hinge_that_hardly_moves_stands_still_and_one_that_opens_opens(batch: ClipBatch) -> None:
