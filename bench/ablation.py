@@ -101,6 +101,7 @@ LESS: Mapping[str, Row] = {
     "no splines": _motion(knot_frames=0, object_knots=1),
     "as many knots of the object": _motion(object_knots=1),
     "hands in the world": _motion(hand_frame="world"),
+    "place of the object's origin": _motion(object_place="origin"),
     "rotation of the object as it is": _motion(object_turn="absolute"),
     "rows not whitened": _motion(whitening_frames=0),
     "rest as generated": _motion(rest_m=0),

@@ -107,13 +107,14 @@ def _taken_for(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
 
 
 def _moved_otherwise(motions: Sequence[GeneratedMotion]) -> list[str]:
-    """Which samples move their object as training clips of another verb than the sentence was read as; for a person."""
+    """Which samples move their object as no training clip of the verb that the sentence was read as; for a person."""
     found = []
     for evidence in (motion.evidence for motion in motions):
-        read_as, moved_as = evidence["read_as"], evidence["moved_as"]
+        read_as, moved_as, number = evidence["read_as"], evidence["moved_as"], evidence["number"] + 1
         if read_as and moved_as and moved_as != read_as[0]:
-            number = evidence["number"] + 1
             found.append(f"sample {number}: the object moves most like training's {moved_as!r}, not {read_as[0]!r}")
+        elif read_as and evidence["unusual"]:
+            found.append(f"sample {number}: not as training's {read_as[0]!r}: {', '.join(evidence['unusual'])}")
     return found
 
 

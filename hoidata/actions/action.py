@@ -7,7 +7,7 @@ training clips follow it; for every other verb the limits are learnt from those 
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -63,11 +63,10 @@ def action_numbers(track: ObjectTrack, gravity: np.ndarray | None, touching: np.
     gravity: (3,) unit vector in the world, or None. touching: (2, frame) bool, whether the left and the right hand
     touch the object.
     """
-    model, degrees = track.model, np.zeros(track.n_frames)
+    degrees = np.zeros(track.n_frames)
     if track.hinge_rad is not None:
         degrees = np.degrees(track.hinge_rad - track.hinge_rad[0], dtype=np.float64)
-    base = model.vertices_m[np.unique(model.faces_of(0))]
-    middle_m = (track.world_from_object @ ((base.min(axis=0) + base.max(axis=0)) / 2)[None])[:, 0]
+    middle_m = object_middle_m(track)
     nothing = dict.fromkeys(NUMBERS, float("nan"))
     return nothing | _upright(track, middle_m, gravity) | _touching(touching) | {
         "path_m": float(np.linalg.norm(np.diff(middle_m, axis=0), axis=1).sum()),
@@ -75,6 +74,12 @@ def action_numbers(track: ObjectTrack, gravity: np.ndarray | None, touching: np.
         "hinge_net_deg": float(degrees[-1]),
         "hinge_max_deg": float(np.abs(degrees).max()),
     }  # fmt: skip
+
+
+def object_middle_m(track: ObjectTrack) -> np.ndarray:
+    """(frame, 3) world: the middle of the box about the object's base."""
+    base = track.model.vertices_m[np.unique(track.model.faces_of(0))]
+    return (track.world_from_object @ ((base.min(axis=0) + base.max(axis=0)) / 2)[None])[:, 0]
 
 
 def _upright(track: ObjectTrack, middle_m: np.ndarray, gravity: np.ndarray | None) -> dict[str, float]:
@@ -128,7 +133,8 @@ class Actions:
     """What the verbs of a dataset ask of a motion.
 
     limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
-    other verbs have theirs from ``actions.toml``. centroids: by verb, the mean of its training clips' standardised
+    other verbs have theirs from ``actions.toml``. usual: what the clips of a verb show, of every verb with enough of
+    them, whether or not it has limits in the file. centroids: by verb, the mean of its training clips' standardised
     numbers. scale: of each of these numbers its mean and standard deviation over all training clips, the latter at
     least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a prediction a little off is not far off.
     """
@@ -137,6 +143,7 @@ class Actions:
     learnt: Mapping[str, int]
     centroids: Mapping[str, np.ndarray]
     scale: Mapping[str, tuple[float, float]]
+    usual: Mapping[str, Limits] = field(default_factory=dict)
 
     def followed(self, verb: str | None, numbers: Mapping[str, float]) -> bool | None:
         """Whether a motion does what the verb says; None where nothing is known of the verb or of its numbers."""
@@ -150,18 +157,33 @@ class Actions:
             return None
         return min(self.centroids, key=lambda verb: float(np.linalg.norm(self.centroids[verb] - asked)))
 
+    def unusual(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
+        """The numbers, in words, that are not as in training clips of the verb; none where it or they are not known."""
+        limits = self.usual.get(verb, {})
+        return tuple(
+            f"{name} {numbers[name]:.3g} (in training {least:.3g} to {most:.3g})"
+            for name, (least, most) in limits.items()
+            if numbers[name] < least or numbers[name] > most
+        )
+
     @property
     def record(self) -> dict[str, Any]:
-        """What ``named`` needs, as plain values."""
+        """What ``named`` and ``unusual`` need, as plain values."""
         centroids = {verb: dict(zip(self.scale, own.tolist(), strict=True)) for verb, own in self.centroids.items()}
-        return {"scale": {name: list(own) for name, own in self.scale.items()}, "centroids": centroids}
+        usual = {verb: {name: list(own) for name, own in limits.items()} for verb, limits in self.usual.items()}
+        scale = {name: list(own) for name, own in self.scale.items()}
+        return {"scale": scale, "centroids": centroids, "usual": usual}
 
     @classmethod
     def read(cls, record: Mapping[str, Any]) -> "Actions":
         """From a record; without limits, so that nothing is known of what follows a verb."""
         scale = {name: (float(mean), float(deviation)) for name, (mean, deviation) in record["scale"].items()}
         centroids = {verb: np.array([own[name] for name in scale]) for verb, own in record["centroids"].items()}
-        return cls({}, {}, centroids, scale)
+        usual = {
+            verb: {name: (float(least), float(most)) for name, (least, most) in limits.items()}
+            for verb, limits in record.get("usual", {}).items()
+        }
+        return cls({}, {}, centroids, scale, usual)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -199,14 +221,15 @@ def learn_actions(
         if len(column) and np.isfinite(column).all():
             scale[name] = float(column.mean()), max(float(column.std()), LEAST_DEVIATION[name.rpartition("_")[2]])
     limits, learnt = dict[str, Limits](), dict[str, int]()
+    usual = {verb: _bands(rows, scale) for verb, rows in numbers.items() if len(rows) >= LEAST_CLIPS}
     for verb, rows in numbers.items():
         known = (written or {}).get(verb)
         if known is not None and np.mean([_within(row, known) is True for row in rows]) >= SHARE_THAT_FOLLOWS:
             limits[verb] = known
-        elif len(rows) >= LEAST_CLIPS:
-            limits[verb], learnt[verb] = _bands(rows, scale), len(rows)
+        elif verb in usual:
+            limits[verb], learnt[verb] = usual[verb], len(rows)
     centroids = {verb: np.mean([_standardised(row, scale) for row in rows], axis=0) for verb, rows in numbers.items()}
-    return Actions(limits, learnt, centroids, scale)
+    return Actions(limits, learnt, centroids, scale, usual)
 
 
 def _bands(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> Limits:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from hoidata.actions.action import action_numbers
+from hoidata.actions.action import action_numbers, object_middle_m
 from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.touch import made_entries
@@ -45,6 +45,13 @@ def jitter_m_s3(pair: Pair, every: int) -> np.ndarray:
         third = np.linalg.norm(np.diff(_seen(pair, side), n=3, axis=0), axis=-1).mean(axis=-1) * FPS**3
         each.append(third[np.isfinite(third)])
     return _joined(each)
+
+
+def object_jitter_m_s3(pair: Pair, every: int) -> np.ndarray:
+    """(frame,) third difference of the world position of the object's middle, m/s^3."""
+    del every  # a derivative needs every frame
+    third = np.diff(object_middle_m(pair.predicted.clip.object).astype(np.float64), n=3, axis=0)
+    return np.linalg.norm(third, axis=-1) * FPS**3
 
 
 def length_error_frames(pair: Pair, every: int) -> np.ndarray:

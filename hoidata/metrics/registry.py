@@ -167,6 +167,10 @@ METRICS: tuple[Metric, ...] = (
         "mean over motions", f"{HANDS}, four in a row", "mean jerk, TransPose (Yi et al. 2021), Sec. 5.2",
     ),
     Metric(
+        "Motion", "object_jitter_m_s3", "jitter of the object's middle in the world", "m/s3", "nearer the truth",
+        motion.object_jitter_m_s3, "mean over motions", "all, four in a row", "this project: the same of the object",
+    ),
+    Metric(
         "Action", "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,
         "mean over motions", "all", "this project: limits of height, way, tilt, hinge and hands (`hoidata/actions`)",
         thresholds="`actions.toml`, or the verb's own training clips: 1st to 99th percentile and half a deviation",

@@ -16,9 +16,11 @@ from hoidata.clips.features import OBJECT_HINGE, OBJECT_POSITION
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.store.distances import DistanceEntries
 from models.common.features import (
+    base_middle_m,
     hands_in_object_frame,
     hands_in_world,
     object_rotmat,
+    placed_at,
     proper_hands,
     proper_object,
     to_object_frame,
@@ -67,7 +69,9 @@ def augment(sample: ClipSample, random: np.random.Generator, number: int) -> Cli
     thing = torch.from_numpy(sample.object)
     hands = hands_in_object_frame(torch.from_numpy(sample.hands)[None], thing[None])[0]
     joints = to_object_frame(torch.from_numpy(sample.joints_m), thing.expand(2, -1, -1))
-    moved = augmented_path(proper_object(at_moments(thing, moments)), random)
+    middle = base_middle_m(torch.from_numpy(sample.points.points_m), torch.from_numpy(sample.points.part))
+    path = proper_object(at_moments(placed_at(thing, middle), moments))
+    moved = placed_at(augmented_path(path, random), -middle)
     before, after = np.floor(moments).astype(int), np.ceil(moments).astype(int)
     world = proper_hands(hands_in_world(at_moments(hands, moments, 1)[None], moved[None])[0])
     placed = at_moments(joints, moments, 1) @ object_rotmat(moved).transpose(-1, -2) + moved[:, None, OBJECT_POSITION]
@@ -93,7 +97,7 @@ def warped_moments(length: int, random: np.random.Generator) -> np.ndarray:
 
 
 def augmented_path(thing: torch.Tensor, random: np.random.Generator) -> torch.Tensor:
-    """Object features (F, 10) with another path and other turns from where it lay at first."""
+    """Object features (F, 10), their position that of the object's middle, with another path and other turns."""
     side, up, turn = np.exp(random.uniform(-1, 1, 3) * (PATH, PATH, TURN))
     yaw = rotvec_to_rotmat(np.array([0.0, 0.0, random.uniform(-SIDE_RAD, SIDE_RAD)])) * (side, side, up)
     start = thing[:1, OBJECT_POSITION]

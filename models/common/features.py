@@ -3,6 +3,7 @@
 Feature layout: ``hoidata.clips.features``. Axes (batch, side, frame, ...); sides left, right; metres, model frame.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -73,6 +74,32 @@ def proper_object(objects: Tensor) -> Tensor:
     return torch.cat(
         (objects[..., OBJECT_POSITION], rotmat_to_rot6d(object_rotmat(objects)), objects[..., OBJECT_HINGE:]), -1
     )
+
+
+def base_middle_m(points_m: Tensor, part: Tensor) -> Tensor:
+    """(..., 3) middle of the box about an object's base, object frame; of all of it where no point is of the base.
+
+    points_m: (..., N, 3). part: (..., N) 1 where the hinge moves a point.
+    """
+    moved = (part == 1) & ~(part == 1).all(-1, keepdim=True)
+    least, most = (points_m.masked_fill(moved[..., None], bound) for bound in (math.inf, -math.inf))
+    return (least.amin(-2) + most.amax(-2)) / 2
+
+
+def placed_at(objects: Tensor, point_m: Tensor) -> Tensor:
+    """Objects (..., F, 10) whose position is where ``point_m`` (..., 3), in the object's frame, is in the world.
+
+    The inverse is that of ``-point_m``.
+    """
+    position = objects[..., OBJECT_POSITION] + (object_rotmat(objects) @ point_m[..., None, :, None])[..., 0]
+    return torch.cat((position, objects[..., OBJECT_ROTATION_6D.start :]), -1)
+
+
+def recentred(hands: Tensor, objects: Tensor) -> tuple[Tensor, Tensor]:
+    """Hands (..., 2, F, 99) and objects (..., F, 10) moved so that the object's position is zero in the first frame."""
+    shift = objects[..., :1, OBJECT_POSITION]
+    hands = torch.cat((hands[..., WRIST] - shift.unsqueeze(-3), hands[..., WRIST.stop :]), -1)
+    return hands, torch.cat((objects[..., OBJECT_POSITION] - shift, objects[..., OBJECT_POSITION.stop :]), -1)
 
 
 def to_object_frame(points_m: Tensor, objects: Tensor) -> Tensor:

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import RequestBatch
-from hoidata.clips.features import HAND_FEATURES, OBJECT_POSITION, WRIST
+from hoidata.clips.features import HAND_FEATURES
 from hoidata.devices import send
 from hoidata.errors import BadInput
-from models.common.features import Normaliser, proper_hands, proper_object
+from models.common.features import Normaliser, proper_hands, proper_object, recentred
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
 from models.common.transformer import (
@@ -197,7 +197,8 @@ class DiffusionModel(nn.Module):
         points = condition.points_m.new_zeros(len(lengths), 0, self.config.transformer.width)
         points_mask = points.new_zeros(points.shape[:2], dtype=torch.bool)
         if self.points_in is not None:
-            shape = condition.points_m, condition.normals, condition.part
+            place = self.code.place_m(condition.points_m, condition.part)
+            shape = condition.points_m - place[:, None], condition.normals, condition.part
             points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
             points = self.points_in(points)
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
@@ -362,11 +363,7 @@ class MotionGenerator:
         denoise = guided(self.network, condition, sampler.guidance)
         device = condition.text.device
         coded = sample_motion(denoise, (send(noise[0], device), send(noise[1], device)), sampler, generator)
-        hands, objects = self._features(coded, condition)
-        shift = objects[:, :1, OBJECT_POSITION].clone()
-        hands[..., WRIST] -= shift[:, None]
-        objects[..., OBJECT_POSITION] -= shift
-        return hands, objects
+        return self._features(coded, condition)
 
     @torch.no_grad()
     def denoise_once(
@@ -385,4 +382,5 @@ class MotionGenerator:
         rows = code.settled(*self.normaliser.decode(*coded), counts)
         hands, objects = code.curves(*rows, counts)
         hands = code.in_world(hands, objects)
-        return proper_hands(hands), proper_object(objects)
+        objects = code.at_origin(proper_object(objects), condition.points_m, condition.part)
+        return recentred(proper_hands(hands), objects)

@@ -100,7 +100,7 @@ class Targets:
 
     @cachedmethod(lambda self: self.made, key=lambda self, sample: sample.key)
     def _clip(self, sample: ClipSample) -> tuple[CodedClip, Tensor, Tensor]:
-        joints, thing = torch.from_numpy(sample.joints_m), torch.from_numpy(sample.object)
+        joints, thing = torch.from_numpy(sample.joints_m), self.code.placed(sample)
         touching = torch.zeros(joints.shape[:3], dtype=torch.bool)
         near = (sample.distances.side, sample.distances.frame, sample.distances.joint)
         touching[tuple(torch.from_numpy(column).long() for column in near)] = True
@@ -231,7 +231,8 @@ class DiffusionObjective:
             found["joints"] = losses.joint_loss(joints, true, present, 1 + weights.touch_weight * touching)
         hands = code.in_world(own, moved)
         if weights.distance_weight:
-            joints, points = self.hands.joints(hands, batch.betas, batch.template_m), place_points(batch, moved)
+            joints = self.hands.joints(hands, batch.betas, batch.template_m)
+            points = place_points(batch, code.at_origin(moved, batch.points_m, batch.part))
             given = batch.entries, batch.entry_distance_m
             found["distance_map"] = losses.distance_map_loss(joints, points, *given)
         if weights.orientation_weight:

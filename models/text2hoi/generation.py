@@ -38,9 +38,10 @@ class GeneratedMotion:
     points: where those points lie on the object. coarse: the motion before refinement. evidence: plain values on how
     the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the
     verb of training the diffusion network takes the sentence for, with its probability, or None where it is told the
-    sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "told": the
-    sentence the networks were told, not the user's where they would take that for another verb ("plainly_read_as");
-    "unseen": what of the sentence was never in training, in words.
+    sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "unusual": what
+    the object does more or less than in any training clip of the verb; "told": the sentence the networks were told, not
+    the user's where they would take that for another verb ("plainly_read_as"); "unseen": what of the sentence was never
+    in training, in words.
     """
 
     clip: Clip
@@ -183,6 +184,7 @@ class Generator:
             "touched_points": int(motion.contact_map.sum()),
             "draws": answer.draws,
             "moved_as": answer.moved_as,
+            "unusual": list(answer.unusual),
         }
         coarse = self.model.clips([request], [motion], refined=False)[0]
         return GeneratedMotion(answer.clip, coarse, motion.contact_map.numpy() > 0, points, evidence | own)

@@ -20,10 +20,13 @@ from hoidata.devices import send
 from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from models.common.features import (
     OBJECT_START_6D,
+    base_middle_m,
     hand_rotmats,
     hands_in_object_frame,
     hands_in_world,
     object_rotmat,
+    placed_at,
+    recentred,
 )
 from models.common.sampling import Motion
 from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
@@ -45,6 +48,10 @@ class MotionCodeConfig:
     (0: as generated), and so does a hinge that nowhere moves by three degrees. What moves by twice as much keeps its
     way: a shake of 2 cm from end to end is at rest, one of 2.5 cm is not.
 
+    object_place: which point of an object its position is, and hands in its frame are measured from: the origin of its
+    mesh, which may lie anywhere, or the middle of the box about its base. An object that is turned in one place keeps
+    its middle there; its origin moves, and what is wrong of the one and of the other adds up to a wobble.
+
     object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
     lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many
     frames (0: the course itself).
@@ -56,6 +63,7 @@ class MotionCodeConfig:
     knot_frames: int = 0
     object_knots: int = 1
     hand_frame: Literal["world", "object"] = "world"
+    object_place: Literal["origin", "box"] = "origin"
     object_turn: Literal["absolute", "since start"] = "absolute"
     whitening_frames: float = 0.0
     rest_m: float = 0.0
@@ -103,7 +111,8 @@ class MotionCode:
 
     def encode(self, sample: ClipSample) -> CodedClip:
         """A recorded clip's rows."""
-        hands, thing = self.converted(torch.from_numpy(sample.hands), torch.from_numpy(sample.object), -1)
+        hands, thing = recentred(torch.from_numpy(sample.hands), self.placed(sample))
+        hands, thing = self.converted(hands, thing, -1)
         present = torch.from_numpy(sample.valid & sample.active_hands[:, None])
         if self.config.hand_frame == "object":
             hands = hands_in_object_frame(hands[None], thing[None])[0]
@@ -118,8 +127,22 @@ class MotionCode:
         touched = stacked_bases([len(thing)], [intervals], len(thing), torch.device("cpu"))[0].T > 0
         return CodedClip(curves, self._whitened(objects), (present.float() @ touched.T.float()) > 0)
 
+    def place_m(self, points_m: Tensor, part: Tensor) -> Tensor:
+        """(..., 3) the point whose place an object's position is, in its frame; points (..., N, 3), part (..., N)."""
+        if self.config.object_place == "box":
+            return base_middle_m(points_m, part)
+        return points_m.new_zeros((*points_m.shape[:-2], 3))
+
+    def placed(self, sample: ClipSample) -> Tensor:
+        """(F, 10) a recorded clip's object, its position that of ``place_m``."""
+        points = torch.from_numpy(sample.points.points_m), torch.from_numpy(sample.points.part)
+        return placed_at(torch.from_numpy(sample.object), self.place_m(*points))
+
     def curves(self, hands: Tensor, objects: Tensor, counts: Sequence[int]) -> Motion:
-        """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper."""
+        """Features of every frame, hands in the frame they are coded in; the 6D as they come, not made proper.
+
+        The object's position is that of ``place_m``; ``at_origin`` makes it the origin's.
+        """
         objects, there = self._course(objects), self.rows(counts, objects.device)[1]
         start = mean_start(objects, there) if self.config.object_turn == "since start" else None
         if not self.config.knot_frames:
@@ -170,6 +193,10 @@ class MotionCode:
             fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
             hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
         return hands, objects
+
+    def at_origin(self, objects: Tensor, points_m: Tensor, part: Tensor) -> Tensor:
+        """Objects (B, F, 10) of ``curves`` with the position of their mesh's origin; points as in ``place_m``."""
+        return placed_at(objects, -self.place_m(points_m, part))
 
     def in_world(self, hands: Tensor, objects: Tensor) -> Tensor:
         """Hands (B, 2, F, 99) of ``curves`` in the model frame."""

@@ -38,6 +38,7 @@ from models.text2hoi.verb_check import VerbCheck
 
 AT_ONCE = 64  # requests of the same hands and of like length: what is cut off for all is not computed
 ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
+ALL_HOLD = 3
 
 
 @dataclass(frozen=True)
@@ -47,7 +48,8 @@ class SamplingConfig:
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
-    at, or whose object moves as in training clips of another verb; the best is the answer. contact_draws: how many
+    at, whose object moves as in training clips of another verb, or more or less than in any of its own; the best is
+    the answer. contact_draws: how many
     contact maps are drawn for a motion by a network that draws anchors; the one most like the others is asked for.
     Draws of a latent hardly differ: one.
     """
@@ -82,7 +84,8 @@ class Text2HoiMotion:
 class Answer:
     """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
     no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where that is not
-    known (``VerbCheck``); other_verb: whether it is not what was asked. draws: how many motions were drawn for it.
+    known (``VerbCheck``); other_verb: whether it is not what was asked. unusual: numbers of what the object does, in
+    words, that are not as in training clips of the verb. draws: how many motions were drawn for it.
     """
 
     motion: Text2HoiMotion
@@ -90,12 +93,13 @@ class Answer:
     carried: float
     moved_as: str | None = None
     other_verb: bool = False
+    unusual: tuple[str, ...] = ()
     draws: int = 1
 
     @property
     def goodness(self) -> tuple[int, float]:
-        """How many of two things hold, that hands carry and that the verb is the one asked for; then the share."""
-        return int(self.carried >= ENOUGH) + (not self.other_verb), self.carried
+        """How many of three things hold: hands carry, the verb is as asked, all is as usual. Then the share."""
+        return int(self.carried >= ENOUGH) + (not self.other_verb) + (not self.unusual), self.carried
 
 
 @dataclass(frozen=True)
@@ -155,13 +159,13 @@ class Text2Hoi:
         refined: bool = True,
         contact_maps: Sequence[Tensor] | None = None,
     ) -> list[Answer]:
-        """Motions and their clips, drawn again where held hands cannot carry, or the object does as another verb says.
+        """Motions and their clips, drawn again where held hands cannot carry, or the object does not as the verb says.
 
         Other arguments as in ``motions``.
         """
         best = self._drawn(requests, refined, contact_maps)
         for draw in range(2, self.config.draws + 1):
-            weak = [number for number, own in enumerate(best) if own.goodness[0] < 2]
+            weak = [number for number, own in enumerate(best) if own.goodness[0] < ALL_HOLD]
             if not weak:
                 break
             again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
@@ -184,9 +188,13 @@ class Text2Hoi:
             return [Answer(motion, clip, 1.0) for motion, clip in zip(motions, clips, strict=True)]
         check, found = VerbCheck.of(self.trained["diffusion"], self.pair), []
         for request, motion, clip in zip(requests, motions, clips, strict=True):
-            moved_as = check.moved_as(clip, request.points) if check else None
-            other = check is not None and check.fails(request, moved_as)
-            found.append(Answer(motion, clip, carried_share(self.pair, clip, self.config.hold), moved_as, other))
+            carried = carried_share(self.pair, clip, self.config.hold)
+            if check is None:
+                found.append(Answer(motion, clip, carried))
+                continue
+            numbers = check.numbers(clip, request.points)
+            moved_as, unusual = check.moved_as(numbers), check.unusual(request, numbers)
+            found.append(Answer(motion, clip, carried, moved_as, check.fails(request, moved_as), unusual))
         return found
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:

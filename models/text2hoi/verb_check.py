@@ -1,8 +1,8 @@
 """Whether the object of a motion moves as in training clips of the verb its sentence was read as.
 
 A sampler draws from what it learnt, now and then a motion of another verb. What the object does is a few numbers
-(``hoidata.actions``), and which verb's training clips do most alike needs no test clip and no judge: a motion that
-fails is drawn again.
+(``hoidata.actions``), and which verb's training clips do most alike, and whether any does by as much, needs no test
+clip and no judge: a motion that fails is drawn again.
 """
 
 from collections.abc import Mapping
@@ -43,15 +43,24 @@ class VerbCheck:
             return None
         return cls(trained, Actions.read(record), trained.facts["contact_threshold_m"], hands)
 
-    def moved_as(self, clip: Clip, points: ObjectPoints) -> str | None:
-        """The verb whose training clips move the object most alike; None where gravity is not known."""
+    def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
+        """What the object does in a clip (``hoidata.actions``)."""
         index, touching = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool)
         for row, side in enumerate(SIDES):
             track = clip.hands[side]
             if track.valid.any():
                 near = index.entries(track_joints(track, self.hands[side]), track.valid, clip.object, self.threshold_m)
                 touching[row, near["frame"]] = True
-        return self.actions.named(action_numbers(clip.object, clip.gravity, touching))
+        return action_numbers(clip.object, clip.gravity, touching)
+
+    def moved_as(self, numbers: Mapping[str, float]) -> str | None:
+        """The verb whose training clips move the object most alike; None where gravity is not known."""
+        return self.actions.named(numbers)
+
+    def unusual(self, request: Request, numbers: Mapping[str, float]) -> tuple[str, ...]:
+        """Which numbers, in words, are not as in training clips of the verb that the sentence was read as."""
+        read = read_verb(self.trained, torch.from_numpy(request.text))
+        return () if read is None else self.actions.unusual(read[0], numbers)
 
     def fails(self, request: Request, moved_as: str | None) -> bool:
         """Whether a motion is of another verb than its sentence was read as; False where either is not known."""

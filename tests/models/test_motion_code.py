@@ -11,7 +11,7 @@ from torch import Tensor
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.store.annotated import AnnotatedStore
-from models.common.features import Normaliser, hands_in_object_frame, hands_in_world, proper_hands
+from models.common.features import Normaliser, hands_in_object_frame, hands_in_world, proper_hands, recentred
 from models.common.spline import fit_spline, intervals_of, projected, settled, spline_basis, stacked_bases
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 
@@ -22,8 +22,9 @@ EVERY_CODE = [
     replace(OURS, hand_frame="world"),
     OURS,
     MotionCodeConfig(object_turn="since start"),
+    MotionCodeConfig(object_place="box"),
     MotionCodeConfig(whitening_frames=8),
-    replace(OURS, object_turn="since start", whitening_frames=8),
+    replace(OURS, object_place="box", object_turn="since start", whitening_frames=8),
 ]
 
 
@@ -82,7 +83,9 @@ def without_jerks(sample: ClipSample) -> ClipSample:
 def decoded(code: MotionCode, sample: ClipSample) -> tuple[Tensor, Tensor]:
     coded = code.encode(sample)
     hands, objects = code.curves(coded.hands[None], coded.object[None], [sample.length])
-    return code.in_world(hands, objects)[0], objects[0]
+    points = torch.from_numpy(sample.points.points_m)[None], torch.from_numpy(sample.points.part)[None]
+    hands, objects = recentred(code.in_world(hands, objects), code.at_origin(objects, *points))
+    return hands[0], objects[0]
 
 
 def test_a_hand_that_holds_a_moving_object_is_constant_in_the_objects_frame(batch: ClipBatch) -> None:

@@ -44,7 +44,21 @@ def asked_for(sample: ClipSample) -> Request:
 @pytest.mark.parametrize("split", ["train", "validation", "test"])
 def test_a_recorded_clip_moves_as_its_verb(annotated: AnnotatedStore, check: VerbCheck, split: str) -> None:
     for sample in clips_of(annotated, split):
-        assert check.moved_as(annotated.store.clip(sample.clip_id), sample.points) == sample.verb
+        numbers = check.numbers(annotated.store.clip(sample.clip_id), sample.points)
+        assert check.moved_as(numbers) == sample.verb
+
+
+def test_what_is_unusual_is_told_for_the_verb_that_the_sentence_was_read_as(
+    annotated: AnnotatedStore, check: VerbCheck
+) -> None:
+    strict = replace(
+        check, actions=replace(check.actions, usual={"lift": {"path_m": (0.0, 0.5), "rise_m": (0.0, 0.5)}})
+    )
+    for sample in clips_of(annotated, "train"):
+        request, numbers = asked_for(sample), check.numbers(annotated.store.clip(sample.clip_id), sample.points)
+        assert check.unusual(request, numbers) == strict.unusual(request, numbers) == ()
+        said = ("path_m 9 (in training 0 to 0.5)",) if sample.verb == "lift" else ()
+        assert strict.unusual(request, numbers | {"path_m": 9.0}) == said
 
 
 def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(
@@ -65,7 +79,7 @@ def test_nothing_is_said_without_gravity_or_of_a_verb_that_no_clip_shows(
 ) -> None:
     sample = clips_of(annotated, "train")[0]
     clip = replace(annotated.store.clip(sample.clip_id), gravity=None)
-    assert check.moved_as(clip, sample.points) is None
+    assert check.moved_as(check.numbers(clip, sample.points)) is None
     strange = replace(check, actions=replace(check.actions, centroids={"pour": np.zeros(1)}))
     assert not strange.fails(asked_for(sample), "pour")
 
@@ -79,11 +93,12 @@ def test_a_network_that_keeps_no_actions_or_is_told_no_verbs_has_no_check(diffus
 
 
 def test_actions_come_back_from_a_file_whatever_the_order_of_its_keys(annotated: AnnotatedStore) -> None:
-    actions = training_actions(annotated)
+    actions = replace(training_actions(annotated), usual={"lift": {"path_m": (0.1, 0.5)}})
     read = Actions.read(json.loads(json.dumps(actions.record, sort_keys=True)))
     assert {verb: dict(zip(read.scale, own, strict=True)) for verb, own in read.centroids.items()} == {
         verb: dict(zip(actions.scale, own, strict=True)) for verb, own in actions.centroids.items()
     }
+    assert read.usual == actions.usual
     draws = np.random.default_rng(0)
     for _ in range(20):
         numbers = {name: mean + deviation * draws.normal() for name, (mean, deviation) in actions.scale.items()}

@@ -128,6 +128,20 @@ def test_limits_learnt_from_training_clips_hold_for_others_of_the_verb_and_fail_
     assert actions.followed(None, others["lift"][0]) is None
 
 
+def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_limits():
+    numbers, others = lifts_and_pours(0), lifts_and_pours(1)
+    actions = learn_actions(numbers, {"lift": {"end_rise_m": (0.1, 0.3)}})
+    for verb in ("lift", "pour"):
+        assert all(actions.unusual(verb, row) == () for row in others[verb])
+    said = actions.unusual("lift", others["pour"][0])
+    assert {own.split()[0] for own in said} >= {"tilt_deg", "rise_m"}
+    most = max(row["tilt_deg"] for row in numbers["lift"]) + 0.5 * actions.scale["tilt_deg"][1]
+    tilt = others["pour"][0]["tilt_deg"]
+    assert f"tilt_deg {tilt:.3g} (in training {-most:.3g} to {most:.3g})" in said
+    assert actions.unusual("lift", numbers["lift"][0] | {"rise_m": float("nan")}) == ()
+    assert actions.unusual("juggle", numbers["lift"][0]) == ()
+
+
 def test_written_limits_count_where_the_training_clips_keep_them():
     numbers = lifts_and_pours(0)
     kept = learn_actions(numbers, {"lift": {"end_rise_m": (0.1, 0.3)}})

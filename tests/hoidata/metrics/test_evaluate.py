@@ -318,6 +318,7 @@ def test_every_metric_is_registered_once_and_floors_have_their_metric():
         "contact_distance_mm": "nearer the truth",
         "smoothness_m_s2": "nearer the truth",
         "jitter_m_s3": "nearer the truth",
+        "object_jitter_m_s3": "nearer the truth",
     }
 
 

@@ -90,6 +90,21 @@ def test_jitter_is_a_known_jerk_in_the_world(make_clip, pair_of):
     assert found == pytest.approx(np.full(5, 7.0))
 
 
+def test_jitter_of_an_object_is_a_known_jerk_of_its_middle_wherever_its_mesh_begins(make_clip, pair_of):
+    """Turned about its middle an object has none, though its origin goes round."""
+    clip, time = make_clip(20), np.arange(20) / FPS
+    turn = np.stack([np.zeros(20), np.zeros(20), np.sin(9 * time)], 1)
+    vertices_m = clip.object.model.vertices_m + np.array([0.1, 0, 0])
+    middle, model = (vertices_m.min(0) + vertices_m.max(0)) / 2, replace(clip.object.model, vertices_m=vertices_m)
+    way = np.stack([7.0 / 6 * time**3, 5 * time**2, time], 1)
+    origin = way - Rotation.from_rotvec(turn).apply(middle)
+    track = replace(clip.object, model=model, rotvec=turn.astype(np.float32), translation_m=origin.astype(np.float32))
+    moving = replace(clip, object=track)
+    found = motion.object_jitter_m_s3(pair_of(moving, moving), 1)
+    assert found == pytest.approx(np.full(17, 7.0), abs=0.1)
+    assert np.linalg.norm(np.diff(origin, n=3, axis=0), axis=1).max() * FPS**3 > 40
+
+
 # --- contact and penetration
 
 
