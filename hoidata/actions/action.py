@@ -133,10 +133,11 @@ class Actions:
     """What the verbs of a dataset ask of a motion.
 
     limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
-    other verbs have theirs from ``actions.toml``. usual: what the clips of a verb show, of every verb with enough of
-    them, whether or not it has limits in the file. centroids: by verb, the mean of its training clips' standardised
-    numbers. scale: of each of these numbers its mean and standard deviation over all training clips, the latter at
-    least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a prediction a little off is not far off.
+    other verbs have theirs from ``actions.toml``. usual: bounds of every verb with ``LEAST_CLIPS`` clips, from the 1st
+    to the 99th percentile and ``MARGIN`` beyond, whether or not it has limits in the file. centroids: by verb, the mean
+    of its training clips' standardised numbers. scale: of each of these numbers its mean and standard deviation over
+    all training clips, the latter at least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a
+    prediction a little off is not far off.
     """
 
     limits: Mapping[str, Limits]
@@ -158,10 +159,10 @@ class Actions:
         return min(self.centroids, key=lambda verb: float(np.linalg.norm(self.centroids[verb] - asked)))
 
     def unusual(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """The numbers, in words, that are not as in training clips of the verb; none where it or they are not known."""
+        """The numbers, in words, that lie outside the verb's ``usual`` bounds; none where it or they are not known."""
         limits = self.usual.get(verb, {})
         return tuple(
-            f"{name} {numbers[name]:.3g} (in training {least:.3g} to {most:.3g})"
+            f"{name} {numbers[name]:.3g} (usual: {least:.3g} to {most:.3g})"
             for name, (least, most) in limits.items()
             if numbers[name] < least or numbers[name] > most
         )

@@ -168,7 +168,8 @@ METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "Motion", "object_jitter_m_s3", "jitter of the object's middle in the world", "m/s3", "nearer the truth",
-        motion.object_jitter_m_s3, "mean over motions", "all, four in a row", "this project: the same of the object",
+        motion.object_jitter_m_s3, "mean over motions", "all, four in a row",
+        "this project: mean jerk, as `jitter_m_s3`",
     ),
     Metric(
         "Action", "action_followed", "the object does what the verb says", "", "higher", motion.action_followed,

@@ -197,8 +197,7 @@ class DiffusionModel(nn.Module):
         points = condition.points_m.new_zeros(len(lengths), 0, self.config.transformer.width)
         points_mask = points.new_zeros(points.shape[:2], dtype=torch.bool)
         if self.points_in is not None:
-            place = self.code.place_m(condition.points_m, condition.part)
-            shape = condition.points_m - place[:, None], condition.normals, condition.part
+            shape = self._placed_points(condition), condition.normals, condition.part
             points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
             points = self.points_in(points)
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
@@ -219,6 +218,10 @@ class DiffusionModel(nn.Module):
             torch.cat(masks, 1),
         )
 
+    def _placed_points(self, condition: Condition) -> Tensor:
+        """(B, N, 3) points of the objects from where hands and objects are measured (``MotionCode.place_m``)."""
+        return condition.points_m - self.code.place_m(condition.points_m, condition.part)[:, None]
+
     def _body(self, condition: Condition, contact: Tensor) -> Tensor:
         """(B, width) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
         config, body = self.config, [condition.object]
@@ -229,7 +232,7 @@ class DiffusionModel(nn.Module):
         if config.scale_input:
             body.append(normalised_points(condition.points_m)[1])
         if config.centroid:
-            body.append(condition.points_m.mean(1))
+            body.append(self._placed_points(condition).mean(1))
         return self.object_condition_in(torch.cat(body, -1)) * self._known(condition.object)
 
     def _known(self, summary: Tensor) -> Tensor:
@@ -369,7 +372,7 @@ class MotionGenerator:
     def denoise_once(
         self, hands: Tensor, objects: Tensor, timesteps: Tensor, condition: Condition, generator: torch.Generator
     ) -> Motion:
-        """Normalised rows of motions, noised to ``timesteps`` (B,) and denoised by a single call."""
+        """Normalised rows of motions, noised to ``timesteps`` (B,), denoised by one call, placed as by ``sample``."""
         signal = alphas_cumprod(timesteps.device)
         noised = []
         for clean in (hands, objects):

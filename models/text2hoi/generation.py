@@ -36,12 +36,12 @@ class GeneratedMotion:
     """clip: the motion, hands that were not asked for invalid. contact: (N,) bool contact map it was made for.
 
     points: where those points lie on the object. coarse: the motion before refinement. evidence: plain values on how
-    the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the
-    verb of training the diffusion network takes the sentence for, with its probability, or None where it is told the
+    the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the verb
+    of training the diffusion network takes the sentence for, with its probability, or None where it is told the
     sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "unusual": what
-    the object does more or less than in any training clip of the verb; "told": the sentence the networks were told, not
-    the user's where they would take that for another verb ("plainly_read_as"); "unseen": what of the sentence was never
-    in training, in words.
+    of it lies outside the bounds of the verb's training clips, in words; "told": the sentence the networks were told,
+    not the user's where they would take that for another verb ("plainly_read_as"); "unseen": what of the sentence was
+    never in training, in words.
     """
 
     clip: Clip

@@ -49,8 +49,9 @@ class MotionCodeConfig:
     way: a shake of 2 cm from end to end is at rest, one of 2.5 cm is not.
 
     object_place: which point of an object its position is, and hands in its frame are measured from: the origin of its
-    mesh, which may lie anywhere, or the middle of the box about its base. An object that is turned in one place keeps
-    its middle there; its origin moves, and what is wrong of the one and of the other adds up to a wobble.
+    mesh, which may lie anywhere, or the middle of the box about the sampled points of its base. An object that is
+    turned in one place keeps its middle there; its origin moves, and what is wrong of the one and of the other adds up
+    to a wobble.
 
     object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
     lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many

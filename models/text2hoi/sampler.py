@@ -38,7 +38,6 @@ from models.text2hoi.verb_check import VerbCheck
 
 AT_ONCE = 64  # requests of the same hands and of like length: what is cut off for all is not computed
 ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
-ALL_HOLD = 3
 
 
 @dataclass(frozen=True)
@@ -48,8 +47,8 @@ class SamplingConfig:
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
-    at, whose object moves as in training clips of another verb, or more or less than in any of its own; the best is
-    the answer. contact_draws: how many
+    at, whose object moves as in training clips of another verb, or outside the bounds of its own verb's (``Actions``);
+    the best is the answer. contact_draws: how many
     contact maps are drawn for a motion by a network that draws anchors; the one most like the others is asked for.
     Draws of a latent hardly differ: one.
     """
@@ -85,7 +84,7 @@ class Answer:
     """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
     no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where that is not
     known (``VerbCheck``); other_verb: whether it is not what was asked. unusual: numbers of what the object does, in
-    words, that are not as in training clips of the verb. draws: how many motions were drawn for it.
+    words, that lie outside the bounds of the verb's training clips. draws: how many motions were drawn for it.
     """
 
     motion: Text2HoiMotion
@@ -97,9 +96,11 @@ class Answer:
     draws: int = 1
 
     @property
-    def goodness(self) -> tuple[int, float]:
-        """How many of three things hold: hands carry, the verb is as asked, all is as usual. Then the share."""
-        return int(self.carried >= ENOUGH) + (not self.other_verb) + (not self.unusual), self.carried
+    def goodness(self) -> tuple[int, bool, float]:
+        """How many of two things are so, that hands carry and that the verb is the one asked for; then whether
+        nothing is unusual (a motion of another verb nearly always is, and is not counted twice); then the share.
+        """
+        return int(self.carried >= ENOUGH) + (not self.other_verb), self.other_verb or not self.unusual, self.carried
 
 
 @dataclass(frozen=True)
@@ -165,7 +166,7 @@ class Text2Hoi:
         """
         best = self._drawn(requests, refined, contact_maps)
         for draw in range(2, self.config.draws + 1):
-            weak = [number for number, own in enumerate(best) if own.goodness[0] < ALL_HOLD]
+            weak = [number for number, own in enumerate(best) if own.goodness[:2] != (2, True)]
             if not weak:
                 break
             again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
@@ -193,8 +194,9 @@ class Text2Hoi:
                 found.append(Answer(motion, clip, carried))
                 continue
             numbers = check.numbers(clip, request.points)
-            moved_as, unusual = check.moved_as(numbers), check.unusual(request, numbers)
-            found.append(Answer(motion, clip, carried, moved_as, check.fails(request, moved_as), unusual))
+            asked, moved_as = check.asked(request), check.moved_as(numbers)
+            other, unusual = check.fails(asked, moved_as), check.unusual(asked, numbers)
+            found.append(Answer(motion, clip, carried, moved_as, other, unusual))
         return found
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:

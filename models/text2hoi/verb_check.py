@@ -1,7 +1,7 @@
 """Whether the object of a motion moves as in training clips of the verb its sentence was read as.
 
 A sampler draws from what it learnt, now and then a motion of another verb. What the object does is a few numbers
-(``hoidata.actions``), and which verb's training clips do most alike, and whether any does by as much, needs no test
+(``hoidata.actions``), and which verb's training clips do most alike, and within which bounds they do it, needs no test
 clip and no judge: a motion that fails is drawn again.
 """
 
@@ -57,15 +57,18 @@ class VerbCheck:
         """The verb whose training clips move the object most alike; None where gravity is not known."""
         return self.actions.named(numbers)
 
-    def unusual(self, request: Request, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """Which numbers, in words, are not as in training clips of the verb that the sentence was read as."""
+    def asked(self, request: Request) -> str | None:
+        """The verb that a sentence was read as; None where that is not known."""
         read = read_verb(self.trained, torch.from_numpy(request.text))
-        return () if read is None else self.actions.unusual(read[0], numbers)
+        return None if read is None else read[0]
 
-    def fails(self, request: Request, moved_as: str | None) -> bool:
-        """Whether a motion is of another verb than its sentence was read as; False where either is not known."""
-        read = read_verb(self.trained, torch.from_numpy(request.text))
-        return not (read is None or moved_as is None or read[0] not in self.actions.centroids or moved_as == read[0])
+    def unusual(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
+        """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for."""
+        return () if asked is None else self.actions.unusual(asked, numbers)
+
+    def fails(self, asked: str | None, moved_as: str | None) -> bool:
+        """Whether a motion is of another verb than the one asked for; False where either is not known."""
+        return not (asked is None or moved_as is None or asked not in self.actions.centroids or moved_as == asked)
 
 
 def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:

@@ -28,7 +28,7 @@ from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.corpus import Corpus
 from models.common.family import Network, Setup
-from models.common.features import Hands, Normaliser
+from models.common.features import Hands, Normaliser, recentred
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.sampling import SamplerConfig
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
@@ -157,14 +157,17 @@ def sampled(stored: dict[str, Checkpoint], sampler: SamplerConfig, requests: lis
 
 
 def rows_of_ours() -> None:
-    """What comes out of the sampler, at rest and as features; no copy in it is waited for."""
+    """What comes out of the sampler, at rest and as features in the world; no copy in it is waited for."""
     motion = read_params(ROOT)["train"]["ours"]["diffusion"]["network"]["motion"]
     code, counts = MotionCode(build_config(MotionCodeConfig, motion, "motion")), [24, 40]
     of_hand, of_object = code.sizes(max(counts))
     hands = torch.zeros(2, 2, of_hand, 99, device=DEVICE)
     objects = torch.zeros(2, of_object, code.object_features, device=DEVICE)
+    points_m, part = torch.zeros(2, 16, 3, device=DEVICE), torch.zeros(2, 16, dtype=torch.uint8, device=DEVICE)
     with step():
         hands, objects = code.curves(*code.settled(hands, objects, counts), counts)
+        objects_at_origin = code.at_origin(objects, points_m, part)
+        hands, objects = recentred(code.in_world(hands, objects), objects_at_origin)
     assert (hands.shape, objects.shape) == ((2, 2, 40, 99), (2, 40, 10))
 
 

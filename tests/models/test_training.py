@@ -236,14 +236,14 @@ def test_a_person_is_told_when_the_object_does_as_another_verb_says(
     notes = {}
     for verb in ("lift", "open"):
         monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers, verb=verb: verb)
-        for strange in ((), ("rise_m 9 (in training 0 to 1)", "path_m 8")):
+        for strange in ((), ("rise_m 9 (usual: 0 to 1)", "path_m 8")):
             monkeypatch.setattr(VerbCheck, "unusual", lambda self, request, numbers, strange=strange: strange)
             said = generate_files(asked, tmp_path / verb).notes
             notes[verb, len(strange)] = [note for note in said if note.startswith("sample 1")]
     other = ["sample 1: the object moves most like training's 'open', not 'lift'"]
     assert notes == {
         ("lift", 0): [],
-        ("lift", 2): ["sample 1: not as training's 'lift': rise_m 9 (in training 0 to 1), path_m 8"],
+        ("lift", 2): ["sample 1: not as training's 'lift': rise_m 9 (usual: 0 to 1), path_m 8"],
         ("open", 0): other,
         ("open", 2): other,
     }

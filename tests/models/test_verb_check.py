@@ -51,14 +51,16 @@ def test_a_recorded_clip_moves_as_its_verb(annotated: AnnotatedStore, check: Ver
 def test_what_is_unusual_is_told_for_the_verb_that_the_sentence_was_read_as(
     annotated: AnnotatedStore, check: VerbCheck
 ) -> None:
-    strict = replace(
-        check, actions=replace(check.actions, usual={"lift": {"path_m": (0.0, 0.5), "rise_m": (0.0, 0.5)}})
-    )
+    usual = {"lift": {"path_m": (0.0, 0.5), "rise_m": (0.0, 0.5)}}
+    strict = replace(check, actions=replace(check.actions, usual=usual))
     for sample in clips_of(annotated, "train"):
-        request, numbers = asked_for(sample), check.numbers(annotated.store.clip(sample.clip_id), sample.points)
-        assert check.unusual(request, numbers) == strict.unusual(request, numbers) == ()
-        said = ("path_m 9 (in training 0 to 0.5)",) if sample.verb == "lift" else ()
-        assert strict.unusual(request, numbers | {"path_m": 9.0}) == said
+        asked = strict.asked(asked_for(sample))
+        numbers = check.numbers(annotated.store.clip(sample.clip_id), sample.points)
+        assert asked == sample.verb
+        assert strict.unusual(asked, numbers) == ()
+        said = ("path_m 9 (usual: 0 to 0.5)",) if sample.verb == "lift" else ()
+        assert strict.unusual(asked, numbers | {"path_m": 9.0}) == said
+        assert strict.unusual(None, numbers | {"path_m": 9.0}) == ()
 
 
 def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(
@@ -69,9 +71,9 @@ def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_a
         read = read_verb(check.trained, torch.from_numpy(request.text))
         assert read is not None
         assert read[0] == sample.verb
-        fails = {verb: check.fails(request, verb) for verb in ("lift", "pass", "open")}
+        fails = {verb: check.fails(check.asked(request), verb) for verb in ("lift", "pass", "open")}
         assert fails == {verb: verb != sample.verb for verb in fails}
-        assert not check.fails(request, None)
+        assert not check.fails(check.asked(request), None)
 
 
 def test_nothing_is_said_without_gravity_or_of_a_verb_that_no_clip_shows(
@@ -81,7 +83,7 @@ def test_nothing_is_said_without_gravity_or_of_a_verb_that_no_clip_shows(
     clip = replace(annotated.store.clip(sample.clip_id), gravity=None)
     assert check.moved_as(check.numbers(clip, sample.points)) is None
     strange = replace(check, actions=replace(check.actions, centroids={"pour": np.zeros(1)}))
-    assert not strange.fails(asked_for(sample), "pour")
+    assert not strange.fails(strange.asked(asked_for(sample)), "pour")
 
 
 def test_a_network_that_keeps_no_actions_or_is_told_no_verbs_has_no_check(diffusion: Checkpoint) -> None:

@@ -137,7 +137,7 @@ def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_li
     assert {own.split()[0] for own in said} >= {"tilt_deg", "rise_m"}
     most = max(row["tilt_deg"] for row in numbers["lift"]) + 0.5 * actions.scale["tilt_deg"][1]
     tilt = others["pour"][0]["tilt_deg"]
-    assert f"tilt_deg {tilt:.3g} (in training {-most:.3g} to {most:.3g})" in said
+    assert f"tilt_deg {tilt:.3g} (usual: {-most:.3g} to {most:.3g})" in said
     assert actions.unusual("lift", numbers["lift"][0] | {"rise_m": float("nan")}) == ()
     assert actions.unusual("juggle", numbers["lift"][0]) == ()
 
