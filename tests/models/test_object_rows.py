@@ -186,3 +186,18 @@ def test_padding_does_not_keep_a_hinge_from_standing_still() -> None:
     there = torch.tensor([[True, True, True, False]])
     found = _still_hinge(torch.tensor([[0.20, 0.22, 0.21, 9.0]]), there)
     torch.testing.assert_close(found[0, :3], torch.full((3,), 0.21))
+
+
+def test_a_lid_that_opens_does_not_tremble_before_and_after() -> None:
+    """It rests, opens by half a radian in half a second, and rests: tremble of some thousandths of a radian goes."""
+    angle, still = np.interp(np.arange(90), [38, 52], [0, 0.5]), np.zeros((90, 3))
+    thing, _ = features(Rotation.identity(90), still, angle)
+    knots = intervals_of(90, 4)
+    rows = fit_spline(turned_since_start(thing), torch.ones(90), knots * CODE.config.object_knots)
+    rows[:, 9] += 0.004 * torch.randn(len(rows), generator=torch.Generator().manual_seed(0))
+    hands, rows = torch.zeros(1, 2, knots + 3, 99), CODE._whitened(rows)[None]
+    before = CODE.curves(hands, rows, [90])[1][0, :, 9]
+    after = CODE.curves(*CODE.settled(hands, rows, [90]), [90])[1][0, :, 9]
+    for rest in (slice(2, 26), slice(64, 88)):
+        assert after[rest].diff().abs().max() < 0.3 * before[rest].diff().abs().max()
+    assert float((after - torch.from_numpy(angle).float()).abs().max()) < 0.05
