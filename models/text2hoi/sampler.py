@@ -48,9 +48,8 @@ class SamplingConfig:
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
     at, whose object moves as in training clips of another verb, or outside the bounds of its own verb's (``Actions``);
-    the best is the answer. contact_draws: how many
-    contact maps are drawn for a motion by a network that draws anchors; the one most like the others is asked for.
-    Draws of a latent hardly differ: one.
+    the best is the answer. contact_draws: how many contact maps are drawn for a motion by a network that draws anchors;
+    the one most like the others is asked for. Draws of a latent hardly differ: one.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
