@@ -77,7 +77,7 @@ def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
     verbs = sorted(filter(None, Vocabulary.read(trained.facts).verbs))
     if not readings or not verbs:
         return None
-    probability = readings[0](text[None].to(readings[0].mean.device))[0]
+    probability = readings[0].read(text[None].to(readings[0].mean.device))[0]
     return verbs[int(probability.argmax())], round(float(probability.max()), 3)
 
 

@@ -17,6 +17,7 @@ from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.predicting import PredictionConfig, requests_for
 from models.text2hoi.diffusion_training import DIFFUSION
 from models.text2hoi.verb_check import VerbCheck, read_verb
+from models.text2hoi.verb_reading import readings_of
 
 HANDS = load_embedded_hands()
 
@@ -74,6 +75,14 @@ def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_a
         fails = {verb: check.fails(check.asked(request), verb) for verb in ("lift", "pass", "open")}
         assert fails == {verb: verb != sample.verb for verb in fails}
         assert not check.fails(check.asked(request), None)
+
+
+def test_how_likely_a_verb_is_is_said_as_it_was_read_not_as_the_network_is_told(diffusion: Checkpoint) -> None:
+    reading = readings_of(diffusion.network)[0]
+    text = reading.mean + 1e-3 * reading.weights.sum(1)  # of no verb in particular
+    said, told = read_verb(diffusion, text), reading(text[None])
+    assert said is not None
+    assert said[1] < float(told.max()) - 0.1
 
 
 def test_nothing_is_said_without_gravity_or_of_a_verb_that_no_clip_shows(

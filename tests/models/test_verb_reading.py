@@ -29,21 +29,26 @@ from models.text2hoi.verb_reading import (
 SIZE, VERBS, NOUNS, FORMS = 96, 6, 8, 3
 
 
-def written(pairs: list[tuple[int, int]], noun_m: float = 3.0) -> Sentences:
-    """Features of a few sentences for each pair of verb and noun: the noun is louder than the verb."""
+def written(pairs: list[tuple[int, int]], noun_m: float = 3.0, odd: float = 0.3) -> Sentences:
+    """Features of a few sentences for each pair of verb and noun: the noun is louder than the verb, all are ``odd``."""
     draws = np.random.default_rng(0)
     verbs, nouns = draws.normal(size=(VERBS, SIZE)), noun_m * draws.normal(size=(NOUNS, SIZE))
     rows = [(verb, noun) for verb, noun in pairs for _ in range(FORMS)]
-    text = np.array([verbs[verb] + nouns[noun] for verb, noun in rows]) + 0.3 * draws.normal(size=(len(rows), SIZE))
+    text = np.array([verbs[verb] + nouns[noun] for verb, noun in rows]) + odd * draws.normal(size=(len(rows), SIZE))
     text = scaled_text(torch.from_numpy(text)).numpy()
     return Sentences(text, *np.array(rows).T, np.full(len(rows), 1 / FORMS))
 
 
+def learnt(known: Sentences) -> VerbReading:
+    """A reading of double precision, fitted."""
+    reading = VerbReading(known.text.shape[1], known.n_verbs).double()
+    reading.learn(known)
+    return reading
+
+
 def read(known: Sentences, asked: Sentences) -> np.ndarray:
     """(S, V) probabilities of verbs."""
-    reading = VerbReading(known.text.shape[1], known.n_verbs)
-    reading.learn(known)
-    return reading(torch.from_numpy(asked.text).float()).numpy()
+    return learnt(known).read(torch.from_numpy(asked.text)).numpy()
 
 
 def nearest_verb(known: Sentences, asked: Sentences) -> np.ndarray:
@@ -79,8 +84,7 @@ def test_verbs_of_sentences_are_read_by_the_encoder_that_comes_with_us() -> None
 def test_the_layer_is_a_ridge_regression_over_pairs_that_weigh_alike() -> None:
     known = written(TOGETHER[:12])
     weight = known.weight * np.random.default_rng(1).uniform(0.5, 2, len(known.weight))
-    reading = VerbReading(SIZE, known.n_verbs).double()
-    reading.learn(replace(known, weight=weight))
+    reading = learnt(replace(known, weight=weight))
     ridge, _ = choose_shrinkage(replace(known, weight=weight))
     share, wanted = weight / weight.sum(), np.eye(known.n_verbs)[known.verb]
     away, left = known.text - share @ known.text, wanted - share @ wanted
@@ -120,15 +124,47 @@ def test_nouns_that_say_nothing_ask_for_another_shrinkage_than_loud_ones() -> No
 
 def test_probabilities_are_as_sharp_as_was_chosen_whatever_the_length_of_features() -> None:
     known = written(TOGETHER)
-    reading = VerbReading(SIZE, VERBS).double()
-    reading.learn(known)
+    reading = learnt(known)
     odds = np.exp(
         choose_shrinkage(known)[1]
         * ((known.text - reading.mean.numpy()) @ reading.weights.numpy() + reading.offset.numpy())
     )
     for length in (0.1, 1.0, 30.0):
-        found = reading(torch.from_numpy(length * known.text)).numpy()
+        found = reading.read(torch.from_numpy(length * known.text)).numpy()
         np.testing.assert_allclose(found, odds / odds.sum(1, keepdims=True), rtol=1e-6)
+
+
+def test_a_trained_network_is_told_no_verb_less_surely_than_most_training_sentences_had_theirs() -> None:
+    both = written([*TOGETHER, *HELD_OUT], odd=1.5)
+    new = np.arange(len(both.verb)) >= FORMS * len(TOGETHER)
+    known, asked = both.take(~new), both.take(new)
+    own = read(known, known)[np.arange(len(known.verb)), known.verb]
+    plain, told = read(known, asked), learnt(known).eval()(torch.from_numpy(asked.text)).numpy()
+    least = told.max(1).min()
+    assert (own < least).mean() == pytest.approx(0.05, abs=1 / len(own))
+    np.testing.assert_array_equal(told.argmax(1), plain.argmax(1))
+    np.testing.assert_allclose(told.max(1), np.maximum(plain.max(1), least))
+    surely = plain.max(1) > least
+    assert surely.any()
+    assert not surely.all()
+    np.testing.assert_array_equal(told[surely], plain[surely])
+    # The verbs that a sentence is not told as keep their order and shares among each other.
+    rest = np.arange(VERBS) != plain.argmax(1)[:, None]
+    of_rest = [(kind / np.where(rest, kind, 0).sum(1, keepdims=True))[rest] for kind in (told, plain)]
+    np.testing.assert_allclose(*of_rest)
+    np.testing.assert_allclose(told.sum(1), 1)
+
+
+def test_sentences_are_told_as_they_are_read_in_training_and_by_checkpoints_that_kept_nothing_else() -> None:
+    both = written([*TOGETHER, *HELD_OUT], odd=1.5)
+    new = np.arange(len(both.verb)) >= FORMS * len(TOGETHER)
+    reading, text = learnt(both.take(~new)), torch.from_numpy(both.text)
+    plain = reading.read(text)
+    assert torch.equal(reading.train()(text), plain)
+    assert not torch.allclose(reading.eval()(text), plain)
+    old = VerbReading(SIZE, VERBS).double()
+    old.load_state_dict({name: value for name, value in reading.state_dict().items() if name != "sure"})
+    assert torch.equal(old.eval()(text), plain)
 
 
 def test_verbs_that_have_a_noun_of_their_own_cannot_be_asked_for() -> None:
