@@ -7,7 +7,8 @@ it reads, are chosen on sentences whose noun was left out of the fit: what reads
 
 Of a sentence with a new pair of verb and noun the layer may be less sure than of nearly all that a network learnt from,
 and half of one verb and half of another is a condition the network never met: it does either. A trained network is
-told the likeliest verb as surely as most training sentences had theirs.
+told a verb that is likelier than all others together as surely as most training sentences had theirs. Below that the
+likeliest one is wrong too often to be sure of.
 """
 
 from collections import Counter
@@ -28,6 +29,7 @@ from models.common.features import scaled_text
 RIDGES = (0.01, 0.03, 0.1, 0.3, 1.0)
 SHARPNESSES = (2.0, 4.0, 8.0, 16.0, 32.0)
 USUAL = (0.3, 8.0)
+LIKELY = 0.5  # likelier than all other verbs together
 LESS_SURE = 0.05  # of the training sentences: a few have odd words, whatever their verb
 
 
@@ -71,7 +73,7 @@ class Sentences:
 class VerbReading(nn.Module):
     """Probabilities (B, V) that sentences with features (B, D) mean each of the verbs of the training clips.
 
-    In evaluation mode the likeliest verb has at least the probability ``sure``, and the others give way in proportion.
+    In evaluation mode a verb above ``LIKELY`` has at least the probability ``sure``; the others give way in proportion.
     """
 
     def __init__(self, text: int, n_verbs: int) -> None:
@@ -89,7 +91,8 @@ class VerbReading(nn.Module):
             return read
         highest, likeliest = read.max(-1, keepdim=True)
         short = ((self.sure - highest) / (1 - highest).clamp(min=1e-12)).clamp(min=0)
-        return torch.lerp(read, torch.zeros_like(read).scatter(-1, likeliest, 1.0), short)
+        certain = torch.zeros_like(read).scatter(-1, likeliest, 1.0)
+        return torch.lerp(read, certain, torch.where(highest > LIKELY, short, 0.0))
 
     def read(self, text: Tensor) -> Tensor:
         """Probabilities (B, V) as they are read."""
