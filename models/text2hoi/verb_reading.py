@@ -109,8 +109,8 @@ class VerbReading(nn.Module):
             own.data.copy_(torch.from_numpy(found))
         self.sharpness.data.fill_(sharpness)
         read = self.read(torch.from_numpy(sentences.text).to(self.mean))
-        own = np.take_along_axis(read.numpy(), sentences.verb[:, None], 1)
-        self.sure.data.fill_(float(np.quantile(own, LESS_SURE)))
+        own = read.gather(1, torch.from_numpy(sentences.verb)[:, None].to(read.device))
+        self.sure.data.copy_(own.quantile(LESS_SURE))
 
     def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
         """As any module; a checkpoint from before ``sure`` was kept tells sentences as they are read."""
