@@ -6,7 +6,7 @@ is fitted by ridge regression to the verbs of the training sentences. How much i
 it reads, are chosen on sentences whose noun was left out of the fit: what reads those reads the verb.
 
 Of a sentence with a new pair of verb and noun the layer may be less sure than of nearly all that a network learnt from,
-and half of one verb and half of another is a condition the network never met: it does either. A trained network is
+and half of one verb and half of another is a condition the network hardly met: it does either. A trained network is
 told a verb that is likelier than all others together as surely as most training sentences had theirs. Below that the
 likeliest one is wrong too often to be sure of.
 """
