@@ -1,7 +1,7 @@
 """The motions of a family for a dataset's test clips, written as an ordinary store of clips."""
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from itertools import chain
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from rich.progress import track
 
+from hoidata.annotation.encoders import TextEncoder
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request, Trajectories
 from hoidata.clips.clip import Clip
@@ -66,14 +67,16 @@ def sample_family(
     *,
     settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
+    encoder: Callable[[], TextEncoder] | None = None,
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
     Requests the family has no answer to stand in ``out/left_out.json``, where there are any. A family that is
     :class:`AsksContact` also gets ``out/asked.npz`` or ``out/asked-distances.npz`` (``hoidata.metrics.asked``).
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
-    params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th motion for a clip is named
-    ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a model takes the first frames.
+    params: a :class:`PredictionConfig`; settings: sections of families, by name. encoder: as in ``Sources``. The k-th
+    motion for a clip is named ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a
+    model takes the first frames.
     """
     config = build_config(PredictionConfig, params, "params.yaml: sample")
     root, checkpoints = Path(annotated_root), Path(checkpoints)
@@ -85,7 +88,7 @@ def sample_family(
         with atomic_folder(out) as partial:
             write_empty(partial, reason or "no test clips")
         return {"clips": 0}
-    sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
+    sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {}, encoder)
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
         left_out, asked = list[LeftOut](), dict[str, np.ndarray | AskedDistances]()
@@ -126,6 +129,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             number=number,
             clip_id=sample.clip_id,
             object_words=sample.object_words,
+            sentence=sample.sentences[0],
             betas=sample.betas,
             template_m=sample.template_m,
             world_from_model=sample.world_from_model,

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hoidata.batches.dataset import HoiDataset
+from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.settings import build_config
@@ -20,7 +20,7 @@ NAMES = tuple(network.name for network in NETWORKS)
 def load_text2hoi(sources: Sources) -> Text2Hoi:
     """The four networks with the settings of ``sample.text2hoi``."""
     config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
-    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device)
+    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device, sources.encoder)
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class BeforeRefiner:
 class OtherPrompt:
     """Text2HOI told another clip's sentence: what is then as good does not come from the words.
 
-    other: features of the sentence to use instead, by clip.
+    other: the clip whose sentence to use instead, by clip.
     """
 
     model: Text2Hoi
-    other: dict[str, np.ndarray]
+    other: dict[str, ClipSample]
 
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         return self.sample_asked(requests)[0]
@@ -54,18 +54,22 @@ class OtherPrompt:
 
     def told(self, requests: Sequence[Request]) -> list[Request]:
         """The requests with the other sentences."""
-        return [replace(request, text=self.other[request.clip_id]) for request in requests]
+        others = [self.other[request.clip_id] for request in requests]
+        return [
+            replace(request, sentence=other.sentences[0], text=other.text[0])
+            for request, other in zip(requests, others, strict=True)
+        ]
 
 
-def other_prompts(sources: Sources) -> dict[str, np.ndarray]:
-    """For every test clip the first sentence's features of another: other verb and object if there is one such."""
+def other_prompts(sources: Sources) -> dict[str, ClipSample]:
+    """For every test clip another whose first sentence it is told: other verb and object if there is one such."""
     test = list(HoiDataset(sources.annotated, "test", crop="start"))
     draws, chosen = np.random.default_rng(0), {}
     for sample in test:
         other = [s for s in test if s.verb != sample.verb and s.object_key != sample.object_key]
         other = other or [s for s in test if s.sentences[0] != sample.sentences[0]] or [sample]
         same_hand = [s for s in other if s.hand_type == sample.hand_type] or other
-        chosen[sample.clip_id] = same_hand[int(draws.integers(len(same_hand)))].text[0]
+        chosen[sample.clip_id] = same_hand[int(draws.integers(len(same_hand)))]
     return chosen
 
 

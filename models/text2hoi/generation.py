@@ -27,8 +27,7 @@ from models.common.vocabulary import Vocabulary
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
 from models.text2hoi.sentences import read_sentence, unseen_words
-from models.text2hoi.understanding import understand
-from models.text2hoi.verb_check import read_verb
+from models.text2hoi.understanding import reading_of, understand
 
 
 @dataclass(frozen=True)
@@ -110,8 +109,9 @@ class Generator:
         verb, thing = read_sentence(text)
         choice = self._hand(text, wish)
         assert choice.hand is not None  # a prior decides last
-        points, read = sample_points(object, self.points), self._read_as
-        told = understand(text, verb, thing, choice.hand, self.vocabulary, self.encoder, read)
+        points, read = sample_points(object, self.points), reading_of(self.model.trained["diffusion"])
+        encode = self.encoder.encode
+        told = understand(text, encode([text])[0], verb, thing, choice.hand, self.vocabulary, encode, read)
         first = Request(
             motion_id=f"generated/{object.name}",
             object=object,
@@ -144,9 +144,6 @@ class Generator:
 
     def _unseen(self, text: str, verb: str | None, thing: str | None, hand: HandType) -> list[str]:
         return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)
-
-    def _read_as(self, text: np.ndarray) -> tuple[str, float] | None:
-        return read_verb(self.model.trained["diffusion"], torch.from_numpy(text))
 
     def _hand(self, text: str, wish: Wish) -> HandChoice:
         """The hand asked for; else by the rules, and where the text names none by the share among training clips."""

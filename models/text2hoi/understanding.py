@@ -2,24 +2,36 @@
 
 Networks of `ours` read the verb of a sentence from its features, learnt on sentences that name a hand and objects of
 training. A sentence without a hand, or of a strange object, may be read as another verb though its own was learnt.
-Such a sentence is told with the hand in words, or with an object that its verb was learnt with.
+Such a sentence is told with the hand in words, or with an object that its verb was learnt with. A recorded clip's
+sentence is told as a person's is, so that figures are of what a person gets.
 """
 
 import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+import torch
 
-from hoidata.annotation.encoders import TextEncoder
+from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import PHRASES, select_hand
-from hoidata.clips.clip import HandType
+from hoidata.annotation.prompts import read_prompt
+from hoidata.batches.requests import Request
+from hoidata.clips.clip import SIDES, HandType
+from models.common.checkpoints import Checkpoint
 from models.common.vocabulary import Vocabulary
+from models.text2hoi.verb_check import read_verb
 
 MOST_OBJECTS = 12
 
 Reading = tuple[str, float]
+Encode = Callable[[Sequence[str]], np.ndarray]
+
+
+def reading_of(diffusion: Checkpoint) -> Callable[[np.ndarray], Reading | None]:
+    """From features (512,) of a sentence to the verb that a diffusion network takes it for."""
+    return lambda text: read_verb(diffusion, torch.from_numpy(text))
 
 
 @dataclass(frozen=True)
@@ -36,29 +48,69 @@ class Understood:
 
 def understand(
     sentence: str,
+    text: np.ndarray,
     verb: str | None,
     thing: str | None,
     hand: HandType,
     known: Vocabulary,
-    encoder: TextEncoder,
+    encode: Encode,
     read: Callable[[np.ndarray], Reading | None],
 ) -> Understood:
     """The user's sentence, or the likeliest of those like it where the networks miss its verb.
 
-    verb, thing: of the sentence, base forms. hand: that acts. read: the reading of features (512,).
+    text: (512,) its features. verb, thing: of it, base forms. hand: that acts. encode: sentences to features, asked
+    only where the verb is missed. read: the reading of features (512,).
     """
-    text = encoder.encode([sentence])[0]
     plainly = read(text)
     own = Understood(sentence, text, plainly, plainly)
     if plainly is None or not verb or plainly[0] == verb or verb not in known.verbs:
         return own
     for sentences in _like(sentence, verb, thing, hand, known):
-        found = [(told, text, read(text)) for told, text in zip(sentences, encoder.encode(sentences), strict=True)]
+        found = [(told, text, read(text)) for told, text in zip(sentences, encode(sentences), strict=True)]
         right = [(reading[1], told, text) for told, text, reading in found if reading and reading[0] == verb]
         if right:
             likely, told, text = max(right, key=lambda item: item[:2])
             return Understood(told, text, (verb, likely), plainly)
     return own
+
+
+@dataclass(frozen=True)
+class Teller:
+    """Tells networks the sentences of recorded clips as a person's are told (:func:`understand`).
+
+    known: what the networks were trained on. encoder: made when the first sentence is misread. read: as there.
+    """
+
+    known: Vocabulary
+    encoder: Callable[[], TextEncoder]
+    read: Callable[[np.ndarray], Reading | None]
+
+    @classmethod
+    def of(cls, trained: Mapping[str, Checkpoint], encoder: Callable[[], TextEncoder]) -> "Teller":
+        """For the networks of one dataset, by name. Its encoder raises BadInput where it is not theirs."""
+        diffusion = trained["diffusion"]
+
+        def own() -> TextEncoder:
+            found = encoder()
+            refuse_other_encoder("params.yaml: annotate.encoder", diffusion.facts["encoder"], found.identity)
+            return found
+
+        return cls(Vocabulary.read(trained["contact"].facts), own, reading_of(diffusion))
+
+    def told(self, request: Request) -> Request:
+        """The request with the features its sentence is told with; unchanged where its sentence is not known."""
+        if not request.sentence:
+            return request
+        words = read_prompt(request.sentence)
+        left, right = request.active_hands
+        hand: HandType = "both" if left and right else SIDES[int(right)]
+        found = understand(
+            request.sentence, request.text, words.verb, words.object_words, hand, self.known, self._encode, self.read
+        )
+        return replace(request, sentence=found.sentence, text=found.text)
+
+    def _encode(self, sentences: Sequence[str]) -> np.ndarray:
+        return self.encoder().encode(sentences)
 
 
 def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vocabulary) -> Sequence[list[str]]:

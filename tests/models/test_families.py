@@ -23,7 +23,7 @@ from models.common.family import Sources, motion_clip
 from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
 from models.text2hoi.diagnostics import mean_map_by_position
-from models.text2hoi.family import other_prompts
+from models.text2hoi.family import OtherPrompt, other_prompts
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.sampler import AT_ONCE, Text2Hoi, Text2HoiMotion, alike
 from models.text2hoi.thresholds import best_threshold, mean_f1
@@ -144,16 +144,18 @@ def test_the_nearest_clip_to_a_training_sentence_is_that_clip_and_the_next_is_an
 
 def test_another_prompt_is_never_the_own_one(sources: Sources) -> None:
     test = {sample.clip_id: sample for sample in samples_of(sources.annotated, "test")}
-    for clip_id, features in other_prompts(sources).items():
-        assert not np.allclose(features, test[clip_id].text[0])
-        others = [other for key, other in test.items() if key != clip_id]
-        assert any(np.array_equal(features, other.text[0]) for other in others)
+    for clip_id, other in other_prompts(sources).items():
+        assert other.clip_id in set(test) - {clip_id}
+        assert not np.allclose(other.text[0], test[clip_id].text[0])
 
 
 def test_another_prompt_is_what_text2hoi_is_told(sources: Sources) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
-    told = replace(request, text=other_prompts(sources)[request.clip_id])
-    (made,) = load_family("other-prompt").load(sources).sample([request])
+    other, family = other_prompts(sources)[request.clip_id], load_family("other-prompt").load(sources)
+    assert isinstance(family, OtherPrompt)
+    told = replace(request, sentence=other.sentences[0], text=other.text[0])
+    assert [own.sentence for own in family.told([request])] == [other.sentences[0]]
+    (made,) = family.sample([request])
     own, expected = load_family("text2hoi").load(sources).sample([request, told])
     np.testing.assert_allclose(joints_of(made), joints_of(expected), atol=1e-5)
     assert abs(joints_of(made) - joints_of(own)).max() > 1e-4

@@ -1,13 +1,26 @@
 """A sentence whose verb was learnt is told so that the networks read that verb; any other is told as it is."""
 
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from hoidata.annotation.encoders import HashEncoder
+from hoidata.annotation.encoders import CachedEncoder, HashEncoder, TextEncoder
+from hoidata.batches.dataset import HoiDataset
+from hoidata.batches.requests import Request
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.store.annotated import AnnotatedStore
+from models.common.family import Sources
+from models.common.predicting import PredictionConfig, requests_for
 from models.common.vocabulary import Vocabulary
-from models.text2hoi.understanding import Understood, understand
+from models.registry import load_family
+from models.text2hoi.sampler import Text2Hoi
+from models.text2hoi.understanding import Teller, Understood, understand
+from tests.models.toy import FAST
 
 KNOWN = Vocabulary({("screw", "jar", "right"): 3, ("screw", "apple", "right"): 2, ("lift", "box", "left"): 4})
 ENCODER = HashEncoder()
@@ -20,7 +33,8 @@ def told(sentence: str, verb: str | None, thing: str | None, readings: Mapping[s
         same = (own for own in readings if (ENCODER.encode([own])[0] == text).all())
         return readings.get(next(same, ""), ("place", 0.9))
 
-    found = understand(sentence, verb, thing, "right", KNOWN, ENCODER, read)
+    text = ENCODER.encode([sentence])[0]
+    found = understand(sentence, text, verb, thing, "right", KNOWN, ENCODER.encode, read)
     np.testing.assert_array_equal(found.text, ENCODER.encode([found.sentence])[0])
     assert found.read_as == read(found.text)
     assert found.plainly == read(ENCODER.encode([sentence])[0])
@@ -58,10 +72,94 @@ def test_what_nothing_helps_is_told_as_it_is(verb: str | None, thing: str | None
 
 
 def test_networks_that_are_told_features_get_the_sentence_as_it_is() -> None:
-    found = understand("Screw a box.", "screw", "box", "right", KNOWN, ENCODER, lambda text: None)
+    text = ENCODER.encode(["Screw a box."])[0]
+    found = understand("Screw a box.", text, "screw", "box", "right", KNOWN, ENCODER.encode, lambda text: None)
     assert (found.sentence, found.read_as, found.plainly) == ("Screw a box.", None, None)
 
 
 def test_an_object_of_two_words_and_one_without_an_article_are_replaced_whole() -> None:
     readings = {"Screw the jar with the right hand.": ("screw", 0.8)}
     assert told("Screw the water bottle.", "screw", "water bottle", readings).sentence in readings
+
+
+@pytest.fixture(scope="module")
+def request_of_a_clip(annotated: AnnotatedStore) -> Request:
+    """A lift with the left hand."""
+    sample = next(iter(HoiDataset(annotated, "test", crop="start")))
+    return requests_for(sample, PredictionConfig(samples=1))[0]
+
+
+def asked(request: Request, sentence: str, *sides: bool) -> Request:
+    return replace(
+        request, sentence=sentence, text=ENCODER.encode([sentence])[0], active_hands=np.array(sides or (False, True))
+    )
+
+
+def teller(*right: str) -> tuple[Teller, list[str]]:
+    """One for networks that read the sentences ``right`` as "screw" and all others as "place"; what it was made for."""
+    features, made = [ENCODER.encode([own])[0] for own in right], list[str]()
+
+    def encoder() -> TextEncoder:
+        made.append("encoder")
+        return ENCODER
+
+    def read(text: np.ndarray) -> tuple[str, float]:
+        return ("screw", 0.8) if any((text == own).all() for own in features) else ("place", 0.9)
+
+    return Teller(KNOWN, encoder, read), made
+
+
+@pytest.mark.parametrize(
+    ("sides", "hand"),
+    [((True, False), "the left hand"), ((False, True), "the right hand"), ((True, True), "both hands")],
+)
+def test_a_clips_sentence_is_told_as_a_persons_with_its_own_hands(
+    request_of_a_clip: Request, sides: tuple[bool, bool], hand: str
+) -> None:
+    wanted = f"Screw a jar with {hand}."
+    made = teller(wanted)[0].told(asked(request_of_a_clip, "Screw a box.", *sides))
+    assert made.sentence == wanted
+    np.testing.assert_array_equal(made.text, ENCODER.encode([wanted])[0])
+    same = replace(made, sentence=request_of_a_clip.sentence, text=request_of_a_clip.text)
+    assert vars(same).keys() == vars(request_of_a_clip).keys()
+    assert all(getattr(same, key) is own for key, own in vars(request_of_a_clip).items() if key != "active_hands")
+
+
+def test_no_encoder_is_made_for_sentences_that_are_read_right_or_not_known(request_of_a_clip: Request) -> None:
+    sentence = "Screw a box with the right hand."
+    own, made = teller(sentence)
+    for request in (asked(request_of_a_clip, sentence), replace(asked(request_of_a_clip, "Screw a box."), sentence="")):
+        found = own.told(request)
+        assert (found.sentence, found.text is request.text) == (request.sentence, True)
+    assert not made
+    own.told(asked(request_of_a_clip, "Screw a jar."))
+    assert made
+
+
+class Stranger(HashEncoder):
+    def __init__(self) -> None:
+        super().__init__()
+        self.identity = self.identity | {"version": "another"}
+
+
+def test_the_family_tells_misread_sentences_of_clips_and_refuses_features_of_another_encoder(
+    annotated: AnnotatedStore, trained: Path, request_of_a_clip: Request
+) -> None:
+    sources = Sources(annotated, trained, load_embedded_hands(), torch.device("cpu"), FAST)
+    plain = load_family("text2hoi").load(sources)
+    model = load_family("text2hoi").load(replace(sources, encoder=lambda: CachedEncoder(HashEncoder())))
+    assert isinstance(plain, Text2Hoi)
+    assert isinstance(model, Text2Hoi)
+    assert model.teller is not None
+    other = request_of_a_clip.sentence.replace("box", "zeppelin")
+    misread = replace(request_of_a_clip, text=-request_of_a_clip.text, sentence=other)
+    assert model.teller.read(misread.text)[0] != "lift" == model.teller.read(request_of_a_clip.text)[0]  # type: ignore[index]
+    expected = model.teller.told(misread)
+    assert model.teller.read(expected.text)[0] == "lift"  # type: ignore[index]
+    (made,), (wanted,), (as_it_is,) = model.sample([misread]), plain.sample([expected]), plain.sample([misread])
+    np.testing.assert_array_equal(made.object.translation_m, wanted.object.translation_m)
+    assert (as_it_is.object.translation_m != wanted.object.translation_m).any()
+    assert torch.equal(model.contact_maps([misread])[0], plain.contact_maps([expected])[0])
+    stranger = load_family("text2hoi").load(replace(sources, encoder=Stranger))
+    with pytest.raises(BadInput, match=r"annotate\.encoder"):
+        stranger.sample([misread])
