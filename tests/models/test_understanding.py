@@ -18,6 +18,7 @@ from models.common.family import Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.vocabulary import Vocabulary
 from models.registry import load_family
+from models.text2hoi.contact_training import touched_maps
 from models.text2hoi.sampler import Text2Hoi
 from models.text2hoi.understanding import Teller, Understood, understand
 from tests.models.toy import FAST
@@ -143,7 +144,7 @@ class Stranger(HashEncoder):
 
 
 def test_the_family_tells_misread_sentences_of_clips_and_refuses_features_of_another_encoder(
-    annotated: AnnotatedStore, trained: Path, request_of_a_clip: Request
+    annotated: AnnotatedStore, trained: Path, request_of_a_clip: Request, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sources = Sources(annotated, trained, load_embedded_hands(), torch.device("cpu"), FAST)
     plain = load_family("text2hoi").load(sources)
@@ -159,7 +160,12 @@ def test_the_family_tells_misread_sentences_of_clips_and_refuses_features_of_ano
     (made,), (wanted,), (as_it_is,) = model.sample([misread]), plain.sample([expected]), plain.sample([misread])
     np.testing.assert_array_equal(made.object.translation_m, wanted.object.translation_m)
     assert (as_it_is.object.translation_m != wanted.object.translation_m).any()
+    seen = list[torch.Tensor]()
+    monkeypatch.setattr(
+        "models.text2hoi.sampler.touched_maps", lambda *given: seen.append(given[2]) or touched_maps(*given)
+    )
     assert torch.equal(model.contact_maps([misread])[0], plain.contact_maps([expected])[0])
+    assert torch.equal(*seen)
     stranger = load_family("text2hoi").load(replace(sources, encoder=Stranger))
     with pytest.raises(BadInput, match=r"annotate\.encoder"):
         stranger.sample([misread])
