@@ -38,7 +38,9 @@ from models.common.predicting import sample_family
 from models.common.repeatable import make_repeatable
 from models.common.training import train_network
 from models.registry import load_network
+from models.text2hoi.family import encoder_of
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
+from models.text2hoi.understanding import Teller
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.params import laid_over, read_params
 from pipelines.stages.tables import mean_and_spread
@@ -210,7 +212,15 @@ class Study:
 def _answering(sources: Sources, folders: Mapping[str, Path], row: Row) -> Text2Hoi:
     """The row's networks, ready to answer; a refiner that nothing asks is not among them."""
     trained = {name: load_checkpoint(path, load_network(name), sources.device) for name, path in folders.items()}
-    return Text2Hoi(trained, Hands(sources.hands).to(sources.device), row.sampling(), sources.device, sources.hands)
+    encoder = encoder_of(sources)
+    return Text2Hoi(
+        trained,
+        Hands(sources.hands).to(sources.device),
+        row.sampling(),
+        sources.device,
+        sources.hands,
+        None if encoder is None else Teller.of(trained, encoder),
+    )
 
 
 def main() -> None:

@@ -46,6 +46,7 @@ LEARNT = tuple(name for name in NUMBERS if name not in OF_GIVEN_HANDS)
 LEAST_CLIPS = 3  # of a verb to learn its limits from
 SHARE_THAT_FOLLOWS = 0.9
 MARGIN = 0.5  # deviations, added to the 1st and 99th percentile of the verb's own clips
+LEAST_SHARE = 0.5  # of the deviation of all clips that a verb's own are taken to have, at least, for what is usual
 LEAST_DEVIATION = {
     "m": 0.03,
     "deg": 10.0,
@@ -133,11 +134,12 @@ class Actions:
     """What the verbs of a dataset ask of a motion.
 
     limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
-    other verbs have theirs from ``actions.toml``. usual: bounds of every verb with ``LEAST_CLIPS`` clips, from the 1st
-    to the 99th percentile and ``MARGIN`` beyond, whether or not it has limits in the file. centroids: by verb, the mean
-    of its training clips' standardised numbers. scale: of each of these numbers its mean and standard deviation over
-    all training clips, the latter at least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a
-    prediction a little off is not far off.
+    other verbs have theirs from ``actions.toml``. usual: bounds of every verb with ``LEAST_CLIPS`` clips, whether or
+    not it has limits in the file: from the 1st to the 99th percentile and ``MARGIN`` of its own deviations beyond;
+    learnt limits are wider, by ``MARGIN`` of the deviations of all clips. centroids: by verb, the mean of its training
+    clips' standardised numbers. scale: of each of these numbers its mean and standard deviation over all training
+    clips, the latter at least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a prediction a little
+    off is not far off.
     """
 
     limits: Mapping[str, Limits]
@@ -222,20 +224,27 @@ def learn_actions(
         if len(column) and np.isfinite(column).all():
             scale[name] = float(column.mean()), max(float(column.std()), LEAST_DEVIATION[name.rpartition("_")[2]])
     limits, learnt = dict[str, Limits](), dict[str, int]()
-    usual = {verb: _bands(rows, scale) for verb, rows in numbers.items() if len(rows) >= LEAST_CLIPS}
+    usual = {verb: _bands(rows, _own(rows, scale)) for verb, rows in numbers.items() if len(rows) >= LEAST_CLIPS}
     for verb, rows in numbers.items():
         known = (written or {}).get(verb)
         if known is not None and np.mean([_within(row, known) is True for row in rows]) >= SHARE_THAT_FOLLOWS:
             limits[verb] = known
         elif verb in usual:
-            limits[verb], learnt[verb] = usual[verb], len(rows)
+            limits[verb], learnt[verb] = _bands(rows, {name: own for name, (_, own) in scale.items()}), len(rows)
     centroids = {verb: np.mean([_standardised(row, scale) for row in rows], axis=0) for verb, rows in numbers.items()}
     return Actions(limits, learnt, centroids, scale, usual)
 
 
-def _bands(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> Limits:
+def _own(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """Deviations of a verb's own clips: some verbs are told from others by how often, not by whether, at all."""
+    return {
+        name: max(float(np.std([row[name] for row in rows])), LEAST_SHARE * every) for name, (_, every) in scale.items()
+    }
+
+
+def _bands(rows: list[dict[str, float]], deviations: Mapping[str, float]) -> Limits:
     bands = {}
-    for name, (_, deviation) in scale.items():
+    for name, deviation in deviations.items():
         low, high = np.percentile([row[name] for row in rows], (1, 99))
         bands[name] = float(low - MARGIN * deviation), float(high + MARGIN * deviation)
     return bands

@@ -35,13 +35,22 @@ class Trajectories:
 
 
 @dataclass(frozen=True)
+class Sentence:
+    """words: as written. verb, thing: what is done and the object's words, base forms; None where that is not known."""
+
+    words: str
+    verb: str | None
+    thing: str | None
+
+
+@dataclass(frozen=True)
 class Request:
     """One motion that is asked for; nothing in it was recorded but what the asker knows.
 
     motion_id: of the clip to make. clip_id: of the recorded clip whose place it takes, "" where there is none.
-    object: the model; points: sampled on it. text: (512,) features of the sentence. sentence: itself, "" where only its
-    features are known. active_hands: (2,) bool, left and right. n_frames: at 30 fps. seed: of everything that is drawn.
-    number: which of several motions asked for alike.
+    object: the model; points: sampled on it. text: (512,) features of the sentence. sentence: itself, None where
+    only its features are known. active_hands: (2,) bool, left and right. n_frames: at 30 fps. seed: of everything that
+    is drawn. number: which of several motions asked for alike.
     betas: (2, 10) hand shapes; template_m: (2, 778, 3) personal rest meshes, or None.
     world_from_model: (4, 4) where the motion is to lie; models work z up, the object at the origin in the first frame.
     gravity_known: whether model's -z is known to be where things fall.
@@ -58,7 +67,7 @@ class Request:
     number: int = 0
     clip_id: str = ""
     object_words: str = ""
-    sentence: str = ""
+    sentence: Sentence | None = None
     betas: np.ndarray = field(default_factory=lambda: np.zeros((2, 10), np.float32))
     template_m: np.ndarray | None = None
     world_from_model: np.ndarray = field(default_factory=lambda: np.eye(4))

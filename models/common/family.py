@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.annotation.encoders import TextEncoder
 from hoidata.batches.dataset import ClipBatch
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack
@@ -93,8 +92,8 @@ class Network(StoredNetwork):
 class Sources:
     """What a family may use to answer. annotated: the dataset; checkpoints: folder with one folder per network.
 
-    hands: the hand model of the dataset's clips. settings: sections of families, by name. encoder: makes the one that
-    wrote the dataset's text features, which takes seconds; None: sentences are told with the features they have.
+    hands: the hand model of the dataset's clips. settings: sections of families, by name. encoder: the name of the one
+    that wrote the dataset's text features, as in ``annotate.encoder``; None: the one the dataset names.
     """
 
     annotated: AnnotatedStore
@@ -102,7 +101,7 @@ class Sources:
     hands: HandPair
     device: torch.device
     settings: Mapping[str, Any] = field(default_factory=dict)
-    encoder: Callable[[], TextEncoder] | None = None
+    encoder: str | None = None
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """The motions of a family for a dataset's test clips, written as an ordinary store of clips."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from itertools import chain
@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from rich.progress import track
 
-from hoidata.annotation.encoders import TextEncoder
 from hoidata.batches.dataset import ClipSample, HoiDataset
-from hoidata.batches.requests import Request, Trajectories
+from hoidata.batches.requests import Request, Sentence, Trajectories
 from hoidata.clips.clip import Clip
 from hoidata.clips.features import GLOBAL_ORIENT_6D
 from hoidata.files import atomic_folder, write_whole
@@ -67,7 +66,7 @@ def sample_family(
     *,
     settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
-    encoder: Callable[[], TextEncoder] | None = None,
+    encoder: str | None = None,
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
@@ -129,7 +128,7 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
             number=number,
             clip_id=sample.clip_id,
             object_words=sample.object_words,
-            sentence=sample.sentences[0],
+            sentence=first_sentence(sample),
             betas=sample.betas,
             template_m=sample.template_m,
             world_from_model=sample.world_from_model,
@@ -138,6 +137,11 @@ def requests_for(sample: ClipSample, config: PredictionConfig) -> list[Request]:
         )
         for number in range(config.samples)
     ]
+
+
+def first_sentence(sample: ClipSample) -> Sentence:
+    """The imperative of a clip, whose features are the first."""
+    return Sentence(sample.sentences[0], sample.verb, sample.object_words or None)
 
 
 def _write_asked(folder: Path, asked: Mapping[str, np.ndarray | AskedDistances]) -> None:

@@ -1,26 +1,36 @@
 """Text2HOI as a family, the same before its refiner, and the same asked with another clip's sentence."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.settings import build_config
 from models.common.family import Family, Sources
+from models.common.predicting import first_sentence
 from models.text2hoi.diagnostics import diagnose
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 
 NAMES = tuple(network.name for network in NETWORKS)
+WITHOUT_FILES = ("use", "hash")
 
 
 def load_text2hoi(sources: Sources) -> Text2Hoi:
     """The four networks with the settings of ``sample.text2hoi``."""
     config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
-    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device, sources.encoder)
+    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device, encoder_of(sources))
+
+
+def encoder_of(sources: Sources) -> Callable[[], TextEncoder] | None:
+    """What makes the encoder of the dataset's sentences; None where it needs a file that nobody has named."""
+    name = sources.encoder or sources.annotated.encoder_identity["name"]
+    return partial(load_encoder, name) if sources.encoder or name in WITHOUT_FILES else None
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,7 @@ class OtherPrompt:
         """The requests with the other sentences."""
         others = [self.other[request.clip_id] for request in requests]
         return [
-            replace(request, sentence=other.sentences[0], text=other.text[0])
+            replace(request, sentence=first_sentence(other), text=other.text[0])
             for request, other in zip(requests, others, strict=True)
         ]
 

@@ -9,14 +9,13 @@ sentence is told as a person's is, so that figures are of what a person gets.
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
 
 from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import PHRASES, select_hand
-from hoidata.annotation.prompts import read_prompt
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, HandType
 from models.common.checkpoints import Checkpoint
@@ -78,7 +77,7 @@ def understand(
 class Teller:
     """Tells networks the sentences of recorded clips as a person's are told (:func:`understand`).
 
-    known: what the networks were trained on. encoder: made when the first sentence is misread. read: as there.
+    known: what the networks were trained on. encoder: asked for only where a sentence is misread. read: as there.
     """
 
     known: Vocabulary
@@ -87,9 +86,10 @@ class Teller:
 
     @classmethod
     def of(cls, trained: Mapping[str, Checkpoint], encoder: Callable[[], TextEncoder]) -> "Teller":
-        """For the networks of one dataset, by name. Its encoder raises BadInput where it is not theirs."""
+        """For the networks of one dataset. The encoder is made once; it raises BadInput where it is not theirs."""
         diffusion = trained["diffusion"]
 
+        @cache
         def own() -> TextEncoder:
             found = encoder()
             refuse_other_encoder("params.yaml: annotate.encoder", diffusion.facts["encoder"], found.identity)
@@ -99,23 +99,22 @@ class Teller:
 
     def told(self, request: Request) -> Request:
         """The request with the features its sentence is told with; unchanged where its sentence is not known."""
-        if not request.sentence:
+        asked = request.sentence
+        if asked is None:
             return request
-        words = read_prompt(request.sentence)
         left, right = request.active_hands
         hand: HandType = "both" if left and right else SIDES[int(right)]
-        found = understand(
-            request.sentence, request.text, words.verb, words.object_words, hand, self.known, self._encode, self.read
-        )
-        return replace(request, sentence=found.sentence, text=found.text)
 
-    def _encode(self, sentences: Sequence[str]) -> np.ndarray:
-        return self.encoder().encode(sentences)
+        def encode(sentences: Sequence[str]) -> np.ndarray:
+            return self.encoder().encode(sentences)
+
+        found = understand(asked.words, request.text, asked.verb, asked.thing, hand, self.known, encode, self.read)
+        return replace(request, sentence=replace(asked, words=found.sentence), text=found.text)
 
 
 def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vocabulary) -> Sequence[list[str]]:
     """The sentence with the hand in words; then that with objects of training in the place of its own."""
-    named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!')} {PHRASES[hand]}."
+    named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!?')} {PHRASES[hand]}."
     place = re.compile(rf"\b(an?\s+)?{re.escape(thing)}\b", re.IGNORECASE) if thing else None
     if place is None or not place.search(named):
         return [[named]]

@@ -1,6 +1,5 @@
 """Stage sample: the motions of one family for the test clips of one dataset, as an ordinary store of clips."""
 
-from functools import cache, partial
 from pathlib import Path
 
 from pipelines.params import read_params
@@ -18,9 +17,6 @@ def run(paths: StagePaths) -> None:
 
 def sample(paths: StagePaths, params: dict, family: str) -> None:
     """Motions of a family into ``paths.samples``; params: all of params.yaml."""
-    from hoidata.annotation.encoders import load_encoder
-    from hoidata.annotation.settings import AnnotationSettings
-    from hoidata.settings import build_config
     from models.common.device import chosen_device
     from models.common.predicting import sample_family
     from models.common.repeatable import make_repeatable
@@ -28,7 +24,6 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
 
     section = dict(params.get("sample") or {})
     settings = {name: section.pop(name) for name in list(section) if isinstance(section[name], dict)}
-    encoder = build_config(AnnotationSettings, params.get("annotate"), "params.yaml: annotate").encoder
     make_repeatable(threads=1)
     counts = sample_family(
         load_family(family),
@@ -39,6 +34,6 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
         load_hands(paths.profile),
         settings=settings,
         device=chosen_device(params.get("device", "auto")),
-        encoder=cache(partial(load_encoder, encoder)),
+        encoder=(params.get("annotate") or {}).get("encoder"),
     )
     print(f"{paths}: {counts['clips']} motions")

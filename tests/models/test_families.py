@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from hoidata.batches.dataset import ClipSample, HoiDataset, load_sample
+from hoidata.batches.requests import Sentence
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
@@ -153,8 +154,9 @@ def test_another_prompt_is_what_text2hoi_is_told(sources: Sources) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
     other, family = other_prompts(sources)[request.clip_id], load_family("other-prompt").load(sources)
     assert isinstance(family, OtherPrompt)
-    told = replace(request, sentence=other.sentences[0], text=other.text[0])
-    assert [own.sentence for own in family.told([request])] == [other.sentences[0]]
+    told = replace(request, sentence=Sentence(other.sentences[0], other.verb, other.object_words), text=other.text[0])
+    assert [own.sentence for own in family.told([request])] == [told.sentence]
+    np.testing.assert_array_equal(family.told([request])[0].text, told.text)
     (made,) = family.sample([request])
     own, expected = load_family("text2hoi").load(sources).sample([request, told])
     np.testing.assert_allclose(joints_of(made), joints_of(expected), atol=1e-5)
@@ -176,7 +178,7 @@ def test_the_words_and_the_order_of_refinement_reach_the_motion(sources: Sources
     assert isinstance(model, Text2Hoi)
     sample = samples_of(sources.annotated, "test")[0]
     request = requests_for(sample, PredictionConfig(samples=1))[0]
-    other = replace(request, text=np.roll(request.text, 7))
+    other = replace(request, sentence=None, text=np.roll(request.text, 7))
     assert abs(joints_of(model.sample([request])[0]) - joints_of(model.sample([other])[0])).max() > 1e-5
     hands = torch.from_numpy(sample.hands)
     before, after = hands.clone(), hands.clone()

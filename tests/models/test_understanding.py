@@ -8,17 +8,20 @@ import numpy as np
 import pytest
 import torch
 
-from hoidata.annotation.encoders import CachedEncoder, HashEncoder, TextEncoder
+from hoidata.annotation.encoders import HashEncoder, TextEncoder
 from hoidata.batches.dataset import HoiDataset
-from hoidata.batches.requests import Request
+from hoidata.batches.requests import Request, Sentence
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.store.annotated import AnnotatedStore
+from models.common.checkpoints import load_checkpoint
 from models.common.family import Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.vocabulary import Vocabulary
 from models.registry import load_family
-from models.text2hoi.contact_training import touched_maps
+from models.text2hoi.contact_training import CONTACT, touched_maps
+from models.text2hoi.diffusion_training import DIFFUSION
+from models.text2hoi.family import encoder_of
 from models.text2hoi.sampler import Text2Hoi
 from models.text2hoi.understanding import Teller, Understood, understand
 from tests.models.toy import FAST
@@ -47,9 +50,10 @@ def test_a_sentence_that_is_read_right_stays() -> None:
     assert told(sentence, "screw", "box", {sentence: ("screw", 0.4)}).sentence == sentence
 
 
-def test_one_without_a_hand_gets_the_hand_in_words() -> None:
+@pytest.mark.parametrize("end", [".", "", "!", "?", " ."])
+def test_one_without_a_hand_gets_the_hand_in_words(end: str) -> None:
     named = "Screw a jar with the right hand."
-    assert told("Screw a jar.", "screw", "jar", {named: ("screw", 0.8)}).sentence == named
+    assert told(f"Screw a jar{end}", "screw", "jar", {named: ("screw", 0.8)}).sentence == named
 
 
 @pytest.mark.parametrize("sentence", ["Screw a box.", "Screw a box with the right hand."])
@@ -90,14 +94,13 @@ def request_of_a_clip(annotated: AnnotatedStore) -> Request:
     return requests_for(sample, PredictionConfig(samples=1))[0]
 
 
-def asked(request: Request, sentence: str, *sides: bool) -> Request:
-    return replace(
-        request, sentence=sentence, text=ENCODER.encode([sentence])[0], active_hands=np.array(sides or (False, True))
-    )
+def asked(request: Request, words: str, *sides: bool) -> Request:
+    sentence, text = Sentence(words, "screw", words.split()[2].strip(".")), ENCODER.encode([words])[0]
+    return replace(request, sentence=sentence, text=text, active_hands=np.array(sides or (False, True)))
 
 
 def teller(*right: str) -> tuple[Teller, list[str]]:
-    """One for networks that read the sentences ``right`` as "screw" and all others as "place"; what it was made for."""
+    """One for networks that read the sentences ``right`` as "screw", all others as "place"; what it was asked for."""
     features, made = [ENCODER.encode([own])[0] for own in right], list[str]()
 
     def encoder() -> TextEncoder:
@@ -118,20 +121,20 @@ def test_a_clips_sentence_is_told_as_a_persons_with_its_own_hands(
     request_of_a_clip: Request, sides: tuple[bool, bool], hand: str
 ) -> None:
     wanted = f"Screw a jar with {hand}."
-    made = teller(wanted)[0].told(asked(request_of_a_clip, "Screw a box.", *sides))
-    assert made.sentence == wanted
+    request = asked(request_of_a_clip, "Screw a box.", *sides)
+    made = teller(wanted)[0].told(request)
+    assert made.sentence == Sentence(wanted, "screw", "box")
     np.testing.assert_array_equal(made.text, ENCODER.encode([wanted])[0])
-    same = replace(made, sentence=request_of_a_clip.sentence, text=request_of_a_clip.text)
-    assert vars(same).keys() == vars(request_of_a_clip).keys()
-    assert all(getattr(same, key) is own for key, own in vars(request_of_a_clip).items() if key != "active_hands")
+    assert all(getattr(made, key) is own for key, own in vars(request).items() if key not in ("sentence", "text"))
 
 
-def test_no_encoder_is_made_for_sentences_that_are_read_right_or_not_known(request_of_a_clip: Request) -> None:
-    sentence = "Screw a box with the right hand."
-    own, made = teller(sentence)
-    for request in (asked(request_of_a_clip, sentence), replace(asked(request_of_a_clip, "Screw a box."), sentence="")):
+def test_no_encoder_is_asked_for_sentences_that_are_read_right_or_not_known(request_of_a_clip: Request) -> None:
+    words = "Screw a box with the right hand."
+    own, made = teller(words)
+    for request in (asked(request_of_a_clip, words), replace(asked(request_of_a_clip, "Screw a box."), sentence=None)):
         found = own.told(request)
-        assert (found.sentence, found.text is request.text) == (request.sentence, True)
+        assert found.sentence == request.sentence
+        assert found.text is request.text
     assert not made
     own.told(asked(request_of_a_clip, "Screw a jar."))
     assert made
@@ -143,18 +146,42 @@ class Stranger(HashEncoder):
         self.identity = self.identity | {"version": "another"}
 
 
-def test_the_family_tells_misread_sentences_of_clips_and_refuses_features_of_another_encoder(
+def test_an_encoder_is_made_once_and_one_of_other_features_is_refused(trained: Path) -> None:
+    networks = {network.name: load_checkpoint(trained / network.name, network) for network in (CONTACT, DIFFUSION)}
+    made = list[str]()
+    own = Teller.of(networks, lambda: made.append("encoder") or HashEncoder())
+    assert made == []
+    assert own.encoder() is own.encoder()
+    assert made == ["encoder"]
+    with pytest.raises(BadInput, match=r"annotate\.encoder"):
+        Teller.of(networks, Stranger).encoder()
+
+
+def test_the_encoder_is_the_datasets_own_unless_one_is_named_and_none_where_it_needs_a_file(
+    annotated: AnnotatedStore, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sources = Sources(annotated, trained, load_embedded_hands(), torch.device("cpu"), FAST)
+    made, named = encoder_of(sources), encoder_of(replace(sources, encoder="use"))
+    assert made is not None
+    assert named is not None
+    assert made().identity == annotated.encoder_identity
+    assert named().identity["name"] == "use"
+    monkeypatch.setattr(annotated, "encoder_identity", {"name": "clip"})
+    assert encoder_of(sources) is None
+
+
+def test_the_family_tells_misread_sentences_of_clips(
     annotated: AnnotatedStore, trained: Path, request_of_a_clip: Request, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sources = Sources(annotated, trained, load_embedded_hands(), torch.device("cpu"), FAST)
-    plain = load_family("text2hoi").load(sources)
-    model = load_family("text2hoi").load(replace(sources, encoder=lambda: CachedEncoder(HashEncoder())))
-    assert isinstance(plain, Text2Hoi)
+    model = load_family("text2hoi").load(sources)
     assert isinstance(model, Text2Hoi)
     assert model.teller is not None
-    other = request_of_a_clip.sentence.replace("box", "zeppelin")
-    misread = replace(request_of_a_clip, text=-request_of_a_clip.text, sentence=other)
-    assert model.teller.read(misread.text)[0] != "lift" == model.teller.read(request_of_a_clip.text)[0]  # type: ignore[index]
+    plain, sentence = replace(model, teller=None), request_of_a_clip.sentence
+    assert sentence == Sentence("Lift a box with the left hand.", "lift", "box")
+    strange = Sentence(sentence.words.replace("box", "zeppelin"), "lift", "zeppelin")
+    misread = replace(request_of_a_clip, text=-request_of_a_clip.text, sentence=strange)
+    assert model.teller.read(misread.text)[0] != "lift"  # type: ignore[index]
     expected = model.teller.told(misread)
     assert model.teller.read(expected.text)[0] == "lift"  # type: ignore[index]
     (made,), (wanted,), (as_it_is,) = model.sample([misread]), plain.sample([expected]), plain.sample([misread])
@@ -166,6 +193,3 @@ def test_the_family_tells_misread_sentences_of_clips_and_refuses_features_of_ano
     )
     assert torch.equal(model.contact_maps([misread])[0], plain.contact_maps([expected])[0])
     assert torch.equal(*seen)
-    stranger = load_family("text2hoi").load(replace(sources, encoder=Stranger))
-    with pytest.raises(BadInput, match=r"annotate\.encoder"):
-        stranger.sample([misread])
