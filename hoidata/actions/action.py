@@ -46,7 +46,7 @@ LEARNT = tuple(name for name in NUMBERS if name not in OF_GIVEN_HANDS)
 LEAST_CLIPS = 3  # of a verb to learn its limits from
 SHARE_THAT_FOLLOWS = 0.9
 MARGIN = 0.5  # deviations, added to the 1st and 99th percentile of the verb's own clips
-LEAST_SHARE = 0.5  # of the deviation of all clips that a verb's own are taken to have, at least, for what is usual
+ALIKE = 0.25  # of the deviation of all clips: a verb whose own deviate by no more says nothing of how much is usual
 LEAST_DEVIATION = {
     "m": 0.03,
     "deg": 10.0,
@@ -135,11 +135,11 @@ class Actions:
 
     limits: of every verb that has any, by number. learnt: how many training clips a verb's limits are learnt from; the
     other verbs have theirs from ``actions.toml``. usual: bounds of every verb with ``LEAST_CLIPS`` clips, whether or
-    not it has limits in the file: from the 1st to the 99th percentile and ``MARGIN`` of its own deviations beyond;
-    learnt limits are wider, by ``MARGIN`` of the deviations of all clips. centroids: by verb, the mean of its training
-    clips' standardised numbers. scale: of each of these numbers its mean and standard deviation over all training
-    clips, the latter at least ``LEAST_DEVIATION``: in clean recordings some hardly differ, and a prediction a little
-    off is not far off.
+    not it has limits in the file: from the 1st to the 99th percentile and ``MARGIN`` of its own deviations beyond, or
+    of all clips' where its own are ``ALIKE``; learnt limits are wider, always by ``MARGIN`` of all clips'. centroids:
+    by verb, the mean of its training clips' standardised numbers. scale: of each of these numbers its mean and standard
+    deviation over all training clips, the latter at least ``LEAST_DEVIATION``: in clean recordings some hardly differ,
+    and a prediction a little off is not far off.
     """
 
     limits: Mapping[str, Limits]
@@ -236,10 +236,9 @@ def learn_actions(
 
 
 def _own(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> dict[str, float]:
-    """Deviations of a verb's own clips: some verbs are told from others by how often, not by whether, at all."""
-    return {
-        name: max(float(np.std([row[name] for row in rows])), LEAST_SHARE * every) for name, (_, every) in scale.items()
-    }
+    """Deviations of a verb's own clips, which tell how often to shake; of all clips where its own are alike."""
+    found = {name: float(np.std([row[name] for row in rows])) for name in scale}
+    return {name: found[name] if found[name] > ALIKE * every else every for name, (_, every) in scale.items()}
 
 
 def _bands(rows: list[dict[str, float]], deviations: Mapping[str, float]) -> Limits:

@@ -135,7 +135,7 @@ def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_li
         assert all(actions.unusual(verb, row) == () for row in others[verb])
     said = actions.unusual("lift", others["pour"][0])
     assert {own.split()[0] for own in said} >= {"tilt_deg", "rise_m"}
-    most = max(row["tilt_deg"] for row in numbers["lift"]) + 0.25 * actions.scale["tilt_deg"][1]
+    most = max(row["tilt_deg"] for row in numbers["lift"]) + 0.5 * actions.scale["tilt_deg"][1]
     tilt = others["pour"][0]["tilt_deg"]
     assert f"tilt_deg {tilt:.3g} (usual: {-most:.3g} to {most:.3g})" in said
     assert actions.unusual("lift", numbers["lift"][0] | {"rise_m": float("nan")}) == ()
@@ -144,20 +144,21 @@ def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_li
 
 def test_bounds_are_as_wide_as_the_verbs_own_clips_differ_and_learnt_limits_as_all_clips_do():
     still = numbers_of(track(np.zeros((30, 3))))
-    shakes = [still | {"reversals_per_s": 2 + number / 10} for number in range(11)]  # a deviation of 0.32 per second
-    actions = learn_actions({"shake": shakes, "hold": [still] * 30})
-    low, high = np.percentile([row["reversals_per_s"] for row in shakes], (1, 99))
-    every = np.std([row["reversals_per_s"] for row in shakes] + [0.0] * 30)
-    assert 1 < every == pytest.approx(actions.scale["reversals_per_s"][1])
-    for verb, lowest, highest, own in (("shake", low, high, np.sqrt(0.1)), ("hold", 0, 0, 0)):
-        usual, learnt = 0.5 * max(own, 0.5 * every), 0.5 * every
-        assert actions.usual[verb]["reversals_per_s"] == pytest.approx((lowest - usual, highest + usual))
-        assert actions.limits[verb]["reversals_per_s"] == pytest.approx((lowest - learnt, highest + learnt))
-    wide = learn_actions({"shake": [*shakes, still | {"reversals_per_s": 9.0}], "hold": [still] * 30})
-    own = np.std([row["reversals_per_s"] for row in shakes] + [9.0])
-    assert own > 0.5 * wide.scale["reversals_per_s"][1]
-    low = np.percentile([row["reversals_per_s"] for row in shakes] + [9.0], 1)
-    assert wide.usual["shake"]["reversals_per_s"][0] == pytest.approx(low - 0.5 * own)
+
+    def shakes(apart: float) -> list[dict[str, float]]:
+        return [still | {"reversals_per_s": 2.5 + apart * number} for number in range(-5, 6)]
+
+    for apart, of_its_own in ((0.12, True), (0.06, False)):
+        rows = {"shake": shakes(apart), "hold": [still] * 30}
+        actions, own = learn_actions(rows), np.sqrt(10) * apart
+        every = np.std([row["reversals_per_s"] for verb in rows for row in rows[verb]])
+        assert 1 < every == pytest.approx(actions.scale["reversals_per_s"][1])
+        assert (own > 0.25 * every) == of_its_own
+        for verb, middle, half in (("shake", 2.5, 4.9 * apart), ("hold", 0, 0)):  # 1st and 99th percentile of eleven
+            usual, learnt = 0.5 * (own if of_its_own and verb == "shake" else every), 0.5 * every
+            bounds, limits = actions.usual[verb]["reversals_per_s"], actions.limits[verb]["reversals_per_s"]
+            assert bounds == pytest.approx((middle - half - usual, middle + half + usual))
+            assert limits == pytest.approx((middle - half - learnt, middle + half + learnt))
 
 
 def test_written_limits_count_where_the_training_clips_keep_them():
