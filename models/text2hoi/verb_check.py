@@ -1,8 +1,9 @@
-"""Whether the object of a motion moves as in training clips of the verb its sentence was read as.
+"""Whether the object of a motion moves as in training clips of the verb its sentence was read as, and hands no faster.
 
 A sampler draws from what it learnt, now and then a motion of another verb. What the object does is a few numbers
 (``hoidata.actions``), and which verb's training clips do most alike, and within which bounds they do it, needs no test
-clip and no judge: a motion that fails is drawn again.
+clip and no judge: a motion that fails is drawn again. So is one with a joint faster than any of training, which no
+figure of means shows: a sampler's hand may leave for a few frames and come back.
 """
 
 from collections.abc import Mapping
@@ -15,7 +16,7 @@ from torch import Tensor, nn
 
 from hoidata.actions.action import Actions, action_numbers, training_actions
 from hoidata.batches.requests import ObjectPoints, Request
-from hoidata.clips.clip import SIDES, Clip
+from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
 from models.common.checkpoints import Checkpoint
@@ -23,35 +24,46 @@ from models.common.corpus import Corpus
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.verb_reading import readings_of
 
-RECORD = "actions"  # its name among the results of a diffusion checkpoint
+# Names among the results of a diffusion checkpoint.
+RECORD = "actions"
+FASTEST = "fastest_joint_m_s"
+JOINT_SPEED = "joint_m_s"
+FASTER = 1.1  # than in any training clip
 
 
 @dataclass(frozen=True)
 class VerbCheck:
-    """actions: of the training clips. threshold_m: how near a joint must come to touch. hands: of the clips."""
+    """actions: of the training clips. threshold_m: how near a joint must come to touch. hands: of the clips.
+
+    fastest_m_s: of a joint in them; infinite for a checkpoint from before it was kept.
+    """
 
     trained: Checkpoint
     actions: Actions
     threshold_m: float
     hands: HandPair
+    fastest_m_s: float = float("inf")
 
     @classmethod
     def of(cls, trained: Checkpoint, hands: HandPair) -> "VerbCheck | None":
         """Of a diffusion checkpoint; None where it is told no verbs, or was written before they were kept."""
-        record = trained.info.get("results", {}).get(RECORD)
-        if record is None or not readings_of(trained.network):
+        results = trained.info.get("results", {})
+        if RECORD not in results or not readings_of(trained.network):
             return None
-        return cls(trained, Actions.read(record), trained.facts["contact_threshold_m"], hands)
+        fastest_m_s = results.get(FASTEST, float("inf"))
+        return cls(trained, Actions.read(results[RECORD]), trained.facts["contact_threshold_m"], hands, fastest_m_s)
 
     def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
-        """What the object does in a clip (``hoidata.actions``)."""
-        index, touching = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool)
+        """What the object does in a clip (``hoidata.actions``), and ``JOINT_SPEED``, the fastest joint's."""
+        index, touching, speeds = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool), [0.0]
         for row, side in enumerate(SIDES):
             track = clip.hands[side]
             if track.valid.any():
-                near = index.entries(track_joints(track, self.hands[side]), track.valid, clip.object, self.threshold_m)
+                joints_m = track_joints(track, self.hands[side])
+                near = index.entries(joints_m, track.valid, clip.object, self.threshold_m)
                 touching[row, near["frame"]] = True
-        return action_numbers(clip.object, clip.gravity, touching)
+                speeds.append(fastest_joint(joints_m, track.valid))
+        return action_numbers(clip.object, clip.gravity, touching) | {JOINT_SPEED: max(speeds)}
 
     def moved_as(self, numbers: Mapping[str, float]) -> str | None:
         """The verb whose training clips move the object most alike; None where gravity is not known."""
@@ -63,8 +75,10 @@ class VerbCheck:
         return None if read is None else read[0]
 
     def unusual(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
-        """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for."""
-        return () if asked is None else self.actions.unusual(asked, numbers)
+        """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for, or of all."""
+        found, most = () if asked is None else self.actions.unusual(asked, numbers), FASTER * self.fastest_m_s
+        speed = numbers[JOINT_SPEED]
+        return (*found, f"{JOINT_SPEED} {speed:.3g} (usual: at most {most:.3g})") if speed > most else found
 
     def fails(self, asked: str | None, moved_as: str | None) -> bool:
         """Whether a motion is of another verb than the one asked for; False where either is not known."""
@@ -82,5 +96,19 @@ def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
 
 
 def action_results(network: nn.Module, corpus: Corpus) -> Mapping[str, Any]:
-    """What a diffusion checkpoint keeps of its training clips' objects, where it is told verbs."""
-    return {RECORD: training_actions(corpus.annotated).record} if readings_of(network) else {}
+    """What a diffusion checkpoint keeps of its training clips, where it is told verbs: their actions, and how fast
+    hands are.
+    """
+    if not readings_of(network):
+        return {}
+    store, speeds = corpus.annotated, [0.0]
+    for clip_id in store.ids("train"):
+        hands = store.clip(clip_id).hands
+        speeds += [fastest_joint(store.joints(clip_id, side), hands[side].valid) for side in SIDES]
+    return {RECORD: training_actions(store).record, FASTEST: max(speeds)}
+
+
+def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:
+    """Speed in m/s of the fastest joint (F, 21, 3) between two frames in which the hand is there, valid (F,) bool."""
+    steps = np.linalg.norm(np.diff(joints_m.astype(np.float64), axis=0), axis=2)[valid[1:] & valid[:-1]]
+    return float(steps.max(initial=0.0)) * FPS

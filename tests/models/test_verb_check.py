@@ -11,7 +11,8 @@ import torch
 from hoidata.actions.action import Actions, training_actions
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
-from hoidata.hands import load_embedded_hands
+from hoidata.clips.clip import SIDES
+from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.predicting import PredictionConfig, requests_for
@@ -62,6 +63,39 @@ def test_what_is_unusual_is_told_for_the_verb_that_the_sentence_was_read_as(
         said = ("path_m 9 (usual: 0 to 0.5)",) if sample.verb == "lift" else ()
         assert strict.unusual(asked, numbers | {"path_m": 9.0}) == said
         assert strict.unusual(None, numbers | {"path_m": 9.0}) == ()
+
+
+def test_a_hand_that_is_faster_than_any_of_training_is_unusual_whatever_the_verb(
+    annotated: AnnotatedStore, diffusion: Checkpoint, check: VerbCheck
+) -> None:
+    speeds = list[float]()
+    for sample in clips_of(annotated, "train"):
+        clip = annotated.store.clip(sample.clip_id)
+        acting = [clip.hands[side] for side in SIDES if clip.hands[side].valid.all()]
+        joints = [track_joints(hand, HANDS[side]) for hand, side in zip(acting, SIDES, strict=True)]
+        speeds.append(30 * max(float(np.linalg.norm(own[1:] - own[:-1], axis=2).max()) for own in joints))
+        assert check.numbers(clip, sample.points)["joint_m_s"] == pytest.approx(speeds[-1], rel=1e-4)
+    assert check.fastest_m_s == pytest.approx(max(speeds), rel=1e-4)
+    number = int(np.argmax(speeds))
+    sample = clips_of(annotated, "train")[number]
+    clip = annotated.store.clip(sample.clip_id)
+    wild, gone = clip.hands["left"].wrist_m.copy(), clip.hands["left"].valid.copy()
+    wild[5] += [0, 0, 2.0]
+    away = replace(clip, hands={**clip.hands, "left": replace(clip.hands["left"], wrist_m=wild)})
+    found = check.numbers(away, sample.points)
+    assert found["joint_m_s"] == pytest.approx(60, rel=0.1)
+    for asked in (None, sample.verb):
+        (said,) = [own for own in check.unusual(asked, found) if own.startswith("joint_m_s")]
+        assert said == f"joint_m_s {found['joint_m_s']:.3g} (usual: at most {1.1 * max(speeds):.3g})"
+    gone[5] = False
+    left = replace(clip.hands["left"], wrist_m=wild, valid=gone)
+    assert check.numbers(replace(clip, hands={**clip.hands, "left": left}), sample.points)["joint_m_s"] < 2 * max(
+        speeds
+    )
+    results = {key: own for key, own in diffusion.info["results"].items() if key != "fastest_joint_m_s"}
+    older = VerbCheck.of(replace(diffusion, info={**diffusion.info, "results": results}), HANDS)
+    assert older is not None
+    assert not [own for own in older.unusual(None, found) if own.startswith("joint_m_s")]
 
 
 def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(
