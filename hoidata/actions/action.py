@@ -164,10 +164,17 @@ class Actions:
         """The numbers, in words, that lie outside the verb's ``usual`` bounds; none where it or they are not known."""
         limits = self.usual.get(verb, {})
         return tuple(
-            f"{name} {numbers[name]:.3g} (usual: {least:.3g} to {most:.3g})"
-            for name, (least, most) in limits.items()
-            if numbers[name] < least or numbers[name] > most
+            f"{name} {numbers[name]:.3g} (usual: {limits[name][0]:.3g} to {limits[name][1]:.3g})"
+            for name in self.beyond(verb, numbers)
         )
+
+    def beyond(self, verb: str, numbers: Mapping[str, float]) -> dict[str, float]:
+        """By how much numbers lie outside the verb's ``usual`` bounds, in widths of these; without those inside."""
+        found = {
+            name: max(least - numbers[name], numbers[name] - most) / (most - least)
+            for name, (least, most) in self.usual.get(verb, {}).items()
+        }
+        return {name: far for name, far in found.items() if far > 0}
 
     @property
     def record(self) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class SamplingConfig:
     field_resolution: int = 48
     refined_by: Literal["preset", "network", "hold"] = "preset"
     hold: HoldSettings = field(default_factory=HoldSettings)
-    draws: int = 3
+    draws: int = 5
     precision: SamplingPrecision = "float32"
     contact_draws: int = 12
 
@@ -84,8 +84,9 @@ class Text2HoiMotion:
 class Answer:
     """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
     no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where that is not
-    known (``VerbCheck``); other_verb: whether it is not what was asked. unusual: numbers of what the object does, in
-    words, that lie outside the bounds of the verb's training clips. draws: how many motions were drawn for it.
+    known (``VerbCheck``); other_verb: whether it is not what was asked. unusual: numbers of object and hands, in words,
+    that lie outside the bounds of the verb's training clips; beyond: by how much the worst of them does, in
+    widths of its bounds, 0 where none does. draws: how many motions were drawn for it.
     """
 
     motion: Text2HoiMotion
@@ -94,14 +95,21 @@ class Answer:
     moved_as: str | None = None
     other_verb: bool = False
     unusual: tuple[str, ...] = ()
+    beyond: float = 0.0
     draws: int = 1
 
     @property
-    def goodness(self) -> tuple[int, bool, float]:
-        """How many of two things are so, that hands carry and that the verb is the one asked for; then whether
-        nothing is unusual (a motion of another verb nearly always is, and is not counted twice); then the share.
+    def goodness(self) -> tuple[int, float, float]:
+        """How many of two things are so, that hands carry and that the verb is the one asked for; then how little is
+        unusual, at most 0 (a motion of another verb nearly always is, and is not counted twice); then the share.
         """
-        return int(self.carried >= ENOUGH) + (not self.other_verb), self.other_verb or not self.unusual, self.carried
+        count = int(self.carried >= ENOUGH) + (not self.other_verb)
+        return count, 0.0 if self.other_verb else -self.beyond, self.carried
+
+    @property
+    def needs_another(self) -> bool:
+        """Whether it is to be drawn again."""
+        return self.goodness[:2] != (2, 0.0)
 
 
 @dataclass(frozen=True)
@@ -177,7 +185,7 @@ class Text2Hoi:
         """
         best = self._drawn(requests, refined, contact_maps)
         for draw in range(2, self.config.draws + 1):
-            weak = [number for number, own in enumerate(best) if own.goodness[:2] != (2, True)]
+            weak = [number for number, own in enumerate(best) if own.needs_another]
             if not weak:
                 break
             again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
@@ -207,7 +215,7 @@ class Text2Hoi:
             numbers = check.numbers(clip, request.points)
             asked, moved_as = check.asked(request), check.moved_as(numbers)
             other, unusual = check.fails(asked, moved_as), check.unusual(asked, numbers)
-            found.append(Answer(motion, clip, carried, moved_as, other, unusual))
+            found.append(Answer(motion, clip, carried, moved_as, other, unusual, check.beyond(asked, numbers)))
         return found
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:

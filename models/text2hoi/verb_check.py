@@ -80,6 +80,11 @@ class VerbCheck:
         speed = numbers[JOINT_SPEED]
         return (*found, f"{JOINT_SPEED} {speed:.3g} (usual: at most {most:.3g})") if speed > most else found
 
+    def beyond(self, asked: str | None, numbers: Mapping[str, float]) -> float:
+        """How unusual the most unusual number is: outside its bounds by so many of their widths; 0 where none is."""
+        found = {} if asked is None else self.actions.beyond(asked, numbers)
+        return max(*found.values(), numbers[JOINT_SPEED] / (FASTER * self.fastest_m_s) - 1, 0.0)
+
     def fails(self, asked: str | None, moved_as: str | None) -> bool:
         """Whether a motion is of another verb than the one asked for; False where either is not known."""
         return not (asked is None or moved_as is None or asked not in self.actions.centroids or moved_as == asked)

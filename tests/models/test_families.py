@@ -252,17 +252,18 @@ def test_requests_share_a_batch_with_those_of_the_same_hands_and_of_like_length(
         ((0.0, 0.25, 0.0), "nnn", 1, 3), ((1.0, 0.9), "yn", 1, 2), ((0.9, 0.1, 1.0), "yny", 2, 3),
         ((0.0, 0.6, 0.1), "yyy", 1, 3), ((1.0, 0.9), "un", 1, 2), ((0.9, 1.0, 0.8), "uyu", 0, 3),
         ((0.9, 0.1, 1.0), "unu", 2, 3), ((0.9, 0.1, 1.0), "bnb", 2, 3),
+        ((0.9, 0.8, 1.0), "vuv", 1, 3), ((0.1, 1.0, 0.8), "nvu", 2, 3),
     ],
     ids=["carries", "the second carries", "none carries more", "the second carries more", "the second does as told",
          "none does both, the third carries most", "all do as another verb says", "the second is as usual",
          "all are unusual or of another verb", "none is usual and carries",
-         "another verb is unusual, too, and counts once"],
+         "another verb is unusual, too, and counts once", "the second is less unusual", "the third is"],
 )  # fmt: skip
 def test_a_motion_whose_hands_cannot_carry_or_that_does_as_another_verb_says_is_drawn_again(
     sources: Sources, monkeypatch: pytest.MonkeyPatch, shares: tuple[float, ...], others: str, taken: int, draws: int
 ) -> None:
     request = requests_for(samples_of(sources.annotated, "test")[0], PredictionConfig(samples=1))[0]
-    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold"}}
+    told = {"text2hoi": {**FAST["text2hoi"], "refined_by": "hold", "draws": 3}}
     model = load_family("text2hoi").load(replace(sources, settings=told))
     assert isinstance(model, Text2Hoi)
     found, left, verbs = list[Clip](), list(shares), list(others)
@@ -273,8 +274,8 @@ def test_a_motion_whose_hands_cannot_carry_or_that_does_as_another_verb_says_is_
 
     monkeypatch.setattr("models.text2hoi.sampler.carried_share", carried_share)
     monkeypatch.setattr(VerbCheck, "moved_as", lambda self, numbers: verbs.pop(0))
-    unusual = iter([("rise_m 9",) if own in "ub" else () for own in others])
-    monkeypatch.setattr(VerbCheck, "unusual", lambda self, request, numbers: next(unusual))
+    beyond = iter([{"u": 0.5, "b": 1.0, "v": 2.0}.get(own, 0.0) for own in others])
+    monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers: next(beyond))
     monkeypatch.setattr(VerbCheck, "fails", lambda self, request, moved_as: moved_as in "yb")
     (answer,) = model.answers([request])
     assert (answer.draws, len(found), left) == (draws, draws, [])

@@ -248,7 +248,7 @@ def test_a_person_is_told_when_the_object_does_as_another_verb_says(
         ("open", 2): other,
     }
     page = (tmp_path / "open" / "index.html").read_text()
-    assert "the best of 3 motions" in page
+    assert "the best of 5 motions" in page
     assert "moves most like training&#39;s &#39;open&#39;" in page
 
 

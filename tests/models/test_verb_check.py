@@ -63,6 +63,9 @@ def test_what_is_unusual_is_told_for_the_verb_that_the_sentence_was_read_as(
         said = ("path_m 9 (usual: 0 to 0.5)",) if sample.verb == "lift" else ()
         assert strict.unusual(asked, numbers | {"path_m": 9.0}) == said
         assert strict.unusual(None, numbers | {"path_m": 9.0}) == ()
+        assert strict.beyond(asked, numbers) == strict.beyond(None, numbers | {"path_m": 9.0}) == 0
+        both = numbers | {"path_m": 9.0, "rise_m": 1.5}  # 17 widths and 2
+        assert strict.beyond(asked, both) == (pytest.approx(17) if sample.verb == "lift" else 0)
 
 
 def test_a_hand_that_is_faster_than_any_of_training_is_unusual_whatever_the_verb(
@@ -87,6 +90,7 @@ def test_a_hand_that_is_faster_than_any_of_training_is_unusual_whatever_the_verb
     for asked in (None, sample.verb):
         (said,) = [own for own in check.unusual(asked, found) if own.startswith("joint_m_s")]
         assert said == f"joint_m_s {found['joint_m_s']:.3g} (usual: at most {1.1 * max(speeds):.3g})"
+        assert check.beyond(asked, found) == pytest.approx(found["joint_m_s"] / (1.1 * max(speeds)) - 1, rel=1e-3)
     gone[5] = False
     left = replace(clip.hands["left"], wrist_m=wild, valid=gone)
     assert check.numbers(replace(clip, hands={**clip.hands, "left": left}), sample.points)["joint_m_s"] < 2 * max(
@@ -96,6 +100,7 @@ def test_a_hand_that_is_faster_than_any_of_training_is_unusual_whatever_the_verb
     older = VerbCheck.of(replace(diffusion, info={**diffusion.info, "results": results}), HANDS)
     assert older is not None
     assert not [own for own in older.unusual(None, found) if own.startswith("joint_m_s")]
+    assert older.beyond(None, found) == 0
 
 
 def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(

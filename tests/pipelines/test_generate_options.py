@@ -104,7 +104,7 @@ def test_encoder_points_and_sampling_are_those_of_the_profile_that_is_asked_for(
     values = {**PARAMS, "profile": "embedded", "profiles": {"own": own}}
     found = [models_of(profile, values) for profile in ("embedded", "own")]
     assert [(one.hands, one.encoder, one.points) for one in found] == [("embedded", "use", 1024), ("own", "hash", 512)]
-    assert [one.sampling.draws for one in found] == [3, 1]
+    assert [one.sampling.draws for one in found] == [5, 1]
     assert {one.sampling.precision for one in found} == {"float32"}
 
 

@@ -140,6 +140,13 @@ def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_li
     assert f"tilt_deg {tilt:.3g} (usual: {-most:.3g} to {most:.3g})" in said
     assert actions.unusual("lift", numbers["lift"][0] | {"rise_m": float("nan")}) == ()
     assert actions.unusual("juggle", numbers["lift"][0]) == ()
+    beyond = actions.beyond("lift", others["pour"][0])
+    assert list(beyond) == [own.split()[0] for own in said]
+    assert beyond["tilt_deg"] == pytest.approx((tilt - most) / (2 * most))
+    least_m, most_m = actions.usual["lift"]["rise_m"]
+    low = numbers["lift"][0] | {"rise_m": least_m - 2 * (most_m - least_m)}
+    assert actions.beyond("lift", low)["rise_m"] == pytest.approx(2)
+    assert actions.beyond("lift", numbers["lift"][0]) == {} == actions.beyond("juggle", low)
 
 
 def test_bounds_are_as_wide_as_the_verbs_own_clips_differ_and_learnt_limits_as_all_clips_do():
