@@ -231,7 +231,7 @@ def learn_actions(
         if len(column) and np.isfinite(column).all():
             scale[name] = float(column.mean()), max(float(column.std()), LEAST_DEVIATION[name.rpartition("_")[2]])
     limits, learnt = dict[str, Limits](), dict[str, int]()
-    usual = {verb: _bands(rows, _own(rows, scale)) for verb, rows in numbers.items() if len(rows) >= LEAST_CLIPS}
+    usual = usual_limits(numbers, scale)
     for verb, rows in numbers.items():
         known = (written or {}).get(verb)
         if known is not None and np.mean([_within(row, known) is True for row in rows]) >= SHARE_THAT_FOLLOWS:
@@ -240,6 +240,13 @@ def learn_actions(
             limits[verb], learnt[verb] = _bands(rows, {name: own for name, (_, own) in scale.items()}), len(rows)
     centroids = {verb: np.mean([_standardised(row, scale) for row in rows], axis=0) for verb, rows in numbers.items()}
     return Actions(limits, learnt, centroids, scale, usual)
+
+
+def usual_limits(
+    numbers: Mapping[str, list[dict[str, float]]], scale: Mapping[str, tuple[float, float]]
+) -> dict[str, Limits]:
+    """Bounds of the numbers that ``scale`` names, of every verb with enough clips, as ``Actions.usual`` has them."""
+    return {verb: _bands(rows, _own(rows, scale)) for verb, rows in numbers.items() if len(rows) >= LEAST_CLIPS}
 
 
 def _own(rows: list[dict[str, float]], scale: Mapping[str, tuple[float, float]]) -> dict[str, float]:

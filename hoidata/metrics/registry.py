@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
+from hoidata.clips.slip import MOVING_CM_S
 from hoidata.metrics import forces, motion, touch, two_hands
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
@@ -133,7 +134,7 @@ METRICS: tuple[Metric, ...] = (
         "Physics", "slip_cm_s", "slip of touching joints on the moving object", "cm/s", "lower", touch.slip_cm_s,
         "mean over motions", f"{HANDS}, a joint touches in two in a row, and the part under it moves",
         "this project: speed in the frame of the part touched",
-        thresholds=f"{CONTACT}; moving: {touch.MOVING_CM_S:g} cm/s",
+        thresholds=f"{CONTACT}; moving: {MOVING_CM_S:g} cm/s",
     ),
     Metric(
         "Physics", "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,

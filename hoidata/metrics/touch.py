@@ -9,17 +9,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, Side
+from hoidata.clips.clip import Side
+from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
-from hoidata.hands.model import N_JOINTS
 from hoidata.metrics.pair import Motion, Pair
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
 from hoidata.surface.solid_overlap import SolidOverlap
 
 DEEP_MM = 10.0
-MOVING_CM_S = 2.0
 CELL_M = 0.002  # of the lattice of lines that volumes are measured along: off by 1 % of the volume
 
 
@@ -80,35 +79,14 @@ def made_entries(pair: Pair) -> dict[Side, np.ndarray]:
 
 
 def slip_cm_s(pair: Pair, every: int) -> np.ndarray:
-    """(joint and frame,) speed of a touching joint over the part it touches, while that moves there, cm/s.
-
-    A joint counts from a frame to the next where it touches the same part in both, and that part's own motion carries
-    the point under the joint by more than ``MOVING_CM_S``.
-    """
+    """(joint and frame,) cm/s: ``joint_slips_cm_s`` of the acting hands."""
     del every  # a speed needs every frame
     clip, each = pair.predicted.clip, [np.zeros(0)]
     for side, near in made_entries(pair).items():
-        touched = _touched_part(near, pair.contact.part, clip.n_frames)
-        for part in clip.object.model.parts:
-            world_from_part = clip.object.world_from_object @ clip.object.model.object_from_part(
-                part, clip.object.hinge_rad
-            )
-            local = world_from_part.inverse() @ pair.predicted.joints_m[side].astype(np.float64)
-            carried = world_from_part[1:] @ local[:-1] - world_from_part[:-1] @ local[:-1]
-            slipped = np.diff(local, axis=0)
-            speed, slip = (100 * FPS * np.linalg.norm(way, axis=-1) for way in (carried, slipped))
-            touching = touched == part
-            each.append(slip[touching[1:] & touching[:-1] & (speed > MOVING_CM_S)])
+        part = pair.contact.part[near["point"]]
+        touched = touched_parts(clip.n_frames, near["frame"], near["joint"], near["distance_m"], part)
+        each.append(joint_slips_cm_s(clip.object, pair.predicted.joints_m[side], touched))
     return np.concatenate(each)
-
-
-def _touched_part(near: np.ndarray, part: np.ndarray, n_frames: int) -> np.ndarray:
-    """(frame, 21) the part of the sampled point nearest to each joint, -1 where none is near."""
-    touched = np.full((n_frames, N_JOINTS), -1)
-    if part.any():  # of several entries of a joint the last one stays: the nearest
-        near = near[np.argsort(-near["distance_m"], kind="stable")]
-    touched[near["frame"], near["joint"]] = part[near["point"]]
-    return touched
 
 
 def contact_distance_mm(pair: Pair, every: int) -> np.ndarray:

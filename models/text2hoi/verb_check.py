@@ -1,9 +1,10 @@
-"""Whether the object of a motion moves as in training clips of the verb its sentence was read as, and hands no faster.
+"""Whether object and hands of a motion do as in training clips of the verb its sentence was read as.
 
 A sampler draws from what it learnt, now and then a motion of another verb. What the object does is a few numbers
 (``hoidata.actions``), and which verb's training clips do most alike, and within which bounds they do it, needs no test
 clip and no judge: a motion that fails is drawn again. So is one with a joint faster than any of training, which no
-figure of means shows: a sampler's hand may leave for a few frames and come back.
+figure of means shows (a sampler's hand may leave for a few frames and come back), and one whose hands slide more over
+an object in motion than in training clips of the verb.
 """
 
 from collections.abc import Mapping
@@ -14,11 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.actions.action import Actions, action_numbers, training_actions
+from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
+from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus
 from models.common.vocabulary import Vocabulary
@@ -29,6 +32,8 @@ RECORD = "actions"
 FASTEST = "fastest_joint_m_s"
 JOINT_SPEED = "joint_m_s"
 FASTER = 1.1  # than in any training clip
+SLIP = "slip_cm_s"
+LEAST_DEVIATION_CM_S = 0.05  # of slip: where recorded hands never slide, a quarter of a millimetre a second is nothing
 
 
 @dataclass(frozen=True)
@@ -54,8 +59,11 @@ class VerbCheck:
         return cls(trained, Actions.read(results[RECORD]), trained.facts["contact_threshold_m"], hands, fastest_m_s)
 
     def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
-        """What the object does in a clip (``hoidata.actions``), and ``JOINT_SPEED``, the fastest joint's."""
+        """What the object does in a clip (``hoidata.actions``), ``JOINT_SPEED``, the fastest joint's, and ``SLIP``, the
+        mean over touching joints.
+        """
         index, touching, speeds = ProximityIndex(points), np.zeros((len(SIDES), clip.n_frames), bool), [0.0]
+        slips = [np.zeros(0)]
         for row, side in enumerate(SIDES):
             track = clip.hands[side]
             if track.valid.any():
@@ -63,7 +71,11 @@ class VerbCheck:
                 near = index.entries(joints_m, track.valid, clip.object, self.threshold_m)
                 touching[row, near["frame"]] = True
                 speeds.append(fastest_joint(joints_m, track.valid))
-        return action_numbers(clip.object, clip.gravity, touching) | {JOINT_SPEED: max(speeds)}
+                part = points.part[near["point"]]
+                touched = touched_parts(clip.n_frames, near["frame"], near["joint"], near["distance_m"], part)
+                slips.append(joint_slips_cm_s(clip.object, joints_m, touched))
+        own = {JOINT_SPEED: max(speeds), SLIP: _mean(np.concatenate(slips))}
+        return action_numbers(clip.object, clip.gravity, touching) | own
 
     def moved_as(self, numbers: Mapping[str, float]) -> str | None:
         """The verb whose training clips move the object most alike; None where gravity is not known."""
@@ -101,16 +113,37 @@ def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
 
 
 def action_results(network: nn.Module, corpus: Corpus) -> Mapping[str, Any]:
-    """What a diffusion checkpoint keeps of its training clips, where it is told verbs: their actions, and how fast
-    hands are.
+    """What a diffusion checkpoint keeps of its training clips, where it is told verbs: their actions, among whose usual
+    bounds are those of slip, and how fast hands are.
     """
     if not readings_of(network):
         return {}
-    store, speeds = corpus.annotated, [0.0]
+    store, speeds, slips = corpus.annotated, [0.0], dict[str, list[dict[str, float]]]()
     for clip_id in store.ids("train"):
         hands = store.clip(clip_id).hands
         speeds += [fastest_joint(store.joints(clip_id, side), hands[side].valid) for side in SIDES]
-    return {RECORD: training_actions(store).record, FASTEST: max(speeds)}
+        if verb := verb_of(store, clip_id):
+            slips.setdefault(verb, []).append({SLIP: _recorded_slip_cm_s(store, clip_id)})
+    record, every = training_actions(store).record, [own[SLIP] for rows in slips.values() for own in rows]
+    scale = {SLIP: (0.0, max(float(np.std(every)), LEAST_DEVIATION_CM_S))} if every else {}
+    for verb, limits in usual_limits(slips, scale).items():
+        record["usual"][verb] |= {name: list(own) for name, own in limits.items()}
+    return {RECORD: record, FASTEST: max(speeds)}
+
+
+def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str) -> float:
+    """``SLIP`` of a recorded clip, from its kept distances."""
+    thing, part = store.clip(clip_id).object, store.points(store.object_key(clip_id)).part
+    slips = []
+    for side in SIDES:
+        near = store.distances(clip_id, side)
+        touched = touched_parts(thing.n_frames, near.frame, near.joint, near.distance_m, part[near.point])
+        slips.append(joint_slips_cm_s(thing, store.joints(clip_id, side), touched))
+    return _mean(np.concatenate(slips))
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(values.mean()) if len(values) else 0.0
 
 
 def fastest_joint(joints_m: np.ndarray, valid: np.ndarray) -> float:

@@ -11,13 +11,14 @@ import torch
 from hoidata.actions.action import Actions, training_actions
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
-from hoidata.clips.clip import SIDES
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.store.annotated import AnnotatedStore
 from models.common.checkpoints import Checkpoint, load_checkpoint
+from models.common.corpus import Corpus
 from models.common.predicting import PredictionConfig, requests_for
 from models.text2hoi.diffusion_training import DIFFUSION
-from models.text2hoi.verb_check import VerbCheck, read_verb
+from models.text2hoi.verb_check import VerbCheck, action_results, read_verb
 from models.text2hoi.verb_reading import readings_of
 
 HANDS = load_embedded_hands()
@@ -101,6 +102,52 @@ def test_a_hand_that_is_faster_than_any_of_training_is_unusual_whatever_the_verb
     assert older is not None
     assert not [own for own in older.unusual(None, found) if own.startswith("joint_m_s")]
     assert older.beyond(None, found) == 0
+
+
+def slide_cm_s(clip: Clip, points_m: np.ndarray) -> float:
+    """Of joints nearer than 2 cm to a point of a rigid object that moves at 2 cm/s and more below them."""
+    slides, thing = list[float](), clip.object
+    for side in SIDES:
+        joints_m, valid = track_joints(clip.hands[side], HANDS[side]).astype(np.float64), clip.hands[side].valid
+        for frame in np.flatnonzero(valid[1:] & valid[:-1]):
+            (turn, place), (next_turn, next_place) = (
+                (thing.world_from_object.rotation[now], thing.world_from_object.translation[now])
+                for now in (frame, frame + 1)
+            )
+            for here, there in zip(joints_m[frame], joints_m[frame + 1], strict=True):
+                own, later = turn.T @ (here - place), next_turn.T @ (there - next_place)
+                touches = all(np.linalg.norm(points_m - at, axis=1).min() < 0.02 for at in (own, later))
+                if touches and 30 * np.linalg.norm(next_turn @ own + next_place - here) > 0.02:
+                    slides.append(3000 * float(np.linalg.norm(later - own)))
+    return float(np.mean(slides)) if slides else 0.0
+
+
+def test_hands_that_slide_more_than_in_training_clips_of_the_verb_are_unusual(
+    annotated: AnnotatedStore, diffusion: Checkpoint, check: VerbCheck, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hoidata.actions.action.LEAST_CLIPS", 1)
+    samples, corpus = clips_of(annotated, "train"), Corpus.of(annotated, 0)
+    found = {one.verb: check.numbers(annotated.store.clip(one.clip_id), one.points)["slip_cm_s"] for one in samples}
+    for sample in samples:
+        if sample.verb != "open":
+            slide = slide_cm_s(annotated.store.clip(sample.clip_id), sample.points.points_m)
+            assert found[sample.verb] == pytest.approx(slide, rel=1e-3)
+    results = action_results(diffusion.network, corpus)
+    spread = np.std(list(found.values()))  # that of all: one clip a verb does not deviate from itself
+        list(found.values())
+    )  # one clip a verb: each deviates from itself by nothing, so that of all counts
+    strict = VerbCheck.of(replace(diffusion, info={**diffusion.info, "results": results}), HANDS)
+    assert strict is not None
+    for verb, slip in found.items():
+        assert results["actions"]["usual"][verb]["slip_cm_s"] == pytest.approx([slip - spread / 2, slip + spread / 2])
+        numbers = strict.numbers(annotated.store.clip(samples[0].clip_id), samples[0].points)
+        held, slides = (numbers | {"slip_cm_s": slip + share * spread} for share in (0.49, 1.5))
+        assert not [own for own in strict.unusual(verb, held) if own.startswith("slip")]
+        assert len([own for own in strict.unusual(verb, slides) if own.startswith("slip")]) == 1
+        assert strict.actions.beyond(verb, slides)["slip_cm_s"] == pytest.approx(1)
+    monkeypatch.setattr("models.text2hoi.verb_check.joint_slips_cm_s", lambda *told: np.zeros(0))
+    for limits in action_results(diffusion.network, corpus)["actions"]["usual"].values():
+        assert limits["slip_cm_s"] == [-0.025, 0.025]
 
 
 def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(
