@@ -127,15 +127,15 @@ def test_hands_that_slide_more_than_in_training_clips_of_the_verb_are_unusual(
 ) -> None:
     monkeypatch.setattr("hoidata.actions.action.LEAST_CLIPS", 1)
     samples, corpus = clips_of(annotated, "train"), Corpus.of(annotated, 0)
-    found = {one.verb: check.numbers(annotated.store.clip(one.clip_id), one.points)["slip_cm_s"] for one in samples}
+    found = {
+        str(one.verb): check.numbers(annotated.store.clip(one.clip_id), one.points)["slip_cm_s"] for one in samples
+    }
     for sample in samples:
         if sample.verb != "open":
             slide = slide_cm_s(annotated.store.clip(sample.clip_id), sample.points.points_m)
-            assert found[sample.verb] == pytest.approx(slide, rel=1e-3)
+            assert found[str(sample.verb)] == pytest.approx(slide, rel=1e-3)
     results = action_results(diffusion.network, corpus)
-    spread = np.std(list(found.values()))  # that of all: one clip a verb does not deviate from itself
-        list(found.values())
-    )  # one clip a verb: each deviates from itself by nothing, so that of all counts
+    spread = float(np.std(list(found.values())))  # that of all: one clip a verb does not deviate from itself
     strict = VerbCheck.of(replace(diffusion, info={**diffusion.info, "results": results}), HANDS)
     assert strict is not None
     for verb, slip in found.items():
