@@ -1,40 +1,62 @@
-"""Rivals that have no networks: training clips of the prompt or the verb, held as the motions of `ours` are.
+"""Rivals that have no networks: training clips of the prompt or the verb, held and looked up again as ours are.
 
-They are not drawn again where they cannot carry, as those are.
+Where hands cannot carry, or the motion is not as usual of the verb, the next clip of the ranking is taken, as often as
+`ours` draws again and by the same rules, so that what choosing does is no merit of a network.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
-from hoidata.refinement import HoldSettings, hold_clip
+from hoidata.refinement import carried_share, hold_clip
 from hoidata.settings import build_config
 from models.baselines.lookups import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, LeftOut, Sampler, Sources
+from models.text2hoi.drawing import Drawn, best_drawn, checked
 from models.text2hoi.sampler import SamplingConfig
+from models.text2hoi.verb_check import VerbCheck, usual_motion
 
 
 @dataclass(frozen=True)
 class HeldLookup:
-    """lookup: whose motions are held. hold: the settings ours has."""
+    """lookup: whose motions are held. config: ours has. check: of the training clips."""
 
     lookup: Sampler
     pair: HandPair
-    hold: HoldSettings
+    config: SamplingConfig
+    check: VerbCheck
 
     @classmethod
     def load(cls, lookup: Family, sources: Sources) -> "HeldLookup":
         config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
-        return cls(lookup.load(sources), sources.hands, config.hold)
+        store = sources.annotated
+        check = VerbCheck.read(usual_motion(store), store.contact_threshold_m, sources.hands)
+        return cls(lookup.load(sources), sources.hands, config, check)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [
-            hold_clip(self.pair, found, self.hold) if isinstance(found, Clip) else found
-            for found in self.lookup.sample(requests)
-        ]
+        found = list(self.lookup.sample(requests))
+        there = [row for row, one in enumerate(found) if isinstance(one, Clip)]
+        most = 1 + max((request.number for request in requests), default=0)
+
+        def draw(numbers: Sequence[int], which: int) -> list[Drawn]:
+            own = [requests[there[number]] for number in numbers]
+            # Beyond what the clip's other motions take first.
+            again = [replace(one, number=one.number + (which - 1) * most) for one in own]
+            return [self._held(one, clip) for one, clip in zip(own, self.lookup.sample(again), strict=True)]
+
+        for row, drawn in zip(there, best_drawn(len(there), self.config.draws, draw), strict=True):
+            found[row] = drawn.clip
+        return found
+
+    def _held(self, request: Request, found: Clip | LeftOut) -> Drawn:
+        assert isinstance(found, Clip)
+        clip = hold_clip(self.pair, found, self.config.hold)
+        asked = request.sentence.verb if request.sentence else None
+        known = checked(self.check, clip, request.points, asked)
+        return Drawn(clip, carried_share(self.pair, clip, self.config.hold), **known)
 
 
 def _held(lookup: Family) -> Family:

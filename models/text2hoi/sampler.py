@@ -30,16 +30,16 @@ from models.text2hoi.anchored_contact import AnchoredContact
 from models.text2hoi.contact_training import most_typical, touched_maps
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import motion_generator
+from models.text2hoi.drawing import Drawn, best_drawn, checked
 from models.text2hoi.length import LengthModel
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.refiner import RefinerModel, refine
 from models.text2hoi.surface import Surface
 from models.text2hoi.thresholds import ContactNetwork
 from models.text2hoi.understanding import Teller
-from models.text2hoi.verb_check import VerbCheck
+from models.text2hoi.verb_check import VerbCheck, asked_verb
 
 AT_ONCE = 64  # requests of the same hands and of like length: what is cut off for all is not computed
-ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
 
 
 @dataclass(frozen=True)
@@ -80,36 +80,11 @@ class Text2HoiMotion:
     contact_map: Tensor
 
 
-@dataclass(frozen=True)
-class Answer:
-    """A motion and its clip. carried: share of some frames in the air in which its hands can carry the object, 1 where
-    no hold asked for it. moved_as: the verb whose training clips move the object most alike, None where that is not
-    known (``VerbCheck``); other_verb: whether it is not what was asked. unusual: numbers of object and hands, in words,
-    that lie outside the bounds of the verb's training clips; beyond: by how much the worst of them does, in
-    widths of its bounds, 0 where none does. draws: how many motions were drawn for it.
-    """
+@dataclass(frozen=True, kw_only=True)
+class Answer(Drawn):
+    """A motion and its clip."""
 
     motion: Text2HoiMotion
-    clip: Clip
-    carried: float
-    moved_as: str | None = None
-    other_verb: bool = False
-    unusual: tuple[str, ...] = ()
-    beyond: float = 0.0
-    draws: int = 1
-
-    @property
-    def goodness(self) -> tuple[int, float, float]:
-        """How many of two things are so, that hands carry and that the verb is the one asked for; then how little is
-        unusual, at most 0 (a motion of another verb nearly always is, and is not counted twice); then the share.
-        """
-        count = int(self.carried >= ENOUGH) + (not self.other_verb)
-        return count, 0.0 if self.other_verb else -self.beyond, self.carried
-
-    @property
-    def needs_another(self) -> bool:
-        """Whether it is to be drawn again."""
-        return self.goodness[:2] != (2, 0.0)
 
 
 @dataclass(frozen=True)
@@ -183,17 +158,14 @@ class Text2Hoi:
 
         Other arguments as in ``motions``.
         """
-        best = self._drawn(requests, refined, contact_maps)
-        for draw in range(2, self.config.draws + 1):
-            weak = [number for number, own in enumerate(best) if own.needs_another]
-            if not weak:
-                break
-            again = [replace(requests[number], seed=_next_seed(requests[number].seed, draw)) for number in weak]
-            given = None if contact_maps is None else [contact_maps[number] for number in weak]
-            for number, own in zip(weak, self._drawn(again, refined, given), strict=True):
-                kept = own if own.goodness > best[number].goodness else best[number]
-                best[number] = replace(kept, draws=draw)
-        return best
+
+        def draw(numbers: Sequence[int], which: int) -> list[Answer]:
+            own = [requests[number] for number in numbers]
+            again = own if which == 1 else [replace(one, seed=_next_seed(one.seed, which)) for one in own]
+            given = None if contact_maps is None else [contact_maps[number] for number in numbers]
+            return self._drawn(again, refined, given)
+
+        return best_drawn(len(requests), self.config.draws, draw)
 
     def _drawn(
         self,
@@ -205,17 +177,13 @@ class Text2Hoi:
         motions = self.motions(requests, refined, contact_maps)
         clips = self.clips(requests, motions, refined)
         if not self._held(refined):
-            return [Answer(motion, clip, 1.0) for motion, clip in zip(motions, clips, strict=True)]
+            return [Answer(clip=clip, motion=motion) for motion, clip in zip(motions, clips, strict=True)]
         check, found = VerbCheck.of(self.trained["diffusion"], self.pair), []
         for request, motion, clip in zip(requests, motions, clips, strict=True):
+            asked = asked_verb(self.trained["diffusion"], request)
+            known = {} if check is None else checked(check, clip, request.points, asked)
             carried = carried_share(self.pair, clip, self.config.hold)
-            if check is None:
-                found.append(Answer(motion, clip, carried))
-                continue
-            numbers = check.numbers(clip, request.points)
-            asked, moved_as = check.asked(request), check.moved_as(numbers)
-            other, unusual = check.fails(asked, moved_as), check.unusual(asked, numbers)
-            found.append(Answer(motion, clip, carried, moved_as, other, unusual, check.beyond(asked, numbers)))
+            found.append(Answer(clip=clip, motion=motion, carried=carried, **known))
         return found
 
     def clips(self, requests: Sequence[Request], motions: Sequence[Text2HoiMotion], refined: bool) -> list[Clip]:

@@ -43,7 +43,6 @@ class VerbCheck:
     fastest_m_s: of a joint in them; infinite for a checkpoint from before it was kept.
     """
 
-    trained: Checkpoint
     actions: Actions
     threshold_m: float
     hands: HandPair
@@ -55,8 +54,12 @@ class VerbCheck:
         results = trained.info.get("results", {})
         if RECORD not in results or not readings_of(trained.network):
             return None
-        fastest_m_s = results.get(FASTEST, float("inf"))
-        return cls(trained, Actions.read(results[RECORD]), trained.facts["contact_threshold_m"], hands, fastest_m_s)
+        return cls.read(results, trained.facts["contact_threshold_m"], hands)
+
+    @classmethod
+    def read(cls, kept: Mapping[str, Any], threshold_m: float, hands: HandPair) -> "VerbCheck":
+        """From what ``usual_motion`` gave."""
+        return cls(Actions.read(kept[RECORD]), threshold_m, hands, kept.get(FASTEST, float("inf")))
 
     def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
         """What the object does in a clip (``hoidata.actions``), ``JOINT_SPEED``, the fastest joint's, and ``SLIP``, the
@@ -81,11 +84,6 @@ class VerbCheck:
         """The verb whose training clips move the object most alike; None where gravity is not known."""
         return self.actions.named(numbers)
 
-    def asked(self, request: Request) -> str | None:
-        """The verb that a sentence was read as; None where that is not known."""
-        read = read_verb(self.trained, torch.from_numpy(request.text))
-        return None if read is None else read[0]
-
     def unusual(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
         """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for, or of all."""
         found, most = () if asked is None else self.actions.unusual(asked, numbers), FASTER * self.fastest_m_s
@@ -102,6 +100,12 @@ class VerbCheck:
         return not (asked is None or moved_as is None or asked not in self.actions.centroids or moved_as == asked)
 
 
+def asked_verb(trained: Checkpoint, request: Request) -> str | None:
+    """The verb that a request's sentence was read as; None where that is not known."""
+    read = read_verb(trained, torch.from_numpy(request.text))
+    return None if read is None else read[0]
+
+
 def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
     """The likeliest verb of a sentence with features (512,), and how likely; None where a network is told no verbs."""
     readings = readings_of(trained.network)
@@ -113,12 +117,13 @@ def read_verb(trained: Checkpoint, text: Tensor) -> tuple[str, float] | None:
 
 
 def action_results(network: nn.Module, corpus: Corpus) -> Mapping[str, Any]:
-    """What a diffusion checkpoint keeps of its training clips, where it is told verbs: their actions, among whose usual
-    bounds are those of slip, and how fast hands are.
-    """
-    if not readings_of(network):
-        return {}
-    store, speeds, slips = corpus.annotated, [0.0], dict[str, list[dict[str, float]]]()
+    """What a diffusion checkpoint keeps of its training clips, where it is told verbs."""
+    return usual_motion(corpus.annotated) if readings_of(network) else {}
+
+
+def usual_motion(store: AnnotatedStore) -> dict[str, Any]:
+    """Of the training clips their actions, among whose usual bounds are those of slip, and how fast hands are."""
+    speeds, slips = [0.0], dict[str, list[dict[str, float]]]()
     for clip_id in store.ids("train"):
         hands = store.clip(clip_id).hands
         speeds += [fastest_joint(store.joints(clip_id, side), hands[side].valid) for side in SIDES]

@@ -18,12 +18,14 @@ from hoidata.refinement import HoldSettings, hold_clip
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
 from models.baselines.controls import HANDS_AWAY_M
-from models.baselines.lookups import Lookup, Prompt, by_sentence, of_the_hand
+from models.baselines.lookups import NEAREST_CLIP, Lookup, Prompt, by_sentence, of_the_hand
 from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.registry import load_family
 from models.text2hoi.controls import OtherContact, OwnContact, other_contact_maps
+from models.text2hoi.held_lookup import HeldLookup
 from models.text2hoi.sampler import Text2Hoi
+from models.text2hoi.verb_check import VerbCheck
 from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
@@ -106,6 +108,29 @@ def test_a_held_lookup_is_the_lookup_with_the_hold_that_ours_has(sources, test):
         np.testing.assert_array_equal(held.object.translation_m, wanted.object.translation_m)
         np.testing.assert_array_equal(joints(held, side), track_joints(wanted.hands[side], HANDS[side]))
         assert np.abs(joints(held, side) - joints(found, side)).max() > 1e-4
+
+
+def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, monkeypatch):
+    """The next clip of the ranking, past those of the other motions; the less unusual of them where none is usual."""
+    sample, several = test[0], requests_for(test[0], PredictionConfig(samples=2))
+    family = HeldLookup.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"draws": 3}}))
+    plain = NEAREST_CLIP.load(sources)
+    ranked = [plain.sample([replace(several[0], number=number)])[0] for number in range(6)]
+    places = [hold_clip(HANDS, own, HoldSettings()).object.translation_m for own in ranked]
+    for beyond, taken in (([0, 0], [0, 1]), ([3, 0, 2, 1], [4, 1]), ([3, 0, 0], [2, 1]), ([1, 2, 1, 2, 1, 2], [0, 1])):
+        left = [float(own) for own in beyond]
+        monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
+        monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers, left=left: left.pop(0))
+        monkeypatch.setattr("models.text2hoi.held_lookup.carried_share", lambda *told: 1.0)
+        found = family.sample(several)
+        assert left == []
+        for one, number in zip(found, taken, strict=True):
+            np.testing.assert_array_equal(one.object.translation_m, places[number])
+    monkeypatch.undo()
+    told = []
+    monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: told.append(asked) or True)
+    family.sample(several)
+    assert told == [sample.verb] * 6
 
 
 def test_static_holds_the_first_frame_in_which_the_hand_touches(sources, annotated, test):
