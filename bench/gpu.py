@@ -5,6 +5,7 @@
 params.yaml, size `full`. The paper's motion of 150 frames took 4.9 s on an RTX 4090 (Table S2).
 """
 
+import math
 import os
 import subprocess
 import tempfile
@@ -29,7 +30,7 @@ from models.common.family import Losses, Network, Objective
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
-from models.common.training import train_network
+from models.common.training import TrainingConfig, train_network
 from models.registry import load_network
 from models.text2hoi.networks import NETWORKS
 from models.text2hoi.sampler import SamplingConfig, Text2Hoi
@@ -39,6 +40,7 @@ from pipelines.stages.train import TrainParams
 
 PRESETS = ("paper", "ours")
 BRIEFLY, WARM_UP = 10, 20  # steps
+SEEN = 0.99  # of a corpus, before a training is watched: copies of clips are made and coded when they are first met
 SAMPLERS = (SamplerConfig("dpm++", 20), SamplerConfig("ddim", 50), SamplerConfig("ddpm", 1000))
 BATCHES, RUNS, PAPERS_S = (1, 32), 3, 4.9
 
@@ -49,7 +51,7 @@ class Watched(Exception):
 
 @dataclass
 class Watch:
-    """The objective of a training on a GPU, which is ended after so many seconds.
+    """The objective of a training on a GPU, which is ended after so many seconds beyond the first steps.
 
     step_s: of a step by the clock. busy: share of the time in which the GPU computed, as nvidia-smi says it.
     validation_s: of one validation. memory_gib: the most that was taken.
@@ -57,6 +59,7 @@ class Watch:
 
     objective: Objective
     seconds: float
+    warm_up: int
     step: int = 0
     began: tuple[int, float] = (0, 0.0)
     step_s: float = 0.0
@@ -82,7 +85,7 @@ class Watch:
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         self.step += 1
-        if self.step == WARM_UP:
+        if self.step == self.warm_up:
             torch.cuda.reset_peak_memory_stats()
             self.began, self.meter = (self.step, _now()), Meter()
         elif self.meter and time.perf_counter() - self.began[1] > self.seconds:
@@ -152,21 +155,29 @@ def training_rows(data: Path, trained: Path, train: TrainParams, seconds: float)
         fit(network, out_folder=trained / network.name, params=brief)
         for precision in ("float32", "bfloat16") if network.name == "diffusion" else ("float32",):
             own = laid_over(settings, {"training": {"precision": precision}})
-            watch = watched(network, partial(fit, out_folder=trained / "none", params=own), seconds)
             training = own["training"]
+            train_once = partial(fit, out_folder=trained / "none", params=own)
+            met = training.get("augmented_copies", 0), training.get("batch", TrainingConfig.batch)
+            watch = watched(network, train_once, seconds, *met)
             steps, validations = training["steps"], training["steps"] / training.get("validate_every", 500)
             hours = (steps * watch.step_s + validations * watch.validation_s) / 3600
             figures = [1 / watch.step_s, watch.busy, watch.memory_gib, watch.validation_s]
             yield [network.name, precision, *(f"{figure:.2f}" for figure in figures), f"{steps:,}", f"{hours:.2f}"]
 
 
-def watched(network: Network, fit: Callable[[Network], object], seconds: float) -> Watch:
-    """What was seen of a training of ``network``, which ``fit`` begins."""
+def steps_until_seen(clips: int, batch: int) -> int:
+    """After how many steps a share ``SEEN`` of so many clips has been met, each step drawing a batch of them."""
+    return max(WARM_UP, math.ceil(-math.log(1 - SEEN) * clips / batch))
+
+
+def watched(network: Network, fit: Callable[[Network], object], seconds: float, copies: int, batch: int) -> Watch:
+    """What was seen of a training of ``network``, which ``fit`` begins, once it has met its clips and their copies."""
     watches: list[Watch] = []
 
     def objective(setup: Any) -> Any:
         made, normaliser = network.objective(setup)
-        watches.append(Watch(made, seconds))
+        clips = len(setup.corpus.train) * (1 + copies)
+        watches.append(Watch(made, seconds, steps_until_seen(clips, batch)))
         return watches[0], normaliser
 
     with suppress(Watched):

@@ -138,7 +138,7 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
     digests = ", ".join(f"{name} {digest[:12]}" for name, digest in evidence["checkpoints"].items())
     drawn = [
         f"sample {shown.evidence['number'] + 1}: the best of {shown.evidence['draws']} motions, as hands did not carry "
-        "the object or it did not move as the verb says"
+        "the object, or hands or object did not move as is usual of the verb"
         for shown in motions
         if shown.evidence["draws"] > 1
     ]
