@@ -11,7 +11,7 @@ from typing import Any
 from hoidata.errors import BadInput
 from hoidata.files.sealed import read_metadata
 from pipelines.lineage.digests import path_digest, value_digest
-from pipelines.lineage.graph import Stage, look_up, producers, read_graph
+from pipelines.lineage.graph import Stage, look_up, producers, written_graph
 from pipelines.params import read_params
 
 SCHEMA = "hoidata.provenance/1"
@@ -25,7 +25,7 @@ def build_provenance(root: Path, stage_name: str, facts: dict[str, Any]) -> dict
     recorded with the values of its params and the digests of its code, inputs and outputs; of the clips, the raw files
     and frames they are.
     """
-    graph = read_graph(root)
+    graph = written_graph(root)
     if stage_name not in graph:
         raise BadInput("dvc.yaml", f"a stage named {stage_name}", f"{len(graph)} others", "check params.yaml")
     params, known = read_params(root), {}

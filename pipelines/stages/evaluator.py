@@ -4,7 +4,7 @@ from pathlib import Path
 
 from hoidata.files.atomic import atomic_folder
 from models.evaluator.settings import EvaluatorSettings
-from pipelines.lineage.graph import producers, read_graph
+from pipelines.lineage.graph import producers, written_graph
 from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, note_empty, write_empty
 
 OFF = "off: params.yaml names no networks under evaluator"
@@ -23,7 +23,7 @@ def run(paths: StagePaths) -> None:
     from pipelines.lineage.provenance import build_provenance
 
     make_repeatable(threads=1)
-    stage = producers(read_graph(Path()))[paths.evaluators.as_posix()].name
+    stage = producers(written_graph(Path()))[paths.evaluators.as_posix()].name
     with atomic_folder(paths.evaluators) as part:
         found = train_evaluators(
             paths.data,

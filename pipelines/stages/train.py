@@ -9,7 +9,7 @@ from typing import Any, Literal
 from hoidata.files import sha256_file
 from hoidata.files.atomic import atomic_folder
 from models.registry import load_network
-from pipelines.lineage.graph import producers, read_graph
+from pipelines.lineage.graph import producers, written_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import laid_over, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
@@ -73,7 +73,7 @@ def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], made: Pa
     from models.common.training import train_network
 
     network = load_network(paths.model)
-    stage = producers(read_graph(Path()))[made.as_posix()].name
+    stage = producers(written_graph(Path()))[made.as_posix()].name
     make_repeatable(threads=1)  # stages run side by side; more processes train one network together
     train_network(
         network,

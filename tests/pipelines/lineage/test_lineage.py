@@ -113,6 +113,15 @@ def test_the_graph_read_without_dvc_is_the_one_dvc_reads(root, place):
     assert written_graph(at) == read_graph(at)
 
 
+def test_a_record_is_made_while_dvc_writes_its_lock_file(root):
+    """Stages run side by side: DVC writes down one that ended while another asks which stages are behind it."""
+    before = build_provenance(root, TRAIN, FACTS)
+    (root / "dvc.lock").write_text("schema: '2.0'\nstages:\n  convert@grab:\n    cm")
+    with pytest.raises(BadInput, match=r"dvc\.lock"):
+        read_graph(root)
+    assert build_provenance(root, TRAIN, FACTS) == before
+
+
 def test_of_a_graph_with_what_is_not_understood_here_dvc_is_asked(root):
     (root / "dvc.yaml").write_text(
         "stages: {each: {foreach: [a, b], do: {cmd: 'echo ${item}', outs: ['${item}.txt']}}}"
