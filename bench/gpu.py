@@ -51,7 +51,7 @@ class Watched(Exception):
 
 @dataclass
 class Watch:
-    """The objective of a training on a GPU, which is ended after so many seconds beyond the first steps.
+    """The objective of a training on a GPU, which is ended after so many seconds beyond the first ``warm_up`` steps.
 
     step_s: of a step by the clock. busy: share of the time in which the GPU computed, as nvidia-smi says it.
     validation_s: of one validation. memory_gib: the most that was taken.

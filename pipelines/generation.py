@@ -107,7 +107,7 @@ def _taken_for(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:
 
 
 def _moved_otherwise(motions: Sequence[GeneratedMotion]) -> list[str]:
-    """Which samples move their object otherwise than training clips of the verb that was read; for a person."""
+    """Which samples move object or hands otherwise than training clips of the verb that was read; for a person."""
     found = []
     for evidence in (motion.evidence for motion in motions):
         read_as, moved_as, number = evidence["read_as"], evidence["moved_as"], evidence["number"] + 1

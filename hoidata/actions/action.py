@@ -171,7 +171,7 @@ class Actions:
     def beyond(self, verb: str, numbers: Mapping[str, float]) -> dict[str, float]:
         """By how much numbers lie outside the verb's ``usual`` bounds, in widths of these; without those inside."""
         found = {
-            name: max(least - numbers[name], numbers[name] - most) / (most - least)
+            name: max(least - numbers[name], numbers[name] - most) / ((most - least) or 1.0)
             for name, (least, most) in self.usual.get(verb, {}).items()
         }
         return {name: far for name, far in found.items() if far > 0}

@@ -1,7 +1,8 @@
 """Rivals that have no networks: training clips of the prompt or the verb, held and looked up again as ours are.
 
 Where hands cannot carry, or the motion is not as usual of the verb, the next clip of the ranking is taken, as often as
-`ours` draws again and by the same rules, so that what choosing does is no merit of a network.
+`ours` draws again and by the same rules, so that what choosing does is no merit of a network. (Presets whose hands no
+hold corrects draw once; these rows choose beside them, too.) A ranking may have fewer clips than there are draws.
 """
 
 from collections.abc import Sequence
@@ -39,13 +40,12 @@ class HeldLookup:
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         found = list(self.lookup.sample(requests))
         there = [row for row, one in enumerate(found) if isinstance(one, Clip)]
-        most = 1 + max((request.number for request in requests), default=0)
 
         def draw(numbers: Sequence[int], which: int) -> list[Drawn]:
             own = [requests[there[number]] for number in numbers]
-            # Beyond what the clip's other motions take first.
-            again = [replace(one, number=one.number + (which - 1) * most) for one in own]
-            return [self._held(one, clip) for one, clip in zip(own, self.lookup.sample(again), strict=True)]
+            again = [replace(one, number=one.number + which - 1) for one in own]
+            clips = [found[there[number]] for number in numbers] if which == 1 else self.lookup.sample(again)
+            return [self._held(one, clip) for one, clip in zip(own, clips, strict=True)]
 
         for row, drawn in zip(there, best_drawn(len(there), self.config.draws, draw), strict=True):
             found[row] = drawn.clip

@@ -49,9 +49,10 @@ class SamplingConfig:
     the diffusion network gives hands in the object's frame, as `ours` does. field_resolution: of the distance grids the
     refiner sees. precision: of the diffusion network's Transformer; float16 is for GPUs (a CPU is slower with it).
     draws: how often at most a motion is drawn whose hands, held, cannot carry its object in half of the frames looked
-    at, whose object moves as in training clips of another verb, or outside the bounds of its own verb's (``Actions``);
-    the best is the answer. contact_draws: how many contact maps are drawn for a motion by a network that draws anchors;
-    the one most like the others is asked for. Draws of a latent hardly differ: one.
+    at, whose object moves as in training clips of another verb, or whose object or hands move outside the bounds of its
+    own verb's (``VerbCheck``); of those that carry and do as asked the least unusual is the answer. contact_draws: how
+    many contact maps are drawn for a motion by a network that draws anchors; the one most like the others is asked for.
+    Draws of a latent hardly differ: one.
     """
 
     sampler: SamplerConfig = field(default_factory=SamplerConfig)
@@ -154,7 +155,7 @@ class Text2Hoi:
         refined: bool = True,
         contact_maps: Sequence[Tensor] | None = None,
     ) -> list[Answer]:
-        """Motions and their clips, drawn again where held hands cannot carry, or the object does not as the verb says.
+        """Motions and their clips, drawn again where held hands cannot carry, or what is done is not usual of the verb.
 
         Other arguments as in ``motions``.
         """

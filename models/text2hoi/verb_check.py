@@ -8,7 +8,7 @@ an object in motion than in training clips of the verb.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
 from hoidata.batches.requests import ObjectPoints, Request
-from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
@@ -33,6 +33,7 @@ FASTEST = "fastest_joint_m_s"
 JOINT_SPEED = "joint_m_s"
 FASTER = 1.1  # than in any training clip
 SLIP = "slip_cm_s"
+MOST_SLIP = "most_slip_cm_s"
 LEAST_DEVIATION_CM_S = 0.05  # of slip: where recorded hands never slide, a quarter of a millimetre a second is nothing
 
 
@@ -40,13 +41,15 @@ LEAST_DEVIATION_CM_S = 0.05  # of slip: where recorded hands never slide, a quar
 class VerbCheck:
     """actions: of the training clips. threshold_m: how near a joint must come to touch. hands: of the clips.
 
-    fastest_m_s: of a joint in them; infinite for a checkpoint from before it was kept.
+    fastest_m_s: of a joint in them; infinite for a checkpoint from before it was kept. most_slip_cm_s: by verb, how
+    much hands may slide over an object that moves; nothing is asked of verbs without it.
     """
 
     actions: Actions
     threshold_m: float
     hands: HandPair
     fastest_m_s: float = float("inf")
+    most_slip_cm_s: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, trained: Checkpoint, hands: HandPair) -> "VerbCheck | None":
@@ -59,7 +62,8 @@ class VerbCheck:
     @classmethod
     def read(cls, kept: Mapping[str, Any], threshold_m: float, hands: HandPair) -> "VerbCheck":
         """From what ``usual_motion`` gave."""
-        return cls(Actions.read(kept[RECORD]), threshold_m, hands, kept.get(FASTEST, float("inf")))
+        fastest_m_s = kept.get(FASTEST) or float("inf")  # 0: no hand ever moved, which bounds nothing
+        return cls(Actions.read(kept[RECORD]), threshold_m, hands, fastest_m_s, kept.get(MOST_SLIP, {}))
 
     def numbers(self, clip: Clip, points: ObjectPoints) -> dict[str, float]:
         """What the object does in a clip (``hoidata.actions``), ``JOINT_SPEED``, the fastest joint's, and ``SLIP``, the
@@ -86,14 +90,19 @@ class VerbCheck:
 
     def unusual(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
         """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for, or of all."""
-        found, most = () if asked is None else self.actions.unusual(asked, numbers), FASTER * self.fastest_m_s
-        speed = numbers[JOINT_SPEED]
-        return (*found, f"{JOINT_SPEED} {speed:.3g} (usual: at most {most:.3g})") if speed > most else found
+        found = () if asked is None else self.actions.unusual(asked, numbers)
+        above = {name: most for name, most in self._most(asked).items() if numbers[name] > most}
+        return (*found, *(f"{name} {numbers[name]:.3g} (usual: at most {most:.3g})" for name, most in above.items()))
 
     def beyond(self, asked: str | None, numbers: Mapping[str, float]) -> float:
         """How unusual the most unusual number is: outside its bounds by so many of their widths; 0 where none is."""
-        found = {} if asked is None else self.actions.beyond(asked, numbers)
-        return max(*found.values(), numbers[JOINT_SPEED] / (FASTER * self.fastest_m_s) - 1, 0.0)
+        found = [] if asked is None else list(self.actions.beyond(asked, numbers).values())
+        return max(0.0, *found, *(numbers[name] / most - 1 for name, most in self._most(asked).items()))
+
+    def _most(self, asked: str | None) -> dict[str, float]:
+        """What the hands' numbers may be at most; for them less is never unusual."""
+        slip = self.most_slip_cm_s.get(asked or "", float("inf"))
+        return {JOINT_SPEED: FASTER * self.fastest_m_s, SLIP: slip}
 
     def fails(self, asked: str | None, moved_as: str | None) -> bool:
         """Whether a motion is of another verb than the one asked for; False where either is not known."""
@@ -122,24 +131,22 @@ def action_results(network: nn.Module, corpus: Corpus) -> Mapping[str, Any]:
 
 
 def usual_motion(store: AnnotatedStore) -> dict[str, Any]:
-    """Of the training clips their actions, among whose usual bounds are those of slip, and how fast hands are."""
+    """Of the training clips their actions, how fast hands are, and how much they slide by verb."""
     speeds, slips = [0.0], dict[str, list[dict[str, float]]]()
     for clip_id in store.ids("train"):
-        hands = store.clip(clip_id).hands
-        speeds += [fastest_joint(store.joints(clip_id, side), hands[side].valid) for side in SIDES]
+        clip = store.clip(clip_id)
+        speeds += [fastest_joint(store.joints(clip_id, side), clip.hands[side].valid) for side in SIDES]
         if verb := verb_of(store, clip_id):
-            slips.setdefault(verb, []).append({SLIP: _recorded_slip_cm_s(store, clip_id)})
-    record, every = training_actions(store).record, [own[SLIP] for rows in slips.values() for own in rows]
+            slips.setdefault(verb, []).append({SLIP: _recorded_slip_cm_s(store, clip_id, clip.object)})
+    every = [own[SLIP] for rows in slips.values() for own in rows]
     scale = {SLIP: (0.0, max(float(np.std(every)), LEAST_DEVIATION_CM_S))} if every else {}
-    for verb, limits in usual_limits(slips, scale).items():
-        record["usual"][verb] |= {name: list(own) for name, own in limits.items()}
-    return {RECORD: record, FASTEST: max(speeds)}
+    most_slip = {verb: limits[SLIP][1] for verb, limits in usual_limits(slips, scale).items()}
+    return {RECORD: training_actions(store).record, FASTEST: max(speeds), MOST_SLIP: most_slip}
 
 
-def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str) -> float:
-    """``SLIP`` of a recorded clip, from its kept distances."""
-    thing, part = store.clip(clip_id).object, store.points(store.object_key(clip_id)).part
-    slips = []
+def _recorded_slip_cm_s(store: AnnotatedStore, clip_id: str, thing: ObjectTrack) -> float:
+    """``SLIP`` of a recorded clip and its object, from its kept distances."""
+    part, slips = store.points(store.object_key(clip_id)).part, []
     for side in SIDES:
         near = store.distances(clip_id, side)
         touched = touched_parts(thing.n_frames, near.frame, near.joint, near.distance_m, part[near.point])

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,13 +112,13 @@ def test_a_held_lookup_is_the_lookup_with_the_hold_that_ours_has(sources, test):
 
 
 def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, monkeypatch):
-    """The next clip of the ranking, past those of the other motions; the less unusual of them where none is usual."""
+    """The next clip of the ranking; the least unusual of them where none is usual."""
     sample, several = test[0], requests_for(test[0], PredictionConfig(samples=2))
     family = HeldLookup.load(NEAREST_CLIP, replace(sources, settings={"text2hoi": {"draws": 3}}))
     plain = NEAREST_CLIP.load(sources)
     ranked = [plain.sample([replace(several[0], number=number)])[0] for number in range(6)]
     places = [hold_clip(HANDS, own, HoldSettings()).object.translation_m for own in ranked]
-    for beyond, taken in (([0, 0], [0, 1]), ([3, 0, 2, 1], [4, 1]), ([3, 0, 0], [2, 1]), ([1, 2, 1, 2, 1, 2], [0, 1])):
+    for beyond, taken in (([0, 0], [0, 1]), ([3, 0, 2, 1], [2, 1]), ([0, 3, 0], [0, 2]), ([1, 2, 1, 2, 1, 2], [0, 1])):
         left = [float(own) for own in beyond]
         monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
         monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers, left=left: left.pop(0))
@@ -126,6 +127,22 @@ def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, mo
         assert left == []
         for one, number in zip(found, taken, strict=True):
             np.testing.assert_array_equal(one.object.translation_m, places[number])
+    monkeypatch.undo()
+    # The second of three has no clip to look up; hands of the third carry at the second try.
+    monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers: 0.0)
+    monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
+    shares = [1.0, 0.0, 1.0]
+    monkeypatch.setattr("models.text2hoi.held_lookup.carried_share", lambda *told: shares.pop(0))
+    nowhere = replace(several[0], motion_id="nowhere")
+    lookup = SimpleNamespace(
+        sample=lambda asked: [
+            LeftOut("nowhere", "no clip") if one.motion_id == "nowhere" else plain.sample([one])[0] for one in asked
+        ]
+    )
+    found = replace(family, lookup=lookup).sample([several[0], nowhere, several[1]])
+    assert isinstance(found[1], LeftOut)
+    for one, number in ((found[0], 0), (found[2], 2)):
+        np.testing.assert_array_equal(one.object.translation_m, places[number])
     monkeypatch.undo()
     told = []
     monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: told.append(asked) or True)

@@ -139,15 +139,32 @@ def test_hands_that_slide_more_than_in_training_clips_of_the_verb_are_unusual(
     strict = VerbCheck.of(replace(diffusion, info={**diffusion.info, "results": results}), HANDS)
     assert strict is not None
     for verb, slip in found.items():
-        assert results["actions"]["usual"][verb]["slip_cm_s"] == pytest.approx([slip - spread / 2, slip + spread / 2])
+        assert results["most_slip_cm_s"][verb] == pytest.approx(slip + spread / 2)
         numbers = strict.numbers(annotated.store.clip(samples[0].clip_id), samples[0].points)
-        held, slides = (numbers | {"slip_cm_s": slip + share * spread} for share in (0.49, 1.5))
-        assert not [own for own in strict.unusual(verb, held) if own.startswith("slip")]
-        assert len([own for own in strict.unusual(verb, slides) if own.startswith("slip")]) == 1
-        assert strict.actions.beyond(verb, slides)["slip_cm_s"] == pytest.approx(1)
+        still, held, slides = (
+            numbers | {"slip_cm_s": own} for own in (0, slip + 0.49 * spread, 3 * (slip + spread / 2))
+        )
+        for usual in (still, held):
+            assert not [own for own in strict.unusual(verb, usual) if own.startswith("slip")]
+        said = f"slip_cm_s {slides['slip_cm_s']:.3g} (usual: at most {slip + spread / 2:.3g})"
+        assert said in strict.unusual(verb, slides)
+        assert strict.beyond(verb, slides) >= 2 - 1e-9
+        assert replace(strict, actions=check.actions, fastest_m_s=float("inf")).beyond(verb, slides) == pytest.approx(2)
     monkeypatch.setattr("models.text2hoi.verb_check.joint_slips_cm_s", lambda *told: np.zeros(0))
-    for limits in action_results(diffusion.network, corpus)["actions"]["usual"].values():
-        assert limits["slip_cm_s"] == [-0.025, 0.025]
+    assert set(action_results(diffusion.network, corpus)["most_slip_cm_s"].values()) == {0.025}
+
+
+def test_clips_without_a_verb_and_verbs_of_few_clips_have_no_bounds(
+    annotated: AnnotatedStore, diffusion: Checkpoint, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    corpus = Corpus.of(annotated, 0)
+    assert action_results(diffusion.network, corpus)["most_slip_cm_s"] == {}  # one clip of each verb
+    monkeypatch.setattr("hoidata.actions.action.LEAST_CLIPS", 1)
+    monkeypatch.setattr("models.text2hoi.verb_check.verb_of", lambda store, clip_id: None)
+    nothing = action_results(diffusion.network, corpus)
+    assert nothing["most_slip_cm_s"] == {}
+    resting = VerbCheck.read(nothing | {"fastest_joint_m_s": 0.0}, 0.02, HANDS)
+    assert resting.beyond(None, {"joint_m_s": 1.0, "slip_cm_s": 9.0}) == 0
 
 
 def test_a_motion_fails_where_it_is_of_another_verb_than_its_sentence_was_read_as(
