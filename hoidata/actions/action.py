@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from hoidata.actions.words import beside_usual
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
@@ -163,10 +164,7 @@ class Actions:
     def unusual(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
         """The numbers, in words, that lie outside the verb's ``usual`` bounds; none where it or they are not known."""
         limits = self.usual.get(verb, {})
-        return tuple(
-            f"{name} {numbers[name]:.3g} (usual: {limits[name][0]:.3g} to {limits[name][1]:.3g})"
-            for name in self.beyond(verb, numbers)
-        )
+        return tuple(beside_usual(name, numbers[name], *limits[name]) for name in self.beyond(verb, numbers))
 
     def beyond(self, verb: str, numbers: Mapping[str, float]) -> dict[str, float]:
         """By how much numbers lie outside the verb's ``usual`` bounds, in widths of these; without those inside."""

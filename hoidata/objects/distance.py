@@ -10,6 +10,7 @@ import igl
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.geometry.rows import distinct_rows
 
 CHUNK_POINTS = 1 << 17
 
@@ -82,15 +83,15 @@ def merged_surface(vertices_m: np.ndarray, faces: np.ndarray) -> MergedSurface:
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
     if not np.isfinite(vertices).all():
         raise BadInput("object mesh", "finite vertices", "NaN or infinity", "repair the mesh")
-    unique, inverse = np.unique(vertices, axis=0, return_inverse=True)
-    merged = inverse.reshape(-1)[np.asarray(faces, dtype=np.int64)].reshape(-1, 3)
+    first, number = distinct_rows(vertices)
+    merged = number[np.asarray(faces, dtype=np.int64)].reshape(-1, 3)
     a, b, c = merged.T
     kept = merged[(a != b) & (b != c) & (c != a)]
     if not len(kept):
         raise BadInput(
             "object mesh", "at least one triangle", f"{len(merged)} faces, none with area", "repair the mesh"
         )
-    return MergedSurface(unique, kept)
+    return MergedSurface(vertices[first], kept)
 
 
 def unmatched_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -82,7 +82,8 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
         except ValueError as error:
             raise BadInput(f"{path}:{number}", "numbers after 'v' or 'f'", repr(line[:60])) from error
         if len(words) < 4:
-            raise BadInput(f"{path}:{number}", "3 coordinates per vertex and 3 or more corners per face", line[:60])
+            wanted = "3 coordinates per vertex and 3 or more corners per face"
+            raise BadInput(f"{path}:{number}", wanted, repr(line[:60].strip()), "export the mesh anew")
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
     mesh = Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
     return checked_mesh(path, mesh)
@@ -103,7 +104,9 @@ def _read_ply(path: Path) -> Mesh:
 def checked_mesh(path: str | Path, mesh: Mesh) -> Mesh:
     """The mesh, if it is a finite triangle mesh with area; ``path`` names it in errors. Raises BadInput."""
     vertices, faces = mesh
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or not len(vertices):
+    if not len(vertices):
+        raise BadInput(path, "a mesh with vertices", "none", "export the mesh anew")
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise BadInput(path, "a mesh with vertices of 3 coordinates", f"an array of shape {vertices.shape}")
     if not np.isfinite(vertices).all():
         raise BadInput(path, "finite vertices", "NaN or infinity")

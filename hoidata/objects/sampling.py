@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.distance import face_normals
 from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import ObjectModel
@@ -52,7 +53,7 @@ def sample_points(model: ObjectModel, count: int = POINT_COUNT) -> SampledPoints
     if not len(corners) or not np.linalg.norm(_face_cross(corners), axis=1).any():
         raise BadInput(f"mesh of {model.name!r}", "faces with area", f"{len(corners)} faces without", "repair the mesh")
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
-    distinct = np.unique(model.vertices_m[np.unique(model.faces)], axis=0)
+    distinct = distinct_rows(model.vertices_m[np.unique(model.faces)]).first
     if len(distinct) >= count and edges.max() <= LONGEST_EDGE_M:
         return _from_vertices(model, count)
     return _from_surface(model, corners, count)
@@ -90,7 +91,7 @@ def _vertex_normals(model: ObjectModel) -> np.ndarray:
     angle = np.arccos(np.clip((ahead * behind).sum(axis=2), -1, 1))
     weighted = angle[:, :, None] * face_normals(model.vertices_m, model.faces)[:, None]
     keys = np.column_stack([model.vertices_m, model.part])
-    group = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+    group = distinct_rows(keys).number
     total = np.zeros((len(keys), 3))
     np.add.at(total, group[model.faces.reshape(-1)], weighted.reshape(-1, 3))
     return _unit(total)[group]

@@ -11,6 +11,7 @@ import igl
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
+from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.distance import is_closed, merged_surface, unmatched_edges, volume_m3
 
 LARGEST_PATCH = 0.01
@@ -42,7 +43,7 @@ def solid_of(vertices_m: np.ndarray, faces: np.ndarray) -> Solid | NoSolid:
     repairs = []
     if not (is_closed(found) and encloses(vertices, found)):
         # One triangle of each set of three vertices, the first.
-        single = found[np.sort(np.unique(np.sort(found, axis=1), axis=0, return_index=True)[1])]
+        single = found[np.sort(distinct_rows(np.sort(found, axis=1)).first)]
         if len(single) < len(found):
             repairs.append(f"{len(found) - len(single)} triangles that lay double left out")
         found = single if is_closed(single) else np.ascontiguousarray(igl.bfs_orient(single)[0], dtype=np.int64)

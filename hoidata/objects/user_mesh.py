@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from hoidata.errors import BadInput
+from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, checked_mesh, load_mesh
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 
@@ -26,6 +27,7 @@ METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
 NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
 SLIGHTLY_RAD, NEARER = 0.3, 0.01  # a turn that shows where a hinge leads, and how much nearer is meant
 CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
+STANDS = 0.1  # of its outline: an object that rolls or rocks on y, as a bowl on its side, does not stand there
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def closes(model: ObjectModel) -> bool:
 def found_up(vertices_m: np.ndarray) -> tuple[str, str]:
     """Which axis of a mesh points up, and why: "z", or "y" where the object then stands on clearly more ground."""
     on_z, on_y = footing(vertices_m, 2), footing(vertices_m, 1)
-    if on_y > CLEARLY * on_z:
+    if on_y > max(CLEARLY * on_z, STANDS):
         return "y", f"y is taken for up: so it stands on {on_y:.0%} of its outline, with z up on {on_z:.0%}"
     return "z", f"z is taken for up: so it stands on {on_z:.0%} of its outline"
 
@@ -96,8 +98,8 @@ def thinned(model: ObjectModel, most_faces: int) -> ObjectModel:
 def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
     size = np.ptp(model.vertices_m, axis=0).max() / cells
     keys = np.column_stack((np.floor((model.vertices_m - model.vertices_m.min(axis=0)) / size), model.part))
-    _, first, cell = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = cell.reshape(-1)[model.faces]
+    first, cell = distinct_rows(keys)
+    faces = cell[model.faces]
     apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     return ObjectModel(model.name, model.vertices_m[first], faces[apart], model.part[first], model.hinge)
 
@@ -221,8 +223,7 @@ def _second_piece(path: Path, mesh: Mesh) -> np.ndarray:
     Vertices are joined where they coincide, as many files repeat them along seams; if that makes one piece of all, as
     of a lid that lies on its box, only those that the file itself has as one.
     """
-    _, same = np.unique(mesh.vertices, axis=0, return_inverse=True)
-    ways = [_pieces(mesh.faces, own) for own in (same.reshape(-1), np.arange(len(mesh.vertices)))]
+    ways = [_pieces(mesh.faces, own) for own in (distinct_rows(mesh.vertices).number, np.arange(len(mesh.vertices)))]
     found = [list(dict.fromkeys(piece[mesh.faces[:, 0]].tolist())) for piece in ways]
     way = 1 if len(found[0]) == 1 else 0
     if len(found[way]) != 2:

@@ -7,6 +7,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
+from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.distance import unmatched_edges, volume_m3
 from hoidata.objects.model import ObjectModel
 
@@ -42,8 +43,9 @@ class SurfaceFacts:
 
 def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
     """Facts of the mesh (vertex, 3), (face, 3), metres."""
-    unique, inverse = np.unique(np.asarray(vertices_m, dtype=np.float64), axis=0, return_inverse=True)
-    merged = inverse.reshape(-1)[faces]
+    vertices = np.asarray(vertices_m, dtype=np.float64)
+    first, number = distinct_rows(vertices)
+    unique, merged = vertices[first], number[faces]
     a, b, c = merged.T
     kept = merged[(a != b) & (b != c) & (c != a)]
     return SurfaceFacts(

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
+from hoidata.actions.words import beside_usual
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
@@ -92,7 +93,7 @@ class VerbCheck:
         """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for, or of all."""
         found = () if asked is None else self.actions.unusual(asked, numbers)
         above = {name: most for name, most in self._most(asked).items() if numbers[name] > most}
-        return (*found, *(f"{name} {numbers[name]:.3g} (usual: at most {most:.3g})" for name, most in above.items()))
+        return (*found, *(beside_usual(name, numbers[name], 0.0, most) for name, most in above.items()))
 
     def beyond(self, asked: str | None, numbers: Mapping[str, float]) -> float:
         """How unusual the most unusual number is: outside its bounds by so many of their widths; 0 where none is."""

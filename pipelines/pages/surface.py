@@ -7,6 +7,8 @@ import trimesh
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
+from hoidata.geometry.rows import distinct_rows
+
 CREASE_RAD = np.radians(40.0)
 PAINT_EDGE_M = 0.006
 PAINT_EDGE_PER_EXTENT = 1 / 40
@@ -52,15 +54,14 @@ def crease_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     triangles = vertices_m[faces].astype(np.float64)
     doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     unit = doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-20)
-    _, vertex = np.unique(np.round(vertices_m, 6), axis=0, return_inverse=True)
-    corner_vertex = vertex.reshape(-1)[faces.reshape(-1)]
+    corner_vertex = distinct_rows(np.round(vertices_m, 6)).number[faces.reshape(-1)]
     ones = np.ones(len(corner_vertex))
     incidence = csr_array((ones, (np.arange(len(corner_vertex)), corner_vertex)))
     pairs = (incidence @ incidence.T).tocoo()
     first, second = pairs.coords
     smooth = np.einsum("ij,ij->i", unit[first // 3], unit[second // 3]) > np.cos(CREASE_RAD)
-    normals = np.zeros((len(corner_vertex), 3))
-    np.add.at(normals, first[smooth], doubled[second[smooth] // 3])
+    to, weighted = first[smooth], doubled[second[smooth] // 3]
+    normals = np.stack([np.bincount(to, column, len(corner_vertex)) for column in weighted.T], axis=1)
     normals += 1e-12 * np.repeat(unit, 3, axis=0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     return normals.reshape(-1, 3, 3)
@@ -88,7 +89,9 @@ def _subdivide(corners: np.ndarray, normals: np.ndarray, edge_m: float) -> tuple
     )
     cut = cut_vertices[cut_faces]
     repeated = np.repeat(corners[origin], 3, axis=0)
-    barycentric = np.nan_to_num(trimesh.triangles.points_to_barycentric(repeated, cut.reshape(-1, 3)), nan=1 / 3)
+    with np.errstate(divide="ignore", invalid="ignore"):  # triangles without area have no weights
+        weights = trimesh.triangles.points_to_barycentric(repeated, cut.reshape(-1, 3))
+    barycentric = np.nan_to_num(weights, nan=1 / 3)
     mixed = np.einsum("nk,nkc->nc", barycentric, np.repeat(normals[origin], 3, axis=0))
     mixed /= np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-20)
     return cut, mixed.reshape(-1, 3, 3)
@@ -97,6 +100,5 @@ def _subdivide(corners: np.ndarray, normals: np.ndarray, edge_m: float) -> tuple
 def _merge(corners: np.ndarray, normals: np.ndarray) -> Surface:
     """Corners of equal position (1 um) and normal become one vertex."""
     rows = np.concatenate([np.round(corners.reshape(-1, 3), 6), np.round(normals.reshape(-1, 3), 4)], axis=1)
-    unique, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    positions = corners.reshape(-1, 3)[first]
-    return Surface(positions, unique[:, 3:], inverse.reshape(-1, 3))
+    first, number = distinct_rows(rows)
+    return Surface(corners.reshape(-1, 3)[first], rows[first, 3:], number.reshape(-1, 3))

@@ -61,7 +61,7 @@ def test_what_is_unusual_is_told_for_the_verb_that_the_sentence_was_read_as(
         numbers = check.numbers(annotated.store.clip(sample.clip_id), sample.points)
         assert asked == sample.verb
         assert strict.unusual(asked, numbers) == ()
-        said = ("path_m 9 (usual: 0 to 0.5)",) if sample.verb == "lift" else ()
+        said = ("path 900 cm (usual: at most 50)",) if sample.verb == "lift" else ()
         assert strict.unusual(asked, numbers | {"path_m": 9.0}) == said
         assert strict.unusual(None, numbers | {"path_m": 9.0}) == ()
         assert strict.beyond(asked, numbers) == strict.beyond(None, numbers | {"path_m": 9.0}) == 0
@@ -89,8 +89,8 @@ def test_a_hand_that_is_faster_than_any_of_training_is_unusual_whatever_the_verb
     found = check.numbers(away, sample.points)
     assert found["joint_m_s"] == pytest.approx(60, rel=0.1)
     for asked in (None, sample.verb):
-        (said,) = [own for own in check.unusual(asked, found) if own.startswith("joint_m_s")]
-        assert said == f"joint_m_s {found['joint_m_s']:.3g} (usual: at most {1.1 * max(speeds):.3g})"
+        (said,) = [own for own in check.unusual(asked, found) if own.startswith("fastest joint")]
+        assert said == f"fastest joint {found['joint_m_s']:.3g} m/s (usual: at most {1.1 * max(speeds):.3g})"
         assert check.beyond(asked, found) == pytest.approx(found["joint_m_s"] / (1.1 * max(speeds)) - 1, rel=1e-3)
     gone[5] = False
     left = replace(clip.hands["left"], wrist_m=wild, valid=gone)
@@ -146,7 +146,7 @@ def test_hands_that_slide_more_than_in_training_clips_of_the_verb_are_unusual(
         )
         for usual in (still, held):
             assert not [own for own in strict.unusual(verb, usual) if own.startswith("slip")]
-        said = f"slip_cm_s {slides['slip_cm_s']:.3g} (usual: at most {slip + spread / 2:.3g})"
+        said = f"slip of hands {slides['slip_cm_s']:.3g} cm/s (usual: at most {slip + spread / 2:.3g})"
         assert said in strict.unusual(verb, slides)
         assert strict.beyond(verb, slides) >= 2 - 1e-9
         assert replace(strict, actions=check.actions, fastest_m_s=float("inf")).beyond(verb, slides) == pytest.approx(2)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.actions.action import NUMBERS, Actions, action_numbers, learn_actions, written_limits
+from hoidata.actions.action import LEARNT, NUMBERS, Actions, action_numbers, learn_actions, written_limits
+from hoidata.actions.words import WORDS, beside_usual
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.errors import BadInput
 from tests.builders.clips import in_another_world
@@ -134,14 +135,17 @@ def test_what_no_training_clip_of_the_verb_does_is_named_whatever_the_written_li
     for verb in ("lift", "pour"):
         assert all(actions.unusual(verb, row) == () for row in others[verb])
     said = actions.unusual("lift", others["pour"][0])
-    assert {own.split()[0] for own in said} >= {"tilt_deg", "rise_m"}
     most = max(row["tilt_deg"] for row in numbers["lift"]) + 0.5 * actions.scale["tilt_deg"][1]
     tilt = others["pour"][0]["tilt_deg"]
-    assert f"tilt_deg {tilt:.3g} (usual: {-most:.3g} to {most:.3g})" in said
+    assert f"greatest tilt {tilt:.3g} degrees (usual: at most {most:.3g})" in said
+    least_m, most_m = (100 * bound for bound in actions.usual["lift"]["rise_m"])
+    rise_m = 100 * others["pour"][0]["rise_m"]
+    assert f"highest rise {rise_m:.3g} cm (usual: {least_m:.3g} to {most_m:.3g})" in said
     assert actions.unusual("lift", numbers["lift"][0] | {"rise_m": float("nan")}) == ()
     assert actions.unusual("juggle", numbers["lift"][0]) == ()
     beyond = actions.beyond("lift", others["pour"][0])
-    assert list(beyond) == [own.split()[0] for own in said]
+    assert {"tilt_deg", "rise_m"} <= set(beyond)
+    assert len(beyond) == len(said)
     assert beyond["tilt_deg"] == pytest.approx((tilt - most) / (2 * most))
     least_m, most_m = actions.usual["lift"]["rise_m"]
     low = numbers["lift"][0] | {"rise_m": least_m - 2 * (most_m - least_m)}
@@ -207,3 +211,10 @@ def test_the_limits_that_are_written_here_can_be_read_and_tell_open_from_close()
     written = written_limits()
     assert written["open"]["hinge_net_deg"][0] > 0 > written["close"]["hinge_net_deg"][1]
     assert written["hand over"]["hand_changes"] == (1, 2)
+
+
+def test_every_number_that_may_be_unusual_has_words_of_its_own():
+    assert set(LEARNT) <= set(WORDS)
+    assert len({words.what for words in WORDS.values()}) == len(WORDS)
+    assert beside_usual("end_rise_m", -0.031, -0.015, 0.02) == "rise at the end -3.1 cm (usual: -1.5 to 2)"
+    assert beside_usual("reversals_per_s", 2.0, -0.5, 0.5) == "turns back 2 times a second (usual: at most 0.5)"

@@ -101,6 +101,7 @@ def test_a_bad_mesh_is_named_with_what_was_expected(tmp_path: Path, name):
         load_mesh(tmp_path / name)
     assert name in caught.value.where
     assert expected in caught.value.expected
+    assert "\n" not in str(caught.value)
 
 
 def test_a_box_has_the_inertia_of_the_textbook_wherever_it_lies():

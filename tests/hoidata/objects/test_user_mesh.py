@@ -34,6 +34,15 @@ def test_a_mesh_that_stands_on_y_is_stood_upright(tmp_path, suffix):
     assert found.notes[0].startswith("y is")
 
 
+def test_a_bowl_that_stands_on_little_is_not_laid_on_its_side(tmp_path):
+    ball = trimesh.creation.icosphere(4, 0.05)
+    ball.update_faces(ball.triangles_center[:, 2] < 0)
+    ball.remove_unreferenced_vertices()
+    found = read_user_object(saved(ball, tmp_path / "bowl.obj"))
+    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.1, 0.1, 0.05], abs=2e-3)
+    assert found.notes[0].startswith("z is taken for up")
+
+
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_the_axis_told_points_up_and_nothing_is_mirrored(tmp_path, up):
     corner = trimesh.Trimesh(
