@@ -20,7 +20,7 @@ from models.common.vocabulary import Vocabulary
 from models.text2hoi.family import NAMES
 from models.text2hoi.generation import GeneratedMotion, Generator, Wish
 from models.text2hoi.sampler import SamplingConfig
-from models.text2hoi.sentences import read_sentence
+from models.text2hoi.sentences import further_verbs, read_sentence
 from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.generation_page import write_generation
 from pipelines.params import chosen_params, read_file
@@ -89,6 +89,8 @@ def generate_files(asked: Asked, out: Path) -> Written:
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
+    if further := further_verbs(asked.text, verb, generator.vocabulary) if verb else []:
+        notes.append(f"a motion is one action: of {verb!r}, not of {', '.join(map(repr, further))}; ask for each alone")
     notes += [*_taken_for(verb, motions[0].evidence), *_moved_otherwise(motions)]
     return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
 
@@ -146,7 +148,9 @@ def chosen_model(asked: Asked, verb: str | None, thing: str | None) -> tuple[Sta
     trained = [paths for paths in runs if not reasons[paths]]
     if not trained:
         reason = "; ".join(f"{paths}: {reasons[paths]}" for paths in runs)
-        raise MissingResource(f"no models that can generate: {reason}")
+        others = [name for name in asked.datasets if not why_not_trained(StagePaths(asked.profile, name))]
+        instead = f"; models are there of {', '.join(others)}" if others else ""
+        raise MissingResource(f"no models that can generate: {reason}{instead}")
     if asked.model:
         return trained[0], f"models: {trained[0]}, as asked for"
     found = [(_vocabulary(paths).knows(verb, thing) + 8 * _has_object(paths, asked.object), paths) for paths in trained]

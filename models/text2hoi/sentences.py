@@ -73,6 +73,14 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
     return reading.verb, reading.object_words
 
 
+def further_verbs(text: str, verb: str, known: Vocabulary) -> list[str]:
+    """Verbs of training that a sentence asks for beside its first, as "pour" in "Lift a mug and then pour"."""
+    first_words = {other.split()[0] for other in known.verbs if other}
+    following = re.findall(r"\b(?:and|then)\s+(?!then\b)(\w+)", text.lower())
+    found = [lemma for word in following for lemma in getAllLemmas(word).get("VERB", ())]
+    return [own for own in dict.fromkeys(found) if own in first_words and own != verb.split()[0]]
+
+
 def is_english(word: str) -> bool:
     """Whether a lower-case word is in lemminflect's dictionary or a function word. ASCII only: no other script is."""
     return word.isascii() and (word in FUNCTION_WORDS or bool(getAllLemmas(word)))

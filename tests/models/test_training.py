@@ -226,6 +226,14 @@ def test_a_person_is_told_when_a_sentence_is_taken_for_another_verb(trained: Pat
     assert f"{read_as} (" in page
 
 
+def test_a_person_is_told_that_a_second_action_is_not_made(trained: Path, tmp_path: Path) -> None:
+    trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
+    models, wish = Models(trained, load_embedded_hands(), load_encoder("hash")), Wish(frames=8)
+    asked = Asked("Lift a box and pass it with the left hand.", tmp_path / "box.stl", models=models, wish=wish)
+    told = "a motion is one action: of 'lift', not of 'pass'; ask for each alone"
+    assert told in generate_files(asked, tmp_path / "out").notes
+
+
 def test_a_person_is_told_when_the_object_does_as_another_verb_says(
     trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

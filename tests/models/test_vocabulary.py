@@ -5,7 +5,7 @@ import pytest
 from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput
 from models.common.vocabulary import Vocabulary
-from models.text2hoi.sentences import is_english, read_sentence, unseen_words
+from models.text2hoi.sentences import further_verbs, is_english, read_sentence, unseen_words
 
 KNOWN = Vocabulary({("lift", "mug", "right"): 5, ("pour", "teapot", "right"): 3, ("lift", "teapot", "left"): 2})
 
@@ -25,6 +25,20 @@ def test_what_is_no_english_sentence_is_refused_with_an_example(text, says):
     with pytest.raises(BadInput, match=says) as error:
         read_sentence(text)
     assert "Lift a mug with the right hand." in str(error.value) or "one action" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "further"),
+    [
+        ("Lift a mug and pour.", ["pour"]),
+        ("Lift the teapot, then pour it, and then pour again", ["pour"]),
+        ("Lift a mug and lift it again.", []),
+        ("Lift a mug and a teapot with the left and right hand.", []),
+        ("Lift a mug and juggle it.", []),
+    ],
+)
+def test_a_second_action_of_a_sentence_is_named_where_training_had_it(text, further):
+    assert further_verbs(text, "lift", KNOWN) == further
 
 
 def test_english_is_read_even_where_no_table_has_its_words():

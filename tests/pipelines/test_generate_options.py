@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from hoidata.errors import BadInput, MissingResource
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.cli import app
-from pipelines.generation import Asked, Models, _of_project
+from pipelines.generation import Asked, Models, _of_project, chosen_model
 from pipelines.hands import _script_text
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
@@ -74,6 +74,16 @@ def test_a_name_longer_than_a_file_may_have(words, tmp_path) -> None:
 
 def test_steps_longer_than_a_name_are_no_file() -> None:
     assert _script_text(LONG_IN_BYTES) == LONG_IN_BYTES
+
+
+def test_a_dataset_without_models_is_told_with_those_that_have_them(monkeypatch) -> None:
+    monkeypatch.setattr(
+        "pipelines.generation.why_not_trained", lambda paths: None if paths.dataset == "grab" else "not there"
+    )
+    with pytest.raises(MissingResource, match=r"embedded-nope: not there; models are there of grab$"):
+        chosen_model(Asked("Lift a box.", "box", "embedded", ("h2o", "grab"), model="nope"), "lift", "box")
+    with pytest.raises(MissingResource, match=r"embedded-h2o: not there$"):
+        chosen_model(Asked("Lift a box.", "box", "embedded", ("h2o",)), "lift", "box")
 
 
 @pytest.fixture
