@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
+from hoidata.annotation.encoders import TextEncoder, load_encoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import HandChoice, Method, choose_hand
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import FPS, SIDES, Clip, HandType
 from hoidata.errors import BadInput
 from hoidata.files import sha256_file
-from hoidata.hands import HandPair
+from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, Checkpoint
@@ -81,8 +81,8 @@ class Generator:
     def load(
         cls,
         checkpoints: str | Path,
-        hands: HandPair,
-        encoder: TextEncoder,
+        hands: HandPair | None = None,
+        encoder: TextEncoder | None = None,
         *,
         sampling: SamplingConfig | None = None,
         points: int = POINT_COUNT,
@@ -90,10 +90,13 @@ class Generator:
     ) -> "Generator":
         """From ``checkpoints/<network>``, with the hands and the encoder the networks were trained with.
 
-        points: sampled on an object, as many as in training. Raises BadInput where a network is missing or was trained
-        with other hands or another encoder.
+        hands: the embedded ones where not given. encoder: the one that the networks name where not given; CLIP must be
+        given, with its file. points: sampled on an object, as many as in training. Raises BadInput where a network is
+        missing or was trained with other hands or another encoder.
         """
+        hands = hands or load_embedded_hands()
         model = Text2Hoi.load(checkpoints, hands, sampling, device)
+        encoder = encoder or load_encoder(str(model.facts["encoder"]["name"]))
         for checkpoint in model.trained.values():
             _refuse_others(checkpoint, hands, encoder, Path(checkpoints))
         digests = {name: sha256_file(Path(checkpoints) / name / FILE_NAME) for name in model.trained}

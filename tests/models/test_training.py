@@ -292,6 +292,13 @@ def test_generation_refuses_other_hands_and_encoders(trained: Path) -> None:
         Generator.load(trained, pair, encoder)
 
 
+def test_hands_and_encoder_that_are_not_given_are_those_of_the_networks(trained: Path) -> None:
+    wish, found = Wish(frames=8), []
+    for loaded in (Generator.load(trained), generator(trained)):
+        found.append(loaded.generate("Lift a box with the left hand.", user_box(), wish)[0].clip.hands["left"])
+    np.testing.assert_array_equal(found[0].wrist_m, found[1].wrist_m)
+
+
 class Downhill:
     """One weight that starts at 2, whose loss is itself: every step of Adam lowers it by the learning rate."""
 
