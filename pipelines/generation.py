@@ -89,10 +89,18 @@ def generate_files(asked: Asked, out: Path) -> Written:
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
     notes += [f"never seen: {note}" for note in motions[0].evidence["unseen"]]
-    if further := further_verbs(asked.text, verb, generator.vocabulary) if verb else []:
-        notes.append(f"a motion is one action: of {verb!r}, not of {', '.join(map(repr, further))}; ask for each alone")
+    notes += _not_made(asked.text, motions[0].evidence["read_as"], verb, generator.vocabulary)
     notes += [*_taken_for(verb, motions[0].evidence), *_moved_otherwise(motions)]
     return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+
+
+def _not_made(text: str, read_as: tuple[str, float] | None, verb: str | None, known: Vocabulary) -> list[str]:
+    """Which actions of a sentence are not made, since a motion is one; for a person."""
+    made = read_as[0] if read_as else verb
+    further = further_verbs(text, made, known)
+    if made is None or not further:
+        return []
+    return [f"a motion is one action: of {made!r}, not of {', '.join(map(repr, further))}; ask for each alone"]
 
 
 def _taken_for(verb: str | None, evidence: Mapping[str, Any]) -> list[str]:

@@ -1,5 +1,6 @@
 """Numbers of a motion in words, beside the bounds they usually have, for a person to read."""
 
+from math import ceil, floor
 from typing import NamedTuple
 
 
@@ -19,13 +20,13 @@ WORDS = {
     "end_sideways_m": Words("sideways at the end", " cm", 100),
     "tilt_deg": Words("greatest tilt", " degrees"),
     "end_tilt_deg": Words("tilt at the end", " degrees"),
-    "turn_deg": Words("turns about the upright, added up", " degrees"),
-    "end_turn_deg": Words("turned about the upright at the end", " degrees", signed=True),
-    "path_m": Words("path", " cm", 100),
+    "turn_deg": Words("turning about the vertical in all", " degrees"),
+    "end_turn_deg": Words("turned at the end, counter-clockwise from above,", " degrees", signed=True),
+    "path_m": Words("length of the path", " cm", 100),
     "reversals_per_s": Words("turns back", " times a second"),
-    "hinge_net_deg": Words("hinge opened at the end", " degrees", signed=True),
-    "hinge_max_deg": Words("hinge moved at most", " degrees"),
-    "hand_changes": Words("hands that change hold", ""),
+    "hinge_net_deg": Words("change of the hinge at the end", " degrees", signed=True),
+    "hinge_max_deg": Words("greatest change of the hinge", " degrees"),
+    "hand_changes": Words("hands that take or give", ""),
     "joint_m_s": Words("fastest joint", " m/s"),
     "slip_cm_s": Words("slip of hands", " cm/s"),
 }
@@ -34,5 +35,12 @@ WORDS = {
 def beside_usual(name: str, value: float, least: float, most: float) -> str:
     """One number beside its usual bounds, as ``highest rise 15.8 cm (usual: 19.1 to 23.7)``."""
     what, unit, times, signed = WORDS[name]
-    bounds = f"{least * times:.3g} to {most * times:.3g}" if signed or least > 0 else f"at most {most * times:.3g}"
-    return f"{what} {value * times:.3g}{unit} (usual: {bounds})"
+    if not unit:  # counted
+        least, most = ceil(least), floor(most)
+    own, low, high = (_rounded(number * times) for number in (value, least, most))
+    return f"{what} {own}{unit} (usual: {f'{low} to {high}' if signed or least > 0 else f'at most {high}'})"
+
+
+def _rounded(number: float) -> str:
+    """Three digits, and never a power of ten."""
+    return f"{number:.0f}" if abs(number) >= 1000 else f"{number:.3g}"

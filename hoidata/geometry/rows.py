@@ -19,7 +19,8 @@ class DistinctRows(NamedTuple):
 def distinct_rows(rows: np.ndarray) -> DistinctRows:
     """Which rows (row, column) are equal; NaN counts as equal to NaN.
 
-    What ``np.unique(rows, axis=0)`` finds, in a tenth of its time: pandas numbers column by column, NumPy sorts rows.
+    What ``np.unique(rows, axis=0)`` finds, several times faster where rows repeat, as corners of triangles do: pandas
+    numbers column by column, NumPy compares whole rows.
     """
     table = pd.DataFrame(np.asarray(rows))
     number = table.groupby(list(table.columns), sort=True, dropna=False).ngroup().to_numpy(np.int64)

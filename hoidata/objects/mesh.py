@@ -80,7 +80,7 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
             else:
                 corners = [_obj_index(word, len(vertices)) for word in words[1:]]
         except ValueError as error:
-            raise BadInput(f"{path}:{number}", "numbers after 'v' or 'f'", repr(line[:60])) from error
+            raise BadInput(f"{path}:{number}", "numbers after 'v' or 'f'", repr(line[:60].strip())) from error
         if len(words) < 4:
             wanted = "3 coordinates per vertex and 3 or more corners per face"
             raise BadInput(f"{path}:{number}", wanted, repr(line[:60].strip()), "export the mesh anew")

@@ -27,7 +27,8 @@ METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
 NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
 SLIGHTLY_RAD, NEARER = 0.3, 0.01  # a turn that shows where a hinge leads, and how much nearer is meant
 CLEARLY = 1.5  # standing on y must give so much more footing than on z, which most datasets use
-STANDS = 0.1  # of its outline: an object that rolls or rocks on y, as a bowl on its side, does not stand there
+STANDS = 0.1  # of its outline: an object that rolls or rocks on y, as a bowl on its side, does not stand there ...
+FAR_MORE = 10.0  # ... unless on z it has hardly any footing, as a glass with a narrow foot that lies
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,10 @@ def closes(model: ObjectModel) -> bool:
 def found_up(vertices_m: np.ndarray) -> tuple[str, str]:
     """Which axis of a mesh points up, and why: "z", or "y" where the object then stands on clearly more ground."""
     on_z, on_y = footing(vertices_m, 2), footing(vertices_m, 1)
-    if on_y > max(CLEARLY * on_z, STANDS):
+    if on_y > CLEARLY * on_z and (on_y > STANDS or on_y > FAR_MORE * on_z):
         return "y", f"y is taken for up: so it stands on {on_y:.0%} of its outline, with z up on {on_z:.0%}"
+    if on_z < STANDS:
+        return "z", "z is taken for up: neither so nor with y up it clearly stands"
     return "z", f"z is taken for up: so it stands on {on_z:.0%} of its outline"
 
 

@@ -18,6 +18,8 @@ NAMED = 3
 # What the dictionary, which inflects, does not list.
 _FUNCTION_WORDS = """the a an with of to from in on onto into at and or then while it its your my his her their this
 that these those as if for until without using only one two three four five both each every no not"""
+_BETWEEN_CLAUSES = re.compile(r"[,;.&]|\band/or\b|\b(?:and|then)\b")
+_ADVERBS = frozenset({"also", "again", "now", "next", "please", "first"})
 FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
 
 
@@ -73,12 +75,42 @@ def read_sentence(text: str) -> tuple[str | None, str | None]:
     return reading.verb, reading.object_words
 
 
-def further_verbs(text: str, verb: str, known: Vocabulary) -> list[str]:
-    """Verbs of training that a sentence asks for beside its first, as "pour" in "Lift a mug and then pour"."""
-    first_words = {other.split()[0] for other in known.verbs if other}
-    following = re.findall(r"\b(?:and|then)\s+(?!then\b)(\w+)", text.lower())
-    found = [lemma for word in following for lemma in getAllLemmas(word).get("VERB", ())]
-    return [own for own in dict.fromkeys(found) if own in first_words and own != verb.split()[0]]
+def further_verbs(text: str, made: str | None, known: Vocabulary) -> list[str]:
+    """Verbs of training that a sentence asks for beside the one that is made, as "pour" in "Lift a mug and pour"."""
+    clauses = [re.findall(r"[a-z-]+", clause) for clause in _BETWEEN_CLAUSES.split(text.lower())]
+    clauses = [rest for words in clauses if (rest := words[_count_adverbs(words) :])]
+    verbs = sorted(filter(None, known.verbs))
+    ordered = bool(clauses) and _is_base_form(clauses[0][0])  # "Lift ..." and not "A hand lifts ..."
+    found = []
+    for number, words in enumerate(clauses):
+        starts = range(1) if ordered or number else _of_no_article(words)
+        told = (verb for start in starts for verb in verbs if _begins_with(words[start:], verb, known, ordered))
+        found += [verb for verb in (next(told, None),) if verb and verb != made]
+    return list(dict.fromkeys(found))
+
+
+def _count_adverbs(words: list[str]) -> int:
+    """How many words before a clause's verb say when or how."""
+    return next((n for n, word in enumerate(words) if not (word.endswith("ly") or word in _ADVERBS)), len(words))
+
+
+def _begins_with(words: list[str], verb: str, known: Vocabulary, ordered: bool) -> bool:
+    """Whether words begin with a known verb: in its base form where ``ordered``, and not with an object's name."""
+    first, *others = verb.split()
+    fits = words[0] == first if ordered else first in getAllLemmas(words[0]).get("VERB", ())
+    if not fits or words[0] in known.objects:
+        return False
+    of_hand = first in ("hand", "use") and {"hand", "hands"} & set(words[1:4])  # "and use both hands"
+    return not of_hand and all(other in words[1:6] for other in others)
+
+
+def _of_no_article(words: list[str]) -> list[int]:
+    """Where a verb may stand in a clause with its subject: not first, and not as "drink" in "a drink"."""
+    return [start for start in range(1, len(words)) if words[start - 1] not in ("a", "an", "the")]
+
+
+def _is_base_form(word: str) -> bool:
+    return word in getAllLemmas(word).get("VERB", ())
 
 
 def is_english(word: str) -> bool:

@@ -218,3 +218,5 @@ def test_every_number_that_may_be_unusual_has_words_of_its_own():
     assert len({words.what for words in WORDS.values()}) == len(WORDS)
     assert beside_usual("end_rise_m", -0.031, -0.015, 0.02) == "rise at the end -3.1 cm (usual: -1.5 to 2)"
     assert beside_usual("reversals_per_s", 2.0, -0.5, 0.5) == "turns back 2 times a second (usual: at most 0.5)"
+    assert beside_usual("hand_changes", 1.0, 1.5, 2.5) == "hands that take or give 1 (usual: 2 to 2)"
+    assert beside_usual("path_m", 12.344, 0.2, 1.0) == "length of the path 1234 cm (usual: 20 to 100)"

@@ -34,6 +34,13 @@ def test_a_mesh_that_stands_on_y_is_stood_upright(tmp_path, suffix):
     assert found.notes[0].startswith("y is")
 
 
+def test_a_glass_with_a_narrow_foot_is_stood_upright(tmp_path):
+    glass = trimesh.creation.revolve([[0, 0], [0.012, 0], [0.002, 0.01], [0.002, 0.08], [0.04, 0.12], [0, 0.12]])
+    found = read_user_object(saved(glass, tmp_path / "glass.obj", turn=Y_UP))
+    assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.12], abs=2e-3)
+    assert found.notes[0].startswith("y is taken for up: so it stands on 9% of its outline")
+
+
 def test_a_bowl_that_stands_on_little_is_not_laid_on_its_side(tmp_path):
     ball = trimesh.creation.icosphere(4, 0.05)
     ball.update_faces(ball.triangles_center[:, 2] < 0)
