@@ -41,6 +41,7 @@ ACTIONS = Vocabulary(
         ("Lift the mug and place it on the table.", "place", ["lift"]),
         ("A hand lifts a mug and then it pours.", "pour", ["lift"]),
         ("The mug is lifted and placed.", "place", ["lift"]),
+        ("The mug is lifted and placed.", "lift", ["place"]),
         ("Lift the mug and hand it over.", "lift", ["hand over"]),
         ("Grab a mug and lift it.", "lift", []),
         ("Lift a mug and lift it again.", "lift", []),
