@@ -32,7 +32,7 @@ def _usual_arithmetic() -> Iterator[None]:
     yield
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
-        torch.use_deterministic_algorithms(False)
+        torch.set_deterministic_debug_mode("default")
         torch.set_float32_matmul_precision("highest")
 
 

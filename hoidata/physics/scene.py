@@ -59,9 +59,17 @@ class Scene:
     @cached_property
     def lowest_m(self) -> np.ndarray:
         """(frame,) height of the object's lowest vertex, against gravity."""
+        return np.minimum.reduce([self._lowest_of_part_m(part) for part in self.model.parts])
+
+    def _lowest_of_part_m(self, part: int) -> np.ndarray:
+        """(frame,) of one part. A height is linear in a vertex's place, so that none is taken to the world."""
+        model, world_from_part = self.model, self.poses.world_from_part(self.model, part)
+        vertices_m = model.vertices_m[model.part == part] if model.is_articulated else model.vertices_m
+        up = -self.gravity
+        ways, origins_m = up @ world_from_part.rotation, world_from_part.translation @ up
         starts = range(0, self.n_frames, _AT_ONCE)
-        heights = [-self.vertices_m(slice(start, start + _AT_ONCE)) @ self.gravity for start in starts]
-        return np.concatenate([np.zeros(0), *(own.min(axis=1) for own in heights)])
+        lowest = [(vertices_m @ ways[start : start + _AT_ONCE].T).min(axis=0) for start in starts]
+        return np.concatenate([np.zeros(0), *lowest]) + origins_m
 
     @property
     def table_height_m(self) -> float:

@@ -16,7 +16,8 @@ def make_repeatable(threads: int) -> None:
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # without it cuBLAS refuses deterministic products
     torch.set_num_threads(threads)
-    torch.use_deterministic_algorithms(True)
+    # As use_deterministic_algorithms(True), which loads torch's compiler as well: a second of every command's start.
+    torch.set_deterministic_debug_mode("error")
     # Nothing here reads memory before writing it; filling it first would cost a seventh of the time.
     setattr(torch.utils.deterministic, "fill_uninitialized_memory", False)  # noqa: B010 (pyright does not know it)
     torch.set_float32_matmul_precision("highest")

@@ -2,6 +2,8 @@
 
 import json
 import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -364,6 +366,15 @@ def test_matrix_products_are_float32_on_every_processor() -> None:
     a, b = torch.randn(256, 256, generator=generator), torch.randn(256, 256, generator=generator)
     exact = (a.double() @ b.double()).float()
     assert float((a @ b - exact).norm() / exact.norm()) < 1e-6
+
+
+def test_operations_that_may_give_other_bytes_are_refused_and_the_compiler_is_not_loaded() -> None:
+    code = "import sys, torch; from models.common.repeatable import make_repeatable; make_repeatable(1); "
+    code += "print(torch.get_deterministic_debug_mode(), 'torch._inductor' in sys.modules)"
+    told = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parents[2], capture_output=True, text=True, check=True
+    )
+    assert told.stdout.split() == ["2", "False"]
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 100])

@@ -247,6 +247,17 @@ def test_a_lid_that_opens_counts_for_the_lowest_vertex():
     np.testing.assert_allclose(scene.lowest_m, expected, atol=1e-9)
 
 
+def test_the_lowest_vertex_is_the_lowest_of_all_in_the_world():
+    random = np.random.default_rng(0)
+    model = two_parts(BOX, box_model(tuple(SIZE), middle_m=(0, SIZE[1], 0)), (0.6, 0, 0.8), (0, SIZE[1] / 2, 0))
+    rotmats = Rotation.random(40, random_state=0).as_matrix()
+    poses = ObjectPoses(rotmats, random.normal(size=(40, 3)), random.uniform(-2, 2, 40))
+    gravity = np.array([0.36, 0.48, -0.8])
+    scene = Scene(model, poses, Capsules(*np.zeros((2, 40, 0, 3)), np.zeros(0)), FPS, gravity)
+    expected = (scene.vertices_m(slice(None)) @ -gravity).min(axis=1)
+    np.testing.assert_allclose(scene.lowest_m, expected, atol=1e-12)
+
+
 def test_a_clip_becomes_a_scene_with_both_hands_and_an_invalid_hand_is_absent(make_clip):
     clip = make_clip(n_frames=6, hand_type="right")
     scene = clip_scene(clip, load_embedded_hands(), table_m=-1.0)
