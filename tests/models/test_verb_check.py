@@ -61,7 +61,7 @@ def test_what_is_unusual_is_told_for_the_verb_that_the_sentence_was_read_as(
         numbers = check.numbers(annotated.store.clip(sample.clip_id), sample.points)
         assert asked == sample.verb
         assert strict.unusual(asked, numbers) == ()
-        said = ("path 900 cm (usual: at most 50)",) if sample.verb == "lift" else ()
+        said = ("length of the path 900 cm (usual: at most 50)",) if sample.verb == "lift" else ()
         assert strict.unusual(asked, numbers | {"path_m": 9.0}) == said
         assert strict.unusual(None, numbers | {"path_m": 9.0}) == ()
         assert strict.beyond(asked, numbers) == strict.beyond(None, numbers | {"path_m": 9.0}) == 0
