@@ -84,10 +84,7 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
         if len(words) < 4:
             wanted = "3 coordinates per vertex and 3 or more corners per face"
             raise BadInput(f"{path}:{number}", wanted, repr(line[:60].strip()), "export the mesh anew")
-        if len(corners) == 3:  # nearly always, and quicker
-            faces.append((corners[0], corners[1], corners[2]))
-        else:
-            faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
+        faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
     mesh = Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
     return checked_mesh(path, mesh)
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from hoidata.geometry.rows import distinct_rows
@@ -54,15 +55,13 @@ def crease_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
     doubled = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     unit = doubled / np.maximum(np.linalg.norm(doubled, axis=1, keepdims=True), 1e-20)
     corner_vertex = distinct_rows(np.round(vertices_m, 6)).number[faces.reshape(-1)]
-    # Every corner beside every corner in the same place, as faces: those of a corner stand together.
-    order, count = np.argsort(corner_vertex, kind="stable"), np.bincount(corner_vertex)
-    size = count[corner_vertex[order]]
-    starts = np.cumsum(size) - size
-    place = np.repeat((np.cumsum(count) - count)[corner_vertex[order]] - starts, size) + np.arange(size.sum())
-    first, second = np.repeat(order // 3, size), order[place] // 3
-    smooth = np.einsum("ij,ij->i", unit[first], unit[second]) > np.cos(CREASE_RAD)
-    normals = np.empty((len(order), 3))
-    normals[order] = np.add.reduceat(np.where(smooth[:, None], doubled[second], 0.0), starts, axis=0)
+    ones = np.ones(len(corner_vertex))
+    incidence = csr_array((ones, (np.arange(len(corner_vertex)), corner_vertex)))
+    pairs = (incidence @ incidence.T).tocoo()
+    first, second = pairs.coords
+    smooth = np.einsum("ij,ij->i", unit[first // 3], unit[second // 3]) > np.cos(CREASE_RAD)
+    to, weighted = first[smooth], doubled[second[smooth] // 3]
+    normals = np.stack([np.bincount(to, column, len(corner_vertex)) for column in weighted.T], axis=1)
     normals += 1e-12 * np.repeat(unit, 3, axis=0)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-20)
     return normals.reshape(-1, 3, 3)
