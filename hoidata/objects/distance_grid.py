@@ -59,14 +59,14 @@ def distance_grid(tree: TriangleTree, solid: bool) -> DistanceGrid:
 @njit(cache=True)
 def _fill(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
     """Distances of all nodes; each bounds that of the next in its row."""
-    triangle, box, link = tree[0], tree[1], tree[2]
+    triangle, link, turned = tree[0], tree[2], tree[6]
     stack, squares = np.empty(DEEPEST, np.int64), np.empty(LEAF)
     for k in range(value.shape[0]):
         for j in range(value.shape[1]):
             y, z, distance = low_m[1] + j * cell_m, low_m[2] + k * cell_m, np.inf
             for i in range(value.shape[2]):
                 x, bound = low_m[0] + i * cell_m, (distance + cell_m) * _WIDER
-                distance = np.sqrt(_least_square(triangle, box, link, x, y, z, bound * bound, 0.0, stack, squares))
+                distance = np.sqrt(_least_square(triangle, link, turned, x, y, z, bound * bound, 0.0, stack, squares))
                 value[k, j, i] = distance
 
 
@@ -99,7 +99,7 @@ def mark_within(tree, grid, places_m, threshold_m, within):  # pragma: no cover 
 
     Places already marked are not looked at.
     """
-    triangle, box, link, low_m, cell_m, value = tree[0], tree[1], tree[2], grid[0], grid[1], grid[2]
+    triangle, box, link, turned, low_m, cell_m, value = tree[0], tree[1], tree[2], tree[6], grid[0], grid[1], grid[2]
     stack, squares = np.empty(DEEPEST, np.int64), np.empty(LEAF)
     bound, enough = threshold_m * threshold_m * _WIDER, threshold_m * threshold_m / _WIDER
     for place in range(len(places_m)):
@@ -112,14 +112,14 @@ def mark_within(tree, grid, places_m, threshold_m, within):  # pragma: no cover 
         if abs(distance) + slack < threshold_m:
             within[place] = True
             continue
-        square = _least_square(triangle, box, link, x, y, z, bound, enough, stack, squares)
+        square = _least_square(triangle, link, turned, x, y, z, bound, enough, stack, squares)
         within[place] = np.sqrt(square) < threshold_m
 
 
 @njit(cache=True)
 def lower_distances(tree, grid, places_m, most_m, distance_m):  # pragma: no cover (compiled)
     """Set ``distance_m (place,)`` to the distance of ``places_m (place, 3)`` where less, and not above ``most_m``."""
-    triangle, box, link, low_m, cell_m, value = tree[0], tree[1], tree[2], grid[0], grid[1], grid[2]
+    triangle, box, link, turned, low_m, cell_m, value = tree[0], tree[1], tree[2], tree[6], grid[0], grid[1], grid[2]
     stack, squares = np.empty(DEEPEST, np.int64), np.empty(LEAF)
     for place in range(len(places_m)):
         x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
@@ -130,7 +130,7 @@ def lower_distances(tree, grid, places_m, most_m, distance_m):  # pragma: no cov
         if abs(near) - slack > most:
             continue
         bound = min(most, abs(near) + slack) * _WIDER + _TINY_M
-        found = np.sqrt(_least_square(triangle, box, link, x, y, z, bound * bound, 0.0, stack, squares))
+        found = np.sqrt(_least_square(triangle, link, turned, x, y, z, bound * bound, 0.0, stack, squares))
         if found <= most:
             distance_m[place] = found
 
@@ -141,26 +141,26 @@ def nearest_triangles(tree, places_m, distance_m, closest_m, triangle_of):  # pr
 
     distance_m: (place,) exact distances, as ``lower_distances`` gives them; places with an infinite one are left alone.
     """
-    triangle, box, link = tree[0], tree[1], tree[2]
+    triangle, link, turned = tree[0], tree[2], tree[6]
     stack, squares = np.empty(DEEPEST, np.int64), np.empty(LEAF)
     for place in range(len(places_m)):
         if distance_m[place] < np.inf:
             x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
             bound = distance_m[place] * _WIDER + _TINY_M
-            number = _triangle_within(triangle, box, link, x, y, z, bound * bound, stack, squares)
+            number = _triangle_within(triangle, link, turned, x, y, z, bound * bound, stack, squares)
             triangle_of[place] = number
             _closest_place(triangle, number, x, y, z, closest_m[place])
 
 
 @njit(cache=True)
-def _triangle_within(triangle, box, link, x, y, z, bound, stack, squares):  # pragma: no cover (compiled)
+def _triangle_within(triangle, link, turned, x, y, z, bound, stack, squares):  # pragma: no cover (compiled)
     """The nearest triangle, of those whose squared distance is not above ``bound``; -1 without any."""
     best, found, size = bound, -1, 1
     stack[0] = 0
     while size:
         size -= 1
         node = stack[size]
-        if _square_to_box(box, node, x, y, z) * _BOX_ROUNDING > best:
+        if _square_to_turned(turned, node, x, y, z) * _BOX_ROUNDING > best:
             continue
         if link[node, 0]:
             stack[size], stack[size + 1] = link[node, 0], node + 1
@@ -225,6 +225,19 @@ def _square_to_box(box, node, x, y, z):  # pragma: no cover (compiled)
     return dx * dx + dy * dy + dz * dz
 
 
+@njit(cache=True, inline="always")
+def _square_to_turned(turned, node, x, y, z):  # pragma: no cover (compiled)
+    """Squared distance to a node's turned box, 0 inside."""
+    nx, ny, nz = turned[node, 0], turned[node, 1], turned[node, 2]
+    ux, uy, uz = turned[node, 3], turned[node, 4], turned[node, 5]
+    along, across = nx * x + ny * y + nz * z, ux * x + uy * y + uz * z
+    third = (ny * uz - nz * uy) * x + (nz * ux - nx * uz) * y + (nx * uy - ny * ux) * z
+    along = max(turned[node, 6] - along, along - turned[node, 9], 0.0)
+    across = max(turned[node, 7] - across, across - turned[node, 10], 0.0)
+    third = max(turned[node, 8] - third, third - turned[node, 11], 0.0)
+    return along * along + across * across + third * third
+
+
 @njit(cache=True, fastmath={"nnan", "ninf", "nsz"})
 def _leaf_squares(triangle, start, stop, x, y, z, squares):  # pragma: no cover (compiled)
     """Squared distances to triangles ``start`` to ``stop``, without branches, so that it runs on vectors.
@@ -256,7 +269,7 @@ def _leaf_squares(triangle, start, stop, x, y, z, squares):  # pragma: no cover 
 
 
 @njit(cache=True)
-def _least_square(triangle, box, link, x, y, z, bound, enough, stack, squares):  # pragma: no cover (compiled)
+def _least_square(triangle, link, turned, x, y, z, bound, enough, stack, squares):  # pragma: no cover (compiled)
     """Least squared distance to the triangles, or ``bound`` where none is nearer than that.
 
     Stops at the first triangle nearer than ``enough`` (0: never). stack: (64,) int64 and squares: (8,) are room.
@@ -266,7 +279,7 @@ def _least_square(triangle, box, link, x, y, z, bound, enough, stack, squares): 
         second = link[node, 0]
         if second:
             near, far = node + 1, second
-            near_square, far_square = _square_to_box(box, near, x, y, z), _square_to_box(box, far, x, y, z)
+            near_square, far_square = _square_to_turned(turned, near, x, y, z), _square_to_turned(turned, far, x, y, z)
             if far_square < near_square:
                 near, far = far, near
                 near_square, far_square = far_square, near_square
@@ -283,16 +296,16 @@ def _least_square(triangle, box, link, x, y, z, bound, enough, stack, squares): 
                 best = min(best, squares[number])
             if best < enough:
                 return best
-        node, size = _next_node(box, stack, size, x, y, z, best)
+        node, size = _next_node(turned, stack, size, x, y, z, best)
         if node < 0:
             return best
 
 
 @njit(cache=True, inline="always")
-def _next_node(box, stack, size, x, y, z, best):  # pragma: no cover (compiled)
+def _next_node(turned, stack, size, x, y, z, best):  # pragma: no cover (compiled)
     """The last waiting node that is still near enough, -1 without any, and how many wait then."""
     while size:
         size -= 1
-        if _square_to_box(box, stack[size], x, y, z) * _BOX_ROUNDING < best:
+        if _square_to_turned(turned, stack[size], x, y, z) * _BOX_ROUNDING < best:
             return stack[size], size
     return -1, 0

@@ -44,7 +44,7 @@ def intervals_inside(tree: TriangleTree, cell_m: float) -> Intervals:
 @njit(cache=True)
 def settle_sides(tree, positions_m, side):  # pragma: no cover (compiled)
     """Where ``side (position,)`` is UNSURE, set it to INSIDE or OUTSIDE for ``positions_m (position, 3)``."""
-    _, box, link, _, corner, vertices_m = tree
+    _, box, link, _, corner, vertices_m, _ = tree
     stack, crossed, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
     for row in range(len(positions_m)):
         if side[row] == UNSURE:
@@ -56,7 +56,7 @@ def settle_sides(tree, positions_m, side):  # pragma: no cover (compiled)
 @njit(cache=True)
 def turn_inside_negative(tree, low_m, cell_m, value):  # pragma: no cover (compiled)
     """Of a grid's nodes ``value (z, y, x)`` those inside."""
-    _, box, link, _, corner, vertices_m = tree
+    _, box, link, _, corner, vertices_m, _ = tree
     stack, crossed, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
     for k in range(value.shape[0]):
         for j in range(value.shape[1]):
@@ -139,7 +139,7 @@ def _side_of_edge(vertices_m, start, stop, y, z):  # pragma: no cover (compiled)
 @njit(cache=True)
 def _intervals(tree, low_m, cell_m, shape):  # pragma: no cover (compiled)
     """Where each line runs inside the solid."""
-    _, box, link, _, corner, vertices_m = tree
+    _, box, link, _, corner, vertices_m, _ = tree
     stack, positions, turns = np.empty(DEEPEST, np.int64), np.empty(len(corner)), np.empty(len(corner))
     first = np.zeros(shape[0] * shape[1] + 1, np.int64)
     start, stop = [0.0 for _ in range(0)], [0.0 for _ in range(0)]

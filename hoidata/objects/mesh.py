@@ -1,6 +1,7 @@
 """Reading triangle meshes exactly as stored, and their mass properties."""
 
 import io
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -12,6 +13,7 @@ from hoidata.objects.ply import MOST_CORNERS, MOST_TRIANGLES, MOST_VERTICES, par
 
 LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen times as much when read
 _MOST = f"at most {MOST_VERTICES} vertices, {MOST_TRIANGLES} triangles and {MOST_CORNERS} corners of one face"
+_MOST_INDEX = 2**31
 _FLAT = 1e-9  # of the cube around a mesh: what encloses less has no inside
 _FARTHEST = 1e9  # in any unit; areas and volumes of such a mesh still fit into a float
 
@@ -65,9 +67,43 @@ def _read_obj(path: Path) -> Mesh:
 def parse_obj(text: str, path: str | Path) -> Mesh:
     """Vertices and triangles of an OBJ file's text, as ``load_mesh`` reads them; ``path`` names it in errors."""
     # Own reader: trimesh splits and reorders vertices where faces carry texture or normal indices.
+    lines = io.StringIO(text, newline=None).readlines()
+    mesh = _plain_triangles(lines)
+    return checked_mesh(path, _any_polygons(lines, path) if mesh is None else mesh)
+
+
+def _plain_triangles(lines: list[str]) -> Mesh | None:
+    """What is written as "v x y z" and "f a b c", in half the time of line by line; None of any other file."""
+    others = (line for line in lines if not line.startswith(("v ", "f ")))
+    if any(line.split(maxsplit=1)[:1] in (["v"], ["f"]) for line in others):
+        return None
+    vertices = _rows_of(lines, "v ", float, np.float64, MOST_VERTICES)
+    faces = _rows_of(lines, "f ", _position_index, np.int64, MOST_TRIANGLES)
+    if vertices is None or faces is None or faces.min(initial=1) < 1 or faces.max(initial=1) >= _MOST_INDEX:
+        return None
+    return Mesh(vertices, faces - 1)
+
+
+def _rows_of(
+    lines: list[str], start: str, number_in: Callable[[str], float], dtype: type, most: int
+) -> np.ndarray | None:
+    """(row, 3) numbers of the lines that start so; None if one has more or fewer, or there are more than ``most``."""
+    own = [line for line in lines if line.startswith(start)]
+    words = "".join(own).split()
+    if len(own) > most or len(words) != 4 * len(own):
+        return None
+    del words[::4]  # where lines have other lengths, a letter is left, which is no number
+    try:
+        return np.array(list(map(number_in, words)), dtype=dtype).reshape(-1, 3)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _any_polygons(lines: list[str], path: str | Path) -> Mesh:
+    """Every vertex and polygon of an OBJ file, line by line. Raises BadInput with the number of a wrong line."""
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(io.StringIO(text, newline=None), 1):
+    for number, line in enumerate(lines, 1):
         words = line.split(maxsplit=MOST_CORNERS + 1)
         if not words or words[0] not in ("v", "f"):
             continue
@@ -85,14 +121,18 @@ def parse_obj(text: str, path: str | Path) -> Mesh:
             wanted = "3 coordinates per vertex and 3 or more corners per face"
             raise BadInput(f"{path}:{number}", wanted, repr(line[:60].strip()), "export the mesh anew")
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
-    mesh = Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
-    return checked_mesh(path, mesh)
+    return Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
+
+
+def _position_index(word: str) -> int:
+    """The first of a corner's indices, before those of texture and normal."""
+    return int(word.partition("/")[0])
 
 
 def _obj_index(word: str, n_vertices: int) -> int:
     """OBJ counts from 1; negative indices count back from the last vertex read."""
-    index = int(word.split("/")[0])
-    if index == 0 or abs(index) >= 2**31:
+    index = _position_index(word)
+    if index == 0 or abs(index) >= _MOST_INDEX:
         raise ValueError(f"corner {word[:40]}")
     return index - 1 if index > 0 else n_vertices + index
 
@@ -130,9 +170,10 @@ def mass_properties(vertices_m: np.ndarray, faces: np.ndarray) -> MassProperties
     """
     mesh = trimesh.Trimesh(vertices_m, faces, process=True)
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is flat, trimesh divides by no volume
-        hull = mesh.convex_hull
-        solid = mesh.is_watertight and abs(mesh.volume) > 1e-3 * hull.volume
-        used = mesh if solid else hull
+        volume, box = abs(mesh.volume), float(np.prod(np.ptp(mesh.vertices, axis=0)))
+        # The hull lies in the mesh's box, and a hull of 100,000 places takes seconds.
+        solid = mesh.is_watertight and (volume > 1e-3 * box or volume > 1e-3 * mesh.convex_hull.volume)
+        used = mesh if solid else mesh.convex_hull
         if used.volume < 0:
             used.invert()
         volume = float(used.volume)

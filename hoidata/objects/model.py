@@ -1,5 +1,6 @@
 """The canonical object: a triangle mesh in metres, its parts, and the hinge between them."""
 
+import hashlib
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -59,6 +60,16 @@ class ObjectModel:
     def masses(self) -> tuple[MassProperties, ...]:
         """Mass, centre and inertia of each of ``parts``, worked out once."""
         return tuple(mass_properties(self.vertices_m, self.faces_of(part)) for part in self.parts)
+
+    @cached_property
+    def digest(self) -> str:
+        """What name, mesh, parts and hinge are, as a SHA-256, worked out once."""
+        hinge = () if self.hinge is None else (self.hinge.axis, self.hinge.origin_m)
+        digest = hashlib.sha256(self.name.encode())
+        for array in (self.vertices_m, self.faces, self.part, *hinge):
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        return digest.hexdigest()
 
     def object_from_part(self, part: int, hinge_rad: np.ndarray | None) -> RigidTransform:
         """Where a part lies in the object frame, seen from its rest position (hinge angle 0), in which its mesh is.

@@ -5,7 +5,6 @@ index serves every frame of every clip at every hinge angle. All answers are exa
 looking at triangles, and is made when an object is asked about so often that this pays.
 """
 
-import hashlib
 from collections import OrderedDict
 from functools import reduce
 
@@ -95,7 +94,7 @@ class PartSurface:
 
 def surface_index(model: ObjectModel) -> "SurfaceIndex":
     """The index of a model; those used last are kept in memory, by what mesh, parts and hinge are."""
-    key = _digest(model)
+    key = model.digest
     if key not in _indices:
         _indices[key] = SurfaceIndex(model)
     _indices.move_to_end(key)
@@ -230,12 +229,3 @@ def _note(model: ObjectModel, solids: dict[int, Solid | NoSolid]) -> str | None:
         elif solid.repairs:
             said.append(f"{name}: {solid.repairs}")
     return "; ".join(said) or None
-
-
-def _digest(model: ObjectModel) -> str:
-    hinge = () if model.hinge is None else (model.hinge.axis, model.hinge.origin_m)
-    digest = hashlib.sha256(model.name.encode())
-    for array in (model.vertices_m, model.faces, model.part, *hinge):
-        digest.update(f"{array.dtype.str}{array.shape}".encode())
-        digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()

@@ -6,6 +6,8 @@ import numpy as np
 from numba import njit
 
 LEAF = 8
+_NO_NORMAL = 1e-3  # of a node's triangles summed up: they cancel each other
+_WIDER = 1e-9  # of the coordinates: more than rounding can take from a turned box
 DEEPEST = 64  # levels a search has room for: triangles are halved, so 2^60 of them would fit
 
 
@@ -15,7 +17,9 @@ class TriangleTree(NamedTuple):
     triangle: (15, triangle) rows: corner a, edges ab and ac, unit normal (zero without area), inverse squared lengths
     of ab, ac and bc (zero without length). box: (node, 6) low and high corners. link: (node, 3) the second child, 0
     for a leaf (the first child follows its parent), and where the triangles below the node start and stop.
-    face: (triangle,) number of each in the caller's order. corner: (triangle, 3) vertex numbers.
+    face: (triangle,) number of each in the caller's order. corner: (triangle, 3) vertex numbers. turned_box: (node, 12)
+    a box along the mean normal of the node's triangles: that unit direction, a second one across it, from where the
+    triangles lie along these two and along the third (first x second), and up to where.
     """
 
     triangle: np.ndarray
@@ -24,6 +28,7 @@ class TriangleTree(NamedTuple):
     face: np.ndarray
     corner: np.ndarray
     vertices_m: np.ndarray
+    turned_box: np.ndarray
 
 
 def triangle_tree(vertices_m: np.ndarray, faces: np.ndarray) -> TriangleTree:
@@ -32,7 +37,9 @@ def triangle_tree(vertices_m: np.ndarray, faces: np.ndarray) -> TriangleTree:
     faces = np.ascontiguousarray(faces, dtype=np.int64)
     corners = vertices[faces]
     order, link, box = _halved(corners)
-    return TriangleTree(_figures(corners[order]), box, link, order, faces[order], vertices)
+    figures = _figures(corners[order])
+    turned = _turned_boxes(corners[order], figures[9:12], link)
+    return TriangleTree(figures, box, link, order, faces[order], vertices, turned)
 
 
 def _figures(corners_m: np.ndarray) -> np.ndarray:
@@ -83,3 +90,33 @@ def _halve(low_m, high_m, centre_m, order, link, box):  # pragma: no cover (comp
             waiting[size], waiting[size + 1] = (middle, stop, count - 1), (start, middle, -1)
             size += 2
     return count
+
+
+@njit(cache=True)
+def _turned_boxes(corners_m, normal, link):  # pragma: no cover (compiled)
+    """(node, 12), see ``TriangleTree``. corners_m: (triangle, 3, 3) and normal (3, triangle), in the leaves' order.
+
+    A patch of a smooth surface is flat: the box along its normal is thin, so that few patches have to be looked at to
+    find the nearest triangle, where boxes along the axes all reach too far.
+    """
+    turned = np.empty((len(link), 12))
+    for node in range(len(link)):
+        start, stop = link[node, 1], link[node, 2]
+        nx, ny, nz = normal[0, start:stop].sum(), normal[1, start:stop].sum(), normal[2, start:stop].sum()
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        nx, ny, nz = (nx / length, ny / length, nz / length) if length > _NO_NORMAL else (0.0, 0.0, 1.0)
+        ux, uy, uz = (0.0, -nz, ny) if abs(nx) < 0.7 else (nz, 0.0, -nx)  # across the normal, and not too short
+        length = np.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux / length, uy / length, uz / length
+        vx, vy, vz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
+        low, high, farthest = np.full(3, np.inf), np.full(3, -np.inf), 0.0
+        for number in range(start, stop):
+            for corner in range(3):
+                x, y, z = corners_m[number, corner, 0], corners_m[number, corner, 1], corners_m[number, corner, 2]
+                farthest = max(farthest, abs(x), abs(y), abs(z))
+                places = nx * x + ny * y + nz * z, ux * x + uy * y + uz * z, vx * x + vy * y + vz * z
+                for way in range(3):
+                    low[way], high[way] = min(low[way], places[way]), max(high[way], places[way])
+        turned[node, 0:3], turned[node, 3:6] = (nx, ny, nz), (ux, uy, uz)
+        turned[node, 6:9], turned[node, 9:12] = low - _WIDER * farthest, high + _WIDER * farthest
+    return turned

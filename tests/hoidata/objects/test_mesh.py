@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,41 @@ def test_an_obj_keeps_vertex_order_and_repeated_vertices(tmp_path: Path):
 def test_a_polygon_becomes_a_fan(tmp_path: Path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
     assert load_mesh(tmp_path / "a.obj").faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+
+
+WRITTEN_OTHERWISE = {
+    "carriage returns": lambda text: text.replace("\n", "\r\n"),
+    "slashes": lambda text: re.sub(r"^f (\d+) (\d+) (\d+)$", r"f \1/7/8 \2//9 \3/4", text, flags=re.MULTILINE),
+    "other records between": lambda text: text.replace("\nf ", "\n# f 1 1 1\nvn 0 0 1\nusemtl v\n\nf "),
+    "spaces": lambda text: re.sub(r"^(.) (\S+) ", r"\1   \2  ", text, flags=re.MULTILINE),
+    "tabs in some": lambda text: text.replace("v 0.", "v\t0.").replace("f 1", " f\t1"),
+    "colours": lambda text: re.sub(r"^(v .*)$", r"\1 0.5 0.5 1", text, flags=re.MULTILINE),
+    "faces first": lambda text: "\n".join(sorted(text.splitlines(), key=lambda line: line[:1] != "f")),
+    "counted from the end": lambda text: re.sub(
+        r"^f (\d+)", lambda row: f"f {int(row[1]) - 43}", text, flags=re.MULTILINE
+    ),
+}
+
+
+@pytest.mark.parametrize("way", WRITTEN_OTHERWISE)
+def test_a_mesh_written_otherwise_is_the_same_mesh(tmp_path: Path, way):
+    ball = trimesh.creation.icosphere(1, radius=0.7)
+    rows = [*(f"v {x!r} {y!r} {z!r}" for x, y, z in ball.vertices.tolist())]
+    rows += [f"f {a} {b} {c}" for a, b, c in (ball.faces + 1).tolist()]
+    plain, other = tmp_path / "plain.obj", tmp_path / "other.obj"
+    plain.write_text("\n".join(rows) + "\n")
+    other.write_bytes(WRITTEN_OTHERWISE[way](plain.read_text()).encode())
+    read = load_mesh(plain)
+    np.testing.assert_array_equal(read.vertices, ball.vertices)
+    np.testing.assert_array_equal(read.faces, ball.faces)
+    np.testing.assert_array_equal(load_mesh(other).vertices, read.vertices)
+    np.testing.assert_array_equal(load_mesh(other).faces, read.faces)
+
+
+def test_a_wrong_line_is_named_however_many_right_ones_there_are(tmp_path: Path):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 50 + "f 1 2 0\n")
+    with pytest.raises(BadInput, match=r"a\.obj:54"):
+        load_mesh(tmp_path / "a.obj")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
@@ -84,6 +120,7 @@ BAD = {
     "no_faces.obj": ("v 0 0 0\nv 1 0 0\n", "faces"),
     "words.obj": ("v 0 zero 0\nf 1 1 1\n", "numbers"),
     "short.obj": ("v 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "3 coordinates"),
+    "short_and_long.obj": ("v 0 0\nv 1 0 0 1\nv 0 1 0\nf 1 2 3\n", "3 coordinates"),
     "outside.obj": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n", "0 to 2"),
     "line.obj": ("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "faces with area"),
     "nan.obj": ("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
@@ -126,5 +163,13 @@ def test_a_mesh_turned_inside_out_is_the_same_solid():
 def test_an_open_mesh_is_replaced_by_its_hull_and_says_so():
     box = trimesh.creation.box((0.1, 0.1, 0.1))
     facts = mass_properties(box.vertices, box.faces[2:])
+    assert facts.source == "convex hull"
+    assert facts.volume_m3 == pytest.approx(0.001)
+
+
+def test_two_shells_that_enclose_next_to_nothing_are_replaced_by_their_hull():
+    outer, inner = trimesh.creation.box((0.1, 0.1, 0.1)), trimesh.creation.box((0.09999, 0.09999, 0.09999))
+    vertices = np.concatenate([outer.vertices, inner.vertices])
+    facts = mass_properties(vertices, np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]))
     assert facts.source == "convex hull"
     assert facts.volume_m3 == pytest.approx(0.001)

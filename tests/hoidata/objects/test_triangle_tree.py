@@ -51,3 +51,29 @@ def test_boxes_hold_their_triangles_and_every_triangle_is_in_one_leaf(count: int
         held += [] if second else range(start, stop)
         assert second or stop - start <= LEAF
     assert sorted(held) == list(range(count))
+
+
+def _plate(axis: int) -> tuple[np.ndarray, np.ndarray]:
+    corners = np.array([[0.0, 0, 0], [0, 1, 0], [0, 1, 1], [0, 0, 1]])
+    return np.roll(corners, axis, axis=1), np.array([[0, 1, 2], [0, 2, 3]])
+
+
+@pytest.mark.parametrize("mesh", [*map(_mesh, (1, 9, 1000)), *map(_plate, range(3))])
+def test_turned_boxes_lie_along_the_mean_normal_and_fit_their_triangles(mesh: tuple[np.ndarray, np.ndarray]) -> None:
+    vertices, faces = mesh
+    tree = triangle_tree(vertices, faces)
+    corners = vertices[faces[tree.face]]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    units = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
+    for (_, start, stop), turned in zip(tree.link, tree.turned_box, strict=True):
+        first, second, low, high = turned.reshape(4, 3)
+        frame = np.stack([first, second, np.cross(first, second)])
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+        mean = units[start:stop].sum(axis=0)
+        if np.linalg.norm(mean) > 1e-2:
+            np.testing.assert_allclose(first, mean / np.linalg.norm(mean), atol=1e-9)
+        places = corners[start:stop].reshape(-1, 3) @ frame.T
+        rounding = 1e-8 * np.abs(corners[start:stop]).max()
+        below, above = places.min(axis=0) - low, high - places.max(axis=0)
+        assert np.minimum(below, above).min() > 0
+        assert np.maximum(below, above).max() < rounding
