@@ -294,7 +294,8 @@ def _mano_mutation(rng: random.Random, data: bytes) -> bytes:
 
 
 def _meshes() -> list[Target]:
-    obj = (mesh._read_obj, mesh.parse_obj, mesh._obj_index, mesh.checked_mesh)
+    quick = (mesh._plain_triangles, mesh._numbers_of, mesh._position_index)
+    obj = (mesh._read_obj, mesh.parse_obj, *quick, mesh._any_polygons, mesh._obj_index, mesh.checked_mesh)
     ply = [mesh._read_ply, *functions_of(ply_reader)]
     text = [item for item in ply if item is not ply_reader._BinaryRows]
     binary = [item for item in ply if item is not ply_reader._TextRows]

@@ -148,6 +148,8 @@ def nearest_triangles(tree, places_m, distance_m, closest_m, triangle_of):  # pr
             x, y, z = places_m[place, 0], places_m[place, 1], places_m[place, 2]
             bound = distance_m[place] * _WIDER + _TINY_M
             number = _triangle_within(triangle, link, turned, x, y, z, bound * bound, stack, squares)
+            if number < 0:  # rounding put a triangle far longer than wide nearer than its box is
+                number = _triangle_within(triangle, link, turned, x, y, z, np.inf, stack, squares)
             triangle_of[place] = number
             _closest_place(triangle, number, x, y, z, closest_m[place])
 

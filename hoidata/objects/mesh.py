@@ -1,7 +1,6 @@
 """Reading triangle meshes exactly as stored, and their mass properties."""
 
 import io
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -67,43 +66,50 @@ def _read_obj(path: Path) -> Mesh:
 def parse_obj(text: str, path: str | Path) -> Mesh:
     """Vertices and triangles of an OBJ file's text, as ``load_mesh`` reads them; ``path`` names it in errors."""
     # Own reader: trimesh splits and reorders vertices where faces carry texture or normal indices.
-    lines = io.StringIO(text, newline=None).readlines()
-    mesh = _plain_triangles(lines)
-    return checked_mesh(path, _any_polygons(lines, path) if mesh is None else mesh)
+    mesh = _plain_triangles(text)
+    return checked_mesh(path, _any_polygons(text, path) if mesh is None else mesh)
 
 
-def _plain_triangles(lines: list[str]) -> Mesh | None:
+def _plain_triangles(text: str) -> Mesh | None:
     """What is written as "v x y z" and "f a b c", in half the time of line by line; None of any other file."""
-    others = (line for line in lines if not line.startswith(("v ", "f ")))
-    if any(line.split(maxsplit=1)[:1] in (["v"], ["f"]) for line in others):
-        return None
-    vertices = _rows_of(lines, "v ", float, np.float64, MOST_VERTICES)
-    faces = _rows_of(lines, "f ", _position_index, np.int64, MOST_TRIANGLES)
-    if vertices is None or faces is None or faces.min(initial=1) < 1 or faces.max(initial=1) >= _MOST_INDEX:
+    vertex_lines: list[str] = []
+    face_lines: list[str] = []
+    own = {"v ": (vertex_lines, MOST_VERTICES), "f ": (face_lines, MOST_TRIANGLES)}
+    for line in io.StringIO(text, newline=None):
+        if (kind := own.get(line[:2])) is not None:
+            lines, most = kind
+            if len(lines) >= most or (not lines and len(line.split(maxsplit=4)) != 4):
+                return None
+            lines.append(line)
+        elif line.split(maxsplit=1)[:1] in (["v"], ["f"]):
+            return None
+    try:
+        faces = np.array(list(map(_position_index, _numbers_of(face_lines))), dtype=np.int64).reshape(-1, 3)
+        if faces.min(initial=1) < 1 or faces.max(initial=1) >= _MOST_INDEX:
+            return None
+        vertices = np.array(list(map(float, _numbers_of(vertex_lines))), dtype=np.float64).reshape(-1, 3)
+    except (ValueError, OverflowError):
         return None
     return Mesh(vertices, faces - 1)
 
 
-def _rows_of(
-    lines: list[str], start: str, number_in: Callable[[str], float], dtype: type, most: int
-) -> np.ndarray | None:
-    """(row, 3) numbers of the lines that start so; None if one has more or fewer, or there are more than ``most``."""
-    own = [line for line in lines if line.startswith(start)]
-    words = "".join(own).split()
-    if len(own) > most or len(words) != 4 * len(own):
-        return None
-    del words[::4]  # where lines have other lengths, a letter is left, which is no number
-    try:
-        return np.array(list(map(number_in, words)), dtype=dtype).reshape(-1, 3)
-    except (ValueError, OverflowError):
-        return None
+def _numbers_of(lines: list[str]) -> list[str]:
+    """The three words behind the letter of each line, one after another. Raises ValueError where there are not three.
+
+    Where lines have other lengths, yet three on average, a letter is left among the words, which is no number.
+    """
+    words = "".join(lines).split(maxsplit=4 * len(lines))
+    if len(words) != 4 * len(lines):
+        raise ValueError("not three numbers in every line")
+    del words[::4]
+    return words
 
 
-def _any_polygons(lines: list[str], path: str | Path) -> Mesh:
+def _any_polygons(text: str, path: str | Path) -> Mesh:
     """Every vertex and polygon of an OBJ file, line by line. Raises BadInput with the number of a wrong line."""
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):
         words = line.split(maxsplit=MOST_CORNERS + 1)
         if not words or words[0] not in ("v", "f"):
             continue

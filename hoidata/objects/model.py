@@ -30,7 +30,10 @@ class Hinge:
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """vertices_m: (vertex, 3); faces: (face, 3) int; part: (vertex,) uint8, 0 = base, 1 = the part the hinge moves."""
+    """vertices_m: (vertex, 3); faces: (face, 3) int; part: (vertex,) uint8, 0 = base, 1 = the part the hinge moves.
+
+    Its arrays are not to be changed: what follows from them is worked out once.
+    """
 
     name: str
     vertices_m: np.ndarray

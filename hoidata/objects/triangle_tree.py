@@ -6,8 +6,9 @@ import numpy as np
 from numba import njit
 
 LEAF = 8
+_NARROWEST = 1e-10  # angle between ab and ac, radians: of 1e-16 the cross product is rounding
 _NO_NORMAL = 1e-3  # of a node's triangles summed up: they cancel each other
-_WIDER = 1e-9  # of the coordinates: more than rounding can take from a turned box
+_WIDER = 1e-9  # of the coordinates: more than rounding can take from a turned box; a search allows for its own
 DEEPEST = 64  # levels a search has room for: triangles are halved, so 2^60 of them would fit
 
 
@@ -32,7 +33,10 @@ class TriangleTree(NamedTuple):
 
 
 def triangle_tree(vertices_m: np.ndarray, faces: np.ndarray) -> TriangleTree:
-    """The tree of a mesh (vertex, 3), (face, 3) with at least one face; triangles without area count as segments."""
+    """The tree of a mesh (vertex, 3), (face, 3) with at least one face.
+
+    Triangles without area count as segments, and so do those so narrow that their normal would be rounding.
+    """
     vertices = np.ascontiguousarray(vertices_m, dtype=np.float64)
     faces = np.ascontiguousarray(faces, dtype=np.int64)
     corners = vertices[faces]
@@ -47,8 +51,9 @@ def _figures(corners_m: np.ndarray) -> np.ndarray:
     normal = np.cross(ab, ac)
     length = np.linalg.norm(normal, axis=1, keepdims=True)
     squares = np.stack([(edge**2).sum(axis=1) for edge in (ab, ac, ac - ab)], axis=1)
+    narrow = length <= _NARROWEST * np.sqrt(squares[:, :1] * squares[:, 1:2])
     inverse = np.divide(1.0, squares, out=np.zeros_like(squares), where=squares > 0)
-    unit = np.divide(normal, length, out=np.zeros_like(normal), where=length > 0)
+    unit = np.divide(normal, length, out=np.zeros_like(normal), where=~narrow)
     return np.ascontiguousarray(np.concatenate([a, ab, ac, unit, inverse], axis=1).T)
 
 

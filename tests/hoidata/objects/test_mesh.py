@@ -7,7 +7,8 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.errors import BadInput
-from hoidata.objects.mesh import load_mesh, mass_properties
+from hoidata.objects import mesh
+from hoidata.objects.mesh import load_mesh, mass_properties, parse_obj
 
 OBJ = """# corners shared between texture seams, out of order, one repeated
 v 1 0 0
@@ -37,12 +38,12 @@ def test_a_polygon_becomes_a_fan(tmp_path: Path):
 
 
 WRITTEN_OTHERWISE = {
-    "carriage returns": lambda text: text.replace("\n", "\r\n"),
     "slashes": lambda text: re.sub(r"^f (\d+) (\d+) (\d+)$", r"f \1/7/8 \2//9 \3/4", text, flags=re.MULTILINE),
     "other records between": lambda text: text.replace("\nf ", "\n# f 1 1 1\nvn 0 0 1\nusemtl v\n\nf "),
     "spaces": lambda text: re.sub(r"^(.) (\S+) ", r"\1   \2  ", text, flags=re.MULTILINE),
     "tabs in some": lambda text: text.replace("v 0.", "v\t0.").replace("f 1", " f\t1"),
     "colours": lambda text: re.sub(r"^(v .*)$", r"\1 0.5 0.5 1", text, flags=re.MULTILINE),
+    "a colour": lambda text: text.replace("\nf", " 0.5 0.5 1 0.5\nf", 1),
     "faces first": lambda text: "\n".join(sorted(text.splitlines(), key=lambda line: line[:1] != "f")),
     "counted from the end": lambda text: re.sub(
         r"^f (\d+)", lambda row: f"f {int(row[1]) - 43}", text, flags=re.MULTILINE
@@ -65,10 +66,25 @@ def test_a_mesh_written_otherwise_is_the_same_mesh(tmp_path: Path, way):
     np.testing.assert_array_equal(load_mesh(other).faces, read.faces)
 
 
-def test_a_wrong_line_is_named_however_many_right_ones_there_are(tmp_path: Path):
-    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 50 + "f 1 2 0\n")
+@pytest.mark.parametrize("ending", ["\r\n", "\r"])
+def test_lines_may_end_as_on_other_systems(ending: str):
+    plain = parse_obj("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "plain")
+    other = parse_obj(f"v 0 0 0{ending}v 1 0 0{ending}v 0 1 0{ending}f 1 2 3", "other")
+    assert [array.tolist() for array in other] == [array.tolist() for array in plain]
+
+
+@pytest.mark.parametrize("corner", [0, 2**31, 2**63, "3.0", "x"])
+def test_a_wrong_line_is_named_however_many_right_ones_there_are(tmp_path: Path, corner):
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\n" + "f 1 2 3\n" * 50 + f"f 1 2 {corner}\n")
     with pytest.raises(BadInput, match=r"a\.obj:54"):
         load_mesh(tmp_path / "a.obj")
+
+
+@pytest.mark.parametrize("limit", ["MOST_VERTICES", "MOST_TRIANGLES"])
+def test_a_mesh_of_too_many_vertices_or_triangles_is_refused(monkeypatch: pytest.MonkeyPatch, limit: str):
+    monkeypatch.setattr(mesh, limit, 3)
+    with pytest.raises(BadInput, match="decimate"):
+        parse_obj("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n" + "f 1 2 3\n" * 5, "a.obj")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian"])
@@ -173,3 +189,12 @@ def test_two_shells_that_enclose_next_to_nothing_are_replaced_by_their_hull():
     facts = mass_properties(vertices, np.concatenate([outer.faces, inner.faces[:, ::-1] + len(outer.vertices)]))
     assert facts.source == "convex hull"
     assert facts.volume_m3 == pytest.approx(0.001)
+
+
+def test_a_thin_solid_across_its_box_is_one():
+    rod = trimesh.creation.cylinder(0.0005, 0.5, sections=6)
+    rod.apply_transform(trimesh.geometry.align_vectors((0, 0, 1), (1, 1, 1)))
+    assert rod.volume < 1e-3 * np.prod(np.ptp(rod.vertices, axis=0))
+    facts = mass_properties(rod.vertices, rod.faces)
+    assert facts.source == "solid"
+    assert facts.volume_m3 == pytest.approx(rod.volume)

@@ -14,7 +14,7 @@ from hoidata.errors import BadInput
 from hoidata.objects.mesh import parse_obj
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.solid import Solid
-from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.objects.surface_index import PartSurface, SurfaceIndex, surface_index
 from tests.builders.objects import box_model, model_of, two_parts
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
@@ -256,3 +256,32 @@ def test_nearest_places_and_gradients_are_those_of_a_ball_and_nothing_is_said_of
     lost = ball.nearest(np.full((1, 1, 3), np.nan), None)
     assert np.isinf(lost.distance_m).all()
     assert np.isnan(lost.closest_m).all()
+
+
+def test_the_nearest_place_beside_a_vertex_is_that_vertex_however_near():
+    rod = trimesh.creation.cylinder(0.03, 0.1, sections=40)
+    surface = PartSurface(rod.vertices, rod.faces, True, 10**9)
+    positions = np.repeat(np.asarray(rod.vertices), 50, axis=0)
+    positions[:, 2] += np.sign(positions[:, 2]) * 10 ** np.random.default_rng(0).uniform(-12, -7, len(positions))
+    found = surface.nearest(positions)
+    np.testing.assert_allclose(found.closest_m, np.repeat(np.asarray(rod.vertices), 50, axis=0), atol=1e-9)
+
+
+# Seeds of which 74, 153 and 1 of 4,000 places were far from the place that was said to be theirs.
+@pytest.mark.parametrize(("seed", "shaken"), [(21, False), (30, False), (183, True)])
+def test_the_nearest_place_on_triangles_as_narrow_as_rounding_is_as_far_as_is_said(seed: int, shaken: bool) -> None:
+    drawn = np.random.default_rng(seed)
+    vertices = np.outer(drawn.normal(size=40), drawn.normal(size=3))  # on a line, but for rounding
+    if shaken:
+        vertices *= 10.0 ** drawn.integers(-3, 3)
+        vertices += drawn.normal(size=3) * drawn.choice([0, 0, 1, 1e3])
+        vertices += drawn.normal(size=vertices.shape) * 10.0 ** drawn.uniform(-18, -3)
+    faces = drawn.integers(0, 40, (60, 3))
+    corners, size = vertices[faces], np.ptp(vertices, axis=0).max()
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True) + 1e-300
+    near = drawn.integers(0, 60, 4000)
+    positions = corners[near, 0] + normals[near] * size * 10 ** drawn.uniform(-6, 0, (4000, 1))
+    found = PartSurface(vertices, faces, False, 10**9).nearest(positions)
+    apart = np.linalg.norm(positions - found.closest_m, axis=1)
+    np.testing.assert_allclose(apart, found.distance_m, atol=1e-6 * size)
