@@ -9,6 +9,7 @@ import trimesh
 
 from hoidata.errors import BadInput
 from hoidata.objects.ply import MOST_CORNERS, MOST_TRIANGLES, MOST_VERTICES, parse_ply
+from hoidata.objects.solid import encloses
 
 LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen times as much when read
 _MOST = f"at most {MOST_VERTICES} vertices, {MOST_TRIANGLES} triangles and {MOST_CORNERS} corners of one face"
@@ -176,9 +177,7 @@ def mass_properties(vertices_m: np.ndarray, faces: np.ndarray) -> MassProperties
     """
     mesh = trimesh.Trimesh(vertices_m, faces, process=True)
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is flat, trimesh divides by no volume
-        volume, box = abs(mesh.volume), float(np.prod(np.ptp(mesh.vertices, axis=0)))
-        # The hull lies in the mesh's box, and a hull of 100,000 places takes seconds.
-        solid = mesh.is_watertight and (volume > 1e-3 * box or volume > 1e-3 * mesh.convex_hull.volume)
+        solid = mesh.is_watertight and encloses(np.asarray(mesh.vertices), np.asarray(mesh.faces))
         used = mesh if solid else mesh.convex_hull
         if used.volume < 0:
             used.invert()
