@@ -89,10 +89,9 @@ def _distances(clip: Clip, points_m: np.ndarray) -> np.ndarray:
     track, model = clip.object, clip.object.model
     local = track.world_from_object.inverse() @ points_m
     nearest = np.full(local.shape[:2], np.inf)
-    for part in np.unique(model.face_part):
-        faces = model.faces[model.face_part == part]
-        in_part = model.object_from_part(int(part), track.hinge_rad).inverse() @ local
-        found = closest_points(model.vertices_m, faces, in_part.reshape(-1, 3)).distance_m
+    for part in model.parts:
+        in_part = model.object_from_part(part, track.hinge_rad).inverse() @ local
+        found = closest_points(model.vertices_m, model.faces_of(part), in_part.reshape(-1, 3)).distance_m
         nearest = np.minimum(nearest, found.reshape(nearest.shape))
     return nearest
 

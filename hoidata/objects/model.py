@@ -10,6 +10,9 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import IDENTITY, RigidTransform
 from hoidata.objects.mesh import MassProperties, mass_properties
+from hoidata.objects.solid import NoSolid, Solid, close_cut, solid_of
+
+SEAM = 2  # in ``ObjectModel.face_part``: a triangle with corners on both parts
 
 
 @dataclass(frozen=True)
@@ -45,24 +48,63 @@ class ObjectModel:
     def is_articulated(self) -> bool:
         return self.hinge is not None
 
-    @property
+    @cached_property
     def face_part(self) -> np.ndarray:
-        """(face,) part of each face: the moving part when at least two of its vertices move."""
-        return (self.part[self.faces].sum(axis=1) >= 2).astype(np.uint8)
+        """(face,) uint8, the part of each face; ``SEAM`` where its corners are on both parts, so that it is on neither.
+
+        A triangle between two parts cannot move with either: its corners would be off by the motion of the hinge.
+        """
+        if not self.is_articulated:
+            return np.zeros(len(self.faces), np.uint8)
+        corners = self.part[self.faces]
+        return np.where((corners == corners[:, :1]).all(axis=1), corners[:, 0], SEAM).astype(np.uint8)
 
     @property
     def parts(self) -> list[int]:
-        """The parts that have faces; of a rigid object one, which all its faces belong to."""
-        return [int(part) for part in np.unique(self.face_part)] if self.is_articulated else [0]
+        """The parts that have faces, in order; [0] for a rigid object."""
+        return [int(part) for part in np.unique(self.face_part) if part != SEAM] if self.is_articulated else [0]
+
+    @property
+    def seam_triangles(self) -> int:
+        """How many triangles span both parts. No part has them; distances and sampled points leave them out."""
+        return int((self.face_part == SEAM).sum())
 
     def faces_of(self, part: int) -> np.ndarray:
-        """(face, 3) those of one part."""
+        """(face, 3) faces of one part."""
         return self.faces[self.face_part == part] if self.is_articulated else self.faces
+
+    def closed_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices (vertex, 3) and faces (face, 3) of one part, closed where the other part was cut off it.
+
+        A surface without such a cut is returned as it is stored. The closing triangles bound a volume; they are not
+        part of the object's surface.
+        """
+        return self._closed_parts[part]
+
+    @cached_property
+    def _closed_parts(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        return {
+            part: close_cut(self.vertices_m, self.faces_of(part), self.faces[self.face_part != part])
+            for part in self.parts
+        }
+
+    @cached_property
+    def solids(self) -> dict[int, Solid | NoSolid]:
+        """By part, the solid that it bounds, or why it bounds none. Raises BadInput for a mesh without triangles."""
+        return {part: solid_of(*self.closed_part(part)) for part in self.parts}
+
+    def filled_part(self, part: int) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and faces that volumes and the sign of distances are computed from: the part's solid, if any.
+
+        An open mesh, and a solid that needed no repair, are returned as ``closed_part`` has them.
+        """
+        solid = self.solids[part]
+        return solid[:2] if isinstance(solid, Solid) and solid.repairs else self.closed_part(part)
 
     @cached_property
     def masses(self) -> tuple[MassProperties, ...]:
-        """Mass, centre and inertia of each of ``parts``, worked out once."""
-        return tuple(mass_properties(self.vertices_m, self.faces_of(part)) for part in self.parts)
+        """Mass, centre and inertia of each of ``parts``."""
+        return tuple(mass_properties(*self.filled_part(part)) for part in self.parts)
 
     @cached_property
     def digest(self) -> str:

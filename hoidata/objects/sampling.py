@@ -13,7 +13,7 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rows import distinct_rows
 from hoidata.objects.distance import face_normals
 from hoidata.objects.farthest import farthest_points
-from hoidata.objects.model import ObjectModel
+from hoidata.objects.model import SEAM, ObjectModel
 
 POINT_COUNT = 1024
 LONGEST_EDGE_M = 0.02
@@ -47,6 +47,7 @@ def sample_points(model: ObjectModel, count: int = POINT_COUNT) -> SampledPoints
 
     "vertices-fps": from the vertices, starting at the first, where at least ``count`` distinct ones lie on faces and no
     edge is longer than 2 cm. "surface-fps": from ``32 count`` points spread over the faces in proportion to area.
+    Triangles that span both parts of a hinged object hold no point but a vertex.
     Raises BadInput for a mesh without area.
     """
     corners = np.asarray(model.vertices_m, dtype=np.float64)[model.faces]
@@ -98,6 +99,7 @@ def _vertex_normals(model: ObjectModel) -> np.ndarray:
 
 
 def _from_surface(model: ObjectModel, corners: np.ndarray, count: int) -> SampledPoints:
+    corners = np.where((model.face_part == SEAM)[:, None, None], corners[:, :1], corners)  # no area, so no point
     face, barycentric = _spread_over_faces(corners, DENSE_FACTOR * count)
     dense = np.einsum("pc,pcx->px", barycentric, corners[face])
     chosen = farthest_points(dense, count)

@@ -156,15 +156,15 @@ def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.nda
 
     An object without the part is far away from everything.
     """
-    faces = model.faces_of(part)
-    if not len(faces) or (part == 1 and not model.is_articulated):
+    if part not in model.parts:
         values = np.zeros((resolution**3, 4), np.float32)
         values[:, 0] = FAR_M
         return values, np.full(3, -1.0), np.full(3, 1.0)
-    corners = model.vertices_m[faces].reshape(-1, 3)
+    vertices_m, faces = model.filled_part(part)
+    corners = vertices_m[faces].reshape(-1, 3)
     low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
     x, y, z = (np.linspace(low[axis], high[axis], resolution) for axis in range(3))
-    grid = SignedDistanceGrid.build(model.vertices_m, faces, (x, y, z))
+    grid = SignedDistanceGrid.build(vertices_m, faces, (x, y, z))
     values = np.concatenate((grid.distance_m[..., None], grid.offset_m), axis=-1)
     return values.reshape(-1, 4).astype(np.float32), low, high
 

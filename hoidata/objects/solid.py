@@ -5,6 +5,7 @@ out, and holes that a patch of 1 % of the surface closes. A cup drawn as one ope
 thick it is.
 """
 
+from collections import defaultdict
 from typing import NamedTuple
 
 import igl
@@ -77,11 +78,27 @@ def encloses(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
     return volume > LEAST_SHARE * hull
 
 
+def close_cut(vertices_m: np.ndarray, faces: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a part (face, 3), closed by fans where ``neighbours`` (face, 3) were cut off it.
+
+    vertices_m: (vertex, 3) of the whole mesh; the fans' centres come after them. A hole is a cut where a neighbour
+    meets one of its edges; cuts are closed whatever their size. Other holes stay.
+    """
+    first, number = distinct_rows(np.ascontiguousarray(vertices_m, dtype=np.float64))
+    holes = _holes(number[faces]) if len(neighbours) else None
+    if not holes:
+        return vertices_m, faces
+    edges, unmatched = unmatched_edges(number[neighbours])
+    met = edges[unmatched > 0] @ (len(first), 1)
+    cuts = [first[hole] for hole in holes if np.isin(hole * len(first) + np.roll(hole, -1), met).any()]
+    return _patched(vertices_m, faces, cuts) if cuts else (vertices_m, faces)
+
+
 def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The mesh with every hole closed by a fan about the middle of its edge, whatever its size: a hand at its wrist.
 
     vertices_m: (..., vertex, 3), any number of poses; faces: (face, 3). The fans' middles come after the mesh's own
-    vertices. Raises ValueError where holes share a vertex.
+    vertices. Raises ValueError where an edge has more than two triangles.
     """
     holes = _holes(faces)
     if holes is None:
@@ -90,19 +107,27 @@ def patched_holes(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray
 
 
 def _holes(faces: np.ndarray) -> list[np.ndarray] | None:
-    """Vertices around each hole, in the order a patch's triangles run; None where holes share a vertex."""
+    """Vertices around each hole, in the order a patch's triangles run; None where an edge is open more than once.
+
+    Holes that share a vertex are told apart there, so that no hole passes a vertex twice.
+    """
     edges, unmatched = unmatched_edges(faces)
-    stop, start = edges[unmatched > 0].T  # a patch runs against the triangles beside it
-    if unmatched.max(initial=0) > 1 or len(np.unique(start)) < len(start) or len(np.unique(stop)) < len(stop):
+    if unmatched.max(initial=0) > 1:
         return None
-    after, holes = dict(zip(start.tolist(), stop.tolist(), strict=True)), []
-    while after:
-        hole = [min(after)]
-        while hole[-1] in after:
-            hole.append(after.pop(hole[-1]))
-        if hole.pop() != hole[0]:
-            return None
-        holes.append(np.array(hole))
+    after: defaultdict[int, list[int]] = defaultdict(list)
+    for stop, start in edges[unmatched > 0].tolist():  # a patch runs against the triangles next to it
+        after[start].append(stop)
+    holes: list[np.ndarray] = []
+    for start in sorted(after):
+        path = [start]
+        while after[path[-1]]:
+            vertex = after[path[-1]].pop()
+            if vertex not in path:
+                path.append(vertex)
+                continue
+            first = path.index(vertex)
+            holes.append(np.array(path[first:]))
+            del path[first + 1 :]
     return holes
 
 

@@ -15,6 +15,7 @@ from hoidata.objects.model import ObjectModel
 
 COARSE_SAMPLES = 9
 _REFINEMENTS = 2
+Surface = tuple[np.ndarray, np.ndarray]  # vertices (vertex, 3) in metres, faces (face, 3)
 _ON_SURFACE_M = 1e-6  # nearer than this the direction to the surface is rounding; the triangle's normal is used
 
 
@@ -100,16 +101,16 @@ def capsule_contacts(
 def _part_contacts(
     model: ObjectModel, part: int, world_from_part: RigidTransform, capsules: Capsules, tolerance_m: float
 ) -> CapsuleContacts:
-    faces = model.faces_of(part)
+    surface = model.filled_part(part)
     start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
-    frame, capsule = _candidates(model.vertices_m[np.unique(faces)], start, end, capsules.radius_m + tolerance_m)
+    frame, capsule = _candidates(surface[0][np.unique(surface[1])], start, end, capsules.radius_m + tolerance_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
     half = np.linalg.norm(end - start, axis=1) / 2
-    middle = _distances(model, faces, (start + end) / 2)
+    middle = _distances(surface, (start + end) / 2)
     near = middle[0] < half + radius + tolerance_m
     frame, capsule, start, end, radius = (column[near] for column in (frame, capsule, start, end, radius))
-    along = _deepest(model, faces, start, end)
-    deepest = _distances(model, faces, start + along[:, None] * (end - start))
+    along = _deepest(surface, start, end)
+    deepest = _distances(surface, start + along[:, None] * (end - start))
     hit = deepest[0] < radius + tolerance_m
     frame, world = frame[hit], world_from_part[frame[hit]]
     places = deepest[1][hit], deepest[2][hit], middle[1][near][hit], middle[2][near][hit]
@@ -130,29 +131,29 @@ def _candidates(
     return frame, capsule
 
 
-def _deepest(model: ObjectModel, faces: np.ndarray, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _deepest(surface: Surface, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(segment,) position on each axis, 0 to 1, where the signed distance is least."""
     grid = np.linspace(0, 1, COARSE_SAMPLES)
     along = np.broadcast_to(grid, (len(start), COARSE_SAMPLES))
     step = grid[1]
     for _ in range(_REFINEMENTS):
-        best = _least(model, faces, start, end, along)
+        best = _least(surface, start, end, along)
         step /= 4
         along = np.clip(best[:, None] + step * np.arange(-4, 5), 0, 1)
-    return _least(model, faces, start, end, along)
+    return _least(surface, start, end, along)
 
 
-def _least(model: ObjectModel, faces: np.ndarray, start: np.ndarray, end: np.ndarray, along: np.ndarray) -> np.ndarray:
+def _least(surface: Surface, start: np.ndarray, end: np.ndarray, along: np.ndarray) -> np.ndarray:
     points = start[:, None] + along[:, :, None] * (end - start)[:, None]
-    distance = _distances(model, faces, points.reshape(-1, 3))[0].reshape(along.shape)
+    distance = _distances(surface, points.reshape(-1, 3))[0].reshape(along.shape)
     return along[np.arange(len(along)), distance.argmin(axis=1)]
 
 
-def _distances(model: ObjectModel, faces: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _distances(surface: Surface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distance, nearest surface point, and the gradient of the distance, of points in the part's frame."""
     if not len(points):
         return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
-    found = signed_distance(model.vertices_m, faces, points)
+    found = signed_distance(*surface, points)
     away = np.abs(found.distance_m) > _ON_SURFACE_M
     gradient = found.normal.copy()
     gradient[away] = (points[away] - found.closest_m[away]) / found.distance_m[away, None]

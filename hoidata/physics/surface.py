@@ -44,7 +44,7 @@ def surface_distances(
     best = SurfaceDistances(np.full(shape, np.inf), np.zeros((*shape, 3)), np.zeros((*shape, 3)))
     for part in model.parts:
         object_from_part = model.object_from_part(part, hinge_rad)
-        found = _part_distances(model, model.faces_of(part), object_from_part, points_m, reach_m)
+        found = _part_distances(*model.filled_part(part), object_from_part, points_m, reach_m)
         nearer = found.distance_m < best.distance_m
         for mine, new in zip(best, found, strict=True):
             mine[nearer] = new[nearer]
@@ -52,15 +52,19 @@ def surface_distances(
 
 
 def _part_distances(
-    model: ObjectModel, faces: np.ndarray, object_from_part: RigidTransform, points_m: np.ndarray, reach_m: float
+    vertices_m: np.ndarray,
+    faces: np.ndarray,
+    object_from_part: RigidTransform,
+    points_m: np.ndarray,
+    reach_m: float,
 ) -> SurfaceDistances:
     local = object_from_part.inverse() @ points_m
-    used = model.vertices_m[np.unique(faces)]
+    used = vertices_m[np.unique(faces)]
     near = ((local > used.min(0) - reach_m) & (local < used.max(0) + reach_m)).all(-1)
     distance = np.full(points_m.shape[:2], np.inf)
     closest, normal = np.zeros(points_m.shape), np.zeros(points_m.shape)
     if near.any():
-        found = signed_distance(model.vertices_m, faces, local[near])
+        found = signed_distance(vertices_m, faces, local[near])
         distance[near], closest[near], normal[near] = found.distance_m, found.closest_m, found.normal
         distance[distance > reach_m] = np.inf
     return SurfaceDistances(distance, object_from_part @ closest, object_from_part.turn(normal))

@@ -10,6 +10,7 @@ from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
+from hoidata.objects.solid import Solid
 from hoidata.quality import motion
 from hoidata.quality.meshes import SurfaceFacts, part_facts
 from hoidata.quality.penetration import depths_m
@@ -46,7 +47,7 @@ class ObjectFacts:
 
     @property
     def solid_parts(self) -> list[int]:
-        return [part for part, surface in self.surfaces.items() if surface.is_solid]
+        return [part for part, solid in self.model.solids.items() if isinstance(solid, Solid)]
 
 
 def object_row(facts: ObjectFacts) -> dict[str, Any]:
@@ -55,6 +56,7 @@ def object_row(facts: ObjectFacts) -> dict[str, Any]:
     return {
         "parts": len(facts.surfaces),
         "faces": len(facts.model.faces),
+        "seam_triangles": facts.model.seam_triangles,
         "watertight": all(surface.open_edge_share == 0 for surface in surfaces),
         "solid": len(facts.solid_parts) == len(facts.surfaces),
         "volume_m3": sum(surface.volume_m3 for surface in surfaces),
@@ -79,6 +81,7 @@ def clip_row(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Thresh
         **_penetration(clip, facts, hands, thresholds),
         **_offset(clip, joints, facts, thresholds),
         "largest_beta": max((largest_beta(meant_betas(clip.hands[side])) for side in seen), default=NAN),
+        "seam_triangles": facts.model.seam_triangles,
         "gap_share": max(motion.gap_share(flags) for flags in valid.values()),
         "handless_share": float((~(valid["left"] | valid["right"])).mean()),
         **{f"{side}_invalid_share": float((~flags).mean()) for side, flags in valid.items()},

@@ -12,7 +12,6 @@ from hoidata.objects.distance import unmatched_edges, volume_m3
 from hoidata.objects.model import ObjectModel
 
 SLIVER = 1e-6
-SOLID_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,6 @@ class SurfaceFacts:
         """1 - volume / convex hull: 1 for a surface that encloses nothing, above 1 for one turned inside out."""
         return 1.0 - self.volume_m3 / self.hull_m3 if self.hull_m3 > 0 else 1.0
 
-    @property
-    def is_solid(self) -> bool:
-        """Watertight and enclosing more than 0.1 % of its hull, so that "inside" has a meaning."""
-        return self.open_edge_share == 0 and abs(self.volume_m3) > SOLID_SHARE * self.hull_m3
-
 
 def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
     """Facts of the mesh (vertex, 3), (face, 3), metres."""
@@ -58,8 +52,8 @@ def surface_facts(vertices_m: np.ndarray, faces: np.ndarray) -> SurfaceFacts:
 
 
 def part_facts(model: ObjectModel) -> dict[int, SurfaceFacts]:
-    """Facts of each part, by its number; one, 0, for a rigid object."""
-    return {part: surface_facts(model.vertices_m, model.faces_of(part)) for part in model.parts}
+    """Facts of each part, by its number, with the cut at the hinge closed; one, 0, for a rigid object."""
+    return {part: surface_facts(*model.closed_part(part)) for part in model.parts}
 
 
 def _open_edge_share(faces: np.ndarray) -> float:

@@ -23,7 +23,7 @@ def depths_m(
     depth = np.zeros(len(points_m))
     for part in parts:
         local = model.object_from_part(part, hinge_rad).inverse() @ points_m
-        depth = np.maximum(depth, _depths_in(model.vertices_m, model.faces_of(part), local))
+        depth = np.maximum(depth, _depths_in(*model.filled_part(part), local))
     return depth
 
 

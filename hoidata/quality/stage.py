@@ -45,12 +45,12 @@ CLIPS = pa.schema(
         *((measure.name, _NUMBER) for measure in CLIP_MEASURES),
         *((f"{side}_invalid_share", _NUMBER) for side in SIDES),
         ("time_offset_confidence", _NUMBER),
-        *((name, _COUNT) for name in ("time_offset_samples", "hand_jump_frame", "object_jump_frame")),
+        *((name, _COUNT) for name in ("time_offset_samples", "hand_jump_frame", "object_jump_frame", "seam_triangles")),
     ]
 )
 MESHES = pa.schema(
     [
-        *(("object", _TEXT), *_JUDGED, ("parts", _COUNT), ("faces", _COUNT)),
+        *(("object", _TEXT), *_JUDGED, ("parts", _COUNT), ("faces", _COUNT), ("seam_triangles", _COUNT)),
         *(("watertight", pa.bool_()), ("solid", pa.bool_()), ("volume_m3", _NUMBER)),
         *((measure.name, _NUMBER) for measure in MESH_MEASURES),
     ]

@@ -91,7 +91,7 @@ def paint_values(
     """
     model = clip.object.model
     parts = []
-    for part in sorted(set(model.face_part.tolist())):
+    for part in model.parts:
         numbers = np.flatnonzero(points.part == part)
         origin = model.hinge.origin_m if part == 1 and model.hinge is not None else np.zeros(3)
         local = np.round((points.points_m[numbers] - origin) * 1e4).astype(int)

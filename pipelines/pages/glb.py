@@ -171,16 +171,15 @@ def _add_object(
     node = builder.node(name, world)
     builder.animate(node, "translation", times, track.translation_m)
     builder.animate(node, "rotation", times, continuous_quaternions(track.rotvec))
-    face_part = model.face_part
     base_colour = OTHER_OBJECT_COLOUR if other else OBJECT_COLOUR
-    _add_part(builder, node, model, model.faces[face_part == 0], 0, base_colour, contact)
+    _add_part(builder, node, model, model.faces_of(0), 0, base_colour, contact)
     if model.hinge is None or track.hinge_rad is None:
         return
     part = builder.node(f"{name} moving part", node, translation=np.float32(model.hinge.origin_m).tolist())
     angles = model.hinge.axis[None] * np.asarray(track.hinge_rad)[:, None]
     builder.animate(part, "rotation", times, continuous_quaternions(angles))
     colour = OTHER_OBJECT_COLOUR if other else MOVING_PART_COLOUR
-    _add_part(builder, part, model, model.faces[face_part == 1], 1, colour, contact)
+    _add_part(builder, part, model, model.faces_of(1), 1, colour, contact)
 
 
 def _add_part(

@@ -25,10 +25,12 @@ from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
 from hoidata.hands import HandPair
+from hoidata.objects.mesh import Mesh
 from hoidata.objects.model import Hinge, ObjectModel
 
 MILLIMETRES = 1e-3
 TOPS = ("", "data/", "arctic_data/data/")
+PARTS_ALIGNED_MM = 5.0  # top.obj and bottom.obj have a topology of their own
 HINGE_AXIS = (0.0, 0.0, -1.0)
 FRAME = WorldFrame("+z", "stated", "ARCTIC's motion-capture world, right-handed, z up, metres")
 CONVENTION = HandConvention(
@@ -49,6 +51,12 @@ MOTION_PARTS = (
     DatasetPart("hand motion", _below_tops("raw_seqs/s*/*.mano.npy"), "raw_seqs.zip"),
     DatasetPart("object meshes", _below_tops("meta/object_vtemplates/*/mesh.obj"), "meta.zip"),
     DatasetPart("parts of the objects", _below_tops("meta/object_vtemplates/*/parts.json"), "meta.zip"),
+    DatasetPart(
+        "separate meshes of the parts",
+        _below_tops("meta/object_vtemplates/*/bottom.obj", "meta/object_vtemplates/*/top.obj"),
+        "meta.zip",
+        optional=True,
+    ),
     DatasetPart("head camera", _below_tops("raw_seqs/s*/*.egocam.dist.npy"), "raw_seqs.zip", optional=True),
     DatasetPart("bodies", _below_tops("raw_seqs/s*/*.smplx.npy"), "raw_seqs.zip", optional=True),
     DatasetPart("image offsets", _below_tops("meta/misc.json"), "meta.zip", optional=True),
@@ -272,10 +280,36 @@ def _hand(where: str, block: Any, side: Side, hands: HandPair) -> HandTrack:
 
 
 def _object_model(raw: RawTree, name: str) -> ObjectModel:
-    mesh_path = _found(raw, f"meta/object_vtemplates/{name}/mesh.obj")
-    part_path = _found(raw, f"meta/object_vtemplates/{name}/parts.json")
+    """The object's bottom.obj and top.obj where the release has both, else mesh.obj divided by parts.json."""
+    folder = f"meta/object_vtemplates/{name}"
+    mesh_path = _found(raw, f"{folder}/mesh.obj")
+    part_path = _found(raw, f"{folder}/parts.json")
     mesh = raw_mesh(raw, mesh_path)
     is_base = parse_parts(raw.read(part_path), part_path, len(mesh.vertices))
+    part_paths = [_found(raw, f"{folder}/{half}.obj") for half in ("bottom", "top")]
+    if all(raw.has(path) for path in part_paths):
+        mesh, is_base = _parts_joined([raw_mesh(raw, path) for path in part_paths], part_paths, mesh, mesh_path)
     hinge = Hinge(axis=np.array(HINGE_AXIS), origin_m=np.zeros(3))
-    part = (~is_base).astype(np.uint8)
-    return ObjectModel(name, mesh.vertices * MILLIMETRES, mesh.faces, part, hinge)
+    return ObjectModel(name, mesh.vertices * MILLIMETRES, mesh.faces, (~is_base).astype(np.uint8), hinge)
+
+
+def _parts_joined(parts: list[Mesh], part_paths: list[str], whole: Mesh, whole_path: str) -> tuple[Mesh, np.ndarray]:
+    """Base and moving part as one mesh, and which vertices (vertex,) are the base's.
+
+    Raises BadInput where their bounding box is not that of the whole object's mesh, in millimetres.
+    """
+    base, moving = parts
+    joined = Mesh(
+        np.concatenate([base.vertices, moving.vertices]),
+        np.concatenate([base.faces, moving.faces + len(base.vertices)]),
+    )
+    boxes = [np.stack([mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)]) for mesh in (joined, whole)]
+    difference_mm = float(np.abs(boxes[0] - boxes[1]).max())
+    if difference_mm > PARTS_ALIGNED_MM:
+        raise BadInput(
+            ", ".join(part_paths),
+            f"parts with the bounding box of {whole_path}, within {PARTS_ALIGNED_MM:g} mm",
+            f"a difference of {difference_mm:.3g} mm",
+            "remove both files to use mesh.obj and parts.json, or download them again",
+        )
+    return joined, np.arange(len(joined.vertices)) < len(base.vertices)

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.model import ObjectModel
+from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import SampledPoints, sample_points
 from tests.builders.objects import model_of, two_parts
 
@@ -92,10 +92,7 @@ def test_a_mesh_without_area_is_refused() -> None:
         sample_points(ObjectModel("line", np.zeros((3, 3)), np.array([[0, 1, 2]]), np.zeros(3, np.uint8)))
 
 
-def test_a_face_moves_with_the_hinge_when_two_of_its_corners_do() -> None:
-    faces = np.array([[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 5]])
-    model = ObjectModel("strip", np.zeros((6, 3)), faces, np.array([0, 0, 0, 1, 1, 1], np.uint8))
-    assert model.face_part.tolist() == [0, 0, 1, 1]
+UP = Hinge(np.array([0.0, 0.0, 1.0]), np.zeros(3))
 
 
 def grid(columns: int, rows: int, longest_edge_m: float) -> ObjectModel:
@@ -125,7 +122,7 @@ def test_vertices_serve_from_1024_of_them_and_up_to_edges_of_2_cm(columns, rows,
 def test_vertices_at_the_seam_of_two_parts_take_a_face_of_their_own() -> None:
     sphere = trimesh.creation.icosphere(4, radius=0.05)
     part = (sphere.vertices[:, 2] > 0).astype(np.uint8)
-    model = ObjectModel("split", np.array(sphere.vertices), np.array(sphere.faces), part)
+    model = ObjectModel("split", np.array(sphere.vertices), np.array(sphere.faces), part, UP)
     points = sample_points(model)
     np.testing.assert_array_equal(points.part, points.points_m[:, 2] > 0)
     np.testing.assert_array_equal(model.face_part[points.face], points.part)

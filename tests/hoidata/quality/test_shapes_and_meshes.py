@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.solid import NoSolid, Solid, solid_of
 from hoidata.objects.surface_index import surface_index
 from hoidata.quality.meshes import part_facts, surface_facts
 from hoidata.quality.penetration import depths_m
@@ -12,6 +13,10 @@ from hoidata.quality.shape import distances_to_others, largest_beta
 from tests.builders.objects import box_model, model_of, two_parts
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
+
+
+def is_solid(faces: np.ndarray) -> bool:
+    return isinstance(solid_of(BOX.vertices, faces), Solid)
 
 
 def test_largest_beta_counts_either_way():
@@ -47,7 +52,7 @@ def test_box_is_solid_and_its_volume_its_own():
     assert facts.volume_m3 == pytest.approx(0.006)
     assert facts.hull_m3 == pytest.approx(0.006)
     assert (facts.open_edge_share, facts.shells, facts.degenerate_share) == (0, 1, 0)
-    assert facts.is_solid
+    assert is_solid(BOX.faces)
     assert facts.unfilled_share == pytest.approx(0, abs=1e-9)
 
 
@@ -60,7 +65,7 @@ def test_vertices_split_along_seams_do_not_open_a_surface():
 def test_missing_triangle_opens_three_edges():
     facts = surface_facts(BOX.vertices, BOX.faces[1:])
     assert facts.open_edge_share == pytest.approx(3 / 33)
-    assert not facts.is_solid
+    assert not is_solid(BOX.faces[1:])
 
 
 def test_collapsed_triangle_is_no_edge_of_the_surface():
@@ -75,15 +80,17 @@ def test_triangle_turned_round_leaves_three_pairs_of_edges_without_an_opposite()
 
 
 def test_inside_out_and_empty_surfaces_are_told_apart_from_filled_ones():
-    inside_out = surface_facts(BOX.vertices, BOX.faces[:, ::-1])
-    both = surface_facts(BOX.vertices, np.concatenate([BOX.faces, BOX.faces[:, ::-1]]))
-    flat = surface_facts(np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]]))
+    turned, doubled = BOX.faces[:, ::-1], np.concatenate([BOX.faces, BOX.faces[:, ::-1]])
+    triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]), np.array([[0, 1, 2], [0, 2, 1]])
+    inside_out, both, flat = (
+        surface_facts(*mesh) for mesh in ((BOX.vertices, turned), (BOX.vertices, doubled), triangle)
+    )
     assert inside_out.unfilled_share == pytest.approx(2)
-    assert inside_out.is_solid
+    assert is_solid(turned)
     assert both.unfilled_share == pytest.approx(1)
-    assert not both.is_solid
+    assert is_solid(doubled)  # one surface, drawn once for each side
     assert flat.unfilled_share == 1
-    assert not flat.is_solid
+    assert isinstance(solid_of(*triangle), NoSolid)
 
 
 def test_separate_pieces_are_shells():

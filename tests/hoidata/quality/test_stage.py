@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips import Clip
@@ -18,6 +19,7 @@ from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import get_adapter
 from hoidata.errors import MissingResource
 from hoidata.hands import load_embedded_hands
+from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.quality import stage
 from hoidata.quality.stage import quality_store
 from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds
@@ -84,6 +86,24 @@ def test_every_clip_and_object_has_its_verdict_its_reasons_and_null_where_nothin
     assert left_out_reasons(tmp_path / "quality") == {"test/s1/1": f"left out by quality control: {jump}"}
     with pytest.raises(MissingResource, match="stage 'quality'"):
         left_out_reasons(tmp_path / "elsewhere")
+
+
+def test_penetration_is_measured_in_an_object_divided_by_part_labels(make_clip, tmp_path):
+    """A closed mesh cut by the parts of its vertices has no hole at the cut; the triangles across it are counted."""
+    clip = make_clip(FRAMES, seed=3, clip_id="test/s1/0")
+    mesh = trimesh.Trimesh(clip.object.model.vertices_m, clip.object.model.faces).subdivide().subdivide()
+    part = (mesh.vertices[:, 2] > mesh.centroid[2] + 1e-6).astype(np.uint8)
+    hinge = Hinge(np.array([1.0, 0.0, 0.0]), np.zeros(3))
+    model = ObjectModel("divided", np.array(mesh.vertices), np.array(mesh.faces), part, hinge)
+    track = replace(clip.object, model=model, hinge_rad=np.zeros(FRAMES, np.float32))
+    write_clips(tmp_path / "clips", [replace(clip, object=track)])
+    quality_store(tmp_path / "clips", tmp_path / "quality", progress=False)
+    clips, meshes = tables(tmp_path / "quality")
+    assert clips["note"].tolist() == [""]
+    assert clips["penetration_m"].notna().all()
+    assert clips["seam_triangles"].tolist() == meshes["seam_triangles"].tolist() == [model.seam_triangles]
+    assert model.seam_triangles > 0
+    assert meshes["solid"].tolist() == [True]
 
 
 def test_mesh_that_is_left_out_takes_its_clips_with_it(clips_folder, tmp_path):

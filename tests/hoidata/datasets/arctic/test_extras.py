@@ -51,6 +51,37 @@ def test_the_body_is_left_out_until_it_is_asked_for(root, load_all):
     assert clip.body.expression is None
 
 
+def write_parts(root: Path, scale: float = 1.0, names: tuple[str, ...] = ("bottom", "top")) -> None:
+    """Meshes of both parts with another topology than mesh.obj: a vertex more, in the middle of each."""
+    quads = {"bottom": recording.BOTTOM_MM, "top": recording.TOP_MM}
+    for name in names:
+        corners = np.array([*quads[name], np.mean(quads[name], axis=0)]) * scale
+        lines = [f"v {x} {y} {z}" for x, y, z in corners] + [f"f {a} {a % 4 + 1} 5" for a in range(1, 5)]
+        path = root / "meta" / "object_vtemplates" / "box" / f"{name}.obj"
+        path.write_text("\n".join(lines) + "\n")
+
+
+def test_the_release_s_separate_parts_are_used_where_both_are_there(root, load_all):
+    whole = first(load_all, root).object.model
+    write_parts(root, names=("top",))
+    np.testing.assert_array_equal(first(load_all, root).object.model.vertices_m, whole.vertices_m)
+    write_parts(root)
+    model = first(load_all, root).object.model
+    assert model.part.tolist() == [0] * 5 + [1] * 5
+    assert (len(model.faces_of(0)), len(model.faces_of(1)), model.seam_triangles) == (4, 4, 0)
+    np.testing.assert_allclose(model.vertices_m[:4], np.array(recording.BOTTOM_MM) / 1000)
+    np.testing.assert_allclose(model.vertices_m[5:9], np.array(recording.TOP_MM) / 1000)
+
+
+def test_separate_parts_in_another_unit_than_mesh_obj_are_refused_by_name(root, load_all):
+    write_parts(root, scale=0.001)
+    with pytest.raises(
+        BadInput, match=r"box of meta/object_vtemplates/box/mesh.obj, within 5 mm, got .* 200 mm"
+    ) as caught:
+        load_all(ArcticAdapter(), root)
+    assert caught.value.where.endswith("box/bottom.obj, meta/object_vtemplates/box/top.obj")
+
+
 def test_whole_sequences_need_no_description_and_have_no_verb(root, load_all):
     shutil.rmtree(root / "description")
     clip = first(load_all, root, clips="whole")
