@@ -70,6 +70,11 @@ class ClipSample:
         return len(self.object)
 
     @property
+    def is_tracked(self) -> bool:
+        """Whether the hands that take part are tracked in every frame, so that their motion can be copied."""
+        return bool(self.valid[self.active_hands].all())
+
+    @property
     def key(self) -> tuple[str, int, int]:
         """What tells it from all other samples of a dataset: its clip and which of its frames."""
         return self.clip_id, self.start, self.length
@@ -189,7 +194,7 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
         joints_m=joints.astype(np.float32),
         valid=np.stack([track.valid for track in tracks]).astype(bool),
         active_hands=active_hands,
-        betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
+        betas=np.stack([track.mean_betas for track in tracks]).astype(np.float32),
         template_m=_templates(tracks),
         text=np.asarray(annotated.text_embedding(clip_id), dtype=np.float32),
         points=points,

@@ -57,6 +57,13 @@ class HandTrack(Track):
     def n_frames(self) -> int:
         return len(self.wrist_m)
 
+    @property
+    def mean_betas(self) -> np.ndarray:
+        """(10,) one shape for the clip: the mean over the valid frames, over all where none is."""
+        if len(self.betas) == 1 or not self.valid.any():
+            return self.betas.mean(axis=0)
+        return self.betas[self.valid].mean(axis=0)
+
     def take(self, frames: Frames) -> "HandTrack":
         """Some frames of it; one shape for the whole clip stays one shape."""
         return replace(super().take(frames), betas=self.betas if len(self.betas) == 1 else self.betas[frames])

@@ -76,6 +76,15 @@ def clips() -> Clips:
     return Clips({f"toy/s1/{number}": make_clip(number, frames) for number, frames in enumerate((30, 12, 45))})
 
 
+def test_the_shape_of_a_hand_is_the_mean_over_frames_in_which_it_is_tracked():
+    clip = make_clip(1, 6)
+    betas = np.repeat(clip.hands["left"].betas, 6, axis=0) + np.arange(6)[:, None]
+    betas[2] = 0  # not tracked: what an adapter fills in
+    clip = replace(clip, hands={side: replace(track, betas=betas) for side, track in clip.hands.items()})
+    sample = HoiDataset(Clips({"toy/s1/1": clip}), "train").whole("toy/s1/1")
+    assert sample.betas == pytest.approx(np.stack([betas[[0, 1, 3, 4, 5]].mean(axis=0)] * 2).astype(np.float32))
+
+
 def test_a_sample_goes_back_to_the_world_it_came_from(clips: Clips) -> None:
     for crop in ("start", "random"):
         sample = HoiDataset(clips, "train", 20, crop, seed=1)[0]
