@@ -181,18 +181,12 @@ def file_name_of(label: str) -> str:
 
 
 def _held(track: HandTrack, joints_m: np.ndarray) -> tuple[HandTrack, np.ndarray]:
-    """A hand and its joints with the last tracked pose in frames without tracking; ``valid`` stays.
-
-    Frames before the first tracked one have that one's pose. A hand that is never tracked is zeros: no pose is known.
-    """
-    tracked = np.flatnonzero(track.valid)
-    if not len(tracked):
-        poses = (track.wrist_m, track.global_orient, track.hand_pose)
-        wrist_m, global_orient, hand_pose = map(np.zeros_like, poses)
-        return replace(track, wrist_m=wrist_m, global_orient=global_orient, hand_pose=hand_pose), 0 * joints_m
-    last = np.searchsorted(tracked, np.arange(track.n_frames), side="right") - 1
-    shown = tracked[np.maximum(last, 0)]
-    return replace(track.take(shown), valid=track.valid), joints_m[shown]
+    """A hand and its joints that keep the last tracked pose; zeros if it is never tracked, as no pose is known."""
+    if track.valid.any():
+        return track.held(), joints_m[track.shown_frames]
+    poses = (track.wrist_m, track.global_orient, track.hand_pose)
+    wrist_m, global_orient, hand_pose = map(np.zeros_like, poses)
+    return replace(track, wrist_m=wrist_m, global_orient=global_orient, hand_pose=hand_pose), 0 * joints_m
 
 
 def _betas(hand: HandTrack) -> np.ndarray:
