@@ -202,6 +202,17 @@ def test_what_may_not_be_passed_on_is_refused_with_the_licence(name, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_rest_meshes_of_persons_are_bound_only_where_the_store_has_some(tmp_path):
+    free = {kind: {"licence": "CC BY 4.0", "may_be_shared": True} for kind in ("hands", "object motion", "words")}
+    facts = generated_info("grab") | {"licence": GRAB, "may_be_shared": False, "licences": free}
+    template = load_embedded_hands().right.template_m.astype(np.float32)
+    for name, clip in (("without", build_clip(3)), ("with", with_hand(build_clip(3), "right", template_m=template))):
+        write_store(tmp_path / name, [clip], facts)
+    export_store(open_store(tmp_path / "without"), "huggingface", tmp_path / "a", progress=False)
+    with pytest.raises(BadInput, match="personal hands under"):
+        export_store(open_store(tmp_path / "with"), "huggingface", tmp_path / "b", progress=False)
+
+
 def test_for_own_use_it_is_written_and_says_so(tmp_path):
     bound = bound_store(tmp_path / "clips", licence=GRAB, may_be_shared=False)
     export_store(bound, "huggingface", tmp_path / "out", for_own_use=True, progress=False)
