@@ -271,7 +271,7 @@ def _shape(clip: Clip) -> tuple[np.ndarray, np.ndarray | None]:
     """(2, 10) shapes and (2, 778, 3) personal meshes, as samples have them."""
     tracks = [clip.hands[side] for side in SIDES]
     templates = [track.template_m for track in tracks if track.template_m is not None]
-    betas = np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32)
+    betas = np.stack([track.mean_betas for track in tracks]).astype(np.float32)
     return betas, np.stack(templates).astype(np.float32) if len(templates) == 2 else None
 
 

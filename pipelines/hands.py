@@ -278,7 +278,7 @@ def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Ha
         own,
         words=clip.object_words,
         gravity=gravity,
-        betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
+        betas=np.stack([track.mean_betas for track in tracks]).astype(np.float32),
         template_m=np.stack(templates) if len(templates) == 2 else None,
     )
     return Asked(clip.object, own, (), f"clip {wish.clip}", notes)

@@ -34,7 +34,8 @@ class ClipSample:
     """One clip in the model frame; NumPy arrays, axes (side, frame, ...), metres and radians.
 
     hands (2, F, 99), object (F, 10), joints_m (2, F, 21, 3): features and true joints, with the clip's own hand shape.
-    valid (2, F): frames in which a side was tracked. active_hands (2,): the sides that take part in the interaction.
+    valid (2, F): frames in which a side was tracked; others have its last tracked pose (``HandTrack.held``).
+    active_hands (2,): the sides that take part in the interaction.
     contact (2, 1024): points that came within ``contact_threshold_m``, the contact stage's, of a joint of that side.
     text (4, 512): features of the four sentences. betas (2, 10); template_m (2, 778, 3) personal rest meshes, or None.
     start: first frame within the clip. world_from_model (4, 4). gravity_known: whether the model's -z is down.
@@ -68,6 +69,11 @@ class ClipSample:
     @property
     def length(self) -> int:
         return len(self.object)
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether the hands that take part are tracked in every frame, so that their motion can be copied."""
+        return bool(self.valid[self.active_hands].all())
 
     @property
     def key(self) -> tuple[str, int, int]:
@@ -172,7 +178,8 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
     points = _points(annotated, annotated.object_key(clip_id))
     distances = _acting_entries(annotated.distances(clip_id), active_hands)
     tracks = [clip.hands[side] for side in SIDES]
-    joints = np.stack([(annotated.joints(clip_id, side) - origin) @ rotation.T for side in SIDES])
+    joints_m = [annotated.joints(clip_id, side)[clip.hands[side].shown_frames] for side in SIDES]
+    joints = np.stack([(positions - origin) @ rotation.T for positions in joints_m])
     return ClipSample(
         clip_id=clip_id,
         dataset=clip.dataset,
@@ -184,12 +191,12 @@ def load_sample(annotated: AnnotatedStore, clip_id: str) -> ClipSample:
         sentences=tuple(annotated.sentences(clip_id)),
         synthetic=clip.synthetic,
         start=0,
-        hands=np.stack([hand_features(track, rotation, origin) for track in tracks]),
+        hands=np.stack([hand_features(track.held(), rotation, origin) for track in tracks]),
         object=object_features(clip.object, rotation, origin),
         joints_m=joints.astype(np.float32),
         valid=np.stack([track.valid for track in tracks]).astype(bool),
         active_hands=active_hands,
-        betas=np.stack([track.betas.mean(axis=0) for track in tracks]).astype(np.float32),
+        betas=np.stack([track.mean_betas for track in tracks]).astype(np.float32),
         template_m=_templates(tracks),
         text=np.asarray(annotated.text_embedding(clip_id), dtype=np.float32),
         points=points,

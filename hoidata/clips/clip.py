@@ -57,6 +57,28 @@ class HandTrack(Track):
     def n_frames(self) -> int:
         return len(self.wrist_m)
 
+    @property
+    def mean_betas(self) -> np.ndarray:
+        """(10,) one shape for the clip: the mean over the valid frames, over all where none is."""
+        if len(self.betas) == 1 or not self.valid.any():
+            return self.betas.mean(axis=0)
+        return self.betas[self.valid].mean(axis=0)
+
+    @property
+    def shown_frames(self) -> np.ndarray:
+        """(frame,) the frame whose pose stands in for each: itself if valid, else the last valid one before it.
+
+        Before the first valid frame that one; of a hand that is never valid each frame itself.
+        """
+        frames, valid = np.arange(self.n_frames), np.flatnonzero(self.valid)
+        if not len(valid):
+            return frames
+        return valid[np.maximum(np.searchsorted(valid, frames, side="right") - 1, 0)]
+
+    def held(self) -> "HandTrack":
+        """The hand with the poses of ``shown_frames``; ``valid`` stays."""
+        return replace(self.take(self.shown_frames), valid=self.valid)
+
     def take(self, frames: Frames) -> "HandTrack":
         """Some frames of it; one shape for the whole clip stays one shape."""
         return replace(super().take(frames), betas=self.betas if len(self.betas) == 1 else self.betas[frames])

@@ -54,9 +54,10 @@ def fit_capsules(model: HandModel, betas: np.ndarray, template_m: np.ndarray | N
 
 
 def hand_capsules(track: HandTrackLike, model: HandModel) -> Capsules:
-    """World capsules (frame, 19) of a recorded hand; its shape is that of the first frame."""
+    """World capsules (frame, 19) of a recorded hand; its shape is that of the first valid frame."""
     template_m = None if track.template_m is None else _float64_bytes(track.template_m)
-    local = _capsules_of(model, _float64_bytes(track.betas[0]), template_m)
+    first = track.valid.argmax() if len(track.betas) > 1 else 0
+    local = _capsules_of(model, _float64_bytes(track.betas[first]), template_m)
     positions = track_joints(track, model)[:, local.joint].astype(np.float64)
     rotmats = world_rotmats(track)[:, local.joint]
     start = positions + np.einsum("fcij,cj->fci", rotmats, local.start_m)

@@ -10,7 +10,7 @@ from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
 from hoidata.objects.model import articulate
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.families import GroundTruth
-from models.baselines.lookups import Lookup, of_the_hand, train_clips
+from models.baselines.lookups import Lookup, lookup_clips, of_the_hand
 from models.common.family import Family, LeftOut
 
 OBJECT_MOVED_M = 0.10
@@ -237,6 +237,6 @@ OTHER_HANDS = Family(
     "other-hands",
     "truth, hands of another clip",
     lambda sources: OtherHands(
-        GroundTruth(sources.annotated), Lookup(train_clips(sources), of_the_hand, "of this hand")
+        GroundTruth(sources.annotated), Lookup(lookup_clips(sources), of_the_hand, "of this hand")
     ),
 )

@@ -119,8 +119,13 @@ def train_clips(sources: Sources) -> list[ClipSample]:
     return list(HoiDataset(sources.annotated, "train", crop="start"))
 
 
+def lookup_clips(sources: Sources) -> list[ClipSample]:
+    """The training clips whose motion can be copied: numbers of a hand that is not tracked are no motion."""
+    return [sample for sample in train_clips(sources) if sample.is_tracked]
+
+
 def _family(name: str, title: str, load: Callable[[Train, Prompt], Lookup]) -> Family:
-    return Family(name, title, lambda sources: load(train_clips(sources), Prompt(sources.annotated)))
+    return Family(name, title, lambda sources: load(lookup_clips(sources), Prompt(sources.annotated)))
 
 
 NEAREST_CLIP = _family("nearest-clip", "nearest training clip", lambda train, prompt: Lookup(train, by_sentence))

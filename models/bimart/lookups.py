@@ -78,6 +78,8 @@ class NearestWindow:
             spread[kind] = np.maximum(spread[kind], 0.05 * spread[kind].mean()) * np.sqrt(spread[kind].size)
         clips: dict[tuple[bool, bool], list[tuple[np.ndarray, np.ndarray]]] = {}
         for sample, scene, row in zip(samples, scenes, rows, strict=True):
+            if not sample.is_tracked:
+                continue
             own = (row - every.mean(axis=0)) / spread, canonical_hands(sample.hands, scene.model_from_canonical)
             clips.setdefault(hands_of(sample), []).append(own)
         return cls(clips, every.mean(axis=0), spread, any(sample.synthetic for sample in samples), drawn)

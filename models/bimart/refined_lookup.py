@@ -33,7 +33,8 @@ class RefinedWindow:
     def load(cls, sources: Sources) -> "RefinedWindow":
         samples: dict[tuple[bool, bool], list[ClipSample]] = {}
         for sample in training_clips(sources.annotated):
-            samples.setdefault(hands_of(sample), []).append(sample)
+            if sample.is_tracked:
+                samples.setdefault(hands_of(sample), []).append(sample)
         return cls(NearestWindow.load(sources), sources.hands, samples)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:

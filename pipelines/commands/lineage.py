@@ -253,7 +253,7 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
     console.print(top, soft_wrap=True)
     if libraries := record.get("libraries"):
         versions = ", ".join(f"{name} {version}" for name, version in libraries.items())
-        console.print(f"libraries: {versions}", soft_wrap=True, highlight=False)
+        console.print(f"libraries: {escape(versions)}", soft_wrap=True, highlight=False)
     console.print(f"status: {overall_status(tree)}", highlight=False)
 
 

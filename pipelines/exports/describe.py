@@ -4,6 +4,7 @@ All of it comes from the store's facts; there is no date in it, so equal stores 
 """
 
 from collections import Counter
+from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -11,12 +12,15 @@ from typing import Any
 import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
+import yaml
 
 from hoidata.dataset_folders import dataset_facts
 from hoidata.files import sha256_file
 from hoidata.store.fields import STORE_FILES, StoreFile
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
+from pipelines.exports.motion import Column
+from pipelines.markdown import markdown_text
 
 CROISSANT = "http://mlcommons.org/croissant/1.1"
 RESPONSIBLE = "http://mlcommons.org/croissant/RAI/1.0"
@@ -54,15 +58,30 @@ CONTEXT: dict[str, Any] = {
 }
 
 
-def write_description(folder: Path, store: Store, to: str, meaning: str, for_own_use: bool) -> None:
+@dataclass(frozen=True)
+class Description:
+    """What an export says of its form.
+
+    meaning: one line for people. world: which frame its coordinates are in. untracked: what the numbers of a hand are
+    in frames without tracking. columns: the arrays that a user reads by name.
+    """
+
+    meaning: str
+    world: str
+    untracked: str
+    columns: tuple[Column, ...]
+    for_own_use: bool
+
+
+def write_description(folder: Path, store: Store, to: str, form: Description) -> None:
     """Write croissant.json and README.md into ``folder``, about the files there; for ``croissant`` about the store."""
     root = store.folder if to == "croissant" else folder
-    described = croissant(root, store, meaning, for_own_use)
+    described = croissant(root, store, form)
     (folder / "croissant.json").write_bytes(orjson.dumps(described, option=orjson.OPT_INDENT_2) + b"\n")
-    (folder / "README.md").write_text(dataset_card(root, store, meaning, for_own_use), encoding="utf-8")
+    (folder / "README.md").write_text(dataset_card(root, store, form), encoding="utf-8")
 
 
-def croissant(root: Path, store: Store, meaning: str, for_own_use: bool) -> dict[str, Any]:
+def croissant(root: Path, store: Store, form: Description) -> dict[str, Any]:
     """The description of the files below ``root``, as JSON-LD; their addresses are relative to it."""
     info, name = store.info, _name(store)
     files = [path for path in sorted(root.rglob("*")) if path.is_file() and not path.name.startswith(".")]
@@ -73,47 +92,75 @@ def croissant(root: Path, store: Store, meaning: str, for_own_use: bool) -> dict
         "@type": "sc:Dataset",
         "conformsTo": [CROISSANT, RESPONSIBLE],
         "name": name,
-        "description": f"{_summary(store)} {meaning[0].upper()}{meaning[1:]}.",
+        "description": f"{_summary(store)} {_sentence(form.meaning)}",
         "license": list(dict.fromkeys(map(_licence_address, rows))),
         "url": _address(str(info.get("where_to_register", ""))),
         "version": _version(str(info["dataset_version"])),
         "keywords": ["hand-object interaction", "motion", "MANO", str(info["dataset"])],
         "citeAs": facts.paper if facts and facts.paper else name,
-        **{f"rai:{key}": value for key, value in _responsible(store).items()},
+        **{f"rai:{key}": value for key, value in _responsible(store, form).items()},
     }
-    if for_own_use:
+    if form.for_own_use:
         described["usageInfo"] = OWN_USE
     described["distribution"] = [_file_object(root, path, rows) for path in files]
-    described["recordSet"] = [_record_set(root, path) for path in files if path.suffix == ".parquet"]
+    meanings = {column.name: column.meaning for column in form.columns}
+    described["recordSet"] = [_record_set(root, path, meanings) for path in files if path.suffix == ".parquet"]
     return described
 
 
-def dataset_card(root: Path, store: Store, meaning: str, for_own_use: bool) -> str:
+def dataset_card(root: Path, store: Store, form: Description) -> str:
     """README.md with the front matter Hugging Face reads: licence, files of each subset; and the licence per array."""
     info, rows = store.info, licences_of(store.info)
-    data = sorted((root / "data").glob("*.parquet"))
+    lines = [f"# {markdown_text(_name(store))}", "", markdown_text(_summary(store)), "", _sentence(form.meaning), ""]
+    if form.for_own_use:
+        lines += [f"**Exported {OWN_USE}.**", ""]
+    lines += _conventions(info, form)
+    lines += ["", "## Licence per array", "", "| arrays | what | SPDX | may be passed on |", "|---|---|---|---|"]
+    lines += [f"| {r.kind.name} | {r.kind.meaning} | {r.spdx} | {'yes' if r.may_be_shared else 'no'} |" for r in rows]
+    lines += ["", *(f"- {r.spdx}: {markdown_text(r.licence)}" for r in {row.spdx: row for row in rows}.values())]
+    lines += ["", "## How it came about", ""]
+    for key, value in _responsible(store, form).items():
+        lines.append(f"- {key}: {markdown_text('; '.join(value) if isinstance(value, list) else value)}")
+    return f"---\n{_front_matter(root, store, rows)}---\n\n" + "\n".join(lines) + "\n"
+
+
+def _front_matter(root: Path, store: Store, rows: tuple[ArrayLicence, ...]) -> str:
     spdx = rows[0].spdx
     known = {"CC0-1.0": "cc0-1.0"}.get(spdx, spdx.lower() if spdx.startswith("CC-") else "other")
-    lines = ["---", f"pretty_name: {_name(store)}", f"license: {known}"]
-    lines += [f"license_name: {spdx.lower()}"] if known == "other" else []
-    lines += ["tags:", "- hand-object-interaction", "- robotics", "- 3d"]
-    if data:
-        lines += ["configs:", "- config_name: default", "  data_files:"]
-        lines += [line for path in data for line in (f"  - split: {path.stem}", f"    path: data/{path.name}")]
-    lines += ["---", "", f"# {_name(store)}", "", _summary(store), "", f"{meaning[0].upper()}{meaning[1:]}.", ""]
-    if for_own_use:
-        lines += [f"**Exported {OWN_USE}.**", ""]
-    lines += ["## Licence per array", "", "| arrays | what | SPDX | may be passed on |", "|---|---|---|---|"]
-    lines += [f"| {r.kind.name} | {r.kind.meaning} | {r.spdx} | {'yes' if r.may_be_shared else 'no'} |" for r in rows]
-    lines += ["", *(f"- {r.spdx}: {r.licence}" for r in {row.spdx: row for row in rows}.values())]
-    lines += ["", "## How it came about", ""]
-    lines += [f"- {key}: {'; '.join(value) if isinstance(value, list) else value}" for key, value in
-              _responsible(store).items()]  # fmt: skip
-    lines += ["", f"Units: metre, radian, second; {info['fps']} frames per second; column vectors; world right-handed."]
-    return "\n".join(lines) + "\n"
+    facts: dict[str, Any] = {"pretty_name": _name(store), "license": known}
+    facts |= {"license_name": spdx.lower()} if known == "other" else {}
+    facts["tags"] = ["hand-object-interaction", "robotics", "3d"]
+    if data := sorted((root / "data").glob("*.parquet")):
+        files = [{"split": path.stem, "path": f"data/{path.name}"} for path in data]
+        facts["configs"] = [{"config_name": "default", "data_files": files}]
+    return yaml.safe_dump(facts, sort_keys=False, allow_unicode=True)
 
 
-def _responsible(store: Store) -> dict[str, Any]:
+def _conventions(info: dict[str, Any], form: Description) -> list[str]:
+    """Lines: frame, units and hand model, and the meaning of each array."""
+    frame, hand = info["frame"], info["hand_model"]
+    up = f"its up axis is {frame['up_axis']}" if frame["up_axis"] else "its up axis is not stated"
+    lines = [
+        "## What the numbers mean",
+        "",
+        f"- Units: metre, radian, second; {info['fps']} frames per second; column vectors; right-handed.",
+        f"- World frame: {form.world}. The source's: {markdown_text(frame['note'])}; {up}; gravity {frame['gravity']}.",
+        f"- Hand model: {markdown_text(hand['name'])}, SHA-256 {markdown_text(hand['digest'])}. Hand parameters are "
+        "relative to it: angles to its flat hand, shape to its template unless a person's own rest mesh is given. "
+        "The wrist joint is joint 0; it is not MANO's transl.",
+        f"- Frames in which a hand is not tracked are marked; {form.untracked}.",
+    ]
+    if form.columns:
+        lines += ["", "| array | type | shape | meaning |", "|---|---|---|---|"]
+        lines += [f"| {c.name} | {c.dtype} | {list(c.shape) or ''} | {c.meaning} |" for c in form.columns]
+    return lines
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}."
+
+
+def _responsible(store: Store, form: Description) -> dict[str, Any]:
     """Croissant's responsible-AI terms that the facts of a store can fill."""
     info, counts, rows = store.info, store.info["counts"], store.sequences
     facts = dataset_facts(str(info["dataset"]))
@@ -131,7 +178,7 @@ def _responsible(store: Store) -> dict[str, Any]:
         "dataCollectionRawData": str(info.get("where_to_register", "see dataCollection")),
         "dataCollectionMissingData": (
             f"{counts['quarantined']} sequences or intervals are left out, with reasons in quarantine.parquet; "
-            "frames in which a hand is not tracked are marked, their numbers mean nothing"
+            f"frames in which a hand is not tracked are marked; {form.untracked}"
         ),
         "dataPreprocessingProtocol": [
             f"resampled from {info['source_fps']:g} to {info['fps']} frames per second, metres, right-handed world",
@@ -210,15 +257,17 @@ def _about(file: StoreFile, rows: tuple[ArrayLicence, ...]) -> str:
     return f"{file.meaning}.{f' Licence: {licences}.' if licences else ''}{listed}"
 
 
-def _record_set(root: Path, path: Path) -> dict[str, Any]:
-    """The columns of a Parquet file."""
+def _record_set(root: Path, path: Path, meanings: dict[str, str]) -> dict[str, Any]:
+    """The columns of a Parquet file. meanings: of columns in an export; those of a store's files are known."""
     name = path.relative_to(root).as_posix()
     record = name.removesuffix(".parquet").replace("/", "_")
-    fields = [_field(record, name, column) for column in pq.read_schema(path)]
+    if file := next((file for file in STORE_FILES if file.path == name), None):
+        meanings = {field.name: field.meaning for field in file.fields}
+    fields = [_field(record, name, column, meanings.get(column.name, "")) for column in pq.read_schema(path)]
     return {"@type": "cr:RecordSet", "@id": record, "name": record, "field": fields}
 
 
-def _field(record: str, file: str, column: pa.Field) -> dict[str, Any]:
+def _field(record: str, file: str, column: pa.Field, meaning: str) -> dict[str, Any]:
     kind, lengths = column.type, []
     while pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
         lengths.append(str(kind.list_size) if pa.types.is_fixed_size_list(kind) else "-1")
@@ -230,11 +279,6 @@ def _field(record: str, file: str, column: pa.Field) -> dict[str, Any]:
         "dataType": _TYPES.get(str(kind), "sc:Text"),
         "source": {"fileObject": {"@id": file}, "extract": {"column": column.name}},
     }
-    if (meaning := _meaning(file, column.name)) != "":
+    if meaning:
         described["description"] = meaning
     return described | ({"isArray": True, "arrayShape": ",".join(lengths)} if lengths else {})
-
-
-def _meaning(file: str, column: str) -> str:
-    fields = next((known.fields for known in STORE_FILES if known.path == file), ())
-    return next((field.meaning for field in fields if field.name == column), "")

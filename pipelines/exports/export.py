@@ -9,12 +9,12 @@ import orjson
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.clips.clip import Clip
+from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.store.store import Store
 from pipelines.exports import bvh, glb, hugging_face, lerobot, spider, usd, web_dataset
-from pipelines.exports.describe import write_description
+from pipelines.exports.describe import Description, write_description
 from pipelines.exports.licences import (
     HANDS,
     MESHES,
@@ -27,9 +27,11 @@ from pipelines.exports.licences import (
     check_may_be_passed_on,
     licences_of,
 )
-from pipelines.exports.motion import ExportedClip, Source
+from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source
 
 _MOTION = (HANDS, OBJECT, WORDS)
+_PARAMETERS = (*_MOTION, PERSON)
+_COLUMNS = (*COLUMNS, *CLIP_COLUMNS)
 _SCENE = (HANDS, OBJECT, MESHES, PERSON, SKIN)
 
 
@@ -39,26 +41,42 @@ def _everything(_: Clip) -> str:
 
 @dataclass(frozen=True)
 class Format:
-    """meaning: one line for people. kinds: the arrays it holds. cannot: why it has no form for a clip, "" where it has.
+    """One form. meaning: one line for people. kinds: the arrays it can hold.
 
-    write: (folder, clips); None: a description alone.
+    write: (folder, clips); None: a description alone. cannot: why it has no form for a clip, "" where it has.
+    world: which frame its coordinates are in. columns: the arrays that a user reads by name.
     """
 
     meaning: str
     kinds: tuple[Kind, ...]
     write: Callable[[Path, Iterable[ExportedClip]], None] | None
     cannot: Callable[[Clip], str] = _everything
+    world: str = WORLD
+    columns: tuple[Column, ...] = ()
+
+    def held_kinds(self, store: Store) -> tuple[Kind, ...]:
+        """The kinds of arrays that an export of this store holds: rest meshes of persons only where it has some."""
+        templates = store.sequences[[f"{side}_template" for side in SIDES]].notna()
+        return tuple(kind for kind in self.kinds if kind is not PERSON or templates.to_numpy().any())
 
 
 FORMATS = {
     "croissant": Format("croissant.json and a dataset card for the store itself, to lie beside its meta/", (), None),
-    "lerobot": Format("LeRobot v3: 2 x 21 joints, object, sentences as tasks", _MOTION, lerobot.write),
-    "huggingface": Format("Parquet with features: datasets.load_dataset(DIR)", _MOTION, hugging_face.write),
-    "webdataset": Format("tar shards with .npz and .json of each clip", _MOTION, web_dataset.write),
-    "glb": Format("an animated scene per clip", _SCENE, glb.write),
-    "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write),
-    "bvh": Format("a skeleton per hand, and the object's motion", (HANDS, OBJECT), bvh.write),
-    "spider": Format("SPIDER's keypoints and meshes", (HANDS, OBJECT, MESHES), spider.write, spider.cannot),
+    "lerobot": Format(
+        "LeRobot v3: 2 x 21 joints, object, sentences as tasks", _MOTION, lerobot.write, columns=lerobot.COLUMNS
+    ),
+    "huggingface": Format(
+        "Parquet with features: datasets.load_dataset(DIR)", _PARAMETERS, hugging_face.write, columns=_COLUMNS
+    ),
+    "webdataset": Format(
+        "tar shards with .npz and .json of each clip", _PARAMETERS, web_dataset.write, columns=_COLUMNS
+    ),
+    "glb": Format("an animated scene per clip", _SCENE, glb.write, world=Y_UP),
+    "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write, world=Y_UP),
+    "bvh": Format("a skeleton per hand, and the object's motion", (HANDS, OBJECT), bvh.write, world=Y_UP),
+    "spider": Format(
+        "SPIDER's keypoints and meshes", (HANDS, OBJECT, MESHES), spider.write, spider.cannot, spider.WORLD
+    ),
 }
 
 
@@ -74,7 +92,7 @@ def export_store(
     if out.exists():
         raise BadInput(out, "a folder that is not there yet", "something else", "choose another name, or remove it")
     _check_clips(store, clip_ids)
-    check_may_be_passed_on(str(store.folder), store.info, form.kinds, for_own_use)
+    check_may_be_passed_on(str(store.folder), store.info, form.held_kinds(store), for_own_use)
     source, left_out = Source(store, clip_ids), {}
     with atomic_folder(out) as partial, Progress(console=Console(stderr=True), disable=not progress) as bar:
         if form.write is not None:
@@ -84,8 +102,10 @@ def export_store(
             reason = next(iter(left_out.values()))
             raise BadInput(store.folder, f"clips that {to} has a form for", f"none: {reason}", "choose another format")
         facts = _facts(store, to, form, for_own_use) | {"clips": len(source.ids) - len(left_out), "left_out": left_out}
+        untracked = "their numbers mean nothing" if form.write is None else "they repeat its last tracked pose"
+        described = Description(form.meaning, form.world, untracked, form.columns, for_own_use)
         (partial / "export.json").write_bytes(orjson.dumps(facts, option=orjson.OPT_INDENT_2) + b"\n")
-        write_description(partial, store, to, form.meaning, for_own_use)
+        write_description(partial, store, to, described)
     return facts
 
 
@@ -122,6 +142,7 @@ def _facts(store: Store, to: str, form: Format, for_own_use: bool) -> dict[str, 
         "dataset_version": info["dataset_version"],
         "synthetic": info["synthetic"],
         "hand_model": info["hand_model"],
+        "world": form.world,
         "terms": OWN_USE if for_own_use else "may be passed on under the licences below",
-        "licences": [row.as_json() for row in rows if row.kind in (form.kinds or [row.kind])],
+        "licences": [row.as_json() for row in rows if row.kind in (form.held_kinds(store) or [row.kind])],
     }

@@ -19,4 +19,5 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
         markers: dict[Side, np.ndarray] = {
             side: item.joints[side] for side in SIDES if item.clip.hands[side].valid.any()
         }
-        (folder / f"{item.file_name}.glb").write_bytes(glb_bytes(item.clip, item.hands, markers=markers))
+        scene = glb_bytes(item.clip, item.hands, extras=item.motion_facts, markers=markers)
+        (folder / f"{item.file_name}.glb").write_bytes(scene)

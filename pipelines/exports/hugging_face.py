@@ -1,6 +1,7 @@
 """A folder of Parquet that Hugging Face ``datasets`` loads: a row per clip, a file per subset.
 
-The features stand in the schema's metadata, as ``datasets`` writes them; README.md names the file of each subset.
+The schema's metadata has the features as ``datasets`` before release 4 writes them, which later releases read too;
+README.md names the file of each subset.
 """
 
 from collections.abc import Iterable
@@ -13,11 +14,11 @@ import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines.exports.motion import COLUMNS, ExportedClip
+from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, Column, ExportedClip
 from pipelines.exports.tables import frames_array, row_type
 
-_TEXTS = ("clip_id", "subject", "sequence", "verb", "object", "object_words")
-WHOLE = "all"  # the file of clips that are in no subset
+_TEXTS = ("clip_id", "subject", "sequence", "verb", "object", "object_words", "gravity_note")
+WHOLE = "unsplit"  # the file of clips in no subset; datasets refuses "all"
 
 
 def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
@@ -36,6 +37,10 @@ def _row(item: ExportedClip) -> pa.Table:
     values.append(pa.array([facts["sentences"]], pa.list_(pa.string())))
     offsets = pa.array(np.array([0, item.clip.n_frames], np.int32))
     values += [pa.ListArray.from_arrays(offsets, frames_array(arrays[c.name], c)) for c in COLUMNS]
+    values += [
+        pa.array([array.tolist()], row_type(c))
+        for c, array in zip(CLIP_COLUMNS, item.clip_arrays().values(), strict=True)
+    ]
     return pa.Table.from_arrays(values, schema=_schema())
 
 
@@ -43,19 +48,25 @@ def _schema() -> pa.Schema:
     fields: list[Any] = [(name, pa.string()) for name in _TEXTS]
     fields += [("sentences", pa.list_(pa.string()))]
     fields += [(column.name, pa.list_(row_type(column))) for column in COLUMNS]
+    fields += [(column.name, row_type(column)) for column in CLIP_COLUMNS]
     # Nested fields are called "item", as datasets calls them.
     features: dict[str, Any] = {name: _value("string") for name in _TEXTS} | {"sentences": _list(_value("string"))}
-    for column in COLUMNS:
-        feature = _value(column.dtype)
-        for length in reversed(column.shape):
-            feature = _list(feature, length)
-        features[column.name] = _list(feature)
+    features |= {column.name: _list(_feature(column)) for column in COLUMNS}
+    features |= {column.name: _feature(column) for column in CLIP_COLUMNS}
     return pa.schema(fields, {"huggingface": orjson.dumps({"info": {"features": features}}).decode()})
+
+
+def _feature(column: Column) -> dict[str, Any]:
+    feature = _value(column.dtype)
+    for length in reversed(column.shape):
+        feature = _list(feature, length)
+    return feature
 
 
 def _value(dtype: str) -> dict[str, Any]:
     return {"dtype": dtype, "_type": "Value"}
 
 
-def _list(feature: dict[str, Any], length: int | None = None) -> dict[str, Any]:
-    return {"feature": feature, "_type": "List"} | ({} if length is None else {"length": length})
+def _list(feature: dict[str, Any], length: int = -1) -> dict[str, Any]:
+    """A list; length -1: any. Called Sequence, because ``List`` stops datasets before release 4 from opening a file."""
+    return {"feature": feature, "length": length, "_type": "Sequence"}

@@ -1,8 +1,9 @@
 """LeRobot's dataset layout v3.0 (huggingface/lerobot, docs "LeRobotDataset v3"): an episode per clip, without video.
 
 ``observation.state`` and ``action`` are the 2 x 21 joints of this and of the next frame,
-``observation.environment_state`` the object: position, quaternion xyzw, hinge. Tasks are the sentences; a frame's task
-is the clip's first one.
+``observation.environment_state`` the object: position, quaternion xyzw, hinge. ``observation.hand_valid`` and
+``next.hand_valid`` are the masks of state and action; statistics count only what they let through. Tasks are the
+sentences; a frame's task is the clip's first one.
 """
 
 from collections.abc import Iterable
@@ -25,17 +26,35 @@ FRAMES_PER_FILE = 60_000  # about 100 MB, LeRobot's own size of a data file
 FILES_PER_CHUNK = 1000
 DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH = "meta/episodes/chunk-000/file-000.parquet"
-STATE, ACTION, OBJECT, VALID = "observation.state", "action", "observation.environment_state", "observation.hand_valid"
+STATE, ACTION, OBJECT = "observation.state", "action", "observation.environment_state"
+# Not "action.": LeRobot gives its policies every feature of that prefix to predict.
+VALID, NEXT_VALID = "observation.hand_valid", "next.hand_valid"
 _OBJECT_NAMES = [*(f"object.{axis}" for axis in "xyz"), *(f"object.q{axis}" for axis in "xyzw"), "object.hinge"]
 _HAND_NAMES = [name for side in SIDES for name in state_names(side)]
-_NAMES = {STATE: _HAND_NAMES, ACTION: _HAND_NAMES, OBJECT: _OBJECT_NAMES, VALID: list(SIDES)}
+_NAMES = {STATE: _HAND_NAMES, ACTION: _HAND_NAMES, OBJECT: _OBJECT_NAMES, VALID: list(SIDES), NEXT_VALID: list(SIDES)}
 COLUMNS = (
-    Column(STATE, "float32", (126,), "world joints of both hands, metres"),
-    Column(ACTION, "float32", (126,), "the joints of the next frame"),
-    Column(OBJECT, "float32", (8,), "object position, quaternion xyzw, hinge angle"),
-    Column(VALID, "bool", (2,), "whether the numbers of a hand mean something"),
-    Column("timestamp", "float32", (), "seconds"),
-    *(Column(name, "int64", (), "") for name in ("frame_index", "episode_index", "index", "task_index")),
+    Column(STATE, "float32", (126,), "21 joints of the left, then of the right hand; world frame, metre"),
+    Column(ACTION, "float32", (126,), "the same of the next frame; the last frame repeats its own"),
+    Column(
+        OBJECT,
+        "float32",
+        (8,),
+        "origin of the object frame, quaternion xyzw of world_from_object, hinge angle from the mesh as stored "
+        "(0 for a rigid object); world frame, metre, radian",
+    ),
+    Column(
+        VALID,
+        "bool",
+        (2,),
+        "whether left and right hand are tracked; where not, the last tracked pose is repeated, before the first one "
+        "the first; zeros if a hand is never tracked in the clip",
+    ),
+    Column(NEXT_VALID, "bool", (2,), f"the same of the next frame, so of {ACTION}; False in the last frame"),
+    Column("timestamp", "float32", (), "since the clip's first frame, second"),
+    Column("frame_index", "int64", (), "frame of the episode, from 0"),
+    Column("episode_index", "int64", (), "the clip, from 0"),
+    Column("index", "int64", (), "frame of the data set, from 0"),
+    Column("task_index", "int64", (), "row of meta/tasks.parquet: the clip's first sentence"),
 )
 
 
@@ -51,6 +70,7 @@ class _Writer:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.episodes: list[dict[str, Any]] = []
+        self.statistics: dict[str, list[dict[str, np.ndarray]]] = {column.name: [] for column in COLUMNS}
         self.tasks: dict[str, int] = {}
         self.ranges: dict[str, list[int]] = {}
         self.frames, self.file, self.in_file = 0, 0, 0
@@ -65,7 +85,10 @@ class _Writer:
         assert self._parquet is not None
         data = [frames_array(arrays[column.name], column) for column in COLUMNS]
         self._parquet.write_table(pa.Table.from_arrays(data, schema=_schema()))
-        self.episodes.append(self._episode(item, arrays))
+        self.episodes.append(self._episode(item))
+        known = _known(item, arrays)
+        for name, rows in self.statistics.items():
+            rows.append(_statistics(arrays[name], known.get(name, True)))
         self.ranges.setdefault(item.subset, [len(self.episodes) - 1, 0])[1] = len(self.episodes)
         self.frames += item.clip.n_frames
         self.in_file += item.clip.n_frames
@@ -89,9 +112,9 @@ class _Writer:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._parquet, self.in_file = pq.ParquetWriter(path, _schema()), 0
 
-    def _episode(self, item: ExportedClip, arrays: dict[str, np.ndarray]) -> dict[str, Any]:
+    def _episode(self, item: ExportedClip) -> dict[str, Any]:
         chunk, file = divmod(self.file, FILES_PER_CHUNK)
-        row: dict[str, Any] = {
+        return {
             "episode_index": len(self.episodes),
             "tasks": list(item.sentences),
             "length": item.clip.n_frames,
@@ -104,11 +127,9 @@ class _Writer:
             "clip_id": item.clip.clip_id,
             "subject": item.clip.subject,
             "object": item.clip.object.model.name,
+            "gravity": item.clip_arrays()["gravity"].tolist(),
+            "gravity_note": item.clip.gravity_note,
         }
-        for column in COLUMNS:
-            for name, value in _statistics(arrays[column.name]).items():
-                row[f"stats/{column.name}/{name}"] = value.tolist()
-        return row
 
     def finish(self) -> None:
         """The files of meta/."""
@@ -116,11 +137,17 @@ class _Writer:
         self._parquet.close()
         path = self.folder / EPISODES_PATH
         path.parent.mkdir(parents=True)
+        totals = {name: _total(rows) for name, rows in self.statistics.items()}
+        for column, rows in self.statistics.items():
+            for episode, row in zip(self.episodes, rows, strict=True):
+                facts = _as_written(row, totals[column])
+                episode |= {f"stats/{column}/{name}": value for name, value in facts.items()}
         pq.write_table(pa.Table.from_pylist(self.episodes), path)
         tasks = pd.DataFrame({"task_index": list(self.tasks.values())}, pd.Index(list(self.tasks), name="task"))
         tasks.to_parquet(self.folder / "meta" / "tasks.parquet")
         _write_json(self.folder / "meta" / "info.json", self._info())
-        _write_json(self.folder / "meta" / "stats.json", {c.name: self._total(c.name) for c in COLUMNS})
+        statistics = {name: _as_written(total, total) for name, total in totals.items()}
+        _write_json(self.folder / "meta" / "stats.json", statistics)
 
     def _info(self) -> dict[str, Any]:
         splits = {name: "{}:{}".format(*self.ranges[name]) for name in SUBSETS if name in self.ranges}
@@ -140,42 +167,65 @@ class _Writer:
             "features": {c.name: _feature(c) for c in COLUMNS},
         }
 
-    def _total(self, name: str) -> dict[str, Any]:
-        """Statistics of all frames, from those of the episodes (the law of total variance)."""
-        part = {key: _column(self.episodes, f"stats/{name}/{key}") for key in ("min", "max", "mean", "std", "count")}
-        share = part["count"] / part["count"].sum()
-        mean = (share * part["mean"]).sum(axis=0)
-        variance = (share * (part["std"] ** 2 + (part["mean"] - mean) ** 2)).sum(axis=0)
-        total = {"min": part["min"].min(axis=0), "max": part["max"].max(axis=0), "mean": mean, "std": np.sqrt(variance)}
-        return {key: value.tolist() for key, value in total.items()} | {"count": [int(part["count"].sum())]}
-
 
 def _frames(item: ExportedClip) -> dict[str, np.ndarray]:
     arrays = item.arrays()
     n_frames = item.clip.n_frames
+    valid = np.stack([arrays[f"{side}_valid"] for side in SIDES], axis=1)
     state = np.concatenate([arrays[f"{side}_joints_m"].reshape(n_frames, 63) for side in SIDES], axis=1)
     pose = (arrays["object_translation_m"], arrays["object_quaternion_xyzw"], arrays["object_hinge_rad"][:, None])
     return {
         STATE: state,
         ACTION: np.concatenate([state[1:], state[-1:]]),
         OBJECT: np.concatenate(pose, axis=1),
-        VALID: np.stack([arrays[f"{side}_valid"] for side in SIDES], axis=1),
+        VALID: valid,
+        NEXT_VALID: np.concatenate([valid[1:], np.zeros((1, 2), bool)]),
     }
 
 
-def _statistics(values: np.ndarray) -> dict[str, np.ndarray]:
+def _known(item: ExportedClip, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """(frame, number) booleans of the columns in which not every number is data: the others fill a place."""
+    has_hinge = np.ones((item.clip.n_frames, 8), bool)
+    has_hinge[:, 7] = item.clip.object.is_articulated
+    masks = {STATE: arrays[VALID], ACTION: arrays[NEXT_VALID]}
+    return {OBJECT: has_hinge, **{name: mask.repeat(63, axis=1) for name, mask in masks.items()}}
+
+
+def _statistics(values: np.ndarray, known: np.ndarray | bool) -> dict[str, np.ndarray]:
+    """Statistics of each number over the frames in which it is known; NaN and a count of 0 for one that never is."""
     rows = values.reshape(len(values), -1).astype(np.float64)
-    return {
-        "min": rows.min(axis=0),
-        "max": rows.max(axis=0),
-        "mean": rows.mean(axis=0),
-        "std": rows.std(axis=0),
-        "count": np.array([len(rows)]),
-    }
+    rows = np.ma.array(rows, mask=~np.broadcast_to(known, rows.shape))
+    found = {"min": rows.min(axis=0), "max": rows.max(axis=0), "mean": rows.mean(axis=0), "std": rows.std(axis=0)}
+    return {name: value.filled(np.nan) for name, value in found.items()} | {"count": rows.count(axis=0)}
 
 
-def _column(rows: list[dict[str, Any]], name: str) -> np.ndarray:
-    return np.array([row[name] for row in rows], np.float64)
+def _total(parts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Statistics of all frames, from those of the episodes (the law of total variance)."""
+    part = {name: np.stack([row[name] for row in parts]) for name in parts[0]}
+    count = part["count"].sum(axis=0)
+    with np.errstate(invalid="ignore"):  # 0 / 0: a number that no episode has
+        share = part["count"] / count
+    mean = _sum(share * part["mean"], count)
+    variance = _sum(share * (part["std"] ** 2 + (part["mean"] - mean) ** 2), count)
+    total = {"min": np.fmin.reduce(part["min"]), "max": np.fmax.reduce(part["max"]), "mean": mean}
+    return total | {"std": np.sqrt(variance), "count": count}
+
+
+def _sum(values: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Sums over the episodes that have the number; NaN where none has."""
+    return np.where(count > 0, np.nansum(values, axis=0), np.nan)
+
+
+def _as_written(statistics: dict[str, np.ndarray], total: dict[str, np.ndarray]) -> dict[str, list]:
+    """As LeRobot has them: finite numbers, and one count for all numbers of a column.
+
+    A number that an episode never has gets the statistics of all episodes, which leave their merger as it is; one that
+    no episode has gets 0.
+    """
+    names = ("min", "max", "mean", "std")
+    filled = {name: np.where(statistics["count"] > 0, statistics[name], total[name]) for name in names}
+    written = {name: np.nan_to_num(values, nan=0.0).tolist() for name, values in filled.items()}
+    return written | {"count": [int(statistics["count"].max())]}
 
 
 def _schema() -> pa.Schema:

@@ -16,9 +16,10 @@ from scipy.spatial.transform import Rotation
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.files.arrays import write_npz
 from hoidata.objects.model import ObjectModel
-from pipelines.exports.motion import ExportedClip
+from pipelines.exports.motion import ExportedClip, file_name_of
 from pipelines.pages.glb import upright_rotation
 
+WORLD = "turned so that gravity is -z: z is up"
 TIPS = (20, 16, 17, 19, 18)  # of the 21 joints: thumb, index, middle, ring, pinky
 _INDEX, _MIDDLE, _RING = 1, 4, 10
 _STILL = np.array([0.0, 0, 0, 1, 0, 0, 0])
@@ -27,8 +28,8 @@ _STILL = np.array([0.0, 0, 0, 1, 0, 0, 0])
 def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
     """Write processed/<dataset>/ below ``folder``."""
     for item in clips:
-        root = folder / "processed" / item.clip.dataset
-        mesh = root / "assets" / "objects" / item.clip.object.model.name
+        root = folder / "processed" / file_name_of(item.clip.dataset)
+        mesh = root / "assets" / "objects" / file_name_of(item.clip.object.model.name)
         if not mesh.exists():
             mesh.mkdir(parents=True)
             (mesh / "visual.obj").write_text(_obj(item.clip.object.model))
@@ -47,6 +48,8 @@ def cannot(clip: Clip) -> str:
     """Why SPIDER has no form for a clip; empty where it has one."""
     if clip.object.is_articulated:
         return "SPIDER moves rigid objects only, this one has a hinge"
+    if clip.gravity is None:
+        return "SPIDER moves objects under gravity, and this clip's is not known"
     if not all(clip.hands[side].valid.all() or not clip.hands[side].valid.any() for side in SIDES):
         return "SPIDER knows no frames without a hand; export the frames in which it is tracked"
     return "" if any(clip.hands[side].valid.any() for side in SIDES) else "no hand is tracked"

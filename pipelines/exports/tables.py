@@ -11,7 +11,7 @@ _ARROW = {"float32": pa.float32(), "int32": pa.int32(), "int64": pa.int64(), "bo
 
 
 def row_type(column: Column) -> pa.DataType:
-    """The Arrow type of one frame: a value, or lists of a fixed length."""
+    """The Arrow type of one frame: a value, or lists; of a fixed length but for -1, which pyarrow too takes for any."""
     kind: pa.DataType = _ARROW[column.dtype]
     for length in reversed(column.shape):
         kind = pa.list_(kind, length)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import orjson
 
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
 from hoidata.errors import MissingResource
@@ -52,6 +53,7 @@ def _write_stage(path: Path, item: ExportedClip) -> None:
     world = _transform(stage, "/world", np.zeros((1, 3)), upright_rotation(item.clip.gravity).as_rotvec()[None])
     stage.SetDefaultPrim(world)
     world.SetCustomDataByKey("clip", item.clip.clip_id)
+    world.SetCustomDataByKey("facts", orjson.dumps(item.motion_facts).decode())
     _add_object(stage, "/world/object", item.clip.object)
     for number, track in enumerate(item.clip.other_objects):
         _add_object(stage, f"/world/other_object_{number}", track)

@@ -1,4 +1,7 @@
-"""WebDataset shards: tar files with ``<number>.npz`` (the arrays) and ``<number>.json`` (the facts) of each clip."""
+"""WebDataset shards: tar files with ``<number>.npz`` and ``<number>.json`` of each clip.
+
+The NPZ has the arrays of ``COLUMNS`` and ``CLIP_COLUMNS``, the JSON the facts.
+"""
 
 import io
 import tarfile
@@ -25,7 +28,7 @@ def write(folder: Path, clips: Iterable[ExportedClip]) -> None:
 
 def _add(tar: tarfile.TarFile, key: str, item: ExportedClip) -> None:
     arrays = io.BytesIO()
-    write_npz_to(arrays, item.arrays())
+    write_npz_to(arrays, item.arrays() | item.clip_arrays())
     for suffix, content in (("npz", arrays.getvalue()), ("json", orjson.dumps(item.facts))):
         member = tarfile.TarInfo(f"{key}.{suffix}")  # dated 1970: equal clips, equal bytes
         member.size = len(content)

@@ -99,9 +99,8 @@ def contact_colours(value: np.ndarray) -> np.ndarray:
 
 def rest_hand(model: HandModel, track: HandTrack) -> tuple[np.ndarray, np.ndarray]:
     """Shaped rest vertices (778, 3) and joints (16, 3), metres, of one hand: mean betas over its valid frames."""
-    betas = track.betas[0] if len(track.betas) == 1 else track.betas[track.valid].mean(axis=0)
     template = model.template_m if track.template_m is None else track.template_m
-    vertices = np.asarray(template, dtype=np.float64) + model.shape_directions @ betas
+    vertices = np.asarray(template, dtype=np.float64) + model.shape_directions @ track.mean_betas
     return vertices, model.joint_regressor @ vertices
 
 

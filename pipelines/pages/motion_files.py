@@ -20,7 +20,8 @@ ARRAYS = {
     "wrist_m": "(S, F, 3) world position of the wrist joint",
     "global_orient": "(S, F, 3) axis-angle about the wrist joint",
     "hand_pose": "(S, F, 45) axis-angle of the 15 finger joints; zero is the flat hand",
-    "betas": "(S, 1 or F, 10) hand shape",
+    "betas": "(S, 1 or F, 10) hand shape, added to the rest mesh",
+    "template_m": "(S, vertex, 3) the person's own rest meshes; empty where the hand model's is the rest mesh",
     "object_rotvec": "(F, 3) axis-angle of world from object",
     "object_translation_m": "(F, 3) world position of the object's origin",
     "object_hinge_rad": "(F,) hinge angle of an articulated object",
@@ -48,6 +49,7 @@ def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
         "valid": valid,
         **values,
         "betas": np.stack(np.broadcast_arrays(*(track.betas for track in tracks))).astype(np.float32),
+        "template_m": _templates_m(clip),
         "object_rotvec": clip.object.rotvec.astype(np.float32),
         "object_translation_m": clip.object.translation_m.astype(np.float32),
     }
@@ -78,6 +80,13 @@ def clip_joints_m(clip: Clip, hands: HandPair) -> np.ndarray:
 def drawn(clip: Clip, most_faces: int = MOST_FACES_DRAWN) -> Clip:
     """The clip for a page: large meshes are thinned, the files keep them whole."""
     return replace(clip, object=replace(clip.object, model=thinned(clip.object.model, most_faces)))
+
+
+def _templates_m(clip: Clip) -> np.ndarray:
+    """(2, 778, 3) personal rest meshes of both hands, (0,) where the person has none."""
+    templates_m = [clip.hands[side].template_m for side in SIDES]
+    own = [template_m for template_m in templates_m if template_m is not None]
+    return np.stack(own).astype(np.float32) if len(own) == len(SIDES) else np.zeros(0, np.float32)
 
 
 def _where_valid(values: list[np.ndarray], valid: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from hoidata.files import write_whole
 from hoidata.files.written import Facts, read_json
 from models.bimart_tables.rows import ROWS
 from models.bimart_tables.variants import variant_of
+from pipelines.markdown import markdown_text
 from pipelines.promises import PROMISES, Promise
 from pipelines.stages.base import EMPTY, StagePaths, empty_reason, load_hands
 
@@ -45,7 +46,7 @@ NOTE = (
 def run(paths: StagePaths) -> None:
     """Write the tables; of a dataset without clips the reason alone."""
     if reason := empty_reason(paths.clips):
-        write_whole(paths.tables, f"{reason}\n")
+        write_whole(paths.tables, f"{markdown_text(reason)}\n")
         return
     found = read_rows(paths)
     lines = [f"# BimArt's tables on {paths.profile}/{paths.dataset}", "", NOTE]
@@ -202,7 +203,7 @@ def _mapping(paths: StagePaths) -> list[str]:
     found["mean"] = {kind: np.nanmean([own[kind] for own in found.values()], axis=0).tolist() for kind in SEEN}
     columns = [f"{where}: {kind}" for where in WHERE for kind in SEEN]
     rows = [
-        [name, *(f"{own[kind][place]:.3f}" for place in range(len(WHERE)) for kind in SEEN)]
+        [markdown_text(name), *(f"{own[kind][place]:.3f}" for place in range(len(WHERE)) for kind in SEEN)]
         for name, own in found.items()
     ]
     return _table(("object", *columns), rows)

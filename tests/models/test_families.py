@@ -20,6 +20,7 @@ from hoidata.metrics.asked import read_asked
 from hoidata.refinement import HoldSettings, hold_hands
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import open_store
+from models.baselines.lookups import Lookup
 from models.common.family import Sources, motion_clip
 from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
@@ -141,6 +142,18 @@ def test_the_nearest_clip_to_a_training_sentence_is_that_clip_and_the_next_is_an
     recorded = sources.annotated.clip(sample.clip_id)
     np.testing.assert_allclose(joints_of(first), track_joints(recorded.hands["right"], HANDS["right"]), atol=2e-5)
     assert abs(first.object.translation_m - second.object.translation_m).max() > 0.01
+
+
+@pytest.mark.parametrize("name", ["nearest-clip", "prompt-lookup", "random-clip"])
+def test_no_lookup_copies_a_clip_in_which_an_acting_hand_is_not_always_tracked(name, sources: Sources, monkeypatch):
+    whole = samples_of(sources.annotated, "train")
+    right, both = (next(one for one in whole if one.hand_type == kind) for kind in ("right", "both"))
+    gap = np.arange(both.length) != 3
+    idle = replace(right, valid=right.valid & np.array([[False], [True]]))  # the hand that takes no part
+    monkeypatch.setattr("models.baselines.lookups.train_clips", lambda _: [replace(both, valid=both.valid & gap), idle])
+    lookup = load_family(name).load(sources)
+    assert isinstance(lookup, Lookup)
+    assert [sample.clip_id for sample in lookup.train] == [right.clip_id]
 
 
 def test_another_prompt_is_never_the_own_one(sources: Sources) -> None:

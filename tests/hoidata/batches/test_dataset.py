@@ -76,15 +76,39 @@ def clips() -> Clips:
     return Clips({f"toy/s1/{number}": make_clip(number, frames) for number, frames in enumerate((30, 12, 45))})
 
 
+def test_the_shape_of_a_hand_is_the_mean_over_frames_in_which_it_is_tracked():
+    clip = make_clip(1, 6)
+    betas = np.repeat(clip.hands["left"].betas, 6, axis=0) + np.arange(6)[:, None]
+    betas[2] = 0  # not tracked: what an adapter fills in
+    clip = replace(clip, hands={side: replace(track, betas=betas) for side, track in clip.hands.items()})
+    sample = HoiDataset(Clips({"toy/s1/1": clip}), "train").whole("toy/s1/1")
+    assert sample.betas == pytest.approx(np.stack([betas[[0, 1, 3, 4, 5]].mean(axis=0)] * 2).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("valid", "shown"),
+    [("11111", [0, 1, 2, 3, 4]), ("00101", [2, 2, 2, 2, 4]), ("01000", [1, 1, 1, 1, 1]), ("00000", [0, 1, 2, 3, 4])],
+)
+def test_a_hand_holds_its_last_tracked_pose_and_keeps_the_mask(valid, shown):
+    flags = np.array([flag == "1" for flag in valid])
+    track = replace(random_hand(5, betas_rows=5), valid=flags)
+    held = track.held()
+    for name in ("wrist_m", "global_orient", "hand_pose", "betas"):
+        np.testing.assert_array_equal(getattr(held, name), getattr(track, name)[shown])
+    np.testing.assert_array_equal(held.valid, flags)
+
+
 def test_a_sample_goes_back_to_the_world_it_came_from(clips: Clips) -> None:
     for crop in ("start", "random"):
         sample = HoiDataset(clips, "train", 20, crop, seed=1)[0]
         clip = clips.clip(sample.clip_id).take(slice(sample.start, sample.start + sample.length))
         rotation, origin = sample.world_from_model[:3, :3], sample.world_from_model[:3, 3]
+        untracked = 2 - sample.start  # of make_clip; the pose of the frame before is repeated
+        shown = [frame - (frame == untracked) for frame in range(sample.length)]
         for number, side in enumerate(("left", "right")):
             world = sample.hands[number, :, :3] @ rotation.T + origin
-            np.testing.assert_allclose(world, clip.hands[side].wrist_m, atol=1e-5)
-            joints = track_joints(clip.hands[side], load_embedded_hands()[side])
+            np.testing.assert_allclose(world, clip.hands[side].wrist_m[shown], atol=1e-5)
+            joints = track_joints(clip.hands[side], load_embedded_hands()[side])[shown]
             np.testing.assert_allclose(sample.joints_m[number] @ rotation.T + origin, joints, atol=1e-5)
         np.testing.assert_allclose(sample.object[:, :3] @ rotation.T + origin, clip.object.translation_m, atol=1e-5)
         turned = rotation.T @ rotvec_to_rotmat(clip.object.rotvec)

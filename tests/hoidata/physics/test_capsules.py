@@ -183,6 +183,13 @@ def test_every_shape_and_personal_mesh_has_capsules_of_its_own_whatever_came_bef
         found.radius_m[0] = 1
 
 
+def test_the_shape_of_capsules_is_that_of_the_first_frame_in_which_the_hand_is_tracked():
+    model, track = load_embedded_hands().right, random_hand(3, seed=2)
+    betas = np.concatenate([np.zeros((1, 10)), track.betas, track.betas])  # zeros: not tracked in frame 0
+    found = hand_capsules(replace(track, betas=betas, valid=np.array([False, True, True])), model)
+    np.testing.assert_array_equal(found.radius_m, fit_capsules(model, track.betas[0]).radius_m)
+
+
 def _signed_gaps(points: np.ndarray, capsules: Capsules) -> np.ndarray:
     """(frame, point) signed distance to the union of capsules, by the formula of a segment."""
     axis = (capsules.end_m - capsules.start_m)[:, None]

@@ -210,6 +210,16 @@ def test_lookups_place_training_hands_at_the_object(sources: Sources, annotated:
         assert np.abs(refined.hands[side].wrist_m - recorded.hands[side].wrist_m).max() < 0.03
 
 
+@pytest.mark.parametrize("family", [NEAREST_WINDOW, NEAREST_REFINED])
+def test_no_window_is_copied_in_which_a_hand_is_not_tracked(family, sources: Sources, annotated, monkeypatch) -> None:
+    train = list(HoiDataset(annotated, "train"))
+    gaps = [replace(one, valid=one.valid & (np.arange(one.length) != 3)) for one in train]
+    for module in ("lookups", "refined_lookup"):
+        monkeypatch.setattr(f"models.bimart.{module}.training_clips", lambda _: gaps)
+    (found,) = family.load(sources).sample(requests_for(train[0], PredictionConfig(samples=1)))
+    assert isinstance(found, LeftOut)
+
+
 @pytest.mark.slow
 def test_two_windows_are_learnt_by_heart_to_5_mm(samples: list[ClipSample]) -> None:
     torch.manual_seed(0)

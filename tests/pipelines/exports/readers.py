@@ -110,8 +110,11 @@ def _of_usd(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def bvh(folder: Path) -> Read:
     found = {}
     for clip in (path for path in folder.iterdir() if path.is_dir()):
-        left, right = (_of_bvh(clip / f"{side}.bvh")[:, :, :3, 3] for side in ("left", "right"))
-        found[clip.name.replace("__", "/")] = (left, right, _of_bvh(clip / "object.bvh")[:, 0])
+        facts = json.loads((clip / "clip.json").read_text())
+        turned = {(0, -1, 0): 0, (0, 0, -1): 90}[tuple(facts["gravity"])]  # degrees about x, from y up to the clip's up
+        back = transforms(np.zeros((1, 3)), Rotation.from_euler("x", [turned], degrees=True).as_quat())
+        left, right, thing = (back[0] @ _of_bvh(clip / f"{name}.bvh") for name in ("left", "right", "object"))
+        found[facts["clip_id"]] = (left[:, :, :3, 3], right[:, :, :3, 3], thing[:, 0])
     return found
 
 

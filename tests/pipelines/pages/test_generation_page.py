@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hoidata.clips.clip import HandTrack
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import track_joints
 from hoidata.objects.sampling import sample_points
@@ -78,6 +79,18 @@ def test_arrays_open_without_pickle_and_hold_the_motion(motion, hands, write):
     assert np.array_equal(arrays["joints_m"][1], track_joints(motion.clip.hands["right"], hands.right))
     assert arrays["contact"].shape == (1024,)
     assert np.allclose(arrays["object_translation_m"], motion.clip.object.translation_m, atol=1e-6)
+
+
+def test_a_person_s_rest_meshes_are_among_the_arrays(motion, hands, write):
+    templates = {side: (hands[side].template_m * 1.1).astype(np.float32) for side in motion.clip.hands}
+    tracks = {side: replace(track, template_m=templates[side]) for side, track in motion.clip.hands.items()}
+    with np.load(write(replace(motion, clip=replace(motion.clip, hands=tracks)))[0]) as archive:
+        arrays = dict(archive)
+    names = ("wrist_m", "global_orient", "hand_pose", "betas", "valid")
+    own = HandTrack(*(arrays[name][1] for name in names), arrays["template_m"][1])
+    assert np.allclose(track_joints(own, hands.right), arrays["joints_m"][1], atol=1e-6)
+    with np.load(write(motion, to="without")[0]) as archive:
+        assert archive["template_m"].size == 0
 
 
 def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, write):
