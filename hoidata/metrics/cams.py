@@ -23,7 +23,7 @@ from scipy.optimize import nnls
 from scipy.spatial import KDTree
 
 from hoidata.clips.clip import FPS, ObjectTrack
-from hoidata.metrics.bimart import DEEP_M, LESS_DEEP_M, TURNED_RAD, Shell, placed_hands, shells
+from hoidata.metrics.bimart import DEEP_M, LESS_DEEP_M, part_depth_m, placed_hands, turns, turns_rad
 from hoidata.metrics.pair import Pair
 from hoidata.objects.mesh import mass_properties
 from hoidata.objects.model import ObjectModel
@@ -58,11 +58,9 @@ class Masses(NamedTuple):
 
 def pen_paper(pair: Pair, every: int) -> np.ndarray:
     """(hand and frame,) share of 778 vertices deeper than 5 mm in a part's mesh, added up over parts."""
-    model = pair.predicted.clip.object.model
-    parts = shells(surface_index(model))
-    each = [np.zeros(0)]
+    model, each = pair.predicted.clip.object.model, [np.zeros(0)]
     for hand in placed_hands(pair):
-        deep = [_depths_m(hand, model, part, shell) > LESS_DEEP_M for part, shell in parts.items()]
+        deep = [part_depth_m(hand, model, part) > LESS_DEEP_M for part in model.parts]
         each.append(np.sum(deep, axis=0).mean(axis=1)[::every])
     return np.concatenate(each)
 
@@ -226,7 +224,7 @@ def art_paper(pair: Pair, every: int) -> np.ndarray:
 
 
 def art_corrected(pair: Pair, every: int) -> np.ndarray:
-    """(frame with a hand in which it turns by more than 0.001 rad,) the same with contacts of the exact surface."""
+    """(frame with a hand in which it turns by more than 0.002 rad,) the same with contacts of the exact surface."""
     return _turned(pair, every, paper=False)
 
 
@@ -235,9 +233,8 @@ def _turned(pair: Pair, every: int, paper: bool) -> np.ndarray:
     hinge = track.model.hinge
     if hinge is None or track.hinge_rad is None or len(track.model.parts) < 2:
         return np.zeros(0)
-    steps = np.abs(np.diff(track.hinge_rad.astype(np.float64)))
-    turning = steps > (TURNED_PAPER_RAD if paper else TURNED_RAD)
-    frames = np.flatnonzero(turning & pair.looked_at()[:-1])[::every]
+    turning = turns_rad(track) > TURNED_PAPER_RAD if paper else turns(track)
+    frames = np.flatnonzero(turning & pair.looked_at())[::every]
     contacts = _contacts(pair, paper) if len(frames) else {}
     turned = []
     for frame in frames:
@@ -299,7 +296,7 @@ Touching = Iterator[tuple[int, np.ndarray, np.ndarray]]
 def _touching_paper(hand: PlacedHand, model: ObjectModel, part: int, local_m: np.ndarray) -> Touching:
     """Row of the hand, vertices of the part nearest to hand vertices that touch, and their normals; part frame."""
     tree, normals, vertices = _vertex_tree(surface_index(model), part)
-    near = _depths_m(hand, model, part, shells(surface_index(model))[part]) > -TOUCH_M
+    near = part_depth_m(hand, model, part) > -TOUCH_M
     for row in np.flatnonzero(near.any(axis=1)):
         nearest = np.unique(tree.query(local_m[row, near[row]])[1])
         yield int(row), vertices[nearest], normals[nearest]
@@ -313,13 +310,6 @@ def _touching_corrected(hand: PlacedHand, model: ObjectModel, part: int, local_m
     for row in np.flatnonzero(near.any(axis=1)):
         found = surface.nearest(np.ascontiguousarray(local_m[row, near[row]]))
         yield int(row), found.closest_m, found.normal
-
-
-def _depths_m(hand: PlacedHand, model: ObjectModel, part: int, shell: Shell) -> np.ndarray:
-    """(valid frame, 778) depth in one part, positive inside; -inf 2 cm outside and beyond."""
-    local = model.object_from_part(part, hand.hinge_rad).inverse() @ hand.vertices_m
-    apart, inside = shell.signed_m(np.ascontiguousarray(local.reshape(-1, 3)))
-    return np.where(inside, apart, -apart).reshape(hand.vertices_m.shape[:2])
 
 
 @lru_cache(maxsize=64)

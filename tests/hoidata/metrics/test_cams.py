@@ -185,6 +185,9 @@ def test_both_parts_must_be_touched_to_turn_them_against_each_other(make_clip, p
         return cams.art_paper(pair, 1).tolist(), cams.art_corrected(pair, 1).tolist()
 
     assert art(0.0) == ([1] * 4, [1] * 2)
+    trembles = on_the_hand(book, np.zeros((3, 3)), hinge_rad=np.float32([0, 0.0015, 0]))  # as a recorded hinge at rest
+    pair = pair_of(trembles, trembles)
+    assert (len(cams.art_paper(pair, 1)), len(cams.art_corrected(pair, 1))) == (2, 0)
     assert art(0.12) == ([0] * 4, [0] * 2)
     clip = on_the_hand(book, np.zeros((5, 3)), hinge_rad=angle)
     for own in (
