@@ -6,12 +6,11 @@ To add one: rows of ``registry.Metric``, whose names no other list has, and its 
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 
-import numpy as np
-
 from hoidata.errors import BadInput
 from hoidata.metrics import bimart, cams
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.registry import HANDS, METRICS, Direction, Metric
+from hoidata.metrics.unmeasured import Values
 
 BIMART, CAMS = "BimArt (Zhang et al. 2025)", "CAMS (Zheng et al. 2023)"
 _PAPER, _CORRECTED = "as released", "this project: corrected"
@@ -28,7 +27,7 @@ _PART = "inside where the winding number of the part's triangles is odd"
 _SOLID = "inside the solid of a closed part"
 _CONTACT = "5 mm or nearer, none deeper than 1 cm"
 _FORCES = "residual below 0.01, friction 0.35, contact 2 mm"
-Measure = Callable[[Pair, int], np.ndarray]
+Measure = Callable[[Pair, int], Values]
 _THREE = f"{HANDS}, three recorded ones in a row"
 _INNER = f"{HANDS}, with a recorded one before and after; known gravity"
 

@@ -19,6 +19,7 @@ from scipy.spatial import KDTree
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
 from hoidata.hands import track_vertices
 from hoidata.metrics.pair import Motion, Pair
+from hoidata.metrics.unmeasured import NO_INSIDE, RIGID, Unmeasured, Values
 from hoidata.objects.distance import MergedSurface, merged_surface
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.objects.surface_index import GRID_PAYS_FROM, PartSurface, SurfaceIndex, surface_index
@@ -50,12 +51,14 @@ def accel_corrected(pair: Pair, every: int) -> np.ndarray:
     return length_m * (FPS / step) ** 2
 
 
-def mul_cm(pairs: Sequence[Pair], every: int) -> np.ndarray:
+def mul_cm(pairs: Sequence[Pair], every: int) -> Values:
     """(pair of motions of one clip,) mean distance of the same vertex in the same frame, cm; none of one motion."""
     del every
     first = pairs[0]
+    if len(pairs) == 1:
+        return Unmeasured("the clip has one motion")
     if any(not np.array_equal(pair.predicted.clip.source_frames, first.predicted.clip.source_frames) for pair in pairs):
-        return np.zeros(0)
+        return Unmeasured("the motions of the clip have other frames")
     seen = [[_vertices_m(pair.predicted, side)[pair.frames(side)] for side in first.sides] for pair in pairs]
     points = [np.concatenate([own.reshape(-1, 3) for own in hands]).astype(np.float64) for hands in seen]
     apart = [np.linalg.norm(a - b, axis=-1).mean() for row, a in enumerate(points) for b in points[:row]]
@@ -114,8 +117,10 @@ def con_paper(pair: Pair, every: int) -> np.ndarray:
     return _percent(_deepest_paper_m(pair)[moving][::every], lambda deepest: deepest > -NEAR_M)
 
 
-def art_paper(pair: Pair, every: int) -> np.ndarray:
+def art_paper(pair: Pair, every: int) -> Values:
     """(frame in which the hinge turns,) the same of the triangles that lie in the moving part with all corners."""
+    if not pair.predicted.clip.object.model.is_articulated:
+        return RIGID
     turning = turns_rad(pair.predicted.clip.object) > TURNED_AS_RELEASED_RAD
     if not turning.any():
         return np.zeros(0)
@@ -243,32 +248,36 @@ def _deepest_paper_m(pair: Pair, moving_part: bool = False) -> np.ndarray:
 # --- penetration and contact, corrected
 
 
-def pen_1cm_corrected(pair: Pair, every: int) -> np.ndarray:
+def pen_1cm_corrected(pair: Pair, every: int) -> Values:
     """(frame,) 100 where a vertex is deeper than 1 cm in the solid, else 0; none for an object without an inside."""
-    return _percent(_depth_m(pair)[::every], lambda deepest: deepest > DEEP_M)
+    return _percent_of_solid(pair, _depth_m(pair)[::every], lambda deepest: deepest > DEEP_M)
 
 
-def pen_5mm_corrected(pair: Pair, every: int) -> np.ndarray:
+def pen_5mm_corrected(pair: Pair, every: int) -> Values:
     """(frame,) the same at 5 mm."""
-    return _percent(_depth_m(pair)[::every], lambda deepest: deepest > LESS_DEEP_M)
+    return _percent_of_solid(pair, _depth_m(pair)[::every], lambda deepest: deepest > LESS_DEEP_M)
 
 
-def con_everywhere_corrected(pair: Pair, every: int) -> np.ndarray:
+def con_everywhere_corrected(pair: Pair, every: int) -> Values:
     """(frame,) 100 where a vertex is within 5 mm of the surface, either side, and none deeper than 1 cm, else 0."""
-    return _percent(_sound_contact(pair)[::every], lambda touching: touching > 0)
+    return _percent_of_solid(pair, _sound_contact(pair)[::every], lambda touching: touching > 0)
 
 
-def con_corrected(pair: Pair, every: int) -> np.ndarray:
+def con_corrected(pair: Pair, every: int) -> Values:
     """(frame in which the object moves,) the same."""
-    return _percent(_sound_contact(pair)[moves(pair.predicted.clip.object)][::every], lambda touching: touching > 0)
+    moving = moves(pair.predicted.clip.object)
+    return _percent_of_solid(pair, _sound_contact(pair)[moving][::every], lambda touching: touching > 0)
 
 
-def art_corrected(pair: Pair, every: int) -> np.ndarray:
+def art_corrected(pair: Pair, every: int) -> Values:
     """(frame in which the hinge turns,) the same of the surface of the moving part, triangles of the seam included."""
+    if not pair.predicted.clip.object.model.is_articulated:
+        return RIGID
     turning = turns(pair.predicted.clip.object)
     if not turning.any():
         return np.zeros(0)
-    return _percent(_sound_contact(pair, moving_part=True)[turning][::every], lambda touching: touching > 0)
+    touching = _sound_contact(pair, moving_part=True)[turning][::every]
+    return _percent_of_solid(pair, touching, lambda touching: touching > 0)
 
 
 @lru_cache(maxsize=1)
@@ -323,10 +332,16 @@ def _percent(values: np.ndarray, is_so: Callable[[np.ndarray], np.ndarray]) -> n
     return 100.0 * is_so(values[~np.isnan(values)])
 
 
+def _percent_of_solid(pair: Pair, values: np.ndarray, is_so: Callable[[np.ndarray], np.ndarray]) -> Values:
+    """The same of values that need an object with an inside."""
+    is_solid = surface_index(pair.predicted.clip.object.model).is_solid
+    return _percent(values, is_so) if is_solid else NO_INSIDE
+
+
 # --- contact maps
 
 
-def cm_paper(pair: Pair, every: int) -> np.ndarray:
+def cm_paper(pair: Pair, every: int) -> Values:
     """(hand and frame,) mean over points of |map made - map asked for|, cm; distances to the nearest of 778 vertices.
 
     None for a motion that was asked for no map (``hoidata.metrics.asked``).
@@ -334,16 +349,16 @@ def cm_paper(pair: Pair, every: int) -> np.ndarray:
     return _map_errors_cm(pair, every, None, np.inf)
 
 
-def cm_corrected(pair: Pair, every: int) -> np.ndarray:
+def cm_corrected(pair: Pair, every: int) -> Values:
     """(hand and frame,) the same to the vertices the map asked for is of, distances beyond 20 cm taken as that."""
     asked = pair.asked_distances
     return _map_errors_cm(pair, every, None if asked is None else asked.hand_vertices, CAP_M)
 
 
-def _map_errors_cm(pair: Pair, every: int, hand_vertices: np.ndarray | None, cap_m: float) -> np.ndarray:
+def _map_errors_cm(pair: Pair, every: int, hand_vertices: np.ndarray | None, cap_m: float) -> Values:
     asked, track, errors = pair.asked_distances, pair.predicted.clip.object, []
     if asked is None:
-        return np.zeros(0)
+        return Unmeasured("the motion was made without a target map of distances")
     world_from_object = track.world_from_object
     for side in pair.sides:
         hand, wanted = _vertices_m(pair.predicted, side), asked.distance_m[:, SIDES.index(side)]

@@ -25,6 +25,7 @@ from scipy.spatial import KDTree
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.metrics.bimart import DEEP_M, LESS_DEEP_M, part_depth_m, placed_hands, turns, turns_rad
 from hoidata.metrics.pair import Pair
+from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, RIGID, Unmeasured, Values
 from hoidata.objects.mesh import mass_properties
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
@@ -65,18 +66,19 @@ def pen_paper(pair: Pair, every: int) -> np.ndarray:
     return np.concatenate(each)
 
 
-def pen_corrected(pair: Pair, every: int) -> np.ndarray:
+def pen_corrected(pair: Pair, every: int) -> Values:
     """(hand and frame,) share of 778 vertices deeper than 5 mm in the solid; none for an object without an inside."""
     index = surface_index(pair.predicted.clip.object.model)
-    hands = placed_hands(pair) if index.is_solid else []
-    depths = [index.depth_m(hand.vertices_m, hand.hinge_rad) for hand in hands]
+    if not index.is_solid:
+        return NO_INSIDE
+    depths = [index.depth_m(hand.vertices_m, hand.hinge_rad) for hand in placed_hands(pair)]
     return np.concatenate([np.zeros(0), *((depth > LESS_DEEP_M).mean(axis=1)[::every] for depth in depths)])
 
 
 # --- forces
 
 
-def con_paper(pair: Pair, every: int) -> np.ndarray:
+def con_paper(pair: Pair, every: int) -> Values:
     """(frame with a hand, between recorded ones,) 1 where contacts carry both parts as in the release, else 0.
 
     None without known gravity.
@@ -84,16 +86,20 @@ def con_paper(pair: Pair, every: int) -> np.ndarray:
     return _carried(pair, every, paper=True)
 
 
-def con_corrected(pair: Pair, every: int) -> np.ndarray:
+def con_corrected(pair: Pair, every: int) -> Values:
     """(frame with a hand, between recorded ones,) the same in SI units; none either for an object without an inside."""
     return _carried(pair, every, paper=False)
 
 
-def _carried(pair: Pair, every: int, paper: bool) -> np.ndarray:
+def _carried(pair: Pair, every: int, paper: bool) -> Values:
     clip, down = pair.predicted.clip, pair.reference.clip.gravity
     triples = pair.triples()
     triples = triples[pair.looked_at()[triples[:, 1]]][::every]
-    if down is None or pair.table_m is None or not len(triples) or not (paper or _all_solid(clip.object.model)):
+    if down is None or pair.table_m is None:
+        return NO_GRAVITY
+    if not (paper or _all_solid(clip.object.model)):
+        return Unmeasured("a part of the object has no inside")
+    if not len(triples):
         return np.zeros(0)
     weight = down * (1.0 if paper else GRAVITY_M_S2)
     bodies = vertex_masses(clip.object) if paper else even_masses(clip.object)
@@ -218,21 +224,21 @@ def _object_vertices_m(pair: Pair) -> np.ndarray:
 # --- torque about the hinge
 
 
-def art_paper(pair: Pair, every: int) -> np.ndarray:
+def art_paper(pair: Pair, every: int) -> Values:
     """(frame with a hand in which the hinge turns,) 1 where both parts can be turned, in opposite senses, else 0."""
     return _turned(pair, every, paper=True)
 
 
-def art_corrected(pair: Pair, every: int) -> np.ndarray:
+def art_corrected(pair: Pair, every: int) -> Values:
     """(frame with a hand in which it turns by more than 0.002 rad,) the same with contacts of the exact surface."""
     return _turned(pair, every, paper=False)
 
 
-def _turned(pair: Pair, every: int, paper: bool) -> np.ndarray:
+def _turned(pair: Pair, every: int, paper: bool) -> Values:
     track = pair.predicted.clip.object
     hinge = track.model.hinge
     if hinge is None or track.hinge_rad is None or len(track.model.parts) < 2:
-        return np.zeros(0)
+        return RIGID
     turning = turns_rad(track) > TURNED_PAPER_RAD if paper else turns(track)
     frames = np.flatnonzero(turning & pair.looked_at())[::every]
     contacts = _contacts(pair, paper) if len(frames) else {}
