@@ -170,11 +170,12 @@ def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
     shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in found.values)]
     never = [metric for metric in ALL_METRICS if metric not in shown and _reasons(metric, found)]
     titles = dict.fromkeys(metric.topic for metric in ALL_METRICS if metric in shown or metric in never)
-    topics = [
-        _topic(title, *([metric for metric in some if metric.topic == title] for some in (shown, never)), found)
-        for title in titles
-    ]
+    topics = [_topic(title, *(_of_topic(title, some) for some in (shown, never)), found=found) for title in titles]
     return MetricsTable([_row(name, found, shown) for name in found.values], topics)
+
+
+def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
+    return [metric for metric in metrics if metric.topic == title]
 
 
 def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
