@@ -76,7 +76,7 @@ def action_followed(pair: Pair, every: int) -> Values:
     if pair.verb is None:
         return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.limits:
-        return Unmeasured("no limits are known of the verb: it is not in actions.toml, and has too few training clips")
+        return Unmeasured("no limits are known of the verb")
     followed = pair.actions.followed(pair.verb, _action(pair))
     return NO_GRAVITY if followed is None else np.array([float(followed)])
 

@@ -76,7 +76,7 @@ class Chart:
 class Topic:
     """Metrics that belong together. columns: (title, unit, which are better); cells: a list for each row.
 
-    unmeasured: (title, reasons and counts in words) of the metrics that no row has a figure of.
+    unmeasured: (titles, reasons and counts in words) of the metrics that no row has a figure of.
     """
 
     title: str
@@ -251,7 +251,10 @@ def _topic(title: str, metrics: list[AnyMetric], never: list[AnyMetric], found: 
     cells = [[_cell(name, metric, found) for metric in metrics] for name in found.values]
     columns = [(metric.title, metric.unit, _better(metric)) for metric in metrics]
     charts = [chart for metric in metrics if (chart := _chart(metric, found))]
-    return Topic(title, columns, cells, charts, [(metric.title, _reasons(metric, found)) for metric in never])
+    titles = defaultdict[str, list[str]](list)
+    for metric in never:
+        titles[_reasons(metric, found)].append(metric.title)
+    return Topic(title, columns, cells, charts, [("; ".join(own), words) for words, own in titles.items()])
 
 
 def _cell(family: str, metric: AnyMetric, found: _Found) -> Cell:

@@ -170,7 +170,7 @@ def test_numbers_keep_three_digits():
 
 
 NO_INSIDE = "the object has no inside"
-PENETRATION, LENGTH = "penetration_mm", "length_error_frames"
+PENETRATION, LENGTH, LENGTH_SHARE = "penetration_mm", "length_error_frames", "length_error_share"
 
 
 @pytest.fixture
@@ -183,7 +183,8 @@ def partly(folder):
         (folder / "ground-truth.json", FIGURES["ground-truth"], 10),
     ):
         unmeasured = {PENETRATION: {NO_INSIDE: missing}} if missing else {}
-        more = {"unmeasured": unmeasured | {LENGTH: {"the length was given": 10}}}
+        given = {"the length was given": 10}
+        more = {"unmeasured": unmeasured | {LENGTH: given, LENGTH_SHARE: given}}
         path.write_text(written(figures, counts={PENETRATION: {"clips": 10 - missing}}, **more))
     return folder
 
@@ -197,13 +198,14 @@ def test_a_metric_measured_in_some_clips_says_in_how_many_and_why_not_in_the_oth
 
 def test_a_metric_that_no_row_has_stands_below_its_topic_with_the_reason(partly):
     topic = next(topic for topic in table_of(partly).topics if topic.unmeasured)
-    assert topic.unmeasured == [(title(LENGTH), "the length was given: 10 clips")]
+    titles = f"{title(LENGTH)}; {title(LENGTH_SHARE)}"
+    assert topic.unmeasured == [(titles, "the length was given: 10 clips")]
     loader = jinja2.PackageLoader("pipelines.pages", "")
     environment = jinja2.Environment(loader=loader, autoescape=True)
     text = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}').render(
         table=table_of(partly)
     )
-    assert f"Not measured: {title(LENGTH)} (the length was given: 10 clips)." in text
+    assert f"Not measured: {titles} (the length was given: 10 clips)." in text
     assert f'title="{NO_INSIDE}: 10 clips">not measured</td>' in text
     assert "3 of 10 clips</span>" in text
 
