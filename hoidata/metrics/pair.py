@@ -99,7 +99,7 @@ class Pair:
     def scene(self) -> Scene | Unmeasured:
         """The acting hands of the prediction and its object, on the table of the reference clip.
 
-        None where gravity is not known, where the object encloses no solid, and for less than three frames.
+        Unmeasured where gravity is not known, where the object encloses no solid, and for less than three frames.
         """
         clip = self.predicted.clip
         if self.table_m is None:
