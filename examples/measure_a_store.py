@@ -10,3 +10,5 @@ if __name__ == "__main__":  # workers import this file
     print(f"{found['motions']} motions of {found['held_out_clips']} clips")
     for name, value in found["figures"].items():
         print(f"{name:28s} {value:.4g}")
+    for name, reasons in found["unmeasured"].items():
+        print(f"{name:28s} not measured: {', '.join(f'{why}: {clips} clips' for why, clips in reasons.items())}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.files.written import read_json
+from hoidata.metrics.unmeasured import reasons_in_words
 from pipelines.stages.base import write_json
 
 # action_named needs an evaluator, so that it is not everywhere.
@@ -19,10 +20,14 @@ def write_figures(
     """``figures.json`` (dataset, family, metric), ``bars/<dataset>.csv`` (the same, a row per family) and
     ``losses/<dataset>-<network>.csv`` (validation loss by step) in the folder ``out``.
 
-    metrics, checkpoints: folders with an entry per dataset. What was not measured or trained is left out.
+    metrics, checkpoints: folders with an entry per dataset. What was not trained is left out. Of metrics that could
+    not be measured, ``figures.json`` has the reasons with counts under ``not measured`` (dataset, family, metric).
     """
-    figures = {dataset: _leading(metrics / dataset, families) for dataset in datasets}
-    write_json(out / "figures.json", {dataset: rows for dataset, rows in figures.items() if rows})
+    measured = {dataset: _read(metrics / dataset, families) for dataset in datasets}
+    figures = {dataset: _leading(rows) for dataset, rows in measured.items()}
+    missing = {dataset: rows for dataset, found in measured.items() if (rows := _unmeasured(found))}
+    named = {dataset: rows for dataset, rows in figures.items() if rows}
+    write_json(out / "figures.json", named | ({"not measured": missing} if missing else {}))
     for folder in ("bars", "losses"):
         (out / folder).mkdir()
     for dataset, rows in figures.items():
@@ -36,11 +41,28 @@ def write_figures(
             _write_csv(out / "losses" / f"{dataset}-{log.parent.name}.csv", ["step", "validation"], table)
 
 
-def _leading(folder: Path, families: Sequence[str]) -> dict[str, dict[str, float]]:
+def _read(folder: Path, families: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """What was evaluated of each family."""
+    return {name: read_json(folder / f"{name}.json") for name in families if (folder / f"{name}.json").is_file()}
+
+
+def _leading(read: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
     """The leading figures of every family that was measured, rounded: floats of another machine differ in the last."""
-    read = {name: read_json(folder / f"{name}.json") for name in families if (folder / f"{name}.json").is_file()}
     found = {family: _rounded(values.get("figures") or {}) for family, values in read.items()}
     return {family: figures for family, figures in found.items() if figures}
+
+
+def _unmeasured(read: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
+    """The leading metrics without a figure, by family, with reasons and counts in words."""
+    rows = {
+        family: {
+            name: reasons_in_words(values["unmeasured"][name])
+            for name in LEADING
+            if name in values.get("unmeasured", {}) and name not in values.get("figures", {})
+        }
+        for family, values in read.items()
+    }
+    return {family: words for family, words in rows.items() if words}
 
 
 def _rounded(figures: dict[str, Any]) -> dict[str, float]:

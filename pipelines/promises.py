@@ -12,6 +12,7 @@ from typing import Any, Literal
 from hoidata.errors import BadInput
 from hoidata.files.written import read_json
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
+from hoidata.metrics.unmeasured import reasons_in_words
 
 TRUTH = "ground-truth"
 NOTHING = 1e-4
@@ -37,12 +38,13 @@ class Promise:
 
 @dataclass(frozen=True)
 class Kept:
-    """A promise with both figures. holds: None where one of them was not measured."""
+    """A promise with both figures. holds: None where one of them was not measured, for the reason ``why``."""
 
     promise: Promise
     reference: float | None
     value: float | None
     holds: bool | None
+    why: str = ""
 
 
 def _promises(must: Must, control: str, *metrics: str, beside: str = TRUTH) -> list[Promise]:
@@ -92,10 +94,9 @@ def datasets_below(folder: Path) -> list[Path]:
 
 
 def read_rows(folder: Path) -> dict[str, dict[str, Any]]:
-    """What was measured of each family of one dataset, controls included."""
+    """What was measured of each family of one dataset, controls included; of one without motions, why (``empty``)."""
     paths = [*folder.glob("*.json"), *folder.glob("controls/*.json")]
-    rows = {path.stem: read_json(path) for path in sorted(paths)}
-    return {name: row for name, row in rows.items() if "figures" in row}
+    return {path.stem: read_json(path) for path in sorted(paths)}
 
 
 def kept(rows: Mapping[str, Mapping[str, Any]], promises: Sequence[Promise] = PROMISES) -> list[Kept]:
@@ -106,7 +107,8 @@ def kept(rows: Mapping[str, Mapping[str, Any]], promises: Sequence[Promise] = PR
 def _kept(rows: Mapping[str, Mapping[str, Any]], promise: Promise) -> Kept:
     reference, value = (_figure(rows.get(name, {}), promise.metric) for name in (promise.beside, promise.control))
     if value is None or reference is None:
-        return Kept(promise, reference, value, None)
+        names = [name for name, own in ((promise.beside, reference), (promise.control, value)) if own is None]
+        return Kept(promise, reference, value, None, "; ".join(_why_none(rows, name, promise.metric) for name in names))
     intervals = rows[promise.beside].get("intervals", {}).get(promise.metric, {})
     low, high = intervals.get("clips", (reference, reference))
     holds = {
@@ -123,6 +125,17 @@ def _figure(row: Mapping[str, Any], metric: str) -> float | None:
     if metric.startswith(CONFUSED):
         return taken_for_reverse(row.get("evaluators", {}).get(metric.removeprefix(CONFUSED).strip(), {}))
     return row.get("figures", {}).get(metric)
+
+
+def _why_none(rows: Mapping[str, Mapping[str, Any]], family: str, metric: str) -> str:
+    """Why a family has no figure of a metric."""
+    row = rows.get(family)
+    if row is None:
+        return f"{family} was not evaluated"
+    if "figures" not in row:
+        return f"{family}: {row['empty']}"
+    reasons = row.get("unmeasured", {}).get(metric)
+    return f"{family}: {reasons_in_words(reasons) if reasons else 'the metric was not computed'}"
 
 
 def taken_for_reverse(evaluator: Mapping[str, Any]) -> float | None:

@@ -6,38 +6,49 @@ To add one: rows of ``registry.Metric``, whose names no other list has, and its 
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 
-import numpy as np
-
 from hoidata.errors import BadInput
 from hoidata.metrics import bimart, cams
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.registry import HANDS, METRICS, Direction, Metric
+from hoidata.metrics.unmeasured import Values
 
 BIMART, CAMS = "BimArt (Zhang et al. 2025)", "CAMS (Zheng et al. 2023)"
 _PAPER, _CORRECTED = "as released", "this project: corrected"
-_MOVES = f"{HANDS} and an object vertex moves by more than 0.01 mm to the next"
-_TURNS = f"{HANDS} and the hinge turns by more than 0.001 rad to the next"
-_PARITY = "inside where a line crosses the whole mesh an odd number of times"
+_HINGE = f"the hinge turns by more than {bimart.TURNED_RAD:g} rad"
+_MOVES = f"{HANDS} and an object vertex moves by more than {1000 * bimart.MOVED_M:g} mm, or {_HINGE}, to the next"
+_TURNS = f"{HANDS} and {_HINGE} to the next"
+_MOVES_RELEASED = (
+    f"{HANDS} and an object vertex moves by more than {1000 * bimart.MOVED_AS_RELEASED_M:g} mm to the next, as in "
+    "every frame of a recording"
+)
+_TURNS_RELEASED = f"{HANDS} and the hinge turns by more than {bimart.TURNED_AS_RELEASED_RAD:g} rad to the next"
+_WHOLE = "inside where the winding number of the whole posed mesh is odd"
+_PART = "inside where the winding number of the part's triangles is odd"
 _SOLID = "inside the solid of a closed part"
 _CONTACT = "5 mm or nearer, none deeper than 1 cm"
 _FORCES = "residual below 0.01, friction 0.35, contact 2 mm"
-Measure = Callable[[Pair, int], np.ndarray]
+Measure = Callable[[Pair, int], Values]
 _THREE = f"{HANDS}, three recorded ones in a row"
 _INNER = f"{HANDS}, with a recorded one before and after; known gravity"
 
 
 def _shares(
-    name: str, title: str, direction: Direction, measures: tuple[Measure, Measure], frames: str, limits: tuple[str, str]
+    name: str,
+    title: str,
+    direction: Direction,
+    measures: tuple[Measure, Measure],
+    frames: tuple[str, str],
+    limits: tuple[str, str],
 ) -> tuple[Metric, Metric]:
     """A share of frames in percent, paper and corrected; ``paper`` pools the frames of each clip's first motion."""
     return (
         Metric(
             "BimArt", f"bimart_{name}_paper", f"{title}, paper", "%", direction, measures[0],
-            "mean over frames", frames, f"{BIMART}, {_PAPER}", samples=1, thresholds=limits[0],
+            "mean over frames", frames[0], f"{BIMART}, {_PAPER}", samples=1, thresholds=limits[0],
         ),
         Metric(
             "BimArt", f"bimart_{name}_corrected", f"{title}, corrected", "%", direction, measures[1],
-            "mean over motions", frames, f"{BIMART}, {_CORRECTED}", thresholds=limits[1],
+            "mean over motions", frames[1], f"{BIMART}, {_CORRECTED}", thresholds=limits[1],
         ),
     )  # fmt: skip
 
@@ -57,15 +68,15 @@ BIMART_METRICS: tuple[Metric, ...] = (
         "mean over motions", _THREE, f"{BIMART}, {_CORRECTED}",
     ),
     *_shares(
-        "pen_1cm", "Pen 1 cm", "lower", (bimart.pen_1cm_paper, bimart.pen_1cm_corrected), HANDS,
-        (f"1 cm, {_PARITY}", f"1 cm, {_SOLID}"),
+        "pen_1cm", "Pen 1 cm", "lower", (bimart.pen_1cm_paper, bimart.pen_1cm_corrected), (HANDS, HANDS),
+        (f"1 cm, {_WHOLE}", f"1 cm, {_SOLID}"),
     ),
     *_shares(
-        "pen_5mm", "Pen 5 mm", "lower", (bimart.pen_5mm_paper, bimart.pen_5mm_corrected), HANDS,
-        (f"5 mm, {_PARITY}", f"5 mm, {_SOLID}"),
+        "pen_5mm", "Pen 5 mm", "lower", (bimart.pen_5mm_paper, bimart.pen_5mm_corrected), (HANDS, HANDS),
+        (f"5 mm, {_WHOLE}", f"5 mm, {_SOLID}"),
     ),
     *_shares(
-        "con", "Con", "higher", (bimart.con_paper, bimart.con_corrected), _MOVES,
+        "con", "Con", "higher", (bimart.con_paper, bimart.con_corrected), (_MOVES_RELEASED, _MOVES),
         ("nearer than 5 mm, or at any depth inside", _CONTACT),
     ),
     Metric(
@@ -73,7 +84,7 @@ BIMART_METRICS: tuple[Metric, ...] = (
         bimart.con_everywhere_corrected, "mean over motions", HANDS, f"{BIMART}, {_CORRECTED}", thresholds=_CONTACT,
     ),
     *_shares(
-        "art", "Art", "higher", (bimart.art_paper, bimart.art_corrected), _TURNS,
+        "art", "Art", "higher", (bimart.art_paper, bimart.art_corrected), (_TURNS_RELEASED, _TURNS),
         (
             "nearer than 5 mm to the faces wholly in the moving part, or at any depth inside",
             f"{_CONTACT}, of the moving part with its seam",
@@ -90,7 +101,7 @@ BIMART_METRICS: tuple[Metric, ...] = (
     ),
     Metric(
         "CAMS", "cams_pen_paper", "CAMS Pen, paper", "", "lower", cams.pen_paper, "mean over motions", HANDS,
-        f"{CAMS}, {_PAPER}: share of hand vertices, added up over parts", samples=1, thresholds=f"5 mm, {_PARITY}",
+        f"{CAMS}, {_PAPER}: share of hand vertices, added up over parts", samples=1, thresholds=f"5 mm, {_PART}",
     ),
     Metric(
         "CAMS", "cams_pen_corrected", "CAMS Pen, corrected", "", "lower", cams.pen_corrected, "mean over motions",

@@ -23,8 +23,9 @@ from scipy.optimize import nnls
 from scipy.spatial import KDTree
 
 from hoidata.clips.clip import FPS, ObjectTrack
-from hoidata.metrics.bimart import DEEP_M, LESS_DEEP_M, TURNED_RAD, Shell, placed_hands, shells
+from hoidata.metrics.bimart import DEEP_M, LESS_DEEP_M, part_depth_m, placed_hands, turns, turns_rad
 from hoidata.metrics.pair import Pair
+from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, RIGID, Unmeasured, Values
 from hoidata.objects.mesh import mass_properties
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
@@ -58,27 +59,26 @@ class Masses(NamedTuple):
 
 def pen_paper(pair: Pair, every: int) -> np.ndarray:
     """(hand and frame,) share of 778 vertices deeper than 5 mm in a part's mesh, added up over parts."""
-    model = pair.predicted.clip.object.model
-    parts = shells(surface_index(model))
-    each = [np.zeros(0)]
+    model, each = pair.predicted.clip.object.model, [np.zeros(0)]
     for hand in placed_hands(pair):
-        deep = [_depths_m(hand, model, part, shell) > LESS_DEEP_M for part, shell in parts.items()]
+        deep = [part_depth_m(hand, model, part) > LESS_DEEP_M for part in model.parts]
         each.append(np.sum(deep, axis=0).mean(axis=1)[::every])
     return np.concatenate(each)
 
 
-def pen_corrected(pair: Pair, every: int) -> np.ndarray:
+def pen_corrected(pair: Pair, every: int) -> Values:
     """(hand and frame,) share of 778 vertices deeper than 5 mm in the solid; none for an object without an inside."""
     index = surface_index(pair.predicted.clip.object.model)
-    hands = placed_hands(pair) if index.is_solid else []
-    depths = [index.depth_m(hand.vertices_m, hand.hinge_rad) for hand in hands]
+    if not index.is_solid:
+        return NO_INSIDE
+    depths = [index.depth_m(hand.vertices_m, hand.hinge_rad) for hand in placed_hands(pair)]
     return np.concatenate([np.zeros(0), *((depth > LESS_DEEP_M).mean(axis=1)[::every] for depth in depths)])
 
 
 # --- forces
 
 
-def con_paper(pair: Pair, every: int) -> np.ndarray:
+def con_paper(pair: Pair, every: int) -> Values:
     """(frame with a hand, between recorded ones,) 1 where contacts carry both parts as in the release, else 0.
 
     None without known gravity.
@@ -86,16 +86,20 @@ def con_paper(pair: Pair, every: int) -> np.ndarray:
     return _carried(pair, every, paper=True)
 
 
-def con_corrected(pair: Pair, every: int) -> np.ndarray:
+def con_corrected(pair: Pair, every: int) -> Values:
     """(frame with a hand, between recorded ones,) the same in SI units; none either for an object without an inside."""
     return _carried(pair, every, paper=False)
 
 
-def _carried(pair: Pair, every: int, paper: bool) -> np.ndarray:
+def _carried(pair: Pair, every: int, paper: bool) -> Values:
     clip, down = pair.predicted.clip, pair.reference.clip.gravity
     triples = pair.triples()
     triples = triples[pair.looked_at()[triples[:, 1]]][::every]
-    if down is None or pair.table_m is None or not len(triples) or not (paper or _all_solid(clip.object.model)):
+    if down is None or pair.table_m is None:
+        return NO_GRAVITY
+    if not (paper or _all_solid(clip.object.model)):
+        return Unmeasured("a part of the object has no inside")
+    if not len(triples):
         return np.zeros(0)
     weight = down * (1.0 if paper else GRAVITY_M_S2)
     bodies = vertex_masses(clip.object) if paper else even_masses(clip.object)
@@ -220,24 +224,23 @@ def _object_vertices_m(pair: Pair) -> np.ndarray:
 # --- torque about the hinge
 
 
-def art_paper(pair: Pair, every: int) -> np.ndarray:
+def art_paper(pair: Pair, every: int) -> Values:
     """(frame with a hand in which the hinge turns,) 1 where both parts can be turned, in opposite senses, else 0."""
     return _turned(pair, every, paper=True)
 
 
-def art_corrected(pair: Pair, every: int) -> np.ndarray:
-    """(frame with a hand in which it turns by more than 0.001 rad,) the same with contacts of the exact surface."""
+def art_corrected(pair: Pair, every: int) -> Values:
+    """(frame with a hand in which it turns by more than 0.002 rad,) the same with contacts of the exact surface."""
     return _turned(pair, every, paper=False)
 
 
-def _turned(pair: Pair, every: int, paper: bool) -> np.ndarray:
+def _turned(pair: Pair, every: int, paper: bool) -> Values:
     track = pair.predicted.clip.object
     hinge = track.model.hinge
     if hinge is None or track.hinge_rad is None or len(track.model.parts) < 2:
-        return np.zeros(0)
-    steps = np.abs(np.diff(track.hinge_rad.astype(np.float64)))
-    turning = steps > (TURNED_PAPER_RAD if paper else TURNED_RAD)
-    frames = np.flatnonzero(turning & pair.looked_at()[:-1])[::every]
+        return RIGID
+    turning = turns_rad(track) > TURNED_PAPER_RAD if paper else turns(track)
+    frames = np.flatnonzero(turning & pair.looked_at())[::every]
     contacts = _contacts(pair, paper) if len(frames) else {}
     turned = []
     for frame in frames:
@@ -299,7 +302,7 @@ Touching = Iterator[tuple[int, np.ndarray, np.ndarray]]
 def _touching_paper(hand: PlacedHand, model: ObjectModel, part: int, local_m: np.ndarray) -> Touching:
     """Row of the hand, vertices of the part nearest to hand vertices that touch, and their normals; part frame."""
     tree, normals, vertices = _vertex_tree(surface_index(model), part)
-    near = _depths_m(hand, model, part, shells(surface_index(model))[part]) > -TOUCH_M
+    near = part_depth_m(hand, model, part) > -TOUCH_M
     for row in np.flatnonzero(near.any(axis=1)):
         nearest = np.unique(tree.query(local_m[row, near[row]])[1])
         yield int(row), vertices[nearest], normals[nearest]
@@ -313,13 +316,6 @@ def _touching_corrected(hand: PlacedHand, model: ObjectModel, part: int, local_m
     for row in np.flatnonzero(near.any(axis=1)):
         found = surface.nearest(np.ascontiguousarray(local_m[row, near[row]]))
         yield int(row), found.closest_m, found.normal
-
-
-def _depths_m(hand: PlacedHand, model: ObjectModel, part: int, shell: Shell) -> np.ndarray:
-    """(valid frame, 778) depth in one part, positive inside; -inf 2 cm outside and beyond."""
-    local = model.object_from_part(part, hand.hinge_rad).inverse() @ hand.vertices_m
-    apart, inside = shell.signed_m(np.ascontiguousarray(local.reshape(-1, 3)))
-    return np.where(inside, apart, -apart).reshape(hand.vertices_m.shape[:2])
 
 
 @lru_cache(maxsize=64)

@@ -11,12 +11,17 @@ Figures of predicted clips beside the clips they were made for. This file is gen
 for any store of clips, whatever made it; ten lines that write one stand in docs/measure.md, and a test runs them.
 `hoidata.metrics.evaluate.evaluate_store` gives the figures to code.
 
-To add a metric: a function of (pair, every) that gives the values of one motion as an array, and a row in `METRICS`.
+To add a metric: a function of (pair, every) that gives the values of one motion as an array, or `Unmeasured` with the
+reason, and a row in `METRICS`.
 
 - *nearer the truth*: the figure of the recorded clips themselves is best (family `ground-truth`), not more, not less.
 - *mean over motions*: of each motion's mean; *mean over frames*: of all values of all motions; *best of a clip's
-  samples*: of each motion's mean the best of a clip, then the mean over clips. Motions without a value (an object
-  without an inside, unknown gravity, nothing lifted) are left out; a file says how many clips, motions, values count.
+  samples*: of each motion's mean the best of a clip, then the mean over clips. A file says how many clips, motions and
+  values went into each figure (`counts`).
+- A clip without a value of a metric is not counted as 0. `unmeasured` gives, for each metric, the reasons (the object
+  has no inside, gravity is not known, no such frame) and how many clips have each. A metric without a value in any clip
+  has no figure, and tables and pages list it as not measured, with reasons and counts. Clips that could not be compared
+  at all are in `left_out`.
 - Acting hands and the frames they are seen in are those of the reference; other hands are not looked at.
 - Two 95 % intervals stand beside a figure. `repetitions`: Student's, over repetitions of the experiment, of which the
   k-th is motion k of every clip; it says what another run of the sampler would give. `clips`: a bootstrap that draws

@@ -28,7 +28,8 @@ from hoidata.metrics.encoded import Encoder
 from hoidata.metrics.encoded_store import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
-from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count
+from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count, unmeasured
+from hoidata.metrics.unmeasured import CHOSEN_LENGTH, Values
 from hoidata.objects.model import ObjectModel
 from hoidata.physics.scene import object_scene
 from hoidata.store.annotated import AnnotatedStore, load_annotated
@@ -52,7 +53,7 @@ class Sample(NamedTuple):
     """One motion that was measured: its number among those of the clip, and its values by metric."""
 
     number: int
-    values: dict[str, np.ndarray]
+    values: dict[str, Values]
 
 
 class Measured(NamedTuple):
@@ -62,8 +63,8 @@ class Measured(NamedTuple):
     samples: list[Sample]
     left_out: list[Unlike]
 
-    def of(self, metric: Metric, number: int | None = None) -> list[np.ndarray]:
-        """The values of one metric, one array per motion it looked at, or those of one number."""
+    def of(self, metric: Metric, number: int | None = None) -> list[Values]:
+        """The values of one metric, or the reason for none, per motion it looked at, or those of one number."""
         chosen = [own.values for own in self.samples if number is None or own.number == number]
         return [values[metric.name] for values in chosen if metric.name in values]
 
@@ -87,7 +88,8 @@ def evaluate_store(
     processes, used from ``WORKERS_PAY_FROM`` motions on; they change no figure. progress: a bar on stderr.
     Gives held_out_clips, motions, synthetic, length ("given" or "own"), figures (one number per metric that has any
     value), intervals (95 %, over repetitions and over clips drawn by source sequence, where there are two or more),
-    counts (how many clips, motions and values went into each), actions (where the limits of verbs come from) and
+    counts (how many clips, motions and values went into each), unmeasured (of each metric without a value of some clip
+    that could be compared, how many such clips there are by reason), actions (where the limits of verbs come from) and
     left_out (clip id and reason); with encoders also notes and evaluators (``encoder_summary``); by_clip: also by_clip,
     for each clip its group (the source sequence) and for each metric with a value there its sum and count, so that
     two stores can be compared clip by clip. Raises BadInput where no clip of the two stores can be compared.
@@ -144,16 +146,19 @@ def _parts_by_clip(metrics: Sequence[Metric], found: Mapping[str, Measured]) -> 
 
 
 def _summary(metrics: Sequence[Metric], measured: list[Measured]) -> dict[str, dict[str, Any]]:
-    """figures, intervals and counts of the metrics that have any value."""
+    """figures, intervals and counts of the metrics that have any value; unmeasured: reasons of those that lack some."""
     figures, intervals, counts = dict[str, float](), dict[str, dict[str, list[float]]](), dict[str, dict[str, int]]()
+    without = dict[str, dict[str, int]]()
     for metric in metrics:
+        if reasons := unmeasured(metric, [own.of(metric) for own in measured]):
+            without[metric.name] = reasons
         figure = reduced(metric, [own.of(metric) for own in measured])
         if figure is not None:
             figures[metric.name] = round(figure.value, DIGITS)
             counts[metric.name] = figure.counts
             if spread := intervals_of(metric, measured):
                 intervals[metric.name] = spread
-    return {"figures": figures, "intervals": intervals, "counts": counts}
+    return {"figures": figures, "intervals": intervals, "counts": counts, "unmeasured": without}
 
 
 def intervals_of(metric: Metric, measured: list[Measured]) -> dict[str, list[float]]:
@@ -252,15 +257,14 @@ class _Bench:
             looking = [
                 metric
                 for metric in self.metrics
-                if (metric.samples is None or len(found) < metric.samples)
-                and (pair.aligned or not metric.aligned)
-                and not metric.together
+                if (metric.samples is None or len(found) < metric.samples) and not metric.together
             ]
-            values = {metric.name: metric.measure(pair, metric.every) for metric in looking}
+            values = {metric.name: _values(metric, pair) for metric in looking}
             found.append(Sample(_number(sample, clip_id), values))
             pairs += [pair] if together else []  # a motion and its meshes are kept no longer than they are asked for
-        for metric in together if pairs and not self.own_length else ():
-            found[0].values[metric.name] = metric.measure(pairs, metric.every)
+        for metric in together if pairs else ():
+            every_motion = CHOSEN_LENGTH if self.own_length else metric.measure(pairs, metric.every)
+            found[0].values[metric.name] = every_motion
         return Measured(group, found, left_out)
 
     def _pair(self, reference: _Reference, sample: str) -> Pair | str:
@@ -296,6 +300,10 @@ class _Bench:
             None if motion.clip.gravity is None else object_scene(motion.clip).table_height_m,
             verb_of(annotated, clip_id),
         )
+
+
+def _values(metric: Metric, pair: Pair) -> Values:
+    return CHOSEN_LENGTH if metric.aligned and not pair.aligned else metric.measure(pair, metric.every)
 
 
 def _no_map_of(distances: AskedDistances, clip: Clip) -> str:

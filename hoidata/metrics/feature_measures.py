@@ -1,4 +1,4 @@
-"""What can be said of encoded motions; each function gives one figure of a ``Comparison``, or None.
+"""What can be said of encoded motions; each function gives one figure of a ``Comparison``, or why there is none.
 
 Every figure is computed per repetition (the first motion of every clip, the second, ...) and is their mean;
 "released" is how IMoS's code does it.
@@ -24,6 +24,7 @@ from hoidata.metrics.feature_distances import (
 )
 from hoidata.metrics.feature_sets import Comparison, FeatureFigure, mean_figure, mean_matrix, rows_of, set_figure
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
+from hoidata.metrics.unmeasured import Unmeasured
 
 SEED = 0
 GROUP = 32  # sentences to choose from in R-precision
@@ -31,7 +32,10 @@ HALVES = 10
 FRECHET_DRAWS = 200
 RELEASED_PAIRS, RELEASED_PAIRS_OF_LABEL = 200, 20
 MEMORISED_BELOW = 0.5
-Measure = Callable[[Comparison], FeatureFigure | None]
+NO_OTHERS = {False: "there is no other sentence", True: "there is no other sentence about the same object"}
+Found = FeatureFigure | Unmeasured
+Measure = Callable[[Comparison], Found]
+NO_TRAINING = Unmeasured("there are no training clips")
 
 
 def is_top(encoded: EncodedSet, k: int) -> np.ndarray:
@@ -43,7 +47,8 @@ def is_top(encoded: EncodedSet, k: int) -> np.ndarray:
 
 
 def accuracy(k: int) -> Measure:
-    return lambda comparison: mean_figure(comparison, is_top(comparison.predicted, k))
+    without = "the verb is in no training clip"
+    return lambda comparison: mean_figure(comparison, is_top(comparison.predicted, k), without=without)
 
 
 def confusion(encoded: EncodedSet) -> np.ndarray:
@@ -54,22 +59,22 @@ def confusion(encoded: EncodedSet) -> np.ndarray:
     return np.bincount(pairs, minlength=size * size).reshape(size, size)
 
 
-def paired(comparison: Comparison) -> FeatureFigure | None:
+def paired(comparison: Comparison) -> Found:
     own = comparison.reference.features[comparison.own_reference]
     return mean_figure(comparison, fid_paired(own, comparison.predicted.features))
 
 
-def frechet(comparison: Comparison) -> FeatureFigure | None:
+def frechet(comparison: Comparison) -> Found:
     """Against the recorded clips of the same part."""
     return _frechet(comparison, comparison.reference, drawn_alike=True)
 
 
-def frechet_train(comparison: Comparison) -> FeatureFigure | None:
+def frechet_train(comparison: Comparison) -> Found:
     """Against the training clips, of which there are more."""
-    return None if comparison.train is None else _frechet(comparison, comparison.train, drawn_alike=False)
+    return NO_TRAINING if comparison.train is None else _frechet(comparison, comparison.train, drawn_alike=False)
 
 
-def _frechet(comparison: Comparison, other: EncodedSet, drawn_alike: bool) -> FeatureFigure | None:
+def _frechet(comparison: Comparison, other: EncodedSet, drawn_alike: bool) -> Found:
     """drawn_alike: whether ``other`` holds the same clips, drawn again with the predicted ones."""
     sets = comparison.repetitions
     if not all(enough_rows(run.features) for run in sets):
@@ -116,7 +121,7 @@ def floor(distance: Callable[[np.ndarray, np.ndarray], float | None]) -> Measure
     return measure
 
 
-def kernel_distance(comparison: Comparison) -> FeatureFigure | None:
+def kernel_distance(comparison: Comparison) -> Found:
     """Over pairs of different clips alone, as each prediction belongs to one recorded clip (Gretton et al. 2012)."""
     true = comparison.reference.features[rows_of(comparison.clips, comparison.reference)]
 
@@ -129,7 +134,7 @@ def kernel_distance(comparison: Comparison) -> FeatureFigure | None:
     return set_figure(comparison, runs, mean_matrix(comparison, pairs), mean_of_pairs)
 
 
-def diversity(comparison: Comparison) -> FeatureFigure | None:
+def diversity(comparison: Comparison) -> Found:
     """Mean distance over all pairs of clips."""
     ones = lambda run: np.ones((1, len(run)))  # noqa: E731
     apart = lambda run: euclidean(run.features, run.features)  # noqa: E731
@@ -137,7 +142,7 @@ def diversity(comparison: Comparison) -> FeatureFigure | None:
     return set_figure(comparison, runs, mean_matrix(comparison, apart), mean_of_pairs)
 
 
-def diversity_released(comparison: Comparison) -> FeatureFigure | None:
+def diversity_released(comparison: Comparison) -> Found:
     """200 pairs drawn with replacement, in which a clip may meet itself."""
     runs = []
     for number, run in enumerate(comparison.repetitions):
@@ -163,7 +168,7 @@ def mean_within_labels(apart: np.ndarray, label: np.ndarray, weights: np.ndarray
     )
 
 
-def multimodality_by_label(comparison: Comparison) -> FeatureFigure | None:
+def multimodality_by_label(comparison: Comparison) -> Found:
     """Mean distance within a true label, over labels of at least two clips."""
     label = comparison.reference.label[rows_of(comparison.clips, comparison.reference)]
     apart = lambda run: euclidean(run.features, run.features)  # noqa: E731
@@ -171,10 +176,10 @@ def multimodality_by_label(comparison: Comparison) -> FeatureFigure | None:
     single = int((np.unique(label[label != UNKNOWN], return_counts=True)[1] == 1).sum())
     note = f"{single} label{'s' * (single > 1)} of one clip left out" if single else ""
     again = lambda matrix, weights: mean_within_labels(matrix, label, weights)  # noqa: E731
-    return set_figure(comparison, runs, mean_matrix(comparison, apart), again, note)
+    return set_figure(comparison, runs, mean_matrix(comparison, apart), again, note, "no label has two clips")
 
 
-def multimodality_released(comparison: Comparison) -> FeatureFigure | None:
+def multimodality_released(comparison: Comparison) -> Found:
     """20 pairs per predicted label, drawn with replacement; a clip may meet itself, absent labels count as 0."""
     runs = []
     for number, run in enumerate(comparison.repetitions):
@@ -185,12 +190,12 @@ def multimodality_released(comparison: Comparison) -> FeatureFigure | None:
             total += np.linalg.norm(run.features[one] - run.features[other], axis=1).sum()
         runs.append(total / (RELEASED_PAIRS_OF_LABEL * len(run.labels)))
     if not runs:
-        return None
+        return Unmeasured("there are no motions")
     counts = (len(comparison.clips), len(comparison.predicted), len(runs))
     return FeatureFigure(float(np.mean(runs)), *counts, t_interval(runs), note="no interval over clips")
 
 
-def multimodality_by_prompt(comparison: Comparison) -> FeatureFigure | None:
+def multimodality_by_prompt(comparison: Comparison) -> Found:
     """Mean distance of the motions made for one prompt; none where every clip has one motion."""
     predicted, values = comparison.predicted, np.full(len(comparison.predicted), np.nan)
     for clip in comparison.clips:
@@ -198,7 +203,7 @@ def multimodality_by_prompt(comparison: Comparison) -> FeatureFigure | None:
         if len(rows) > 1:
             features = predicted.features[rows]
             values[rows] = mean_of_pairs(euclidean(features, features), np.ones((1, len(rows))))[0]
-    return mean_figure(comparison, values, by_repetition=False)
+    return mean_figure(comparison, values, by_repetition=False, without="the clip has one motion")
 
 
 def ranks(distance: np.ndarray, own: np.ndarray) -> np.ndarray:
@@ -244,10 +249,10 @@ def matched_sentences(comparison: Comparison, hard: bool) -> Groups:
 
 
 def r_precision(k: int, hard: bool) -> Measure:
-    def measure(comparison: Comparison) -> FeatureFigure | None:
+    def measure(comparison: Comparison) -> Found:
         found = matched_sentences(comparison, hard)
         values = np.where(np.isfinite(found.ranks), found.ranks < k, np.nan)
-        return mean_figure(comparison, values, _sizes_in_words(found.sizes))
+        return mean_figure(comparison, values, _sizes_in_words(found.sizes), without=NO_OTHERS[hard])
 
     return measure
 
@@ -255,9 +260,10 @@ def r_precision(k: int, hard: bool) -> Measure:
 def r_precision_chance(k: int, hard: bool) -> Measure:
     """What guessing gives in the same groups."""
 
-    def measure(comparison: Comparison) -> FeatureFigure | None:
+    def measure(comparison: Comparison) -> Found:
         found = matched_sentences(comparison, hard)
-        return mean_figure(comparison, np.minimum(k / found.sizes, 1.0), _sizes_in_words(found.sizes))
+        chance, note = np.minimum(k / found.sizes, 1.0), _sizes_in_words(found.sizes)
+        return mean_figure(comparison, chance, note, without=NO_OTHERS[hard])
 
     return measure
 
@@ -270,15 +276,15 @@ def _sizes_in_words(sizes: np.ndarray) -> str:
     return f"groups of {low}" if low == high else f"groups of {low} to {high}"
 
 
-def matching_distance(comparison: Comparison) -> FeatureFigure | None:
+def matching_distance(comparison: Comparison) -> Found:
     assert comparison.predicted.text is not None
     return mean_figure(comparison, np.linalg.norm(comparison.predicted.features - comparison.predicted.text, axis=1))
 
 
-def memorised(comparison: Comparison) -> FeatureFigure | None:
+def memorised(comparison: Comparison) -> Found:
     """1 where a motion is less than half as far from its nearest training clip as its recorded clip is from its own."""
     if comparison.train is None:
-        return None
+        return NO_TRAINING
     sets, train = (comparison.predicted, comparison.reference), comparison.train.features
     own, usual = (euclidean(encoded.features, train).min(axis=1) for encoded in sets)
     return mean_figure(comparison, (own < MEMORISED_BELOW * usual[comparison.own_reference]).astype(float))

@@ -33,6 +33,7 @@ from hoidata.metrics.feature_measures import (
     r_precision_chance,
 )
 from hoidata.metrics.feature_sets import Comparison, FeatureFigure
+from hoidata.metrics.unmeasured import Unmeasured
 
 Direction = Literal["higher", "lower", "nearer the truth"]
 
@@ -65,17 +66,24 @@ class FeatureMetric:
 def feature_figures(
     predicted: EncodedSet, reference: EncodedSet, train: EncodedSet | None = None
 ) -> dict[str, FeatureFigure]:
-    """Every figure of the encoder that made the three sets, by name; those of which nothing can be said are not there.
+    """Every figure of the encoder that made the three sets, by name, without those that could not be measured.
 
     Raises ValueError where the sets come from different encoders.
     """
+    found = feature_findings(predicted, reference, train)
+    return {name: figure for name, figure in found.items() if isinstance(figure, FeatureFigure)}
+
+
+def feature_findings(
+    predicted: EncodedSet, reference: EncodedSet, train: EncodedSet | None = None
+) -> dict[str, FeatureFigure | Unmeasured]:
+    """The same with all figures of the encoder: for one that could not be measured the reason."""
     sets = [item for item in (predicted, reference, train) if item is not None]
     if len({(item.encoder, item.digest) for item in sets}) != 1:
         raise ValueError("features of different encoders are no distance apart")
     comparison = Comparison(predicted, reference, train)
     own = [metric for metric in FEATURE_METRICS if metric.encoder == predicted.encoder]
-    found = {metric.name: metric.measure(comparison) for metric in own}
-    return {name: figure for name, figure in found.items() if figure is not None}
+    return {metric.name: metric.measure(comparison) for metric in own}
 
 
 class _Row(NamedTuple):

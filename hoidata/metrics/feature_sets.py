@@ -9,13 +9,15 @@ import numpy as np
 
 from hoidata.metrics.encoded import EncodedSet
 from hoidata.metrics.intervals import Interval, Statistic, bootstrap_interval, t_interval
+from hoidata.metrics.unmeasured import Unmeasured
 
 
 class FeatureFigure(NamedTuple):
     """One figure. value: None where it must not be given, for the reason ``note``. clips, motions, values: in it.
 
     repetitions: 95 % interval over repetitions (Student), which repeat the sampler; bootstrap: over clips, whole
-    sequences drawn again. None where there is none. note: what was left out, or why there is no value.
+    sequences drawn again. None where there is none. note: what was left out, or why there is no value. without: why
+    clips that are not among ``clips`` have no value; "" where all are.
     """
 
     value: float | None
@@ -25,6 +27,7 @@ class FeatureFigure(NamedTuple):
     repetitions: Interval | None = None
     bootstrap: Interval | None = None
     note: str = ""
+    without: str = ""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -69,15 +72,15 @@ def rows_of(clips: np.ndarray, encoded: EncodedSet) -> np.ndarray:
 
 
 def mean_figure(
-    comparison: Comparison, values: np.ndarray, note: str = "", by_repetition: bool = True
-) -> FeatureFigure | None:
-    """The mean of (motion,) values; NaN are left out. None without any.
+    comparison: Comparison, values: np.ndarray, note: str = "", by_repetition: bool = True, without: str = "no value"
+) -> FeatureFigure | Unmeasured:
+    """The mean of (motion,) values; NaN are left out, for the reason ``without``.
 
     by_repetition: whether a repetition alone has a figure.
     """
     known = np.isfinite(values)
     if not known.any():
-        return None
+        return Unmeasured(without)
     clip, sample, values = comparison.predicted.clip[known], comparison.predicted.sample[known], values[known]
     clips, row = np.unique(clip, return_inverse=True)
     means = np.bincount(row, values) / np.bincount(row)
@@ -87,16 +90,25 @@ def mean_figure(
     counts = (len(clips), len(values), len(values))
     over_runs = t_interval(runs) if by_repetition and len(numbers) > 1 else None
     value = float(runs.mean() if by_repetition else means.mean())
-    return FeatureFigure(value, *counts, over_runs, bootstrap_interval(means, groups), note)
+    missing = without if len(clips) < len(comparison.clips) else ""
+    return FeatureFigure(value, *counts, over_runs, bootstrap_interval(means, groups), note, missing)
 
 
 def set_figure(
-    comparison: Comparison, runs: Sequence[float], values: np.ndarray, statistic: Statistic, note: str = ""
-) -> FeatureFigure | None:
-    """A figure of whole sets: (repetition,) figures, and what ``statistic`` needs of the clips to draw them again."""
+    comparison: Comparison,
+    runs: Sequence[float],
+    values: np.ndarray,
+    statistic: Statistic,
+    note: str = "",
+    without: str = "fewer than two clips",
+) -> FeatureFigure | Unmeasured:
+    """A figure of whole sets: (repetition,) figures, and what ``statistic`` needs of the clips to draw them again.
+
+    without: why it has none where no repetition has one.
+    """
     runs = [run for run in runs if np.isfinite(run)]
     if not runs:
-        return None
+        return Unmeasured(without)
     drawn = bootstrap_interval(values, comparison.groups, statistic)
     counts = (len(comparison.clips), len(comparison.predicted), len(runs))
     return FeatureFigure(float(np.mean(runs)), *counts, t_interval(runs), drawn, note)

@@ -11,8 +11,11 @@ from hoidata.actions.action import action_numbers, object_middle_m
 from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.touch import made_entries
+from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured, Values
 from hoidata.physics.mano_capsules import world_rotmats
 from hoidata.physics.realism import has_acceleration, smoothness_m_s2
+
+NO_VERB = Unmeasured("the clip has no verb")
 
 
 def joint_error_mm(pair: Pair, every: int) -> np.ndarray:
@@ -54,32 +57,39 @@ def object_jitter_m_s3(pair: Pair, every: int) -> np.ndarray:
     return np.linalg.norm(third, axis=-1) * FPS**3
 
 
-def length_error_frames(pair: Pair, every: int) -> np.ndarray:
+def length_error_frames(pair: Pair, every: int) -> Values:
     """(1,) by how many frames the length a family chose is wrong, either way; none where the length was given."""
     del every
     wrong = abs(pair.predicted.clip.n_frames - pair.reference.clip.n_frames)
-    return np.zeros(0) if pair.aligned else np.array([float(wrong)])
+    return Unmeasured("the length was given") if pair.aligned else np.array([float(wrong)])
 
 
-def length_error_share(pair: Pair, every: int) -> np.ndarray:
+def length_error_share(pair: Pair, every: int) -> Values:
     """(1,) the same as a share of the true length."""
-    return length_error_frames(pair, every) / pair.reference.clip.n_frames
+    wrong = length_error_frames(pair, every)
+    return wrong if isinstance(wrong, Unmeasured) else wrong / pair.reference.clip.n_frames
 
 
-def action_followed(pair: Pair, every: int) -> np.ndarray:
+def action_followed(pair: Pair, every: int) -> Values:
     """(1,) 1 where the object does what the verb says, else 0; none where nothing is known of the verb."""
     del every
-    followed = None if pair.actions is None else pair.actions.followed(pair.verb, _action(pair))
-    return np.zeros(0) if followed is None else np.array([float(followed)])
+    if pair.verb is None:
+        return NO_VERB
+    if pair.actions is None or pair.verb not in pair.actions.limits:
+        return Unmeasured("no limits are known of the verb")
+    followed = pair.actions.followed(pair.verb, _action(pair))
+    return NO_GRAVITY if followed is None else np.array([float(followed)])
 
 
-def action_named(pair: Pair, every: int) -> np.ndarray:
+def action_named(pair: Pair, every: int) -> Values:
     """(1,) 1 where the verb whose training clips move the object most alike is the one asked for, else 0."""
     del every
+    if pair.verb is None:
+        return NO_VERB
     if pair.actions is None or pair.verb not in pair.actions.centroids:
-        return np.zeros(0)
+        return Unmeasured("no training clip has the verb")
     named = pair.actions.named(_action(pair))
-    return np.zeros(0) if named is None else np.array([float(named == pair.verb)])
+    return NO_GRAVITY if named is None else np.array([float(named == pair.verb)])
 
 
 @lru_cache(maxsize=1)

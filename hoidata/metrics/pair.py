@@ -11,6 +11,7 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import AskedDistances
+from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import Scene, clip_scene
 
@@ -95,14 +96,18 @@ class Pair:
         return triples[np.ptp(np.diff(triples, axis=1), axis=1) == 0]
 
     @cached_property
-    def scene(self) -> Scene | None:
+    def scene(self) -> Scene | Unmeasured:
         """The acting hands of the prediction and its object, on the table of the reference clip.
 
-        None where gravity is not known, where the object encloses no solid, and for less than three frames.
+        Unmeasured where gravity is not known, where the object encloses no solid, and for less than three frames.
         """
         clip = self.predicted.clip
-        if self.table_m is None or clip.n_frames < 3 or not surface_index(clip.object.model).is_solid:
-            return None
+        if self.table_m is None:
+            return NO_GRAVITY
+        if clip.n_frames < 3:
+            return Unmeasured("the motion has fewer than three frames")
+        if not surface_index(clip.object.model).is_solid:
+            return NO_INSIDE
         hands = {side: replace(track, valid=self._present(side)) for side, track in clip.hands.items()}
         gravity = self.reference.clip.gravity
         return clip_scene(replace(clip, hands=hands, gravity=gravity), self.predicted.hands, self.table_m)

@@ -1,6 +1,7 @@
 """The one list of metrics: evaluation, the tables on pages and README.md beside this file are made from it.
 
-To add one: a function of (pair, every) that gives the values of one motion as an array, and a row here. A list of
+To add one: a function of (pair, every) that gives the values of one motion as an array, or ``Unmeasured`` with the
+reason, and a row here. A list of
 ``asked_metrics.py`` is computed only where it is asked for.
 """
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from hoidata.clips.slip import MOVING_CM_S
 from hoidata.metrics import forces, motion, touch, two_hands
+from hoidata.metrics.unmeasured import Unmeasured, Values, counted
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
 
@@ -27,7 +29,7 @@ class Metric:
     topic: what it is about; tables are divided so. name: its key in files. title: in words. unit: of the figure; ""
     for a share or score from 0 to 1.
     direction: which figures are better; "nearer the truth": than the figure of the recorded clips themselves.
-    measure: the values of one motion, given every how many frames to look at; none where nothing can be said.
+    measure: the values of one motion, given every how many frames to look at, or why it has none.
     reduction: how values become one figure. "best of a clip's samples": the mean of each motion's values, the best of
     each clip, the mean over clips; "mean over motions": the mean of each motion's values, the mean over motions; "mean
     over frames": of all values of all motions alike.
@@ -43,7 +45,7 @@ class Metric:
     title: str
     unit: str
     direction: Direction
-    measure: Callable[..., np.ndarray]
+    measure: Callable[..., Values]
     reduction: Reduction
     frames: str
     source: str
@@ -203,12 +205,12 @@ def metric(name: str) -> Metric:
     return found
 
 
-def reduced(metric: Metric, clips: list[list[np.ndarray]]) -> Figure | None:
+def reduced(metric: Metric, clips: list[list[Values]]) -> Figure | None:
     """One figure of the values of every motion, by clip and sample; None where no motion has a value.
 
-    Motions without values are left out, not counted as 0.
+    Motions without values are left out, not counted as 0; ``unmeasured`` counts them.
     """
-    motions = [[values for values in samples if len(values)] for samples in clips]
+    motions = [_with_values(samples) for samples in clips]
     motions = [samples for samples in motions if samples]
     if not motions:
         return None
@@ -221,9 +223,23 @@ def reduced(metric: Metric, clips: list[list[np.ndarray]]) -> Figure | None:
     return Figure(float(value), len(motions), sum(map(len, means)), len(every))
 
 
-def sum_and_count(metric: Metric, samples: list[np.ndarray]) -> tuple[float, int]:
+def unmeasured(metric: Metric, clips: list[list[Values]]) -> dict[str, int]:
+    """How many clips no motion of which has a value, by the reason that the first motion has."""
+    return counted(_why_none(metric, samples) for samples in clips if not _with_values(samples))
+
+
+def _with_values(samples: list[Values]) -> list[np.ndarray]:
+    return [values for values in samples if isinstance(values, np.ndarray) and len(values)]
+
+
+def _why_none(metric: Metric, samples: list[Values]) -> str:
+    reasons = [values.reason for values in samples if isinstance(values, Unmeasured)]
+    return reasons[0] if reasons else f"no such frame: {metric.frames}"
+
+
+def sum_and_count(metric: Metric, samples: list[Values]) -> tuple[float, int]:
     """What one clip brings to a figure: sums over all clips, divided by counts, are the figure."""
-    known = [values for values in samples if len(values)]
+    known = _with_values(samples)
     if metric.reduction == "mean over frames":
         return float(sum(values.sum() for values in known)), sum(map(len, known))
     means = [float(values.mean()) for values in known]

@@ -14,11 +14,13 @@ from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
 from hoidata.metrics.pair import Motion, Pair
+from hoidata.metrics.unmeasured import NO_INSIDE, Unmeasured, Values
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
 from hoidata.surface.solid_overlap import SolidOverlap
 
 DEEP_MM = 10.0
+TOO_LARGE = Unmeasured("the object is too large for a lattice of lines")
 CELL_M = 0.002  # of the lattice of lines that volumes are measured along: off by 1 % of the volume
 
 
@@ -45,10 +47,12 @@ def contact_recall(pair: Pair, every: int) -> np.ndarray:
     return _share(made & true, true, made)
 
 
-def adherence(pair: Pair, every: int) -> np.ndarray:
+def adherence(pair: Pair, every: int) -> Values:
     """(1,) F1 of the contact map the motion makes against the one it was asked for; none where none was asked for."""
     del every
-    return np.zeros(0) if pair.asked is None else np.array([f1_score(touched_points(pair), pair.asked)])
+    if pair.asked is None:
+        return Unmeasured("the motion was made without a target contact map")
+    return np.array([f1_score(touched_points(pair), pair.asked)])
 
 
 def _maps(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
@@ -99,24 +103,26 @@ def contact_distance_mm(pair: Pair, every: int) -> np.ndarray:
     return 1000 * np.concatenate([np.zeros(0), *each])
 
 
-def penetration_mm(pair: Pair, every: int) -> np.ndarray:
+def penetration_mm(pair: Pair, every: int) -> Values:
     """(hand and frame,) depth of the deepest vertex, millimetres, 0 outside; none for an object without an inside."""
-    return 1000 * _deepest_m(pair, every)
+    found = _deepest_m(pair, every)
+    return found if isinstance(found, Unmeasured) else 1000 * found
 
 
-def deep_share(pair: Pair, every: int) -> np.ndarray:
+def deep_share(pair: Pair, every: int) -> Values:
     """(hand and frame,) 1 where the deepest vertex is deeper than ``DEEP_MM``, else 0."""
-    return (penetration_mm(pair, every) > DEEP_MM).astype(np.float64)
+    found = penetration_mm(pair, every)
+    return found if isinstance(found, Unmeasured) else (found > DEEP_MM).astype(np.float64)
 
 
-def penetration_volume_cm3(pair: Pair, every: int) -> np.ndarray:
+def penetration_volume_cm3(pair: Pair, every: int) -> Values:
     """(hand and frame,) volume that the hand and the solid object both fill, cubic centimetres.
 
     None for an object without an inside, or too large for a lattice of ``CELL_M``.
     """
     overlap = _overlap(surface_index(pair.predicted.clip.object.model))
-    if overlap is None:
-        return np.zeros(0)
+    if isinstance(overlap, Unmeasured):
+        return overlap
     hands = _hands(pair, every)
     return 1e6 * np.concatenate(
         [np.zeros(0)] + [overlap.volume_m3(hand.vertices_m, hand.faces, hand.hinge_rad) for hand in hands]
@@ -124,11 +130,12 @@ def penetration_volume_cm3(pair: Pair, every: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _deepest_m(pair: Pair, every: int) -> np.ndarray:
+def _deepest_m(pair: Pair, every: int) -> Values:
     """Kept for one pair: two metrics ask for it, and meshes are what costs."""
     index = surface_index(pair.predicted.clip.object.model)
-    hands = _hands(pair, every) if index.is_solid else []
-    return np.concatenate([np.zeros(0)] + [deepest_m(hand, index)[hand.frames] for hand in hands])
+    if not index.is_solid:
+        return NO_INSIDE
+    return np.concatenate([np.zeros(0)] + [deepest_m(hand, index)[hand.frames] for hand in _hands(pair, every)])
 
 
 @lru_cache(maxsize=1)
@@ -139,11 +146,11 @@ def _hands(pair: Pair, every: int) -> list[PlacedHand]:
 
 
 @lru_cache(maxsize=64)
-def _overlap(index: SurfaceIndex) -> SolidOverlap | None:
+def _overlap(index: SurfaceIndex) -> SolidOverlap | Unmeasured:
     try:
-        return SolidOverlap(index, CELL_M) if index.is_solid else None
+        return SolidOverlap(index, CELL_M) if index.is_solid else NO_INSIDE
     except BadInput:  # a lattice of millimetres over metres
-        return None
+        return TOO_LARGE
 
 
 def _at(hand: PlacedHand, frames: np.ndarray) -> PlacedHand:

@@ -4,17 +4,20 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES
 from hoidata.metrics.pair import Pair
+from hoidata.metrics.unmeasured import Unmeasured, Values
 from hoidata.physics.capsules import Capsules
 from hoidata.physics.mano_capsules import hand_capsules
 
 
-def hand_hand_mm(pair: Pair, every: int) -> np.ndarray:
+def hand_hand_mm(pair: Pair, every: int) -> Values:
     """(frame,) depth of the deepest capsule of one hand in one of the other, millimetres, 0 where they are apart.
 
     None where one hand acts alone.
     """
     frames = np.flatnonzero(pair.valid("left") & pair.valid("right"))[::every]
-    if pair.sides != SIDES or not len(frames):
+    if pair.sides != SIDES:
+        return Unmeasured("one hand acts alone")
+    if not len(frames):
         return np.zeros(0)
     clip, hands = pair.predicted.clip.take(frames), pair.predicted.hands
     left, right = (hand_capsules(clip.hands[side], hands[side]) for side in SIDES)

@@ -9,11 +9,16 @@ from hoidata.errors import BadInput
 Verdict = Literal["ok", "warned", "left out"]
 
 
+NO_HAND = "no hand is ever valid"
+NO_SOLID = "the mesh of the object is not solid"
+
+
 @dataclass(frozen=True)
 class Measure:
     """unit: "" for a count or a share. words: what it is, for people; its faults sit at high values.
 
     warn, leave_out: its :class:`Limit` by default. frame: the column of the frame it was found at, "" for none.
+    unmeasured: why a clip has none, in words.
     """
 
     name: str
@@ -22,6 +27,7 @@ class Measure:
     warn: float | None = None
     leave_out: float | None = None
     frame: str = ""
+    unmeasured: str = NO_HAND
 
 
 # Limits are chosen on the embedded corpora (251 clips) and ManipNet's recordings (45): no clip of theirs reaches
@@ -37,11 +43,32 @@ CLIP_MEASURES = (
         "frozen_hand_frames", "frames", "longest stretch of one hand exactly still while something else moves", 45.0
     ),
     Measure("frozen_all_frames", "frames", "longest stretch of everything exactly still", 30.0, 90.0),
-    Measure("penetration_m", "m", "deepest hand vertex inside the object", 0.02),
-    Measure("penetration_share", "", "share of frames in which a hand is too deep inside", 0.5),
-    Measure("time_offset_frames", "frames", "lag between hands and object, either way", 1.0, 5.0),
-    Measure("largest_beta", "sd", "largest shape coefficient", 3.0, 10.0),
-    Measure("beta_distance", "sd", "distance of the shape from the subject's other clips", 1.5, 6.0),
+    Measure("penetration_m", "m", "deepest hand vertex inside the object", 0.02, unmeasured=NO_SOLID),
+    Measure("penetration_share", "", "share of frames in which a hand is too deep inside", 0.5, unmeasured=NO_SOLID),
+    Measure(
+        "time_offset_frames",
+        "frames",
+        "lag between hands and object, either way",
+        1.0,
+        5.0,
+        unmeasured="hands move with the object in too few frames, or too unlike it",
+    ),
+    Measure(
+        "largest_beta",
+        "sd",
+        "largest shape coefficient",
+        3.0,
+        10.0,
+        unmeasured="no hand is ever valid, or its shape is a template",
+    ),
+    Measure(
+        "beta_distance",
+        "sd",
+        "distance of the shape from the subject's other clips",
+        1.5,
+        6.0,
+        unmeasured="the subject has no other clip, or no hand with a shape",
+    ),
     Measure("gap_share", "", "share of frames in which a hand is lost and comes back", 0.05, 0.5),
     Measure("handless_share", "", "share of frames without any hand", 0.1, 0.9),
 )

@@ -1,6 +1,7 @@
 """``hoidata controls``: whether the rows that must lose do."""
 
 import sys
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +20,7 @@ WORDS = {True: "yes", False: "NO", None: "not measured"}
 
 def controls(
     folder: Metrics,
-    every: Annotated[bool, typer.Option("--all", help="Also list what was not measured.")] = False,
+    every: Annotated[bool, typer.Option("--all", help="Also list each that was not measured.")] = False,
 ) -> None:
     """Check what every control must lose against the truth or a model; exit code 1 where one does not."""
     from rich.console import Console
@@ -32,6 +33,8 @@ def controls(
         console.print(_table(str(dataset), [item for item in found if every or item.holds is not None]))
         counts = {holds: sum(item.holds is holds for item in found) for holds in WORDS}
         typer.echo(f"{counts[True]} hold, {counts[False]} do not, {counts[None]} were not measured")
+        for why, count in sorted(Counter(item.why for item in found if item.holds is None).items()):
+            typer.echo(f"  not measured: {count}: {why}")
         broken += counts[False]
     raise typer.Exit(bool(broken))
 

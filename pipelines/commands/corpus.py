@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+NO_VALUE = "-: the figure compares with training clips, or there are no clips of which it can be said"
 Folders = Annotated[
     list[Path],
     typer.Argument(
@@ -32,7 +33,7 @@ def corpus(
     if as_json:
         typer.echo(json.dumps(found, indent=2, allow_nan=False))
         return
-    table = Table(title="shares are of 1; parts are those of the chosen split")
+    table = Table(title="shares are of 1; parts are those of the chosen split", caption=NO_VALUE)
     table.add_column("figure", overflow="fold")
     for column in COLUMNS:
         table.add_column(column, justify="right")
@@ -42,7 +43,7 @@ def corpus(
 
 
 def _text(value: float | None) -> str:
-    """Counts as they are, all else with two decimals; "-" where a figure says nothing."""
+    """Counts as they are, all else with two decimals; "-" as ``NO_VALUE`` says."""
     if value is None:
         return "-"
     return f"{value:,}" if isinstance(value, int) else f"{value:.2f}"

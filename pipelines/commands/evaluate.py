@@ -35,7 +35,7 @@ def evaluate(
     from hoidata.files import write_whole
     from hoidata.metrics.asked_metrics import with_lists
     from hoidata.metrics.evaluate import evaluate_store
-    from pipelines.pages.metrics_table import printed_table
+    from pipelines.pages.metrics_table import printed_table, unmeasured_lines
     from pipelines.stages.base import jobs
 
     encoders = []
@@ -48,6 +48,8 @@ def evaluate(
         store, reference, hands, split=split, metrics=asked, encoders=encoders, jobs=jobs(), progress=True
     )
     Console(width=None if sys.stdout.isatty() else 120).print(printed_table(found))
+    for line in unmeasured_lines(found):
+        typer.echo(line)
     for item in found["left_out"]:
         typer.echo(f"left out: {item['clip_id']}: {item['reason']}")
     if out is not None:

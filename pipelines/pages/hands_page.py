@@ -10,6 +10,7 @@ from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.files.arrays import write_npz
 from hoidata.files.digest import canonical_json
 from hoidata.hands import HandPair
+from hoidata.metrics.unmeasured import NO_INSIDE
 from hoidata.object_paths.path import PathStep
 from models.bimart.hands import TOUCH_M, MadeHands, Standing
 from pipelines.pages.glb import HAND_COLOURS, write_glb
@@ -187,9 +188,11 @@ def _figures(before: Standing, after: Standing) -> list[tuple[str, ...]]:
         (f"{side} hand touches", *(f"{100 * own.touching[side].mean():.0f} % of frames" for own in (before, after)))
         for side in after.touching
     ]
-    if before.deepest_m is not None and after.deepest_m is not None:
-        deep = [1000 * own.deepest_m for own in (before, after) if own.deepest_m is not None]
-        rows.append(("deepest vertex", *(f"{own.max():.1f} mm" for own in deep)))
-        rows.append(("frames deeper than 1 cm", *(f"{100 * (own > 10).mean():.0f} %" for own in deep)))
+    depths = [own.deepest_m for own in (before, after)]
+    for name, words in (
+        ("deepest vertex", lambda depth_m: f"{1000 * depth_m.max():.1f} mm"),
+        ("frames deeper than 1 cm", lambda depth_m: f"{100 * (depth_m > 0.01).mean():.0f} %"),
+    ):
+        rows.append((name, *(f"not measured: {NO_INSIDE.reason}" if d is None else words(d) for d in depths)))
     rows.append(("mean acceleration", *(f"{own.acceleration_m_s2:.2f} m/s²" for own in (before, after))))
     return rows

@@ -1,5 +1,6 @@
 """What evaluation found, as tables and charts: rows are families and controls, columns the registered metrics."""
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +14,7 @@ from hoidata.files.written import read_json
 from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
+from hoidata.metrics.unmeasured import reasons_in_words
 from pipelines.promises import TRUTH
 
 AnyMetric = Metric | FeatureMetric
@@ -23,7 +25,8 @@ ALL_METRICS: tuple[AnyMetric, ...] = (
 )
 LOOKUPS = ("nearest-clip", "verb-lookup", "verb-lookup-held", "prompt-lookup", "prompt-lookup-held")
 CONTROLS = "controls"
-NO_FIGURE = "-"
+NO_FIGURE = "-"  # the metric was not computed of this row
+NOT_MEASURED = "not measured"
 OTHER_EVALUATOR = "another evaluator"
 INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
 
@@ -32,13 +35,15 @@ INTERVALS = {"clips": "95 %, clips", "repetitions": "95 %, repetitions"}
 class Cell:
     """A figure in text. mark: "good" for the best of all families, "bad" where it loses to a lookup, else "".
 
-    spread: its 95 % interval over clips, in text; note: why there is no figure, or what it leaves out.
+    spread: its 95 % interval over clips, in text; note: why there is no figure, or what it leaves out. share: how many
+    of the clips it is of, in text; "" where it is of all.
     """
 
     text: str
     mark: str = ""
     spread: str = ""
     note: str = ""
+    share: str = ""
 
 
 @dataclass(frozen=True)
@@ -55,22 +60,30 @@ class Bar:
 
 @dataclass(frozen=True)
 class Chart:
-    """One metric with a bar for every row that has a figure. ends: what 0 and 100 percent stand for, in text."""
+    """One metric with a bar for every row that has a figure. ends: what 0 and 100 percent stand for, in text.
+
+    missing: the rows of which it could not be measured, in words.
+    """
 
     title: str
     better: str
     ends: tuple[str, str]
     bars: list[Bar]
+    missing: str = ""
 
 
 @dataclass(frozen=True)
 class Topic:
-    """Metrics that belong together. columns: (title, unit, which are better); cells: a list for each row."""
+    """Metrics that belong together. columns: (title, unit, which are better); cells: a list for each row.
+
+    unmeasured: (titles, reasons and counts in words) of the metrics that no row has a figure of.
+    """
 
     title: str
     columns: list[tuple[str, str, str]]
     cells: list[list[Cell]]
     charts: list[Chart]
+    unmeasured: list[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -136,20 +149,40 @@ class _Found:
     def note(self, family: str, metric: AnyMetric) -> str:
         return str(self.values[family].get("notes", {}).get(metric.name, ""))
 
+    def unmeasured(self, family: str, metric: AnyMetric) -> dict[str, int]:
+        """How many clips of a row have no value of a metric, by reason."""
+        return self.values[family].get("unmeasured", {}).get(metric.name, {})
+
+    def share(self, family: str, metric: AnyMetric) -> str:
+        """``25 of 28``: clips with a value of those that were compared; "" where all have one."""
+        missing = sum(self.unmeasured(family, metric).values())
+        clips = self.values[family].get("counts", {}).get(metric.name, {}).get("clips", 0)
+        return f"{clips:,} of {clips + missing:,}" if missing else ""
+
 
 def metrics_tables(folder: str | Path, families: Sequence[str]) -> MetricsTable:
-    """``folder/<family>.json``, families in the order given, then ``folder/controls``; empty topics are left out."""
+    """``folder/<family>.json``, families in the order given, then ``folder/controls``.
+
+    A topic has a column for each metric with a figure in some row, and a line for each that could not be measured in
+    any; topics of which nothing was computed are left out.
+    """
     found = _found(Path(folder), families)
     shown = [metric for metric in ALL_METRICS if any(found.has(name, metric) for name in found.values)]
-    titles = dict.fromkeys(metric.topic for metric in shown)
-    topics = [_topic(title, [metric for metric in shown if metric.topic == title], found) for title in titles]
+    never = [metric for metric in ALL_METRICS if metric not in shown and _reasons(metric, found)]
+    titles = dict.fromkeys(metric.topic for metric in ALL_METRICS if metric in shown or metric in never)
+    topics = [_topic(title, *(_of_topic(title, some) for some in (shown, never)), found=found) for title in titles]
     return MetricsTable([_row(name, found, shown) for name in found.values], topics)
 
 
-def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
-    """The metrics ``names`` of every row that has one, as Markdown; what loses to a lookup says so in its cell.
+def _of_topic(title: str, metrics: list[AnyMetric]) -> list[AnyMetric]:
+    return [metric for metric in metrics if metric.topic == title]
 
-    Raises BadInput for a name no metric has.
+
+def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[str]) -> str:
+    """The metrics ``names`` of every row that was evaluated, as Markdown; what loses to a lookup says so in its cell.
+
+    Below the table: why rows were not evaluated, and why metrics could not be measured. Raises BadInput for a name no
+    metric has.
     """
     found, known = _found(Path(folder), families), {metric.name: metric for metric in ALL_METRICS}
     if unknown := [name for name in names if name not in known]:
@@ -157,15 +190,30 @@ def markdown_table(folder: str | Path, families: Sequence[str], names: Sequence[
     metrics = [known[name] for name in names]
     heads = [f"{own.title}{', ' * bool(own.unit)}{own.unit} ({_better(own)})" for own in metrics]
     lines = [f"| row | {' | '.join(heads)} |", "|---" * (len(metrics) + 1) + "|"]
-    for name in found.values:
-        cells = [_cell(name, metric, found) for metric in metrics]
-        if any(cell.text != NO_FIGURE for cell in cells):
+    below = []
+    for name, values in found.values.items():
+        if "figures" in values:
+            cells = [_cell(name, metric, found) for metric in metrics]
             lines.append(f"| {name} | {' | '.join(_marked(cell, found.kind(name)) for cell in cells)} |")
-    return "\n".join(lines) + "\n"
+        else:
+            below.append(f"- {name}: not evaluated, {values['empty']}")
+    below += [f"- {own.title}: not measured, {words}" for own in metrics if (words := _reasons(own, found))]
+    return "\n".join([*lines, *([""] if below else []), *below]) + "\n"
 
 
 def _marked(cell: Cell, kind: str) -> str:
-    return f"{cell.text} (loses)" if cell.mark == "bad" and kind == "family" else cell.text
+    share = f" ({cell.share} clips)" if cell.share else ""
+    return f"{cell.text}{share} (loses)" if cell.mark == "bad" and kind == "family" else f"{cell.text}{share}"
+
+
+def _reasons(metric: AnyMetric, found: _Found) -> str:
+    """Why clips have no value of a metric, in words; rows with the same reasons and counts together."""
+    rows = defaultdict[str, list[str]](list)
+    for name in found.values:
+        if reasons := found.unmeasured(name, metric):
+            rows[reasons_in_words(reasons)].append(name)
+    measured = [name for name, values in found.values.items() if "figures" in values]
+    return "; ".join(words if names == measured else f"{', '.join(names)}: {words}" for words, names in rows.items())
 
 
 def _found(folder: Path, families: Sequence[str]) -> _Found:
@@ -189,7 +237,8 @@ def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:
     own = {name: sum(family in column and name in column for _, column in columns) for name in lost}
     words = [f"loses to {name} in {len(titles)} of {own[name]} figures" for name, titles in lost.items()]
     told = [f"to {name}: {', '.join(titles)}" for name, titles in lost.items()]
-    diagnostics = [(name, number(value)) for name, value in _flat(values.get("diagnostics", {})).items()]
+    flat = _flat(values.get("diagnostics", {}))
+    diagnostics = [(name, NOT_MEASURED if value is None else number(value)) for name, value in flat.items()]
     left_out = len(values.get("left_out", []))
     note = f"{values['motions']:,} motions of {values['held_out_clips']:,} clips"
     note += f", {left_out:,} left out" if left_out else ""
@@ -197,27 +246,34 @@ def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:
     return Row(family, kind, "; ".join(words), told, "", note, diagnostics)
 
 
-def _topic(title: str, metrics: list[AnyMetric], found: _Found) -> Topic:
+def _topic(title: str, metrics: list[AnyMetric], never: list[AnyMetric], found: _Found) -> Topic:
+    """metrics: those with a figure in some row; never: those that could not be measured in any."""
     cells = [[_cell(name, metric, found) for metric in metrics] for name in found.values]
     columns = [(metric.title, metric.unit, _better(metric)) for metric in metrics]
-    return Topic(title, columns, cells, [chart for metric in metrics if (chart := _chart(metric, found))])
+    charts = [chart for metric in metrics if (chart := _chart(metric, found))]
+    titles = defaultdict[str, list[str]](list)
+    for metric in never:
+        titles[_reasons(metric, found)].append(metric.title)
+    return Topic(title, columns, cells, charts, [("; ".join(own), words) for words, own in titles.items()])
 
 
 def _cell(family: str, metric: AnyMetric, found: _Found) -> Cell:
-    note = found.note(family, metric)
+    note, reasons = found.note(family, metric), reasons_in_words(found.unmeasured(family, metric))
     if not found.has(family, metric):
-        return Cell(note or NO_FIGURE)
+        return Cell(note or (NOT_MEASURED if reasons else NO_FIGURE), note=reasons)
     if found.is_foreign(family, metric):
         return Cell(OTHER_EVALUATOR)
     column = found.column(metric)
     loses = any(loses_to(lookup, metric, family, column) for lookup in LOOKUPS)
     mark = "bad" if loses else "good" if family in best_families(metric, column) else ""
     ends = found.interval(family, metric, "clips")
-    return Cell(number(column[family]), mark, f"{number(ends[0])} to {number(ends[1])}" if ends else "", note)
+    spread = f"{number(ends[0])} to {number(ends[1])}" if ends else ""
+    note = "; ".join(filter(None, (note, reasons and f"{NOT_MEASURED}: {reasons}")))
+    return Cell(number(column[family]), mark, spread, note, found.share(family, metric))
 
 
 def _chart(metric: AnyMetric, found: _Found) -> Chart | None:
-    """All rows of one metric beside each other; None where there is nothing to set beside another."""
+    """All rows of one metric compared; None for fewer than two figures."""
     column = found.column(metric)
     if len(column) < 2:
         return None
@@ -238,7 +294,9 @@ def _chart(metric: AnyMetric, found: _Found) -> Chart | None:
         for name, value in column.items()
     ]
     unit = f", {metric.unit}" if metric.unit else ""
-    return Chart(f"{metric.title}{unit}", _better(metric), (number(low), number(high)), bars)
+    missing = [name for name in found.values if name not in column and found.unmeasured(name, metric)]
+    words = f"{NOT_MEASURED}: {', '.join(missing)}" if missing else ""
+    return Chart(f"{metric.title}{unit}", _better(metric), (number(low), number(high)), bars, words)
 
 
 def best_families(metric: AnyMetric, column: Mapping[str, float]) -> list[str]:
@@ -277,13 +335,20 @@ def _printed_rows(found: Mapping[str, Any]) -> Iterator[tuple[str, ...]]:
     own = _Found({"": found})
     for metric in ALL_METRICS:
         if not own.has("", metric):
-            if note := own.note("", metric):
-                yield metric.title, note, "", "", metric.unit, _better(metric), ""
+            missing = sum(own.unmeasured("", metric).values())
+            if text := own.note("", metric) or (NOT_MEASURED if missing else ""):
+                yield metric.title, text, "", "", metric.unit, _better(metric), f"0 of {missing:,}" if missing else ""
             continue
         ends = [" to ".join(map(number, own.interval("", metric, kind) or ())) for kind in INTERVALS]
-        clips = found["counts"][metric.name]["clips"]
+        clips = own.share("", metric) or f"{found['counts'][metric.name]['clips']:,}"
         figure = number(found["figures"][metric.name])
-        yield metric.title, figure, *ends, metric.unit, _better(metric), f"{clips:,}"
+        yield metric.title, figure, *ends, metric.unit, _better(metric), clips
+
+
+def unmeasured_lines(found: Mapping[str, Any]) -> list[str]:
+    """For a terminal: of each metric without a value of some clip, the reasons and how many clips each has."""
+    reasons = {metric: _Found({"": found}).unmeasured("", metric) for metric in ALL_METRICS}
+    return [f"{NOT_MEASURED}: {metric.title}: {reasons_in_words(own)}" for metric, own in reasons.items() if own]
 
 
 def _better(metric: AnyMetric) -> str:

@@ -41,7 +41,10 @@ class MeasureRow:
 
 @dataclass(frozen=True)
 class QualityFacts:
-    """What quality control found. failed, warned, notes: (clip, why); meshes: objects that are not ok, with why."""
+    """What quality control found. failed, warned, notes: (clip, why); meshes: objects that are not ok, with why.
+
+    unmeasured: (measure, why, clips) of the measures that some clips do not have.
+    """
 
     summary: str
     clips: list[MeasureRow]
@@ -51,6 +54,7 @@ class QualityFacts:
     warned: list[tuple[str, str]] = field(default_factory=list)
     unsound: list[tuple[str, str, str]] = field(default_factory=list)
     notes: list[tuple[str, int]] = field(default_factory=list)
+    unmeasured: list[tuple[str, str, int]] = field(default_factory=list)
 
 
 def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
@@ -71,13 +75,18 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
         warned=[(name, why) for name, verdict, why in _judged(clips, "clip_id") if verdict == "warned"],
         unsound=[row for row in _judged(meshes, "object") if row[1] != "ok"],
         notes=sorted(Counter(note for note in clips["note"].tolist() if note).items()),
+        unmeasured=[
+            (measure.words, measure.unmeasured, missing)
+            for measure in CLIP_MEASURES
+            if (missing := int(np.isnan(_values(clips, measure)).sum()))
+        ],
     )
 
 
 def measures_svg(
     table: pd.DataFrame, measures: Sequence[Measure], limits: Mapping[str, dict[str, float | None]], salt: str
 ) -> str:
-    """A histogram of each measure over the clips, with its limits as lines; one that was never taken is left out."""
+    """A histogram of each measure over the clips, with its limits as lines, but for those that were never taken."""
     sizes = {measure.name: np.abs(_values(table, measure)) for measure in measures}
     shown = [measure for measure in measures if np.isfinite(sizes[measure.name]).any()]
     rows = -(-len(shown) // COLUMNS)

@@ -9,16 +9,18 @@ from hoidata.errors import BadInput
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.surface.store import REMEDY, SurfaceStore, open_surface
 
+NOT_MEASURED = "not measured"
 PENETRATION_M = 0.01  # BimArt counts frames with a hand vertex deeper than this ("Pen 1cm")
 
 
 @dataclass(frozen=True)
 class ObjectContact:
-    """One object, or all of them, over the frames of its clips: each a text, "" where nothing can be inside.
+    """One object, or all of them, over the frames of its clips: texts, "not measured" where nothing can be inside.
 
     touching: share of frames in which a hand touches; inside, deep: in which a hand vertex lies inside, and deeper than
     1 cm; deepest: in all frames; volume: the largest that a hand and the object share in the frame of the deepest
-    vertex of a clip. note: what was repaired of the mesh, or why it has no inside.
+    vertex of a clip. note: what was repaired of the mesh, or why it has no inside; of all objects, in how many clips
+    nothing can be inside.
     """
 
     name: str
@@ -69,7 +71,9 @@ def contact_by_object(store: SurfaceStore) -> list[ObjectContact]:
     notes = dict(zip(store.objects["object"].tolist(), store.objects["note"].tolist(), strict=True))
     rows = [_row(name, found, notes[name]) for name, found in sorted(frames.items())]
     everything = [clip for found in frames.values() for clip in found]
-    return [_row("all objects", everything, None), *rows] if len(rows) > 1 else rows
+    without = sum(np.isnan(clip.volume_m3) for clip in everything)
+    note = f"{NOT_MEASURED} in {without:,} of {len(everything):,} clips: the object has no inside" if without else None
+    return [_row("all objects", everything, note), *rows] if len(rows) > 1 else rows
 
 
 def _frames(store: SurfaceStore, clip_id: str) -> _Frames:
@@ -93,11 +97,11 @@ def _row(name: str, found: list[_Frames], note: str | None) -> ObjectContact:
         touching=_share(touching),
         inside=_share(depth > 0),
         deep=_share(depth > PENETRATION_M),
-        deepest=f"{depth.max() * 1000:.1f}" if len(depth) else "",
-        volume=f"{max(volumes) * 1e6:.2f}" if volumes else "",
+        deepest=f"{depth.max() * 1000:.1f}" if len(depth) else NOT_MEASURED,
+        volume=f"{max(volumes) * 1e6:.2f}" if volumes else NOT_MEASURED,
         note=note.removeprefix(f"{name}: ") if isinstance(note, str) else "",
     )
 
 
 def _share(hits: np.ndarray) -> str:
-    return f"{hits.mean() * 100:.1f} %" if len(hits) else ""
+    return f"{hits.mean() * 100:.1f} %" if len(hits) else NOT_MEASURED

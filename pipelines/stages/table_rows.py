@@ -122,5 +122,5 @@ def _measured(paths: StagePaths, name: str, row: Row, settings: TableSettings, s
         found = evaluate_store(out / "clips", paths.data, hands, metrics=metrics, jobs=jobs(), by_clip=True)
         inside = read_json(out / "diagnostics.json")
     print(f"{paths}: {name}: {counts['clips']} motions", flush=True)
-    kept = ("motions", "figures", "intervals", "counts", "synthetic", "by_clip")
+    kept = ("motions", "figures", "intervals", "counts", "unmeasured", "synthetic", "by_clip")
     return {"title": row.title, **{key: found[key] for key in kept}, "diagnostics": inside}

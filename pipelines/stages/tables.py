@@ -8,6 +8,7 @@ import numpy as np
 
 from hoidata.files import write_whole
 from hoidata.files.written import Facts, read_json
+from hoidata.metrics.unmeasured import reasons_in_words
 from models.bimart_tables.rows import ROWS
 from models.bimart_tables.variants import variant_of
 from pipelines.markdown import markdown_text
@@ -53,6 +54,7 @@ def run(paths: StagePaths) -> None:
     for title, names in TABLES.items():
         if rows := [_row(found[name]) for name in names if name in found]:
             lines += ["", f"## {title}", "", *_table(("row", "seeds", "motions", *COLUMNS), rows)]
+            lines += unmeasured_lines([seed for name in names for seed in found.get(name, ())])
     lines += controls_lines(paths) + maps_lines(found)
     lines += ["", "## Table 6: error of contact maps seen by basis points, cm", "", *_mapping(paths)]
     write_whole(paths.tables, "\n".join(lines) + "\n")
@@ -82,6 +84,16 @@ def _row(seeds: list[Facts]) -> list[str]:
         for own in COLUMNS.values()
     ]
     return [seeds[0]["title"], str(len(measured)), str(sum(seed["motions"] for seed in measured)), *cells]
+
+
+def unmeasured_lines(seeds: Iterable[Facts]) -> list[str]:
+    """Below a table: why rows have no figure of a metric, or of some clips only."""
+    lines = dict[str, None]()  # a reason that all seeds of a row share is given once
+    for seed in seeds:
+        for name in (name for own in COLUMNS.values() for name in own):
+            if reasons := seed.get("unmeasured", {}).get(name):
+                lines[f"- {seed['title']}: {name} not measured, {reasons_in_words(reasons)}"] = None
+    return ["", *lines] if lines else []
 
 
 def controls_lines(paths: StagePaths) -> list[str]:

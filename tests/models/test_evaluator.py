@@ -254,6 +254,9 @@ def test_figures_of_features_stand_beside_the_others_with_the_digests_of_the_wei
     assert figures["fid_paired_paper"] == figures["fid_paired_corrected"] == 0
     assert found["notes"]["fid_frechet_corrected"] == "N too small"
     assert "fid_frechet_corrected" not in figures
+    assert found["unmeasured"]["fid_frechet_corrected"] == {"N too small": len(clips)}
+    own = {item.name for item in FEATURE_METRICS if item.encoder in {*found["evaluators"], "path"}}
+    assert own <= set(figures) | set(found["unmeasured"])
     assert {name for name in figures if name.endswith(("_paper", "_corrected", "_text_motion", "_path"))} <= known
     assert figures["joint_error_mm"] == 0
     assert np.sum(found["evaluators"]["corrected"]["confusion"]) == 4

@@ -9,7 +9,7 @@ import pytest
 from pipelines.promises import Promise
 from pipelines.stages import tables
 from pipelines.stages.base import StagePaths
-from pipelines.stages.tables import compared, controls_lines, maps_lines, read_rows
+from pipelines.stages.tables import compared, controls_lines, maps_lines, read_rows, unmeasured_lines
 
 PATHS = StagePaths("embedded", "arctic")
 F1 = "contact_f1"
@@ -116,3 +116,12 @@ def test_errors_of_maps_are_means_over_the_runs_that_drew_some(rows: Path) -> No
 def test_without_rows_there_is_nothing_to_promise(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     assert (controls_lines(PATHS), maps_lines(read_rows(PATHS))) == ([], [])
+
+
+def test_rows_without_a_figure_say_why_below_the_table_once_for_all_seeds() -> None:
+    seed = {"title": "BimArt", "unmeasured": {"bimart_pen_1cm_corrected": {"the object has no inside": 14}}}
+    assert unmeasured_lines([seed, seed, {"title": "truth"}]) == [
+        "",
+        "- BimArt: bimart_pen_1cm_corrected not measured, the object has no inside: 14 clips",
+    ]
+    assert unmeasured_lines([{"title": "truth"}]) == []

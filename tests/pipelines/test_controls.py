@@ -186,3 +186,25 @@ def test_every_promise_holds_on_what_was_measured_here(profile):
         if item.holds is False
     ]
     assert broken == []
+
+
+def test_an_expected_ordering_that_was_not_measured_says_why(tmp_path):
+    rows = {
+        "ground-truth": {"figures": {"contact_f1": 1.0}, "unmeasured": {"realism_si": {"gravity is not known": 28}}},
+        "static": {"empty": "no motions"},
+    }
+    for name, row in rows.items():
+        (tmp_path / f"{name}.json").write_text(json.dumps(row))
+    asked = [
+        Promise("ground-truth", "realism_si", "fall"),
+        Promise("static", "contact_f1", "fall"),
+        Promise("noise", "contact_f1", "fall"),
+    ]
+    found = kept(read_rows(tmp_path), asked)
+    assert [item.holds for item in found] == [None] * 3
+    assert found[0].why.startswith("ground-truth: gravity is not known: 28 clips")
+    assert [item.why for item in found[1:]] == ["static: no motions", "noise was not evaluated"]
+    result = CliRunner().invoke(app, ["controls", str(tmp_path)])
+    assert result.exit_code == 0
+    assert "not measured" in result.output
+    assert "noise was not evaluated" in result.output

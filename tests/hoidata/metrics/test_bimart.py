@@ -17,6 +17,8 @@ from hoidata.metrics.asked import DISTANCES_NAME, AskedDistances, read_asked_dis
 from hoidata.metrics.asked_metrics import ASKED_LISTS, BIMART_METRICS, with_lists
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.metrics.registry import METRICS
+from hoidata.objects.distance import is_closed
+from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from hoidata.surface.contact import PlacedHand
@@ -109,21 +111,54 @@ def test_a_hinge_that_moves_asks_for_contact_with_the_part_that_moves(pair_of):
     assert art(-0.95) == ([0] * 4, [0] * 4)
 
 
-def test_open_parts_have_an_unreliable_inside_as_released_and_none_in_the_corrected(pair_of):
+def test_an_open_submesh_is_touched_where_it_is_and_has_no_inside_in_the_corrected(pair_of):
     """A plate whose top has corners in both parts: all that lies wholly in the moving part is its far side."""
     mesh = trimesh.creation.box((0.1, 0.5, 0.02))
     model = notebook()
     model = replace(model, vertices_m=np.array(mesh.vertices), faces=np.array(mesh.faces))
     model = replace(model, part=(model.vertices_m[:, 0] > 0).astype(np.uint8))
-    index = bimart.surface_index(model)
-    released = bimart.shells(index, moving_part=True)[1].surface.tree
-    assert len(released.face) == 2
-    assert len(released.face) < len(model.faces_of(1))
+    released = bimart.shells(bimart.surface_index(model))[1].mesh.faces
+    assert len(released) == 2
+    assert len(released) < len(model.faces_of(1))
     clip = under_the_hand(model, np.full(4, 0.003), 0.01, hinge_rad=np.float32([0, 0.002, 0.004, 0.006]))
     pair = pair_of(clip, clip)
-    # Centimetres away from those two triangles, but before them on a line along x.
-    assert bimart.art_paper(pair, 1).tolist() == [100, 100, 100]
+    # Centimetres away from those two triangles, outside their box, though before them on a line along x.
+    assert bimart.art_paper(pair, 1).tolist() == [0, 0, 0]
     assert len(bimart.art_corrected(pair, 1)) == len(bimart.pen_1cm_corrected(pair, 1)) == 0
+
+
+def cut_box(half_m):
+    """A closed box about the origin, cut at x = 0: each part is open along the cut, and triangles span both."""
+    mesh = trimesh.creation.box(2 * np.array(half_m)).subdivide().subdivide()
+    mesh.apply_translation((0.001, 0, 0))  # no vertex lies in the plane of the cut
+    part = (mesh.vertices[:, 0] > 0).astype(np.uint8)
+    hinge = Hinge(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, half_m[2]]))
+    model = ObjectModel("cut box", np.array(mesh.vertices), np.array(mesh.faces), part, hinge)
+    assert not any(is_closed(model.faces_of(own)) for own in (0, 1))
+    return model
+
+
+def placed(points_m, hinge_rad):
+    return PlacedHand(points_m[None], np.zeros(1, int), np.array([hinge_rad]), np.zeros((0, 3), int), 1)
+
+
+def test_depth_as_released_takes_its_sign_from_the_whole_posed_mesh_though_each_part_is_open():
+    model, random = cut_box((0.06, 0.05, 0.04)), np.random.default_rng(2)
+    points = random.uniform(-0.08, 0.08, (400, 3))
+    found = bimart.whole_depth_m(placed(points, 0.0), model)[0]
+    outside_by = np.abs(points - [0.001, 0, 0]) - [0.06, 0.05, 0.04]
+    inside = (outside_by < 0).all(axis=1)
+    assert 20 < inside.sum() < 380
+    assert found[inside] == pytest.approx(-outside_by[inside].max(axis=1))  # to the nearest face of the box
+    assert found[inside].max() > 0.02  # beyond what thresholds ask for, and finite
+    assert (found[~inside] < 0).all()
+    for angle in (-0.3, 0.4):
+        found = bimart.whole_depth_m(placed(points, angle), model)[0]
+        posed = articulate(model.vertices_m, model.part, model.hinge, np.array([angle]))[0]
+        expected = depth(points, posed, model.faces)
+        near = expected > -0.02
+        assert found[near] == pytest.approx(expected[near], abs=1e-9)
+        assert (found[~near] <= -0.02).all()
 
 
 def test_what_two_parts_both_enclose_is_outside_as_released():
@@ -131,8 +166,7 @@ def test_what_two_parts_both_enclose_is_outside_as_released():
     cube, shifted = box_model((0.04, 0.04, 0.04)), box_model((0.04, 0.04, 0.04), middle_m=(0.03, 0, 0))
     model = two_parts(cube, shifted, (0, 0, 1))
     places = np.array([[0, 0.003, 0.001], [0.015, 0.003, 0.001], [0.044, 0.003, 0.001], [0.057, 0.003, 0.001]])
-    hand = PlacedHand(places[None], np.zeros(1, int), np.zeros(1), np.zeros((0, 3), int), 1)
-    found = bimart.signed_in(hand, model, bimart.shells(bimart.surface_index(model)))
+    found = bimart.whole_depth_m(placed(places, 0.0), model)
     # 1 cm from the face at x = 1 cm; between the faces at 1 cm and 2 cm; 6 mm within, and 7 mm beyond x = 5 cm.
     assert found[0] == pytest.approx([0.010, -0.005, 0.006, -0.007], abs=1e-9)
 
@@ -155,6 +189,29 @@ def test_shifted_hands_lose_contact_and_pressed_hands_keep_the_papers_alone(make
     assert con(0.0) == [100, 100]
     assert con(0.03) == [0, 0]
     assert con(-0.03) == [100, 0]
+
+
+def shaken(model, steps_m, hinge_rad=None):
+    """An object whose place along x changes by (frame - 1,) steps."""
+    place = np.zeros((len(steps_m) + 1, 3), np.float32)
+    place[1:, 0] = np.cumsum(steps_m)
+    return ObjectTrack(model, np.zeros_like(place), place, hinge_rad)
+
+
+def test_a_still_object_with_the_noise_of_recordings_does_not_move_as_corrected_and_does_as_released():
+    noise = 1e-3 * np.array([0.19, -0.31, 0.4, -0.4])
+    assert not bimart.moves(shaken(ball(), noise)).any()
+    assert (bimart.steps_m(shaken(ball(), noise))[:-1] > bimart.MOVED_AS_RELEASED_M).all()
+    assert bimart.moves(shaken(ball(), [6e-4, -6e-4])).tolist() == [True, True, False]
+
+
+def test_a_hinge_that_trembles_as_in_recordings_does_not_turn_and_one_that_turns_moves_the_object():
+    tremble = np.float32([0, 0.0015, 0, 0.0019, 0.005])
+    track = shaken(notebook(), np.zeros(4), tremble)
+    assert bimart.turns(track).tolist() == [False, False, False, True, False]
+    assert bimart.moves(track)[3]
+    small = replace(notebook(), vertices_m=notebook().vertices_m / 10)  # 1 cm wide: its vertices move by 0.03 mm
+    assert bimart.moves(shaken(small, np.zeros(4), tremble)).tolist() == [False, False, False, True, False]
 
 
 # --- the released definitions, written anew: other distances, other rays, loops

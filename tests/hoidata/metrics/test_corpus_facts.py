@@ -169,6 +169,7 @@ def test_the_command_prints_every_figure_in_words_or_as_json(make_clip, tmp_path
     said = CliRunner().invoke(app, ["corpus", str(root)])
     assert said.exit_code == 0
     lines = " ".join(said.output.split())
+    assert "-: the figure compares with training clips" in lines  # what the dashes mean
     assert "of them in more than one part │ 0 │ 0 │ 0 │ 0" in lines
     assert "no hand touches the object in the first frame │ 0.00 │ 0.00 │ 0.00 │ 0.00" in lines
     found = json.loads(CliRunner().invoke(app, ["corpus", str(root), "--json"]).output)

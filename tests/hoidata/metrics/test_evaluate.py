@@ -11,12 +11,14 @@ from hoidata.errors import BadInput
 from hoidata.files.arrays import write_npz
 from hoidata.metrics import registry
 from hoidata.metrics.asked import FILE_NAME, write_asked
+from hoidata.metrics.asked_metrics import with_lists
 from hoidata.metrics.describe import readme
 from hoidata.metrics.evaluate import Measured, Sample, evaluate_store, intervals_of, matched
 from hoidata.metrics.registry import METRICS, is_better, metric, reduced
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from tests.builders.annotated import write_annotated_dataset
 
 RIGHT, BOTH = "toy/s3/2", "toy/s3/3"
 
@@ -325,3 +327,46 @@ def test_every_metric_is_registered_once_and_floors_have_their_metric():
 def test_the_readme_is_the_one_the_registry_gives():
     path = Path(registry.__file__).with_name("README.md")
     assert path.read_text() == readme(), "run: python -m hoidata.metrics.describe > hoidata/metrics/README.md"
+
+
+def test_a_metric_that_no_clip_allows_is_listed_with_its_reason_and_their_number(make_clip, tmp_path):
+    def open_clip(*given, **named):
+        clip = make_clip(*given, **named)
+        sheet = replace(clip.object.model, faces=clip.object.model.faces[[4, 6]], name="sheet")  # the side above
+        return replace(clip, object=replace(clip.object, model=sheet))
+
+    root, clips = write_annotated_dataset(tmp_path / "annotated", open_clip)
+    every = with_lists(["bimart"])
+    found = evaluate_store(written(tmp_path / "same", clips.values()), root, metrics=every)
+    no_inside = {"the object has no inside": 2}
+    for name in ("penetration_mm", "deep_share", "penetration_volume_cm3", "bimart_pen_1cm_corrected"):
+        assert name not in found["figures"]
+        assert found["unmeasured"][name] == no_inside
+    assert found["unmeasured"]["hand_hand_mm"] == {"one hand acts alone": 1}
+    assert found["counts"]["hand_hand_mm"]["clips"] == 1
+    assert found["unmeasured"]["adherence"] == {"the motion was made without a target contact map": 2}
+    assert found["unmeasured"]["cams_art_paper"] == {"the object has no hinge": 2}
+    assert set(found["figures"]) | set(found["unmeasured"]) == {item.name for item in every}
+    for item in every:  # each clip was measured, or there is a reason
+        measured = found["counts"].get(item.name, {"clips": 0})["clips"]
+        assert measured + sum(found["unmeasured"].get(item.name, {}).values()) == 2
+
+
+def test_what_cannot_be_compared_frame_by_frame_says_so_where_a_family_chose_the_length(write_annotated, tmp_path):
+    root, clips = write_annotated()
+    shorter = [named(clips[RIGHT].take(slice(0, 10)), f"{RIGHT}~{number}") for number in range(2)]
+    write_store(tmp_path / "own", shorter, generated_info("predicted", length="own"))
+    found = evaluate_store(tmp_path / "own", root, metrics=with_lists(["bimart"]))
+    reason = {"the family chose the length, so frames cannot be compared": 1}
+    aligned = [item.name for item in with_lists(["bimart"]) if item.aligned]
+    assert len(aligned) == 3
+    assert [found["unmeasured"][name] for name in aligned] == [reason] * 3
+    given = evaluate_store(written(tmp_path / "given", clips.values()), root)
+    assert given["unmeasured"]["length_error_frames"] == {"the length was given": 2}
+
+
+def test_clips_of_an_empty_selection_of_frames_say_which_frames_were_asked_for():
+    slip = metric("slip_cm_s")
+    assert registry.unmeasured(slip, [[np.zeros(0)], [np.zeros(0), np.ones(2)], []]) == {
+        f"no such frame: {slip.frames}": 2
+    }

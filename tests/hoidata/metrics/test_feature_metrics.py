@@ -9,8 +9,9 @@ import pytest
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_distances import TOO_SMALL, fid_frechet, fid_paired, frechet_distance, kid
 from hoidata.metrics.feature_measures import ranks
-from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_figures
+from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_figures, feature_findings
 from hoidata.metrics.majority import majority_rows
+from hoidata.metrics.unmeasured import Unmeasured
 
 CLIPS, LABELS = 60, ("close", "lift", "open")
 
@@ -253,3 +254,15 @@ def test_what_the_inputs_give_away_is_the_majority_of_the_training_clips():
     assert found["nothing"] == {"top1": 0.5, "top3": 1.0}
     assert found["object"] == {"top1": 0.75, "top3": 1.0}
     assert found["object and hand"] == {"top1": 0.5, "top3": 0.75}
+
+
+def test_figures_of_features_that_could_not_be_measured_have_a_reason():
+    one = encoded(normal(CLIPS, 4), encoder="path")
+    assert feature_findings(one, one)["memorised_share_path"] == Unmeasured("there are no training clips")
+    known = encoded(normal(5, 3), label=np.array([0, 0, 1, UNKNOWN, UNKNOWN]))
+    found = feature_findings(known, known)
+    assert found["accuracy_top1_corrected"].without == "the verb is in no training clip"
+    assert found["accuracy_top1_corrected"].clips == 3
+    assert found["multimodality_by_prompt_corrected"] == Unmeasured("the clip has one motion")
+    alone = encoded(normal(2, 3), label=np.array([0, 1]))
+    assert feature_findings(alone, alone)["multimodality_by_label_corrected"] == Unmeasured("no label has two clips")

@@ -137,7 +137,15 @@ def test_object_without_an_inside_has_no_depths_in_the_table(page_clip, hands, t
     write_clips(tmp_path / "clips", [replace(clip, object=replace(clip.object, model=plate))], "grab")
     surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
     [row] = contact_by_object(open_surface(tmp_path / "surface"))
-    assert (row.inside, row.deep, row.deepest, row.volume) == ("", "", "", "")
+    assert (row.inside, row.deep, row.deepest, row.volume) == ("not measured",) * 4
+    both = [
+        clip,
+        replace(clip, clip_id="test/s1/open", object=replace(clip.object, model=replace(plate, name="plate"))),
+    ]
+    write_clips(tmp_path / "both", both, "grab")
+    surface_store(tmp_path / "both", tmp_path / "both-surface", points=32, progress=False)
+    every = contact_by_object(open_surface(tmp_path / "both-surface"))[0]
+    assert every.note == "not measured in 1 of 2 clips: the object has no inside"
     assert "open" in row.note
 
 

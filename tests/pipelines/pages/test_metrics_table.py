@@ -16,6 +16,7 @@ from pipelines.pages.metrics_table import (
     metrics_tables,
     number,
     printed_table,
+    unmeasured_lines,
 )
 
 ACCURACY = "accuracy_top1_corrected"
@@ -147,7 +148,8 @@ def test_markdown_marks_in_words_what_loses(folder):
     assert lines[0].startswith("| row | joint error of the best sample, mm (lower is better) |")
     assert lines[2:] == [
         "| ours | 30.0 | 0.500 (loses) |", "| nearest-clip | 40.0 | 0.600 |", "| ground-truth | 0.00 | 1.00 |",
-        "| static | - | 0.200 |",
+        "| static | - | 0.200 |", "", "- untrained: not evaluated, not trained: <length>",
+        "- absent: not evaluated, not evaluated",
     ]  # fmt: skip
     with pytest.raises(BadInput, match="contact_f1"):
         markdown_table(folder, FAMILIES, ["contact_f2"])
@@ -165,3 +167,69 @@ def test_the_terminal_shows_intervals_and_reasons():
 
 def test_numbers_keep_three_digits():
     assert [number(value) for value in (1234567, 0.01234, 11.0, None, "x")] == ["1,234,567", "0.0123", "11.0", "", "x"]
+
+
+NO_INSIDE = "the object has no inside"
+PENETRATION, LENGTH, LENGTH_SHARE = "penetration_mm", "length_error_frames", "length_error_share"
+
+
+@pytest.fixture
+def partly(folder):
+    """``ours`` has a penetration in 3 of 10 clips, ``static`` in none; no row has an error of its length."""
+    for path, figures, missing in (
+        (folder / "ours.json", FIGURES["ours"] | {PENETRATION: 2.0}, 7),
+        (folder / "controls" / "static.json", {"contact_f1": 0.2}, 10),
+        (folder / "nearest-clip.json", FIGURES["nearest-clip"] | {PENETRATION: 3.0}, 0),
+        (folder / "ground-truth.json", FIGURES["ground-truth"], 10),
+    ):
+        unmeasured = {PENETRATION: {NO_INSIDE: missing}} if missing else {}
+        given = {"the length was given": 10}
+        more = {"unmeasured": unmeasured | {LENGTH: given, LENGTH_SHARE: given}}
+        path.write_text(written(figures, counts={PENETRATION: {"clips": 10 - missing}}, **more))
+    return folder
+
+
+def test_a_metric_measured_in_some_clips_says_in_how_many_and_why_not_in_the_others(partly):
+    cells = {name: cells_of(table_of(partly), name)[title(PENETRATION)] for name in ("ours", "nearest-clip", "static")}
+    assert (cells["ours"].share, cells["ours"].note) == ("3 of 10", f"not measured: {NO_INSIDE}: 7 clips")
+    assert (cells["nearest-clip"].share, cells["nearest-clip"].note) == ("", "")
+    assert (cells["static"].text, cells["static"].note) == ("not measured", f"{NO_INSIDE}: 10 clips")
+
+
+def test_a_metric_that_no_row_has_stands_below_its_topic_with_the_reason(partly):
+    topic = next(topic for topic in table_of(partly).topics if topic.unmeasured)
+    titles = f"{title(LENGTH)}; {title(LENGTH_SHARE)}"
+    assert topic.unmeasured == [(titles, "the length was given: 10 clips")]
+    loader = jinja2.PackageLoader("pipelines.pages", "")
+    environment = jinja2.Environment(loader=loader, autoescape=True)
+    text = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}').render(
+        table=table_of(partly)
+    )
+    assert f"Not measured: {titles} (the length was given: 10 clips)." in text
+    assert f'title="{NO_INSIDE}: 10 clips">not measured</td>' in text
+    assert "3 of 10 clips</span>" in text
+
+
+def test_a_chart_names_the_rows_it_has_no_bar_for(partly):
+    charts = {chart.title: chart for topic in table_of(partly).topics for chart in topic.charts}
+    assert charts[f"{title(PENETRATION)}, mm"].missing == "not measured: ground-truth, static"
+
+
+def test_markdown_says_below_what_was_not_measured(partly):
+    lines = markdown_table(partly, FAMILIES, [PENETRATION, LENGTH]).splitlines()
+    assert "| ours | 2.00 (3 of 10 clips) | not measured |" in lines
+    assert "| static | not measured | not measured |" in lines
+    below = (
+        f"- {title(PENETRATION)}: not measured, ours: {NO_INSIDE}: 7 clips; ground-truth, static: {NO_INSIDE}: 10 clips"
+    )
+    assert lines[-2:] == [below, f"- {title(LENGTH)}: not measured, the length was given: 10 clips"]
+
+
+def test_the_terminal_lists_metrics_that_were_not_measured(partly):
+    found = json.loads((partly / "controls" / "static.json").read_text())
+    found["counts"] = {"contact_f1": {"clips": 10}}
+    columns = [list(column.cells) for column in printed_table(found).columns]
+    rows = {name: (figure, clips) for name, figure, clips in zip(columns[0], columns[1], columns[-1], strict=True)}
+    assert rows[title(PENETRATION)] == ("not measured", "0 of 10")
+    assert rows[title("contact_f1")] == ("0.200", "10")
+    assert f"not measured: {title(PENETRATION)}: {NO_INSIDE}: 10 clips" in unmeasured_lines(found)

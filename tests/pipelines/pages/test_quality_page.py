@@ -38,6 +38,7 @@ def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
     assert f"<td>test/s1/1</td><td>{JUMP}</td>" in text
     assert "<td>open box</td><td>warned</td><td>share of edges at a hole" in text
     assert "penetration not measured: the mesh of open box is not solid (1 clip)." in text
+    assert "Not measured: deepest hand vertex inside the object (the mesh of the object is not solid: 1 clip)." in text
     assert text.count("<svg") == 1
 
 
@@ -52,6 +53,8 @@ def test_every_measure_has_its_row_with_median_worst_and_counts(folders):
     hole = facts.meshes[0]
     assert (hole.worst_id, hole.leave_out, hole.warned, hole.left_out) == ("open box", "", 1, 0)
     assert facts.failed == [("test/s1/1", JUMP)]
+    missing = {words: (why, count) for words, why, count in facts.unmeasured}
+    assert missing["deepest hand vertex inside the object"] == ("the mesh of the object is not solid", 1)
 
 
 def test_dataset_without_quality_control_has_no_section(folders, hands, tmp_path):
