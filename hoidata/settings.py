@@ -108,9 +108,9 @@ def _value(hint: Any, value: Any, where: str, item: Field | None = None) -> Any:
         if value not in choices:
             raise BadInput(where, f"one of {', '.join(map(str, choices))}", repr(value), "choose one of them")
         return value
-    if origin is Mapping:
+    if origin in (Mapping, dict):
         return _mapping(choices[1], value, where, item)
-    if isinstance(value, list):
+    if isinstance(value, list) and hint not in (int, float, bool, str):
         return tuple(_value(choices[0] if choices else Any, item, where) for item in value)
     if origin is tuple and not isinstance(value, tuple):
         raise BadInput(where, "a list", repr(value), "write [...]")

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
-from hoidata.files.written import read_json
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
+from pipelines.figures import read_metrics
 
 TRUTH = "ground-truth"
 NOTHING = 1e-4
@@ -94,7 +94,7 @@ def datasets_below(folder: Path) -> list[Path]:
 def read_rows(folder: Path) -> dict[str, dict[str, Any]]:
     """What was measured of each family of one dataset, controls included."""
     paths = [*folder.glob("*.json"), *folder.glob("controls/*.json")]
-    rows = {path.stem: read_json(path) for path in sorted(paths)}
+    rows = {path.stem: read_metrics(path) for path in sorted(paths)}
     return {name: row for name, row in rows.items() if "figures" in row}
 
 

@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from hoidata.files.written import read_json
+from hoidata.files.written import EMPTY, read_json
+from hoidata.files.written import empty_reason as empty_reason  # for the stages
 from hoidata.settings import build_config
 from pipelines.params import chosen_params, read_file
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
-EMPTY = "empty.json"
 HAND = "hand"
 OWN = "own"
 Settings = TypeVar("Settings")
@@ -139,13 +139,7 @@ def load_hands(profile: str) -> "HandPair":
 def hand_is_present(profile: str) -> bool:
     """Whether the profile has a hand of its own: the embedded one, or MANO files that were scanned."""
     path = StagePaths(profile).hand_manifest
-    return path.is_file() and bool(read_json(path)["present"])
-
-
-def empty_reason(folder: Path) -> str | None:
-    """Why a stage's output folder is empty, or None when it holds something."""
-    note = folder / EMPTY
-    return read_json(note)["reason"] if note.is_file() else None
+    return path.is_file() and bool(read_json(path, {"present": bool})["present"])
 
 
 def note_empty(folder: Path, reason: str) -> None:
