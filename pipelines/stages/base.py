@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from hoidata.dataset_folders import SETTINGS, machine_folder
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
@@ -95,7 +96,7 @@ def own_root(name: str) -> Path | None:
     """The user's raw folder of ``name``: its environment variable, else hoidata.toml's [roots], else None."""
     if value := os.environ.get(root_variable(name)):
         return Path(value)
-    root = _registered_roots(Path("hoidata.toml")).get(name)
+    root = _registered_roots(machine_folder() / SETTINGS).get(name)
     return None if root is None else Path(root)
 
 
@@ -114,7 +115,7 @@ def _registered_roots(path: Path) -> dict[str, str]:
 def raw_root(paths: StagePaths) -> Path:
     """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
     if paths.is_generated:
-        root = paths.generated_raw
+        root = paths.generated_raw if paths.generated_raw.is_dir() else machine_folder() / paths.generated_raw
         remedy = f"write it again with `hoidata synth write {paths.dataset} --profile {paths.profile}`"
     else:
         root = own_root(paths.dataset)
