@@ -54,7 +54,7 @@ class Facts(dict[str, Any]):
                 names = ", ".join(kind.__name__ for kind in kinds)
                 raise BadInput(self.path, f"{names} as the entry {self.key + name!r}", repr(value)[:80], REMEDY)
             if isinstance(wanted, Mapping):
-                value.check(wanted)
+                self[name].check(wanted)
         return self
 
     def check_given(self, shape: Mapping[str, Shape]) -> "Facts":

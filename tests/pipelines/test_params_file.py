@@ -58,6 +58,15 @@ def test_a_key_that_is_given_twice_is_refused_as_dvc_refuses_it(tmp_path):
         read_file(tmp_path / "params.yaml")
 
 
+@pytest.mark.parametrize(
+    "text", ["a: !!bool z", "a: !!int ''", "a: !!python/object:os.system x", "a: =", "a: -_", "[a"]
+)
+def test_text_that_is_no_yaml_is_refused_in_words(tmp_path, text):
+    (tmp_path / "params.yaml").write_text(text)
+    with pytest.raises(BadInput, match="expected YAML text"):
+        read_file(tmp_path / "params.yaml")
+
+
 def test_a_lock_file_gives_the_numbers_dvc_noted():
     text = b"stages: {train@a: {params: {params.yaml: {train.small: {learning_rate: 1e-05}}}}}"
     assert parse_locks({"dvc.lock": text})["train@a"].params == {"train.small": {"learning_rate": 0.00001}}
