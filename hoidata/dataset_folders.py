@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
+from hoidata.machine_folder import SETTINGS, machine_folder
 
 BUILT_IN = Path(__file__).with_name("datasets")
 VARIABLE = "HOIDATA_DATASETS"
-SETTINGS = "hoidata.toml"
 REMEDY = "correct it; hoidata/datasets/README.md shows a whole one"
 
 
@@ -52,16 +52,6 @@ _KINDS: dict[Any, tuple[type, ...]] = {
     str: (str,), bool: (bool,), float: (float, int), dict[str, str]: (dict,), dict[str, dict[str, Any]]: (dict,),
 }  # fmt: skip
 _OF_ARRAYS = {"licence": str, "may_be_shared": bool}
-
-
-def machine_folder() -> Path:
-    """The project folder with the files that git does not carry: hoidata.toml, generated raw files, new manifests.
-
-    This is the current folder, except in an experiment that DVC runs in a temporary copy (``dvc exp run --temp`` and
-    ``--queue``, below ``.dvc/tmp``): then it is the project the copy was made from, which DVC names in DVC_ROOT.
-    """
-    root = os.environ.get("DVC_ROOT")
-    return Path(root) if root and Path.cwd().is_relative_to(Path(root).resolve() / ".dvc/tmp") else Path()
 
 
 def built_in_names() -> list[str]:

@@ -6,9 +6,9 @@ import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from hoidata.dataset_folders import SETTINGS
 from hoidata.errors import BadInput, HoidataError
 from hoidata.files.sealed import payload_digest
+from hoidata.machine_folder import SETTINGS
 from pipelines.lineage.locks import read_locks
 from pipelines.lineage.targets import WEIGHTS, Target
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hoidata.dataset_folders import machine_folder
 from hoidata.datasets.base import Adapter
 from hoidata.datasets.registry import adapter_names, get_adapter
 from hoidata.errors import BadInput
+from hoidata.machine_folder import machine_folder
 from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
 from pipelines.stages.base import StagePaths, load_settings, own_root, raw_root
 

@@ -8,8 +8,9 @@ from types import SimpleNamespace
 import pytest
 import yaml
 
-from hoidata.dataset_folders import machine_folder, outside_folders
+from hoidata.dataset_folders import outside_folders
 from hoidata.errors import MissingResource
+from hoidata.machine_folder import machine_folder
 from pipelines.stages.adapters import ensure_manifests, manifest_of
 from pipelines.stages.base import StagePaths, own_root, raw_root
 
