@@ -9,7 +9,7 @@ from setuptools import find_packages, setup
 INSTALLED = "hoidata.installed"
 DATA = ["npz", "csv", "html", "json", "toml", "js", "css", "md"]
 GRAPHS = ["dvc.yaml", "pipelines/dvc.yaml", "models/*/dvc.yaml"]
-PROJECT = ["params.yaml", "prefect.toml", ".dvcignore", ".gitattributes", ".gitignore"]
+PROJECT = ["params.yaml", "prefect.toml", ".dvcignore", ".gitignore"]
 FOLDERS = [".dvc/config", ".dvc/.gitignore", "manifests/embedded/*.json", "manifests/study/*.json", *GRAPHS]
 
 own = find_packages(include=["hoidata*"])

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
+from hoidata.machine_folder import SETTINGS, machine_folder
 
 BUILT_IN = Path(__file__).with_name("datasets")
 VARIABLE = "HOIDATA_DATASETS"
-SETTINGS = Path("hoidata.toml")
 REMEDY = "correct it; hoidata/datasets/README.md shows a whole one"
 
 
@@ -61,8 +61,9 @@ def built_in_names() -> list[str]:
 
 def outside_folders() -> dict[str, Path]:
     """The folders the user lists, by name; a built-in name cannot be taken over."""
-    listed = [path for path in os.environ.get(VARIABLE, "").split(os.pathsep) if path] or _listed_in_settings()
-    folders = [Path(path).expanduser().absolute() for path in listed]
+    named = [Path(path) for path in os.environ.get(VARIABLE, "").split(os.pathsep) if path]
+    listed = named or [machine_folder() / Path(path).expanduser() for path in _listed_in_settings()]
+    folders = [path.expanduser().absolute() for path in listed]
     for folder in folders:
         if not (folder / "adapter.py").is_file() or not folder.name.isidentifier():
             got = "no adapter.py" if folder.name.isidentifier() else f"the name {folder.name!r}"
@@ -113,12 +114,13 @@ def _read_facts(folder: Path) -> DatasetFacts:
 
 def _listed_in_settings() -> list[str]:
     """``[datasets] paths`` of hoidata.toml; none without that file."""
-    if not SETTINGS.is_file():
+    path = machine_folder() / SETTINGS
+    if not path.is_file():
         return []
-    section = _read_toml(SETTINGS).get("datasets", {})
+    section = _read_toml(path).get("datasets", {})
     paths = section.get("paths", []) if isinstance(section, dict) else None
     if not isinstance(paths, list) or not all(isinstance(path, str) for path in paths):
-        raise BadInput(SETTINGS, "[datasets] with a list of folders called paths", str(section)[:80], "correct it")
+        raise BadInput(path, "[datasets] with a list of folders called paths", str(section)[:80], "correct it")
     return paths
 
 

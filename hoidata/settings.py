@@ -3,6 +3,7 @@
 The dataclass is the one place of a setting's name, type and default; a mapping states only what differs.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, Field, asdict, fields, is_dataclass
 from types import UnionType
@@ -12,6 +13,14 @@ from hoidata.errors import BadInput
 
 Config = TypeVar("Config")
 NONE = type(None)
+
+
+class Section(dict[str, Any]):
+    """Settings read from a file, with the full key of each entry: the file may hold them in other places than they are
+    merged into. ``keys_in_file`` is for errors only.
+    """
+
+    keys_in_file: Mapping[str, str] = {}
 
 
 def build_config(kind: type[Config], values: Mapping[str, Any] | None, where: str) -> Config:
@@ -27,8 +36,47 @@ def build_config(kind: type[Config], values: Mapping[str, Any] | None, where: st
     if missing := [name for name in needed if name not in values]:
         raise BadInput(where, f"a value for {', '.join(missing)}", "none", "give one")
     hints = get_type_hints(kind)
-    built = {name: _value(hints[name], value, f"{where}.{name}", known[name]) for name, value in values.items()}
-    return kind(**built)
+    built = {
+        name: _value(hints[name], value, key_in_file(values, name, where), known[name])
+        for name, value in values.items()
+    }
+    try:
+        return kind(**built)
+    except BadInput as error:  # a check of the dataclass itself, which does not know where its values come from
+        name = error.where.rpartition(".")[2]
+        place = key_in_file(values, name, where) if name in known else error.where
+        raise BadInput(place, error.expected, error.got, error.remedy) from error
+
+
+def as_section(values: Mapping[str, Any], prefix: str) -> Section:
+    """``values`` of a file and the mappings inside, whose keys in the file begin with ``prefix``."""
+    section = Section(
+        (name, as_section(value, f"{prefix}{name}.") if isinstance(value, dict) else value)
+        for name, value in values.items()
+    )
+    section.keys_in_file = {name: f"{prefix}{name}" for name in values}
+    return section
+
+
+def laid_over(base: Mapping[str, Any], overlay: Mapping[str, Any]) -> Section:
+    """``base`` with the entries of ``overlay``: mappings are merged, other values replaced; each keeps its full key."""
+
+    def value_of(name: str, value: Any) -> Any:
+        both = isinstance(base.get(name), dict) and isinstance(value, dict)
+        return laid_over(base[name], value) if both else value
+
+    section = Section({**base, **{name: value_of(name, value) for name, value in overlay.items()}})
+    section.keys_in_file = {**_keys_in_file(base), **_keys_in_file(overlay)}
+    return section
+
+
+def key_in_file(values: Mapping[str, Any], name: str, where: str) -> str:
+    """The full key of an entry for an error message; where nothing else is known, ``name`` in the section ``where``."""
+    return _keys_in_file(values).get(name) or f"{where}.{name}"
+
+
+def _keys_in_file(values: Mapping[str, Any]) -> Mapping[str, str]:
+    return values.keys_in_file if isinstance(values, Section) else {}
 
 
 def at_least(where: str, config: Any, name: str, least: float) -> None:
@@ -40,7 +88,8 @@ def at_least(where: str, config: Any, name: str, least: float) -> None:
 def refuse_unknown(values: Mapping[str, Any], known: Sequence[str], where: str) -> None:
     """Raise BadInput that names the keys that are not known and lists those that are."""
     if unknown := [str(name) for name in values if name not in known]:
-        raise BadInput(where, f"keys among: {', '.join(known)}", ", ".join(unknown), "correct it")
+        section = key_in_file(values, unknown[0], where).removesuffix(f".{unknown[0]}")
+        raise BadInput(section, f"keys among: {', '.join(known)}", ", ".join(unknown), "correct it")
 
 
 def plain_config(config: Any) -> dict[str, Any]:
@@ -59,10 +108,10 @@ def _value(hint: Any, value: Any, where: str, item: Field | None = None) -> Any:
         if value not in choices:
             raise BadInput(where, f"one of {', '.join(map(str, choices))}", repr(value), "choose one of them")
         return value
-    if origin is Mapping:
+    if origin in (Mapping, dict):
         return _mapping(choices[1], value, where, item)
-    if isinstance(value, list):
-        return tuple(value)
+    if isinstance(value, list) and hint not in (int, float, bool, str):
+        return tuple(_value(choices[0] if choices else Any, item, where) for item in value)
     if origin is tuple and not isinstance(value, tuple):
         raise BadInput(where, "a list", repr(value), "write [...]")
     return _number_or_text(hint, value, where) if hint in (int, float, bool, str) else value
@@ -76,7 +125,7 @@ def _mapping(hint: Any, value: Any, where: str, item: Field | None) -> dict[str,
         return {**default, **value}
     refuse_unknown(value, list(default), where)
     given = {name: _checked_mapping(entry, f"{where}.{name}") for name, entry in value.items()}
-    whole = {name: {**asdict(default[name]), **entry} for name, entry in given.items()}
+    whole = {name: laid_over(asdict(default[name]), entry) for name, entry in given.items()}
     return {**default, **{name: _value(hint, entry, f"{where}.{name}") for name, entry in whole.items()}}
 
 
@@ -87,10 +136,24 @@ def _checked_mapping(value: Any, where: str) -> Mapping[str, Any]:
 
 
 def _number_or_text(hint: type, value: Any, where: str) -> Any:
+    """``value`` as the type asked for. Text and floats that are such a number count: ``"1e-05"``, and 1e3 of an int."""
+    if hint in (int, float) and isinstance(value, str):
+        value = _number(value)
+    if hint is int and isinstance(value, float) and value.is_integer():
+        value = int(value)
     allowed = (int, float) if hint is float else hint
     if not isinstance(value, allowed) or (isinstance(value, bool) and hint is not bool):
         raise BadInput(where, hint.__name__, repr(value), "correct it")
     return hint(value)
+
+
+def _number(text: str) -> Any:
+    """The finite number that ``text`` is; the text itself where it is none."""
+    try:
+        number = float(text)
+    except ValueError:
+        return text
+    return number if math.isfinite(number) else text
 
 
 def _plain(value: Any) -> Any:

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from hoidata.files.written import read_json
+from hoidata.errors import BadInput
+from hoidata.files.written import NUMBER, NUMBER_OR_NONE, REMEDY, Facts, read_json
 from hoidata.metrics.unmeasured import reasons_in_words
 from pipelines.stages.base import write_json
 
@@ -41,18 +42,38 @@ def write_figures(
             _write_csv(out / "losses" / f"{dataset}-{log.parent.name}.csv", ["step", "validation"], table)
 
 
-def _read(folder: Path, families: Sequence[str]) -> dict[str, dict[str, Any]]:
+def read_metrics(path: Path) -> Facts:
+    """What the stage evaluate wrote of one family: its ``figures``, or the reason ``empty``. Raises BadInput."""
+    found = read_json(path)
+    if "figures" not in found:
+        return found.check({"empty": str})
+    found.check_given({"motions": int, "held_out_clips": int, "left_out": list})
+    found.check_given(dict.fromkeys(("figures", "intervals", "notes", "evaluators", "diagnostics", "unmeasured"), dict))
+    found["figures"].check(dict.fromkeys(found["figures"], NUMBER_OR_NONE))
+    for name in ("intervals", "evaluators"):
+        found.get(name, Facts(path, {})).check(dict.fromkeys(found.get(name, ()), dict))
+    for intervals in found.get("intervals", {}).values():
+        intervals.check(dict.fromkeys(intervals, (list, type(None))))
+        for name, ends in intervals.items():
+            if ends and not (len(ends) == 2 and all(isinstance(end, NUMBER) for end in ends)):
+                raise BadInput(path, f"two numbers as the entry {intervals.key + name!r}", repr(ends)[:80], REMEDY)
+    for evaluator in found.get("evaluators", {}).values():
+        evaluator.check_given({"labels": list, "confusion": list, "digest": str})
+    return found
+
+
+def _read(folder: Path, families: Sequence[str]) -> dict[str, Facts]:
     """What was evaluated of each family."""
-    return {name: read_json(folder / f"{name}.json") for name in families if (folder / f"{name}.json").is_file()}
+    return {name: read_metrics(folder / f"{name}.json") for name in families if (folder / f"{name}.json").is_file()}
 
 
-def _leading(read: dict[str, dict[str, Any]]) -> dict[str, dict[str, float]]:
+def _leading(read: dict[str, Facts]) -> dict[str, dict[str, float]]:
     """The leading figures of every family that was measured, rounded: floats of another machine differ in the last."""
     found = {family: _rounded(values.get("figures") or {}) for family, values in read.items()}
     return {family: figures for family, figures in found.items() if figures}
 
 
-def _unmeasured(read: dict[str, dict[str, Any]]) -> dict[str, dict[str, str]]:
+def _unmeasured(read: dict[str, Facts]) -> dict[str, dict[str, str]]:
     """The leading metrics without a figure, by family, with reasons and counts in words."""
     rows = {
         family: {

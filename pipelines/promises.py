@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
-from hoidata.files.written import read_json
 from hoidata.metrics.feature_metrics import FEATURE_METRICS
 from hoidata.metrics.unmeasured import reasons_in_words
+from pipelines.figures import read_metrics
 
 TRUTH = "ground-truth"
 NOTHING = 1e-4
@@ -96,7 +96,7 @@ def datasets_below(folder: Path) -> list[Path]:
 def read_rows(folder: Path) -> dict[str, dict[str, Any]]:
     """What was measured of each family of one dataset, controls included; of one without motions, why (``empty``)."""
     paths = [*folder.glob("*.json"), *folder.glob("controls/*.json")]
-    return {path.stem: read_json(path) for path in sorted(paths)}
+    return {path.stem: read_metrics(path) for path in sorted(paths)}
 
 
 def kept(rows: Mapping[str, Mapping[str, Any]], promises: Sequence[Promise] = PROMISES) -> list[Kept]:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from hoidata.files.written import read_json
-from pipelines.figures import LEADING
+from pipelines.figures import LEADING, read_metrics
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import read_params
 
@@ -26,12 +26,12 @@ def describe_results(project: Path, profile: str) -> str:
 
 
 def _counts(dataset: str, data: Path) -> str:
-    counts = read_json(data / "clips/meta/info.json")["counts"]
+    counts = read_json(data / "clips/meta/info.json", {"counts": {"clips": int, "quarantined": int}})["counts"]
     splits = data / "splits/info.json"
-    parts = read_json(splits).get("chosen", {}).get("clips", {}) if splits.is_file() else {}
+    parts = read_json(splits, {"chosen": {"clips": {}}})["chosen"]["clips"] if splits.is_file() else {}
     numbers = [parts.get(name, "") for name in ("train", "validation", "test")]
     return f"| {' | '.join(map(str, (dataset, counts['clips'], counts['quarantined'], *numbers)))} |"
 
 
 def _measured(path: Path) -> bool:
-    return path.is_file() and "figures" in read_json(path)
+    return path.is_file() and "figures" in read_metrics(path)

@@ -29,7 +29,7 @@ from hoidata.processor import same_kernels
 SOCKET = "HOIDATA_WARM"
 PRELOADED = (
     "numpy", "scipy.spatial.transform", "scipy.optimize", "scipy.stats", "pandas", "pyarrow.parquet", "numba", "orjson",
-    "torch", "safetensors.torch", "trimesh", "igl", "rich.progress", "yaml", "filelock", "threadpoolctl",
+    "torch", "safetensors.torch", "trimesh", "igl", "rich.progress", "ruamel.yaml", "filelock", "threadpoolctl",
 )  # fmt: skip
 # Read as libraries are loaded. Threads of OpenMP that wait must sleep: spinning ones cost a busy machine ten times as
 # much. One thread of BLAS: its matrices are small here, two threads took five times as long and gave other last bits.

@@ -18,7 +18,7 @@ PROJECT = Path(__file__).parents[1]
 OURS = ("hoidata", "models", "pipelines")
 BESIDE = (
     *("pyproject.toml", "setup.py", "dvc.yaml", "params.yaml", "prefect.toml", "manifests", "README.md", "NOTICE"),
-    *("LICENSE*", ".dvc", ".dvcignore", ".gitattributes", ".gitignore"),
+    *("LICENSE*", ".dvc", ".dvcignore", ".gitignore"),
 )
 # A user's own packages, which have nothing to do with hoidata.
 USERS = "from models import mine\nfrom pipelines import own\nimport hoidata.errors\nprint(mine, own)"

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M
-from hoidata.errors import BadInput, MissingResource
-from hoidata.files.written import read_json
+from hoidata.errors import BadInput
+from hoidata.files.written import NUMBER, read_json, require_output
 from hoidata.objects.sampling import POINT_COUNT
 from hoidata.settings import build_config
 
@@ -32,7 +32,6 @@ def check_threshold(where: str, threshold_m: float) -> None:
 def read_contact_settings(folder: str | Path) -> ContactSettings:
     """The settings an output of the stage contact was made with. Raises MissingResource where there is none."""
     path = Path(folder) / "info.json"
-    if not path.is_file():
-        raise MissingResource(f"{folder} is not there: run the stage 'contact' of this dataset first")
-    info = read_json(path)
-    return build_config(ContactSettings, {name: info.get(name) for name in ("points", "threshold_m")}, str(path))
+    require_output(folder, "contact")
+    info = read_json(path, {"points": int, "threshold_m": NUMBER})
+    return build_config(ContactSettings, {name: info[name] for name in ("points", "threshold_m")}, str(path))

@@ -2,16 +2,13 @@
 
 from pathlib import Path
 
-from hoidata.errors import MissingResource
-from hoidata.files.written import read_table
+from hoidata.files.written import read_table, require_output
 
 
 def left_out_reasons(folder: str | Path) -> dict[str, str]:
     """Why each clip that failed is left out, by clip id. Raises MissingResource where no stage has written."""
-    path = Path(folder) / "clips.parquet"
-    if not path.is_file():
-        raise MissingResource(f"{path} is not there: run the stage 'quality' of this dataset first")
-    rows = read_table(path, ["clip_id", "verdict", "reasons"])
+    require_output(folder, "quality", "clips.parquet")
+    rows = read_table(Path(folder) / "clips.parquet", ["clip_id", "verdict", "reasons"])
     failed = rows[rows["verdict"] == "left out"]
     return {
         clip_id: f"left out by quality control: {reasons}"

@@ -6,6 +6,8 @@ from functools import lru_cache
 import orjson
 
 from hoidata.dataset_folders import dataset_folder
+from hoidata.errors import BadInput
+from hoidata.settings import build_config
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ def published(dataset: str) -> Published:
     path = None if folder is None else folder / "published.json"
     if path is None or not path.is_file():
         return Published("")
-    values = orjson.loads(path.read_bytes())
-    lists = {key: tuple(value) for key, value in values.items() if key != "source"}
-    return Published(values["source"], **lists)
+    try:
+        values = orjson.loads(path.read_bytes())
+    except orjson.JSONDecodeError as error:
+        raise BadInput(path, "a JSON object", str(error), "correct it") from error
+    return build_config(Published, values, str(path))

@@ -32,9 +32,9 @@ import orjson
 import pandas as pd
 
 from hoidata.clips.clip import SIDES, Clip, HandType, Side
-from hoidata.errors import BadInput, MissingResource
+from hoidata.errors import BadInput
 from hoidata.files.arrays import read_npz
-from hoidata.files.written import read_json, read_table
+from hoidata.files.written import NUMBER, Shape, read_json, read_table, require_output
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import SampledPoints
@@ -47,17 +47,18 @@ from hoidata.store.store import Store, open_store
 VARIATION = "variation"
 SUBSETS = ("train", "validation", "test")
 STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
+MEASURED: dict[str, Shape] = {"threshold_m": NUMBER, "points": int}
+SUBSET_COUNTS = {"name": str, "clips": dict.fromkeys((*SUBSETS, "left_out"), int), "keeps_its_promises": bool}
 
 
 def load_annotated(root: str | Path, hands: HandPair | None = None) -> "AnnotatedStore":
     """Open ``root/clips``, ``root/annotation``, ``root/contact`` and ``root/splits`` for reading.
 
-    hands: as in ``open_store``. Raises MissingResource naming the stage whose folder is not there.
+    hands: as in ``open_store``. Raises MissingResource naming the stage that has not run, or why a dataset is empty.
     """
     root = Path(root)
     for folder, stage in STAGES.items():
-        if not (root / folder).is_dir():
-            raise MissingResource(f"{root / folder} is not there: run the stage '{stage}' of this dataset first")
+        require_output(root / folder, stage, ".")
     return AnnotatedStore(root, open_store(root / "clips", hands))
 
 
@@ -74,9 +75,10 @@ class AnnotatedStore:
         self.splits: dict[str, str | None] = {
             clip_id: None if pd.isna(subset) else str(subset) for clip_id, subset in chosen.itertuples(index=False)
         }
-        self.split_info: dict[str, Any] = read_json(root / "splits" / "info.json")
-        self.annotation_info: dict[str, Any] = read_json(annotation / "info.json")
-        self.contact_info: dict[str, Any] = read_json(contact / "info.json")
+        self.split_info = read_json(root / "splits" / "info.json", {"chosen": SUBSET_COUNTS, "splits": {}})
+        self.split_info["splits"].check(dict.fromkeys(self.split_info["splits"], SUBSET_COUNTS))
+        self.annotation_info = read_json(annotation / "info.json", MEASURED)
+        self.contact_info = read_json(contact / "info.json", MEASURED)
         embeddings = read_npz(annotation / "embeddings.npz")
         self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
         self._features = embeddings["features"]

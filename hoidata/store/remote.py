@@ -53,7 +53,8 @@ def pull_store(address: str, folder: str | Path) -> int:
         if not system.exists(f"{root}/{LISTING}"):
             raise MissingResource(f"{address} holds no store, or one that is being sent: it has no {LISTING}")
         system.get_file(f"{root}/{LISTING}", str(partial / LISTING))
-        digests = dict(read_json(partial / LISTING))
+        listing = read_json(partial / LISTING)
+        digests: dict[str, str] = dict(listing.check(dict.fromkeys(listing, str)))
         (partial / LISTING).unlink()
         for name, digest in digests.items():
             path = partial / name

@@ -31,7 +31,7 @@ from hoidata.clips.clip import (
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files.written import REMEDY, read_json, read_table
+from hoidata.files.written import REMEDY, empty_reason, read_json, read_table
 from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.model import Hinge, ObjectModel
@@ -78,6 +78,9 @@ def read_info(folder: str | Path) -> dict[str, Any]:
     Raises MissingResource when ``folder`` is no store, BadInput when the file is no JSON object with a schema_version.
     """
     path = Path(folder) / "meta" / "info.json"
+    for noted in (Path(folder), Path(folder).parent):  # a family without motions has the note in the place of clips/
+        if not path.is_file() and (reason := empty_reason(noted)):
+            raise MissingResource(f"{noted} is empty: {reason}")
     if not path.is_file():
         raise MissingResource(f"{folder} is no store: {path} is missing; run the conversion of this dataset first")
     info = read_json(path)

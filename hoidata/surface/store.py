@@ -31,11 +31,11 @@ import pandas as pd
 import pyarrow as pa
 
 from hoidata.clips.clip import SIDES, Side
-from hoidata.errors import BadInput, MissingResource
+from hoidata.errors import BadInput
 from hoidata.files import canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
-from hoidata.files.written import read_json, read_table
+from hoidata.files.written import NUMBER, read_json, read_table, require_output
 from hoidata.hands.model import N_VERTICES
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.mapped import map_npz
@@ -185,13 +185,13 @@ def open_surface(folder: str | Path) -> "SurfaceStore":
     Raises MissingResource where it has not run, BadInput for another version or a damaged folder.
     """
     folder = Path(folder)
-    if not (folder / "info.json").is_file():
-        raise MissingResource(f"{folder} is not there: run the stage 'surface' of this dataset first")
+    require_output(folder, "surface")
     info = read_json(folder / "info.json")
     version = info["surface_version"]
     tables = {name: read_table(folder / f"{name}.parquet") for name in ("clips", "objects")}
     if version != VERSION:
         raise BadInput(folder / "info.json", f"surface_version {VERSION}", repr(version)[:80], REMEDY)
+    info.check({"touch_m": NUMBER, "points": int, "vertices": int, "map_step_m": NUMBER, "map_reach_m": NUMBER})
     for name, schema in (("clips", CLIPS), ("objects", OBJECTS)):
         if missing := sorted(set(schema.names) - set(tables[name].columns)):
             raise BadInput(folder / f"{name}.parquet", "all columns", f"none named {', '.join(missing)}", REMEDY)

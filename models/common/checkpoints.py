@@ -17,14 +17,13 @@ from torch import Tensor, nn
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, write_whole
 from hoidata.files.sealed import METADATA_KEY, OPEN_SEAL, check_seal, sealed
-from hoidata.files.written import read_json
+from hoidata.files.written import EMPTY, empty_reason
 from hoidata.settings import build_config, plain_config
 from models.common.family import StoredNetwork
 from models.common.features import Normaliser
 
 FORMAT = 1
 FILE_NAME = "model.safetensors"
-EMPTY_NAME = "empty.json"
 _WEIGHTS, _NORMALISER = "weights.", "normaliser."
 
 
@@ -110,13 +109,7 @@ def _config(network: StoredNetwork, info: dict[str, Any], path: Path) -> Any:
 
 def write_empty(folder: str | Path, reason: str) -> Path:
     """``empty.json`` in place of a checkpoint that could not be trained, with the reason."""
-    return write_whole(Path(folder) / EMPTY_NAME, canonical_json({"reason": reason}) + "\n")
-
-
-def empty_reason(folder: str | Path) -> str | None:
-    """Why a folder holds no checkpoint, or None when it says nothing."""
-    path = Path(folder) / EMPTY_NAME
-    return read_json(path)["reason"] if path.is_file() else None
+    return write_whole(Path(folder) / EMPTY, canonical_json({"reason": reason}) + "\n")
 
 
 def _below(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -20,7 +20,7 @@ from hoidata.batches.dataset import ClipBatch
 from hoidata.errors import BadInput
 from hoidata.files import canonical_json, sha256_bytes, sha256_file
 from hoidata.hands import HandPair
-from hoidata.settings import at_least, build_config, plain_config
+from hoidata.settings import at_least, build_config, key_in_file, plain_config, refuse_unknown
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import (
     FILE_NAME,
@@ -97,13 +97,14 @@ class Plan:
         Raises BadInput for unknown keys.
         """
         where = f"params.yaml: {network.name}"
-        known = {"network", "training", "loss", "seed"}
-        if unknown := set(params) - known:
-            raise BadInput(where, f"keys among {sorted(known)}", ", ".join(sorted(unknown)), "correct it")
+        refuse_unknown(params, ("network", "training", "loss", "seed"), where)
+        network_key, training_key, loss_key = (
+            key_in_file(params, name, where) for name in ("network", "training", "loss")
+        )
         return cls(
-            build_config(network.config, params.get("network"), f"{where}.network"),
-            build_config(TrainingConfig, params.get("training"), f"{where}.training"),
-            build_config(network.loss, params.get("loss"), f"{where}.loss") if network.loss else None,
+            build_config(network.config, params.get("network"), network_key),
+            build_config(TrainingConfig, params.get("training"), training_key),
+            build_config(network.loss, params.get("loss"), loss_key) if network.loss else None,
             int(params.get("seed", 0)),
         )
 

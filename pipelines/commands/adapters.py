@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-import yaml
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from hoidata.errors import BadInput
 from pipelines.commands.hands import chosen_hands
+from pipelines.params import load_yaml
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
@@ -78,7 +78,10 @@ def read_settings(pairs: list[str]) -> dict[str, Any]:
         key, equals, value = pair.partition("=")
         if not equals:
             raise BadInput("--setting", "key=value", pair, "correct it")
-        settings[key] = yaml.safe_load(value)
+        try:
+            settings[key] = load_yaml(value.encode())
+        except (ValueError, RecursionError) as error:
+            raise BadInput(f"--setting {key}", "a value as in params.yaml", str(error)[:300], "correct it") from error
     return settings
 
 

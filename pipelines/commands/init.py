@@ -9,10 +9,10 @@ import typer
 
 from hoidata.beside import FOLDER
 from hoidata.errors import BadInput
-from pipelines.commands.project import PROFILE, profile_line
+from pipelines.commands.project import PROFILE
 
-FILES = ("params.yaml", "prefect.toml", ".dvcignore", ".gitattributes", ".gitignore", ".dvc/config", ".dvc/.gitignore")
-ADDED_TO = (".gitignore", ".gitattributes")  # a repository may have its own
+FILES = ("params.yaml", "prefect.toml", ".dvcignore", ".gitignore", ".dvc/config", ".dvc/.gitignore")
+ADDED_TO = (".gitignore",)  # a repository may have its own
 GRAPHS = ("dvc.yaml", "pipelines/dvc.yaml", "models/*/dvc.yaml")
 PATTERNS = ("manifests/embedded/*.json", "manifests/study/*.json", *GRAPHS)
 # In a clone the stages run the code that lies there, in a project of `init` that of the installation.
@@ -31,7 +31,7 @@ def init(
         with open(folder / path, "a") as stream:
             stream.write((FOLDER / path).read_text().replace(IN_CLONE, INSTALLED))
     params, config = folder / "params.yaml", folder / ".dvc/config"
-    params.write_text(PROFILE.sub(profile_line("embedded"), params.read_text(), count=1))
+    params.write_text(PROFILE.sub("profile: embedded", params.read_text(), count=1))
     if not _in_repository(folder):
         config.write_text(config.read_text().replace("[core]\n", "[core]\n    no_scm = true\n"))
     typer.echo(f"{folder}: a project. Go there, then `hoidata repro`, or a part: `hoidata repro convert@embedded-grab`")

@@ -3,16 +3,13 @@
 import json
 import os
 import re
-import subprocess
 import tomllib
 from pathlib import Path
 
-from hoidata.errors import MissingResource
-from pipelines.params import PROFILES, read_params
+from hoidata.errors import BadInput, MissingResource
+from pipelines.params import read_params
 
-PROFILE = re.compile("^profile: .*", re.MULTILINE)
-FILTER = "hoidata-profile"
-CHOSEN = "hoidata-profile.sed"
+PROFILE = re.compile(r"^profile: *\S+", re.MULTILINE)
 
 
 def enter_project() -> Path:
@@ -36,33 +33,15 @@ def current_profile() -> str:
 
 
 def set_profile(profile: str) -> bool:
-    """Set the profile line of params.yaml, for this copy of the project alone; False when it said so already."""
+    """Set the profile in params.yaml, a change that git and DVC see as any other; False when it said so already."""
     path = Path("params.yaml")
-    text, before = path.read_text(), current_profile()
-    _keep_profile_from_git(profile)
-    if before != profile:
-        path.write_text(PROFILE.sub(profile_line(profile), text, count=1))
-    return before != profile
-
-
-def profile_line(profile: str) -> str:
-    """Equally long for all profiles: git looks closer at a file of the same size before it calls it changed."""
-    return f"profile: {profile}  # or {', '.join(name for name in PROFILES if name != profile)}"
-
-
-def _keep_profile_from_git(profile: str) -> None:
-    """A filter of this clone (see gitattributes): git stores the line as delivered and checks out what is chosen."""
-
-    def git(*words: str) -> str:
-        return subprocess.run(["git", *words], check=True, capture_output=True, text=True).stdout.strip()
-
-    try:
-        chosen = Path(git("rev-parse", "--git-path", CHOSEN))
-    except (OSError, subprocess.CalledProcessError):
-        return  # no git here, no work tree to keep clean
-    chosen.write_text(f"s/{PROFILE.pattern}/{profile_line(profile)}/\n")
-    git("config", f"filter.{FILTER}.clean", f"sed -e 's/{PROFILE.pattern}/{profile_line('embedded')}/'")
-    git("config", f"filter.{FILTER}.smudge", f'sed -e "$(cat "$(git rev-parse --git-path {CHOSEN})" 2>/dev/null)"')
+    if current_profile() == profile:
+        return False
+    text, changed = PROFILE.subn(f"profile: {profile}", path.read_text(), count=1)
+    if not changed:
+        raise BadInput(path, "a line `profile: NAME`", "none", "add it at the top of the file")
+    path.write_text(text)
+    return True
 
 
 def remember_root(name: str, root: Path) -> None:

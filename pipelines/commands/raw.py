@@ -48,7 +48,7 @@ def scan(
 def profile(
     name: Annotated[str, typer.Argument(help="embedded, study or own; nothing: say which one it is.")] = "",
 ) -> None:
-    """Say which data this copy of the project works on, or choose it; git does not see the choice."""
+    """Say which data the project works on, or choose it: the line `profile` of params.yaml, which git and DVC see."""
     enter_project()
     if name and name not in PROFILES:
         raise BadInput("hoidata profile", " or ".join(PROFILES), name, "choose one of them")

@@ -8,8 +8,6 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from hoidata.errors import BadInput
 from pipelines.params import load_yaml, read_file
 
@@ -80,7 +78,7 @@ def written_graph(root: Path) -> dict[str, Stage]:
     params = read_file(root / "params.yaml")
     try:
         stages = [stage for file in _graph_files(root) for stage in _written(root, file, params)]
-    except (yaml.YAMLError, BadInput, ValueError, TypeError, AttributeError, KeyError, OSError):
+    except (BadInput, ValueError, TypeError, AttributeError, KeyError, OSError):
         return read_graph(root)
     return {stage.name: stage for stage in stages}
 

@@ -10,8 +10,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from hoidata.errors import BadInput
 from hoidata.files.written import md5_file
 from pipelines.params import load_yaml
@@ -54,7 +52,7 @@ def parse_locks(texts: Mapping[str, bytes]) -> dict[str, Locked]:
         try:
             stages = load_yaml(text)["stages"]
             found |= {prefix + name: _locked(prefix + name, body) for name, body in stages.items()}
-        except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
             raise BadInput(file, "a lock file of DVC", type(error).__name__, "run `dvc repro`") from error
     return found
 

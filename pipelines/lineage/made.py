@@ -46,6 +46,7 @@ def compare_made(root: Path, path: Path) -> list[Node]:
     table = read_json(path)
     if table["schema"] != SCHEMA:
         raise BadInput(path, f"schema {SCHEMA}", str(table["schema"]), "take the one of this version")
+    table.check({"outputs": dict, "networks": dict, "processor": str, "libraries": dict})
     nodes = [_node("data", root, name, digest, dvc_digest(root / name)) for name, digest in table["outputs"].items()]
     elsewhere = "; ".join(_other_circumstances(table))
     for name, digest in table["networks"].items():

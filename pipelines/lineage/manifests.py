@@ -17,8 +17,10 @@ from hoidata.clips.clip import SourceFile
 from hoidata.datasets.base import Adapter, DatasetPart, RawTree
 from hoidata.errors import BadInput
 from hoidata.files import write_whole
+from hoidata.settings import build_config
 
 SCHEMA = "hoidata.manifest/1"
+REMEDY = "restore it with git checkout, or write it again with `hoidata raw scan`"
 FRAME_FILE = re.compile(r"\d{6}\.txt|\d{1,6}\.(?:json|pickle)")
 NEVER_READ = re.compile(r"\.(png|jpe?g|mp4|avi|mkv|zip|tar|tgz|tar\.gz|part[a-z]*)$", re.IGNORECASE)
 
@@ -64,12 +66,19 @@ def read_manifest(path: Path) -> Manifest:
     except (ValueError, RecursionError, OSError) as error:
         raise BadInput(path, "a JSON manifest", str(error), "restore it, or run `hoidata raw scan`") from error
     if not isinstance(values, dict) or values.pop("schema", None) != SCHEMA:
-        raise BadInput(path, f"schema {SCHEMA}", "another one", "write it anew with `hoidata raw scan`")
+        raise BadInput(path, f"schema {SCHEMA}", "another one", REMEDY)
     try:
         files = tuple(SourceFile(**entry) for entry in values.pop("files", ()))
-        return Manifest(**values, files=files)
     except TypeError as error:
-        raise BadInput(path, "the fields of a manifest", str(error), "write it anew with `hoidata raw scan`") from error
+        raise BadInput(path, "files with path, size and sha256", str(error), REMEDY) from error
+    if not all(
+        type(file.size) is int and isinstance(file.path, str) and isinstance(file.sha256, str) for file in files
+    ):
+        raise BadInput(path, "files with path, size and sha256", "other types of values", REMEDY)
+    try:
+        return replace(build_config(Manifest, values, str(path)), files=files)
+    except BadInput as error:
+        raise BadInput(error.where, error.expected, error.got, REMEDY) from error
 
 
 def write_manifest(path: Path, manifest: Manifest) -> None:

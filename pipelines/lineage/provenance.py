@@ -3,13 +3,13 @@
 No time, host, user or commit is recorded; those would change the file's digest without changing what it is.
 """
 
-import json
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 from hoidata.errors import BadInput
 from hoidata.files.sealed import read_metadata
+from hoidata.files.written import read_json
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.lineage.graph import Stage, look_up, producers, written_graph
 from pipelines.params import read_params
@@ -70,7 +70,7 @@ def _record(root: Path, stage: Stage, params: dict[str, Any], known: dict[str, s
 
     return {
         "params": {key: look_up(params, key) for key in sorted(stage.params)},
-        "code": {path: digest for file in stage.code for path, digest in json.loads((root / file).read_text()).items()},
+        "code": {path: digest for file in stage.code for path, digest in read_json(root / file).items()},
         "inputs": digests(stage.data),
         "outputs": digests(stage.outs),
     }

@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 
 from hoidata.errors import BadInput, HoidataError
 from hoidata.files.sealed import payload_digest
+from hoidata.machine_folder import SETTINGS
 from pipelines.lineage.locks import read_locks
 from pipelines.lineage.targets import WEIGHTS, Target
 
@@ -59,14 +60,14 @@ def _resolved(root: Path, commit: str) -> str:
 
 
 def _link_inputs(root: Path, clone: Path, out: Path) -> None:
-    """Data, manifests git ignores, the other checkpoints and the chosen profile."""
+    """Data, manifests and hoidata.toml where git has none, the other checkpoints and the chosen profile."""
     from pipelines.params import read_params
 
     _, profile, dataset, _ = out.parts
     chosen, params = read_params(root)["profile"], clone / "params.yaml"
     text = params.read_text()
     params.write_text(text.replace(f"profile: {read_params(clone)['profile']}", f"profile: {chosen}", 1))
-    links = [Path("data") / profile / dataset, Path("manifests") / profile]
+    links = [Path("data") / profile / dataset, Path("manifests") / profile, Path(SETTINGS)]
     links += [path.relative_to(root) for path in (root / out.parent).iterdir() if path.name != out.name]
     for path in links:
         if (root / path).exists() and not (clone / path).exists():

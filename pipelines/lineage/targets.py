@@ -15,6 +15,7 @@ from hoidata.errors import BadInput
 from hoidata.files.digest import sha256_file
 from hoidata.files.numpy_files import load_npz_objects
 from hoidata.files.sealed import payload_digest, seal_fault
+from hoidata.files.written import read_json
 from pipelines.lineage.history import History
 from pipelines.lineage.locks import Locked, cached_listing, dvc_digest, lock_files, parse_locks, read_locks
 from pipelines.lineage.provenance import read_provenance
@@ -164,7 +165,7 @@ def _lock_stage(root: Path, lock: Locked) -> dict[str, Any]:
     files: dict[str, str] = {}
     for path, digest in code.items():
         known = dvc_digest(root / path) == digest
-        files |= json.loads((root / path).read_text()) if known else {path: digest}
+        files |= read_json(root / path) if known else {path: digest}
     inputs = {path: digest for path, digest in lock.deps.items() if path not in code}
     return {"params": lock.params, "code": files, "inputs": inputs, "outputs": lock.outs}
 

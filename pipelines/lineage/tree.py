@@ -225,14 +225,12 @@ class _Comparison:
 
     def value_in(self, text: bytes, key: str) -> Any:
         """A param of another params.yaml, under the profile that is chosen now; None where it has no such thing."""
-        import yaml
-
         try:
             values = load_yaml(text)
             if "profile" in self.params:
                 values["profile"] = self.params["profile"]
             return look_up(chosen_params(values), key)
-        except (BadInput, yaml.YAMLError, ValueError, TypeError, AttributeError, RecursionError):
+        except (BadInput, ValueError, TypeError, AttributeError, RecursionError):
             return None
 
     def as_committed(self, key: str, recorded: Any) -> str:

@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
-from hoidata.errors import MissingResource
-from hoidata.files.written import read_json, read_table
+from hoidata.files.written import read_table, require_output
 from hoidata.hands import JOINT_NAMES, HandPair
 from hoidata.quality.thresholds import CLIP_MEASURES
 from hoidata.store.annotated import AnnotatedStore
 from pipelines.pages.clip_page_series import ClipSeries
+from pipelines.pages.quality import read_limits
 
 Rows = list[tuple[str, ...]]
 NOTHING = "none"
@@ -130,10 +130,9 @@ def _joint(annotated: AnnotatedStore, clip_id: str, side: Side, frame: int) -> s
 
 def clip_quality(folder: Path, clip_id: str) -> ClipQuality:
     """What quality control found. Raises MissingResource where its stage has not run."""
-    if not (folder / "clips.parquet").is_file():
-        raise MissingResource(f"{folder} is not there: run the stage 'quality' of this dataset first")
+    require_output(folder, "quality", "clips.parquet")
     row = read_table(folder / "clips.parquet").set_index("clip_id").loc[clip_id]
-    limits = read_json(folder / "info.json")["thresholds"]["limits"]
+    limits = read_limits(folder)
     measures = [
         (
             f"{measure.words}{', ' + measure.unit if measure.unit else ''}",

@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from hoidata.clips.clip import FPS
-from hoidata.files.written import read_json
+from hoidata.files.written import empty_reason
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.store.store import Store, open_store
@@ -55,8 +55,7 @@ def read_dataset(root: Path, name: str, hands: HandPair) -> DatasetFacts:
 
 def reason_for_nothing(folder: Path) -> str:
     """The reason a stage noted in ``folder/empty.json``; "" where it noted none."""
-    note = folder / "empty.json"
-    return str(read_json(note)["reason"]) if note.is_file() else ""
+    return empty_reason(folder) or ""
 
 
 def has_tables(root: Path, *tables: str) -> bool:

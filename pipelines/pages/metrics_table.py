@@ -10,11 +10,11 @@ from rich import box
 from rich.table import Table
 
 from hoidata.errors import BadInput
-from hoidata.files.written import read_json
 from hoidata.metrics.asked_metrics import ASKED_LISTS
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, FeatureMetric
 from hoidata.metrics.registry import METRICS, Metric, is_better
 from hoidata.metrics.unmeasured import reasons_in_words
+from pipelines.figures import read_metrics
 from pipelines.promises import TRUTH
 
 AnyMetric = Metric | FeatureMetric
@@ -130,7 +130,7 @@ class _Found:
         return {name: value for name, value in found.items() if not self.is_foreign(name, metric)}
 
     def has(self, family: str, metric: AnyMetric) -> bool:
-        return metric.name in self.values[family].get("figures", {})
+        return self.values[family].get("figures", {}).get(metric.name) is not None
 
     def is_foreign(self, family: str, metric: AnyMetric) -> bool:
         """Whether the figure comes from other weights than the first family's: they are not to be compared."""
@@ -224,7 +224,7 @@ def _found(folder: Path, families: Sequence[str]) -> _Found:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    return read_json(path) if path.is_file() else {"empty": "not evaluated"}
+    return read_metrics(path) if path.is_file() else {"empty": "not evaluated"}
 
 
 def _row(family: str, found: _Found, shown: list[AnyMetric]) -> Row:

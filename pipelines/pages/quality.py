@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from hoidata.files.written import read_json, read_table
+from hoidata.files.written import NUMBER_OR_NONE, read_json, read_table
 from hoidata.quality.thresholds import CLIP_MEASURES, MESH_MEASURES, Measure
 from pipelines.pages.curves import COLOURS, figure_svg
 from pipelines.pages.metrics_table import number
@@ -22,6 +22,10 @@ BINS = 24
 WARN_COLOUR, LEAVE_OUT_COLOUR = "#c98a00", "#b5371f"
 # A limit farther away than this times what the clips show would leave the chart empty.
 FARTHEST = 2.5
+
+
+# What the stage counts, by the entry of its info.json.
+COUNTS = ("clips", "ok", "warned", "left_out", "objects", "objects_warned", "objects_left_out")
 
 
 @dataclass(frozen=True)
@@ -61,11 +65,11 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
     """What the stage left in ``folder``; None where it has not run, or found no clip."""
     if not (folder / "clips.parquet").is_file():
         return None
-    info = read_json(folder / "info.json")
+    info = read_json(folder / "info.json", {"counts": dict.fromkeys(COUNTS, int)})
     clips, meshes = (read_table(folder / f"{name}.parquet") for name in ("clips", "meshes"))
     if not len(clips):
         return None
-    limits = info["thresholds"]["limits"]
+    limits = read_limits(folder)
     return QualityFacts(
         summary=_summary(info["counts"]),
         clips=[_row(clips, "clip_id", measure, limits[measure.name]) for measure in CLIP_MEASURES],
@@ -81,6 +85,14 @@ def read_quality(folder: Path, dataset: str) -> QualityFacts | None:
             if (missing := int(np.isnan(_values(clips, measure)).sum()))
         ],
     )
+
+
+def read_limits(folder: Path) -> dict[str, dict[str, float | None]]:
+    """The limits ``warn`` and ``leave_out`` of every measure, as the stage used them. Raises BadInput."""
+    limit = {"warn": NUMBER_OR_NONE, "leave_out": NUMBER_OR_NONE}
+    names = [measure.name for measure in (*CLIP_MEASURES, *MESH_MEASURES)]
+    info = read_json(folder / "info.json", {"thresholds": {"limits": dict.fromkeys(names, limit)}})
+    return info["thresholds"]["limits"]
 
 
 def measures_svg(

@@ -12,6 +12,7 @@ from typing import Any
 from hoidata.datasets.base import Adapter
 from hoidata.datasets.registry import adapter_names, get_adapter
 from hoidata.errors import BadInput
+from hoidata.machine_folder import machine_folder
 from pipelines.lineage.manifests import ABSENT_HAND, Manifest, absent_manifest, read_manifest, write_manifest
 from pipelines.stages.base import StagePaths, load_settings, own_root, raw_root
 
@@ -40,9 +41,11 @@ class ConvertSettings:
 def manifest_of(paths: StagePaths) -> Manifest:
     """What is known of a dataset's raw files; that it is absent where nothing has been scanned.
 
-    Of a variant that has no manifest of its own: what is known of its source.
+    Of a variant that has no manifest of its own: what is known of its source. An experiment in a temporary copy of the
+    project reads manifests that git does not know yet where they were written.
     """
-    known = [path for path in (paths.manifest, source_paths(paths).manifest) if path.is_file()]
+    written = (paths.manifest, source_paths(paths).manifest)
+    known = [folder / path for path in written for folder in (Path(), machine_folder()) if (folder / path).is_file()]
     return read_manifest(known[0]) if known else absent_manifest(configured_adapter(paths.dataset))
 
 
@@ -72,7 +75,8 @@ def ensure_manifests(profile: str, datasets: Sequence[str]) -> None:
             write_manifest(paths.manifest, manifest_of(paths))
     hand = StagePaths(profile).hand_manifest
     if not hand.is_file():
-        write_manifest(hand, ABSENT_HAND)
+        scanned = machine_folder() / hand
+        write_manifest(hand, read_manifest(scanned) if scanned.is_file() else ABSENT_HAND)
 
 
 def configured_adapter(name: str) -> Adapter:

@@ -11,14 +11,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from hoidata.files.written import read_json
+from hoidata.files.written import EMPTY, read_json
+from hoidata.files.written import empty_reason as empty_reason  # for the stages
+from hoidata.machine_folder import SETTINGS, machine_folder
 from hoidata.settings import build_config
 from pipelines.params import chosen_params, read_file
 
 if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
-EMPTY = "empty.json"
 HAND = "hand"
 OWN = "own"
 Settings = TypeVar("Settings")
@@ -95,7 +96,7 @@ def own_root(name: str) -> Path | None:
     """The user's raw folder of ``name``: its environment variable, else hoidata.toml's [roots], else None."""
     if value := os.environ.get(root_variable(name)):
         return Path(value)
-    root = _registered_roots(Path("hoidata.toml")).get(name)
+    root = _registered_roots(machine_folder() / SETTINGS).get(name)
     return None if root is None else Path(root)
 
 
@@ -114,7 +115,7 @@ def _registered_roots(path: Path) -> dict[str, str]:
 def raw_root(paths: StagePaths) -> Path:
     """The raw folder of a dataset that is present. Raises MissingResource with what to do when it is not there."""
     if paths.is_generated:
-        root = paths.generated_raw
+        root = paths.generated_raw if paths.generated_raw.is_dir() else machine_folder() / paths.generated_raw
         remedy = f"write it again with `hoidata synth write {paths.dataset} --profile {paths.profile}`"
     else:
         root = own_root(paths.dataset)
@@ -139,13 +140,7 @@ def load_hands(profile: str) -> "HandPair":
 def hand_is_present(profile: str) -> bool:
     """Whether the profile has a hand of its own: the embedded one, or MANO files that were scanned."""
     path = StagePaths(profile).hand_manifest
-    return path.is_file() and bool(read_json(path)["present"])
-
-
-def empty_reason(folder: Path) -> str | None:
-    """Why a stage's output folder is empty, or None when it holds something."""
-    note = folder / EMPTY
-    return read_json(note)["reason"] if note.is_file() else None
+    return path.is_file() and bool(read_json(path, {"present": bool})["present"])
 
 
 def note_empty(folder: Path, reason: str) -> None:

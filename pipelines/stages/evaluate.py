@@ -1,11 +1,10 @@
 """Stage evaluate: every metric of one family's motions of one dataset. It knows no family."""
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hoidata.files.written import read_json
+from hoidata.files.written import read_json, read_json_rows
 from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_json
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ def run(paths: StagePaths) -> None:
 
 def _with_reasons(left_out: list[dict[str, str]], told: Path) -> list[dict[str, str]]:
     """What was left out, with the reason of the family itself where it had no motion for a clip."""
-    known = json.loads(told.read_text(encoding="utf-8")) if told.is_file() else []
+    known = read_json_rows(told, {"clip_id": str, "reason": str}) if told.is_file() else []
     reasons = {item["clip_id"].rpartition("~")[0]: item["reason"] for item in known}
     return [{**item, "reason": reasons.get(item["clip_id"], item["reason"])} for item in left_out]
 

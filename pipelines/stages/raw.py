@@ -47,8 +47,8 @@ def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
     from hoidata.synthetic.corpus import write_corpus
 
     recipe = manifest.recipe or {}
-    if recipe.keys() != {"seed", "size"}:
-        raise BadInput(paths.manifest, "a recipe of seed and size", ", ".join(recipe), "restore it with git checkout")
+    if {name: type(value) for name, value in recipe.items()} != {"seed": int, "size": str}:
+        raise BadInput(paths.manifest, "a recipe of seed and size", repr(recipe)[:80], "restore it with git checkout")
     write_corpus(source_of(paths.dataset), root, recipe["seed"], recipe["size"], jobs())
 
 

@@ -65,8 +65,14 @@ def read_rows(paths: StagePaths) -> dict[str, list[Facts]]:
     """What was measured of each row, by its name, seed by seed."""
     known = [name for rows in ROWS.values() for name in rows]
     files = [file for folder in _runs(paths) for file in sorted(folder.glob("*.json")) if file.name != EMPTY]
-    rows = [(file.stem, read_json(file)) for file in files]
+    rows = [(file.stem, read_row(file)) for file in files]
     return {name: own for name in known if (own := [row for stem, row in rows if stem == name])}
+
+
+def read_row(path: Path) -> Facts:
+    """What was measured of one row. Raises BadInput."""
+    measured = {"figures": dict, "motions": int, "by_clip": dict, "diagnostics": dict, "empty": (str, type(None))}
+    return read_json(path, {"title": str}).check_given(measured)
 
 
 def _runs(paths: StagePaths) -> list[Path]:
@@ -173,7 +179,7 @@ def _rows_by_family(folder: Path) -> dict[str, Facts]:
     found: dict[str, Facts] = {}
     for name, row in ROWS[variant_of(folder.name)[0]].items():
         path = folder / f"{name}.json"
-        if not row.settings and path.is_file() and "by_clip" in (facts := read_json(path)):
+        if not row.settings and path.is_file() and "by_clip" in (facts := read_row(path)):
             found.setdefault(row.family, facts)  # the first of a family, not the same with more motions
     return found
 

@@ -37,7 +37,7 @@ class TrainParams:
     def of(self, network: str) -> dict[str, Any]:
         """The network's settings by preset and size, with the seed; a network without any keeps its defaults."""
         method, size = (getattr(self, name).get(network) or {} for name in (self.preset, self.size))
-        return {**laid_over(method, size), "seed": self.seed}
+        return laid_over(laid_over(method, size), {"seed": self.seed})
 
 
 def run(paths: StagePaths) -> None:

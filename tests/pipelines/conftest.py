@@ -24,7 +24,6 @@ PARTS = (
     "dvc.yaml",
     "params.yaml",
     ".dvcignore",
-    ".gitattributes",
     ".gitignore",
     "prefect.toml",
     ".dvc/config",

@@ -40,8 +40,10 @@ def commit(folder: Path, tools) -> None:
         assert tools.run(folder, "git", *words).returncode == 0
 
 
-def is_clean(folder: Path, tools) -> bool:
-    return not tools.run(folder, "git", "status", "--porcelain").stdout
+def changed_files(folder: Path, tools) -> set[str]:
+    """What git shows as changed or new, as ``git status --short`` marks it."""
+    shown = tools.run(folder, "git", "status", "--porcelain", "--untracked-files=all").stdout
+    return {line for line in shown.splitlines()}
 
 
 @pytest.mark.slow
@@ -81,11 +83,12 @@ def test_mano_files_are_registered_by_digest_and_place(project, tmp_path, projec
     assert is_present(project, "hand")
     assert str(mano) in (project / "hoidata.toml").read_text()
     assert "profile: embedded" in (project / "params.yaml").read_text()
-    assert is_clean(project, project_tools)
+    names = ("hand", *yaml.safe_load((project / "params.yaml").read_text())["datasets"])
+    assert changed_files(project, project_tools) == {f"?? manifests/own/{name}.json" for name in names}
 
 
 @pytest.mark.slow
-def test_scanning_a_dataset_leaves_the_work_tree_clean_and_dvc_builds_the_users_profile(
+def test_git_sees_the_chosen_profile_and_the_manifests_of_a_scan_and_dvc_builds_the_users_profile(
     project, small_corpus, project_tools
 ):
     make_plain_params(project)
@@ -94,32 +97,37 @@ def test_scanning_a_dataset_leaves_the_work_tree_clean_and_dvc_builds_the_users_
     raw = small_corpus("grab").raw
     scanned = project_tools.run(project, "hoidata", "raw", "scan", "grab", "--root", str(raw))
     assert scanned.returncode == 0, scanned.stderr
-    assert yaml.safe_load((project / "params.yaml").read_text())["profile"] == "own"
-    assert is_clean(project, project_tools)
+    params = yaml.safe_load((project / "params.yaml").read_text())
+    assert params["profile"] == "own"
+    manifests = {f"?? manifests/own/{name}.json" for name in ("hand", *params["datasets"])}
+    assert changed_files(project, project_tools) == {" M params.yaml", *manifests}
     built = project_tools.run(project, "dvc", "repro", "raw@own-grab", "raw@own-h2o")
     assert built.returncode == 0, built.stderr
     assert len(json.loads((project / "data/own/grab/raw.json").read_text())["files"]) > 5
     assert not json.loads((project / "data/own/h2o/raw.json").read_text())["present"]
 
 
-def test_the_chosen_profile_is_kept_from_git_and_survives_a_change_of_params_by_git(here, project_tools):
+def test_the_chosen_profile_is_one_changed_line_of_params_as_git_sees_any_other_setting(here, project_tools):
     make_plain_params(here)
     commit(here, project_tools)
     assert hoidata("profile", "own").stdout == "own\n"
-    assert is_clean(here, project_tools)
+    diff = project_tools.run(here, "git", "diff", "-U0", "params.yaml").stdout
+    changed = [line for line in diff.splitlines() if line[0] in "+-" and line[:3] not in ("+++", "---")]
+    assert changed == ["-profile: embedded  # embedded, study or own", "+profile: own  # embedded, study or own"]
     params = here / "params.yaml"
+    commit(here, project_tools)
     params.write_text(params.read_text().replace("seed: 0", "seed: 5"))
-    changed = project_tools.run(here, "git", "diff", "-U0").stdout
-    assert "seed: 5" in changed
-    assert "own" not in changed
     project_tools.run(here, "git", "checkout", "--quiet", "params.yaml")
-    assert yaml.safe_load(params.read_text())["profile"] == "own"
+    assert hoidata("profile").stdout == "own\n"
     assert "seed: 0" in params.read_text()
-    assert hoidata("profile", "study").stdout == "study\n"
-    assert is_clean(here, project_tools)
     assert hoidata("profile", "embedded").stdout == hoidata("profile").stdout == "embedded\n"
-    assert is_clean(here, project_tools)
     assert isinstance(hoidata("profile", "mine").exception, BadInput)
+
+
+def test_a_profile_that_cannot_be_set_is_told(here):
+    params = here / "params.yaml"
+    params.write_text(params.read_text().replace("profile: embedded", '"profile": embedded'))
+    assert isinstance(hoidata("profile", "own").exception, BadInput)
 
 
 def make_plain_params(folder: Path) -> None:

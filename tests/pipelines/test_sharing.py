@@ -3,6 +3,7 @@
 import shutil
 import tomllib
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import yaml
@@ -35,26 +36,82 @@ def test_sharing_needs_a_remote_to_share_with(project, project_tools):
     assert "dvc remote add" in refused.stderr
 
 
-@pytest.mark.slow
-def test_dvc_push_sends_nothing_derived_until_it_is_shared(project, project_tools, tmp_path):
-    built = project_tools.run(project, "dvc", "repro", "convert@embedded-manipnet")
-    assert built.returncode == 0, built.stderr
-    for words in (("git", "add", "-A"), ("git", "-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "built")):
-        project_tools.run(project, *words)
-    project_tools.run(project, "dvc", "remote", "add", "--local", "-d", "there", str(tmp_path / "remote"))
+@pytest.fixture
+def built(project, project_tools, tmp_path) -> SimpleNamespace:
+    """A project with clips, its remote, and the commands of this module in words."""
+    remote = tmp_path / "remote"
 
-    def pushed() -> int:
-        assert project_tools.run(project, "dvc", "push").returncode == 0
-        return sum(path.is_file() for path in (tmp_path / "remote").rglob("*"))
+    def run(*command: str, folder: Path = project) -> str:
+        done = project_tools.run(folder, *command)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
 
-    kept = pushed()
-    assert project_tools.run(project, "hoidata", "share", "--on").returncode == 0
-    shared = pushed()
-    assert shared > kept
-    assert project_tools.run(project, "git", "status", "--porcelain").stdout == ""
-    assert project_tools.run(project, "hoidata", "share", "--off").returncode == 0
-    shutil.rmtree(tmp_path / "remote")
-    assert pushed() == kept
+    def commit() -> None:
+        run("git", "add", "-A")
+        run("git", "-c", "user.name=a", "-c", "user.email=b", "commit", "-qm", "built")
+
+    def push(*options: str) -> set[str]:
+        """Names of the files on the remote after ``dvc push``: digests of what they hold."""
+        run("dvc", "push", *options)
+        found = [path.relative_to(remote) for path in remote.rglob("*") if path.is_file()]
+        return {"".join(path.parts[-2:]) for path in found if "runs" not in path.parts}
+
+    run("dvc", "repro", "convert@embedded-manipnet")
+    run("dvc", "remote", "add", "-d", "there", str(remote))
+    commit()
+    stages = yaml.safe_load((project / "dvc.lock").read_text())["stages"]
+    outs = [(stage.partition("@")[0], out["md5"]) for stage, body in stages.items() for out in body["outs"]]
+    return SimpleNamespace(
+        project=project, remote=remote, run=run, push=push,
+        may_leave={digest for stage, digest in outs if stage == "raw"},
+        clips={digest for stage, digest in outs if stage == "convert"},
+    )  # fmt: skip
+
+
+@pytest.mark.long
+def test_sharing_that_is_off_sends_nothing_derived_whatever_was_pushed_before(built):
+    every_way = ((), ("--all-commits",), ("--run-cache",), ("-r", "there"))
+    for options in every_way:
+        assert built.push(*options) == built.may_leave, options
+    built.run("hoidata", "share", "--on")
+    assert built.push() > built.may_leave | built.clips
+    assert built.run("git", "status", "--porcelain") == ""
+    built.run("hoidata", "share", "--off")
+    shutil.rmtree(built.remote)
+    for options in every_way:
+        assert built.push(*options) == built.may_leave, options
+    built.run("hoidata", "share", "--on")
+    assert built.push() > built.may_leave | built.clips
+
+
+@pytest.mark.long
+def test_a_clone_pulls_what_is_shared_also_after_it_tried_too_early(built, project_tools, tmp_path):
+    assert built.push() == built.push() == built.may_leave
+    built.run("hoidata", "share", "--on")
+    assert built.push() > built.clips
+    clone, clips = tmp_path / "clone", "data/embedded/manipnet/clips"
+    built.run("git", "clone", "-q", str(built.project), str(clone))
+    assert project_tools.run(clone, "dvc", "pull", clips).returncode != 0
+    built.run("hoidata", "share", "--on", folder=clone)
+    built.run("dvc", "pull", clips, folder=clone)
+    assert built.run("hoidata", "validate", clips, folder=clone)
+    assert (clone / clips / "meta/info.json").read_bytes() == (built.project / clips / "meta/info.json").read_bytes()
+
+
+@pytest.mark.parametrize("address", ["s3://bucket/team", "s3://bucket/team/", "ssh://host/a"])
+def test_derived_outputs_never_have_the_address_of_the_others(project, monkeypatch, address):
+    """DVC's index of an address is kept from one push to the next, whichever remotes outputs had meanwhile."""
+    from pipelines.commands.share import _config, _keep_here, _lead_out
+
+    monkeypatch.chdir(project)
+    with _config().edit() as config:
+        config["core"]["remote"] = "team"
+        config["remote"]["team"] = {"url": address}
+    assert _lead_out() == f"{address.rstrip('/')}/derived"
+    shared, plain = (_config()["remote"][name]["url"].rstrip("/") for name in ("derived", "team"))
+    assert shared != plain
+    _keep_here()
+    assert Path(_config()["remote"]["derived"]["url"]).resolve() == (project / ".dvc/cache").resolve()
 
 
 def test_plain_dvc_and_prefect_typed_in_this_folder_send_nothing_home(monkeypatch):

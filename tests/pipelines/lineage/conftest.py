@@ -150,7 +150,8 @@ def write_locks(root: Path) -> None:
         file, _, name = stage.name.rpartition(":")
         files[file.replace("yaml", "lock") or "dvc.lock"][name] = run(stage)
     for file, stages in files.items():
-        (root / file).write_text(yaml.safe_dump({"schema": "2.0", "stages": stages}, sort_keys=False))
+        values = json.loads(json.dumps({"schema": "2.0", "stages": stages}))  # plain dictionaries, which PyYAML writes
+        (root / file).write_text(yaml.safe_dump(values, sort_keys=False))
 
 
 def git(root: Path, *words: str) -> str:
