@@ -472,7 +472,7 @@ def _oakink2() -> list[Target]:
     others = [{"a": {"obj_id": "a", "obj_name": "mug"}}, {"a": {"obj_name": 1}}, {"a": ["b"], "b": ["c"]}, {"a": ["a"]}]
     texts = (
         *(oakink2_files.read_program, oakink2_files._segment, oakink2_files._ranges, oakink2_files._range),
-        *(oakink2_files.read_names, oakink2_files.read_roots, oakink2_files._topmost, oakink2_files._json),
+        *(oakink2_files.read_names, oakink2_files.read_roots, oakink2_files._json),
         oakink2_files.Segment,
     )
     return [
