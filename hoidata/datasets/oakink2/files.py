@@ -218,13 +218,14 @@ def read_roots(data: bytes, where: str) -> dict[str, str]:
     topmost: dict[str, str] = {}
     for child in parent:
         path = dict[str, None]()  # up to a part whose topmost one is known, so that no step is made twice
-        name = child
+        name: str = child
         while name in parent and name not in topmost:
             if name in path:
                 raise BadInput(where, "a tree of parts", f"{name[:40]!r} below itself")
             path[name] = None
             name = parent[name]
-        topmost |= dict.fromkeys(path, topmost.get(name, name))
+        root: str = topmost.get(name, name)
+        topmost |= {below: root for below in path}
     return topmost
 
 
