@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hoidata.errors import BadInput
+from hoidata.objects.ply import MOST_TRIANGLES
 
 _LARGEST_JSON = 4 << 20
 _MOST_CORNERS = 5_000_000  # decoded or shown, of a file with fewer bytes than that
@@ -121,11 +122,14 @@ class _Scene:
     def shown(self) -> Glb:
         self._place_nodes()
         showing = sorted(number for number in self.world if "mesh" in self.nodes[number])
-        vertices, faces, counts, start = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], [], 0
+        vertices, faces, counts = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], []
+        start = shown = 0
         for number in showing:
             node = self.nodes[number]
             points, corners = self._shaped(node)
             self._spend(len(points) + corners.size)
+            shown += len(corners)
+            _check_count(shown)
             if "skin" in node:
                 points = self._skinned(node, points)
             else:
@@ -217,7 +221,9 @@ class _Scene:
             if weight and "POSITION" in target:
                 points = points + float(weight) * self._accessor(target["POSITION"])
         order = np.arange(len(points)) if "indices" not in primitive else self._accessor(primitive["indices"]).ravel()
-        faces = _triangles(order.astype(np.int64), primitive.get("mode", _TRIANGLES))
+        mode = primitive.get("mode", _TRIANGLES)
+        _check_count(len(order) // 3 if mode == _TRIANGLES else len(order) - 2)
+        faces = _triangles(order.astype(np.int64), mode)
         if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
             raise ValueError(f"corner {faces.max()} of {len(points)} vertices")
         return points.astype(np.float64), faces
@@ -285,6 +291,11 @@ class _Scene:
         if stride < size or start < 0 or count < 0 or end > min(len(data), start - offset + stated["byteLength"]):
             raise ValueError(f"{count} vertices or corners in the {stated['byteLength']} bytes of buffer view {view}")
         return np.ndarray((count, width), kind, data, start, (stride, kind.itemsize))
+
+
+def _check_count(triangles: int) -> None:
+    if triangles > MOST_TRIANGLES:
+        raise ValueError(f"more than {MOST_TRIANGLES} triangles: decimate the mesh")
 
 
 def _item(items: list[Any], number: int) -> Any:

@@ -172,6 +172,17 @@ def many_nodes() -> bytes:
                 "scene": 0}, body)  # fmt: skip
 
 
+def long_strip() -> bytes:
+    """Forty million triangles, of one byte each."""
+    body = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + bytes([0, 1, 2, 1]) * (10 * MB)
+    views = [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 40 * MB}]
+    accessors = [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3},
+                 {"bufferView": 1, "componentType": 5121, "type": "SCALAR", "count": 40 * MB}]  # fmt: skip
+    mesh = {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 5}]}
+    return glb({"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(body)}], "bufferViews": views,
+                "accessors": accessors, "meshes": [mesh], "nodes": [{"mesh": 0}]}, body)  # fmt: skip
+
+
 def header_of_lists() -> bytes:
     text = b'{"a":[' + b"[]," * 10_000_000 + b"[]]}"
     return len(text).to_bytes(8, "little") + text
@@ -247,6 +258,7 @@ ATTACKS: list[Attack] = [
     ("one-polygon.obj", wide_obj, load_mesh),
     ("empty-accessors.glb", empty_accessors, read_user_object),
     ("many-nodes.glb", many_nodes, read_user_object),
+    ("long-strip.glb", long_strip, read_user_object),
     ("parts.json", lambda: b"[" + b"[]," * 1_800_000 + b"[]]", lambda path: parse_parts(path.read_bytes(), "p", 9)),
     ("action_train.txt", lambda: b"\n" * (5 * MB), listed),
     ("rows.csv", lambda: b"time_s\n" + b"0\n" * (8 * MB), read_trajectories),
