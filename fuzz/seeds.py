@@ -1,5 +1,6 @@
 """Small valid files of every format, made here: nothing binary is committed."""
 
+import base64
 import gzip
 import io
 import json
@@ -312,7 +313,75 @@ def glb_files() -> list[bytes]:
         }
         found += [_glb(tree, body), _glb({**tree, "scenes": [], "nodes": []}, body)]
     huge = _glb({"accessors": [{"count": 10**9}], "meshes": [{"primitives": [{"attributes": {}}]}]}, b"")
-    return [*found, huge, b"glTF", b""]
+    return [*found, huge, *_glb_of_everything(), b"glTF", b""]
+
+
+def _glb_of_everything() -> list[bytes]:
+    """A strip and a fan of normalised, sparse, skinned and morphed vertices in a mirrored node; and one fault each."""
+    positions, moved = (np.array(_CORNERS) * 100).astype("|i1"), np.array(_CORNERS, "<f4")
+    joints, weights = np.tile(np.array([0, 1, 0, 0], "|u1"), (4, 1)), np.tile(np.array([0.5, 0.5, 0, 0], "<f4"), (4, 1))
+    arrays = (np.pad(positions, ((0, 0), (0, 1))), np.array([0, 1, 2, 3], "<u4"), moved, joints, weights)
+    arrays = (*arrays, np.tile(np.eye(4, dtype="<f4").ravel(), (2, 1)), np.array([1, 3], "<u4"))
+    kinds = ((5120, "VEC3"), (5125, "SCALAR"), (5126, "VEC3"), (5121, "VEC4"), (5126, "VEC4"), (5126, "MAT4"))
+    views, body = [], b""
+    for array in arrays:
+        views.append({"buffer": 0, "byteOffset": len(body), "byteLength": array.nbytes})
+        body += array.tobytes()
+    views[0]["byteStride"] = 4
+    accessors = [
+        {"bufferView": number, "componentType": kind, "type": name, "count": len(arrays[number])}
+        for number, (kind, name) in enumerate(kinds)
+    ]
+    accessors[0]["normalized"] = True
+    places = {"bufferView": 6, "componentType": 5125}
+    accessors[0]["sparse"] = {"count": 2, "indices": places, "values": {"bufferView": 0}}
+    accessors.append({"componentType": 5126, "type": "VEC3", "count": 4})
+    attributes = {"POSITION": 0, "JOINTS_0": 3, "WEIGHTS_0": 4}
+    shapes = [{"attributes": attributes, "indices": 1, "mode": mode, "targets": [{"POSITION": 2}]} for mode in (5, 6)]
+    tree = {
+        "asset": {"version": "2.0"},
+        "extensionsRequired": ["KHR_mesh_quantization"],
+        "nodes": [
+            {"mesh": 0, "scale": [-1, 1, 1], "weights": [0.5], "children": [1, 2]},
+            {"mesh": 0, "skin": 0, "matrix": np.eye(4).ravel().tolist()},
+            {"mesh": 1, "name": "more"},
+        ],
+        "meshes": [{"primitives": shapes}, {"primitives": [{"attributes": {"POSITION": 7}, "mode": 0}]}],
+        "skins": [{"joints": [0, 1], "inverseBindMatrices": 5}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(body)}],
+    }
+    inside = {"uri": "data:application/octet-stream;base64," + base64.b64encode(body).decode()}
+    changes: tuple[dict, ...] = (
+        *({}, {"buffers": [inside]}, {"buffers": [{"uri": "a.bin"}]}, {"scenes": [{"nodes": [1, 1]}]}),
+        *({"extensionsRequired": ["KHR_draco_mesh_compression"]}, {"scenes": [{"nodes": [-1]}]}),
+        *({"meshes": [{"primitives": [shapes[0] | {"attributes": own}]}] * 2} for own in ({"POSITION": 1}, {})),
+        {"meshes": [{"primitives": [{"attributes": {**attributes, "JOINTS_1": 3}}]}] * 2},
+        {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": own}]} for own in (1, 3)]},
+    )
+    whole = _glb(tree, body)
+    headers = whole[:4] + b"\1" + whole[5:], whole[:12] + b"\xff" * 4 + whole[16:]
+    return [*(_glb({**tree, **change}, body) for change in changes), *headers, _glb({"asset": "x" * (5 << 20)}, b"")]
+
+
+def stl_files() -> list[bytes]:
+    """Two solids as text and one as binary, and the same with faults."""
+    facet = "facet normal 0 0 1\nouter loop\n" + "vertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n" + "endloop\nendfacet\n"
+    text = f"solid a\n{facet}endsolid a\nsolid b\n{facet}endsolid b\n".encode()
+    rows = np.zeros(2, [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+    rows["corners"] = np.eye(3)
+    binary = bytes(80) + struct.pack("<I", 2) + rows.tobytes()
+    return [
+        text,
+        text.replace(b"vertex 1 0 0\n", b"", 1),
+        text[:-20],
+        binary,
+        binary[:-3],
+        binary + b"\0",
+        b"solid",
+        b"",
+    ]
 
 
 def _glb(tree: dict, body: bytes) -> bytes:

@@ -48,7 +48,7 @@ from hoidata.files import (
 )
 from hoidata.hands import mano, model
 from hoidata.object_paths import keyframes, script
-from hoidata.objects import mesh, user_mesh
+from hoidata.objects import glb, mesh, stl, user_mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store, versions
 from models.manipnet import trajectory_files
@@ -295,10 +295,10 @@ def _mano_mutation(rng: random.Random, data: bytes) -> bytes:
 
 def _meshes() -> list[Target]:
     quick = (mesh._plain_triangles, mesh._numbers_of, mesh._position_index)
-    obj = (mesh._read_obj, mesh.parse_obj, *quick, mesh._any_polygons, mesh._obj_index, mesh.checked_mesh)
-    ply = [mesh._read_ply, *functions_of(ply_reader)]
-    text = [item for item in ply if item is not ply_reader._BinaryRows]
-    binary = [item for item in ply if item is not ply_reader._TextRows]
+    slow = (mesh._any_polygons, mesh._whole_lines, mesh._obj_index, mesh._Names)
+    obj = (mesh._read_obj, mesh.load_named_mesh, mesh._parse_named_obj, *quick, *slow, mesh.checked_mesh)
+    text = [mesh._read_ply, *functions_of(ply_reader)]
+    binary = [item for item in text if item not in (ply_reader._numbers, ply_reader._as_numbers)]
     return [
         Target(
             "obj", lambda: [seeds.OBJ, *seeds.near_meshes(), ABSENT], on_disk("a.obj", mesh.load_mesh), obj, MESH_WORDS
@@ -321,7 +321,7 @@ def _meshes() -> list[Target]:
             "glb",
             lambda: [*seeds.glb_files(), ABSENT],
             on_disk("a.glb", user_mesh.read_mesh_file),
-            (user_mesh.read_mesh_file, user_mesh._check_glb, user_mesh._accessors),
+            (user_mesh.read_mesh_file, user_mesh._read, user_mesh._of_glb, user_mesh._joined, *functions_of(glb)),
             (
                 b'"count": 9',
                 b"5126",
@@ -334,6 +334,13 @@ def _meshes() -> list[Target]:
                 b"BIN\0",
                 b"-1",
             ),
+        ),
+        Target(
+            "stl",
+            lambda: [*seeds.stl_files(), ABSENT],
+            on_disk("a.stl", user_mesh.read_mesh_file),
+            (user_mesh._read, user_mesh._of_stl, user_mesh._joined, *functions_of(stl)),
+            (b"solid", b"endsolid", b"facet", b"endfacet", b"vertex 0 0 1\n", b"nan", b"\xff", b"\0"),
         ),
     ]
 
@@ -465,7 +472,7 @@ def _oakink2() -> list[Target]:
     others = [{"a": {"obj_id": "a", "obj_name": "mug"}}, {"a": {"obj_name": 1}}, {"a": ["b"], "b": ["c"]}, {"a": ["a"]}]
     texts = (
         *(oakink2_files.read_program, oakink2_files._segment, oakink2_files._ranges, oakink2_files._range),
-        *(oakink2_files.read_names, oakink2_files.read_roots, oakink2_files._topmost, oakink2_files._json),
+        *(oakink2_files.read_names, oakink2_files.read_roots, oakink2_files._json),
         oakink2_files.Segment,
     )
     return [

@@ -5,13 +5,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from hoidata.actions.action import written_limits
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.contact.settings import ContactSettings
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
-from hoidata.objects.user_mesh import read_user_object
+from hoidata.objects.user_mesh import read_user_object, two_pieces
 from hoidata.settings import build_config
 from hoidata.store.store import open_store
 from models.common.checkpoints import FILE_NAME, read_info
@@ -85,6 +86,7 @@ def generate_files(asked: Asked, out: Path) -> Written:
     make_repeatable(threads=1)  # one motion is too small for two threads to agree on
     hands = models.hands
     model = user.model if user else _stored_object(str(asked.object), models)
+    notes += _no_hinge(verb, asked.object, model)
     sampling = replace(models.sampling, sampler=replace(models.sampling.sampler, **asked.sampler))
     generator = Generator.load(models.checkpoints, hands, models.encoder, sampling=sampling, points=models.points)
     motions = generator.generate(asked.text, model, asked.wish, thing if user else None)
@@ -92,6 +94,22 @@ def generate_files(asked: Asked, out: Path) -> Written:
     notes += _not_made(asked.text, motions[0].evidence["read_as"], verb, generator.vocabulary)
     notes += [*_taken_for(verb, motions[0].evidence), *_moved_otherwise(motions)]
     return Written(write_generation(out, motions, hands, str(models.checkpoints), notes), notes)
+
+
+def _no_hinge(verb: str | None, object: str | Path, model: ObjectModel) -> list[str]:
+    """That the verb turns a hinge and the object has none, and what to add; for a person."""
+    least, most = written_limits().get(verb or "", {}).get("hinge_net_deg", (0.0, 0.0))
+    if model.is_articulated or least <= 0 <= most:
+        return []
+    says = f"{verb!r} turns a hinge, but the object has none"
+    if not isinstance(object, Path):
+        return [f"{says}: choose one that has"]
+    pieces = two_pieces(object)
+    if pieces is None:
+        return [f"{says}: it needs a mesh of two objects or nodes, the second of which moves, and --hinge"]
+    named = f" ({pieces[0]!r} and {pieces[1]!r})" if all(pieces) else ""
+    add = '--hinge "px,py,pz dx,dy,dz", a point and the direction of the axis about which the second turns'
+    return [f"{says}: the mesh has two pieces{named}; add {add}"]
 
 
 def _not_made(text: str, read_as: tuple[str, float] | None, verb: str | None, known: Vocabulary) -> list[str]:

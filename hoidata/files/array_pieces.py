@@ -26,7 +26,7 @@ from hoidata.files.numpy_files import open_archive
 from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
 
 MOST_MEMBERS = 256
-MOST_MEMBER_BYTES = 8 << 30
+MOST_MEMBER_BYTES = 4 << 30
 _REST_BYTES = 1 << 16  # what a dict of arrays takes without their data
 _LONG_BYTES = 4096
 _PIECE_BYTES = 4 << 20

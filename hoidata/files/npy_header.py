@@ -16,6 +16,7 @@ from hoidata.errors import BadInput
 
 _MAGIC = b"\x93NUMPY"
 _LONGEST_HEADER = 10_000
+_PIECE_BYTES = 16 << 20
 _MOST_DIMENSIONS = 32
 _DTYPE = re.compile(r"[<>=|]?(b1|[iu][1248]|f[248]|c8|c16|[SU]\d{1,6}|O8?)")
 _PYTHON_2_LONG = re.compile(r"(?<=\d)L(?=[,)])")
@@ -97,8 +98,11 @@ def read_plain_array(stream: Any, header: NpyHeader, available: int, where: str 
     try:
         array = np.zeros(shape, header.dtype)
         data = array.reshape(-1).view(np.uint8) if array.nbytes else np.zeros(0, np.uint8)
-        if stream.readinto(data.data) != len(data):
-            raise ValueError("fewer bytes than that")
+        # In pieces: a zip file's stream unpacks all that it is asked for before it copies any.
+        for start in range(0, len(data), _PIECE_BYTES):
+            piece = data[start : start + _PIECE_BYTES]
+            if stream.readinto(piece.data) != len(piece):
+                raise ValueError("fewer bytes than that")
         check_text(data, header.dtype)
     except ValueError as error:
         raise BadInput(where, f"{header.dtype} of shape {header.shape}", str(error)) from None

@@ -10,10 +10,13 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.files.npy_header import read_npy_header, read_plain_array
-from hoidata.files.restricted_pickle import ARRAYS, restricted_load
+from hoidata.files.restricted_pickle import ARRAYS, StoredSize, restricted_load
 
 _MAX_MEMBERS = 256
 _MAX_BYTES = 1 << 30
+# Numbers of recordings shrink to a half or a third, constant ones to a thousandth; those are small.
+_UNPACKED_PER_BYTE = 8
+_FREE_BYTES = 64 << 20
 _FORMAT = "a NumPy file"
 
 
@@ -32,22 +35,24 @@ def load_npy_object(path: str | Path) -> Any:
 def load_npz_objects(path: str | Path, members: Collection[str] | None = None) -> dict[str, Any]:
     """All members of an ``.npz`` (or only those named), 0-d ones as their item: GRAB's sequence files.
 
-    BadInput if a named member is absent, on more than 256 members, or on more than 1 GiB when unpacked.
+    BadInput if a named member is absent, on more than 256 members, and where they unpack to more than 1 GiB, or to more
+    than 64 MiB and eight times the file.
     """
     with open_archive(path) as archive:
         chosen = _chosen_members(path, archive, members)
-        return {name: _item(_read_member(path, archive, info, True)) for name, info in chosen.items()}
+        size = StoredSize(Path(path).stat().st_size)
+        return {name: _item(_read_member(path, archive, info, size)) for name, info in chosen.items()}
 
 
 def load_npz_arrays(path: str | Path) -> dict[str, np.ndarray]:
     """All members of an ``.npz`` of plain arrays, by name: a file of ours, of any size.
 
-    BadInput on Python objects, and where it unpacks to more than 1 GiB and more than its own size.
+    BadInput on Python objects, and where it unpacks to more than ``load_npz_objects`` reads and more than its own size.
     """
     with open_archive(path) as archive:
         infos = archive.infolist()
-        _check_size(path, infos, max(_MAX_BYTES, Path(path).stat().st_size))
-        return {info.filename.removesuffix(".npy"): _read_member(path, archive, info, False) for info in infos}
+        _check_size(path, infos, Path(path).stat().st_size)
+        return {info.filename.removesuffix(".npy"): _read_member(path, archive, info, None) for info in infos}
 
 
 @contextmanager
@@ -62,10 +67,13 @@ def open_archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
         raise BadInput(path, "a whole .npz file", f"{type(error).__name__}: {error}") from None
 
 
-def _read_member(path: str | Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, allow_objects: bool) -> np.ndarray:
+def _read_member(
+    path: str | Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo, stored: StoredSize | None
+) -> np.ndarray:
+    """stored: what objects in the archive may cost; None where there may be none."""
     where = f"{path}: {info.filename.removesuffix('.npy')}"
     with archive.open(info) as stream:
-        array = _read(stream, where, info.file_size, allow_objects)
+        array = _read(stream, where, info.file_size, stored)
         if stream.read(1):  # at the end the checksum is compared, too
             raise BadInput(where, "nothing behind the array", "more bytes")
     return array
@@ -84,32 +92,38 @@ def _chosen_members(
         if absent:
             raise BadInput(path, f"members {sorted(members)}", f"a file without {absent}")
         infos = {name: info for name, info in infos.items() if name in members}
-    _check_size(path, infos.values(), _MAX_BYTES)
+    _check_size(path, infos.values())
     return infos
 
 
-def _check_size(path: str | Path, infos: Iterable[zipfile.ZipInfo], most: int) -> None:
+def _check_size(path: str | Path, infos: Iterable[zipfile.ZipInfo], always: int = 0) -> None:
+    """Raise BadInput where members unpack to too much for an archive of this size. always: bytes that are allowed."""
     size = sum(info.file_size for info in infos)
+    by_size = max(_FREE_BYTES, _UNPACKED_PER_BYTE * Path(path).stat().st_size)
+    most = max(always, min(_MAX_BYTES, by_size))
     if size > most:
-        raise BadInput(path, f"at most {most} bytes when unpacked", str(size))
+        raise BadInput(
+            path, f"at most {most} bytes when unpacked", str(size), "download it again, or store it uncompressed"
+        )
 
 
 def _load(path: str | Path, allow_objects: bool) -> np.ndarray:
     try:
         with open(path, "rb") as stream:
-            return _read(stream, path, Path(path).stat().st_size, allow_objects)
+            size = Path(path).stat().st_size
+            return _read(stream, path, size, StoredSize(size) if allow_objects else None)
     except OSError as error:
         raise BadInput(path, _FORMAT, f"{type(error).__name__}: {error.strerror}") from None
 
 
-def _read(stream: Any, where: str | Path, size: int, allow_objects: bool) -> np.ndarray:
-    """The array in a stream of ``size`` bytes."""
+def _read(stream: Any, where: str | Path, size: int, stored: StoredSize | None) -> np.ndarray:
+    """The array in a stream of ``size`` bytes. stored: what its objects may cost; None where it may have none."""
     header = read_npy_header(stream, where)
     if not header.dtype.hasobject:
         return read_plain_array(stream, header, size - stream.tell(), where)
-    if not allow_objects:
+    if stored is None:
         raise BadInput(where, "an array of numbers", "Python objects")
-    value = restricted_load(stream, ARRAYS, where=where)
+    value = restricted_load(stream, ARRAYS, where=where, archive=stored)
     if not isinstance(value, np.ndarray):
         raise BadInput(where, "a pickled array", type(value).__name__)
     return value

@@ -1,8 +1,11 @@
 """A look at a pickle's opcodes before any of them is executed: a walk over its stack that notes what lies there.
 
-An allow-list of names does not stop a small file from ending the process or from keeping it busy for ever: tuples
-nested 500,000 deep as a key of a dictionary overflow the C stack when they are hashed, tuples that hold the one before
-twice take 2^depth steps, a memo index may ask for any amount of memory. So no key is a tuple, and indices are small.
+An allow-list of names does not stop a small file from ending the process or from keeping it busy for ever. Tuples
+nested 500,000 deep as a key of a dictionary overflow the C stack when they are hashed, and tuples that hold the one
+before twice take 2^depth steps. Python hashes an integer to its remainder by 2^61 - 1 and a frozenset to a mixture of
+its members' hashes, so thousands of either can share one hash, and each new key is compared with all before it. A memo
+index may ask for any amount of memory. So keys are no tuples, frozensets or integers beyond 64 bits (of those that are
+left at most some dozens share a hash: texts have random ones), and indices are small.
 """
 
 import pickle
@@ -14,25 +17,42 @@ from typing import Any
 REFUSED_OPCODES = frozenset(
     {"PERSID", "BINPERSID", "EXT1", "EXT2", "EXT4", "INST", "OBJ", "NEXT_BUFFER", "READONLY_BUFFER"} | {"DUP", "LONG4"}
 )
-_MOST_OPCODES = 1_000_000  # three seconds; numbers lie within few opcodes, a tensor takes about 50
-_BYTES_PER_OPCODE = 8  # of large files: one of 4,000 frames of 16 tensors each has 13 bytes per opcode
+_MOST_OPCODES = 400_000  # about a second; numbers lie within few opcodes, a tensor takes about 50
+_BYTES_PER_OPCODE = 8  # stored, of large files: one of 4,000 frames of 16 tensors each has 13 bytes per opcode
 _PUT_OPCODES = {"PUT", "BINPUT", "LONG_BINPUT"}
 _GET_OPCODES = {"GET", "BINGET", "LONG_BINGET"}
 _TUPLES = {"TUPLE", "TUPLE1", "TUPLE2", "TUPLE3", "EMPTY_TUPLE"}
+_INTEGERS = {"INT", "LONG", "LONG1"}
+# What lies on the stack; the first three are refused as keys.
 _TUPLE = "tuple"
+_FROZENSET = "frozenset"
+_LARGE = "number beyond 64 bits"
 _OTHER = "other"
+_REFUSED_KEYS = (_TUPLE, _FROZENSET, _LARGE)
 _MARK = "mark"
 
 
-def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES) -> None:
-    """Refuse opcodes we never need, memo indices beyond the file's length, and tuples as keys or in sets.
+class OpcodeLimit:
+    """How many opcodes the pickles of one file may have together. n_stored: bytes of the file, compressed or not."""
 
+    def __init__(self, n_stored: int) -> None:
+        self.most = self.left = max(_MOST_OPCODES, n_stored // _BYTES_PER_OPCODE)
+
+    def spend(self) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise pickle.UnpicklingError(f"it has more than {self.most} opcodes")
+
+
+def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES, limit: OpcodeLimit | None = None) -> None:
+    """Refuse opcodes we never need, memo indices beyond the file's length, and keys that take long to hash or compare.
+
+    limit: of the file that ``data`` comes from; ``data`` is the whole file where it is not given.
     Raises UnpicklingError, or what pickletools raises on something that is no pickle.
     """
-    walk, most = _Walk(), max(_MOST_OPCODES, len(data) // _BYTES_PER_OPCODE)
-    for number, (opcode, argument, _) in enumerate(pickletools.genops(data)):
-        if number >= most:
-            raise pickle.UnpicklingError(f"it has more than {most} opcodes")
+    walk, limit = _Walk(), limit or OpcodeLimit(len(data))
+    for opcode, argument, _ in pickletools.genops(data):
+        limit.spend()
         if opcode.name in refused:
             raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
         if opcode.name in _PUT_OPCODES and isinstance(argument, int) and argument > len(data):
@@ -41,7 +61,7 @@ def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES) -> None:
 
 
 class _Walk:
-    """The stack of an unpickler with, in the place of each value, whether it is a tuple."""
+    """The stack of an unpickler with, in the place of each value, whether it is one that may be no key."""
 
     def __init__(self) -> None:
         self.stack: list[str] = []
@@ -59,14 +79,15 @@ class _Walk:
             self._top()
             self.stack.pop()
         else:
-            self._replace(opcode)
+            self._replace(opcode, argument)
 
-    def _replace(self, opcode: Any) -> None:
+    def _replace(self, opcode: Any, argument: Any) -> None:
         """Take what an opcode takes, check the keys among it, and leave what it leaves."""
         taken = self._taken(opcode)
-        if any(key is _TUPLE for key in _hashed(opcode.name, taken)):
-            raise pickle.UnpicklingError("a tuple as a key, which is not allowed")
-        self.stack += [_TUPLE if opcode.name in _TUPLES else _OTHER] * len(opcode.stack_after)
+        for key in _hashed(opcode.name, taken):
+            if key in _REFUSED_KEYS:
+                raise pickle.UnpicklingError(f"a {key} as a key, which is not allowed")
+        self.stack += [_kind(opcode.name, argument)] * len(opcode.stack_after)
 
     def _taken(self, opcode: Any) -> list[str]:
         wanted = opcode.stack_before
@@ -91,6 +112,20 @@ class _Walk:
         if not self.stack:
             raise pickle.UnpicklingError("it takes more than there is")
         return self.stack[-1]
+
+
+def _kind(name: str, argument: Any) -> str:
+    """What an opcode leaves on the stack."""
+    if name in _TUPLES:
+        return _TUPLE
+    if name == "FROZENSET":
+        return _FROZENSET
+    return _LARGE if name in _INTEGERS and is_large(argument) else _OTHER
+
+
+def is_large(number: int) -> bool:
+    """Whether an integer needs more than 64 bits."""
+    return not -(2**63) <= number < 2**64
 
 
 def _hashed(name: str, taken: list[str]) -> list[str]:

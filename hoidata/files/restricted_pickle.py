@@ -17,12 +17,13 @@ import numpy as np
 
 from hoidata.errors import BadInput
 from hoidata.files.npy_header import check_text, plain_dtype
-from hoidata.files.pickle_check import check_opcodes
+from hoidata.files.pickle_check import OpcodeLimit, check_opcodes, is_large
 
 MAX_BYTES = 2 << 30
 _PIECE_BYTES = 1 << 20
-# What calls in a pickle make may take this much more than the file: a call can be repeated in a few bytes.
-_GROWTH = 4
+# What calls in a pickle make may take twice its bytes, twice those it is stored in and this: a call can be repeated in
+# a few bytes, and a compressed member may unpack to a thousand times its size.
+_GROWTH = 2
 _FREE_BYTES = 64 << 20
 Allow = Mapping[tuple[str, str], Any]
 
@@ -35,18 +36,21 @@ def restricted_load(
     encoding: str = "ASCII",
     where: str | Path = "pickle",
     max_bytes: int = MAX_BYTES,
+    archive: "StoredSize | None" = None,
 ) -> Any:
     """Unpickle ``source`` with only the globals of ``allow``; arrays come back as plain ``numpy.ndarray``.
 
     allow: (module, name) -> what stands for it; ``ARRAYS`` covers arrays in containers. encoding: "latin1" for files
-    written by Python 2. Raises BadInput for anything malformed, oversized or not allowed.
+    written by Python 2. archive: of a pickle inside a compressed file. Raises BadInput for anything malformed,
+    oversized or not allowed.
     """
     data = source if isinstance(source, bytes) else read_at_most(source, max_bytes + 1)
     if len(data) > max_bytes:
         raise BadInput(where, f"at most {max_bytes} bytes", "more", _REMEDY)
     try:
-        check_opcodes(data)
-        most = _GROWTH * len(data) + _FREE_BYTES
+        archive = archive or StoredSize(len(data))
+        check_opcodes(data, limit=archive.opcodes)
+        most = _GROWTH * (len(data) + archive.n_bytes) + _FREE_BYTES
         value = _Unpickler(io.BytesIO(data), allow, encoding, Budget(most)).load()
         _written_out(value, {}, most)
         return _plain(value, {})
@@ -64,6 +68,14 @@ def read_at_most(stream: BinaryIO, size: int) -> bytes:
         pieces.append(piece)
         left -= len(piece)
     return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+class StoredSize:
+    """What the pickles in one archive may cost together, by the bytes of the archive itself."""
+
+    def __init__(self, n_bytes: int) -> None:
+        self.n_bytes = n_bytes
+        self.opcodes = OpcodeLimit(n_bytes)
 
 
 class Budget:
@@ -131,10 +143,10 @@ def _written_out(value: Any, known: dict[int, int | None], most: int) -> int:
     """
     if isinstance(value, str | bytes | bytearray):
         return len(value)
-    items = _items(value)
-    if not len(items):
-        return value.nbytes if isinstance(value, np.ndarray) else 8
-    if id(value) not in known:
+    if id(value) not in known:  # first: to list what an array of objects holds takes as long as it is large
+        items = _items(value)
+        if not len(items):
+            return value.nbytes if isinstance(value, np.ndarray) else 8
         known[id(value)] = None
         known[id(value)] = 8 + sum(_written_out(item, known, most) for item in items)
     size = known[id(value)]
@@ -274,8 +286,8 @@ def _reconstruct(subtype: Any, shape: Any, dtype: Any) -> CheckedArray:
 
 def _scalar(dtype: Any, raw: Any = b"") -> Any:
     kind = _checked_dtype(dtype)
-    if kind.hasobject:
-        raise pickle.UnpicklingError("a scalar of object dtype, which is not allowed")
+    if kind.hasobject or kind.kind == "c":  # the hash of a complex number can be chosen
+        raise pickle.UnpicklingError(f"a scalar of dtype {kind}, which is not allowed")
     data = _as_bytes(raw)
     if len(data) != kind.itemsize:
         raise pickle.UnpicklingError(f"a scalar of {len(data)} bytes for dtype {kind}")
@@ -310,9 +322,10 @@ def _set(items: Any = ()) -> set:
 
 
 def checked_keys(items: Sequence[Any]) -> Sequence[Any]:
-    """The items, known not to be tuples: hashing those can take for ever (see pickle_check)."""
-    if any(isinstance(item, tuple) for item in items):
-        raise pickle.UnpicklingError("a tuple as a key, which is not allowed")
+    """The items, known not to be tuples and others that hashing can take for ever (see pickle_check)."""
+    for item in items:
+        if isinstance(item, tuple | frozenset) or (isinstance(item, int) and is_large(item)):
+            raise pickle.UnpicklingError(f"a {type(item).__name__} as a key, which is not allowed")
     return items
 
 

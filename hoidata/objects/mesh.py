@@ -1,6 +1,8 @@
 """Reading triangle meshes exactly as stored, and their mass properties."""
 
 import io
+from array import array
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,6 +17,7 @@ LARGEST_MESH_BYTES = 64 << 20  # a million vertices as text, which take fifteen 
 _MOST = f"at most {MOST_VERTICES} vertices, {MOST_TRIANGLES} triangles and {MOST_CORNERS} corners of one face"
 _MOST_INDEX = 2**31
 _FLAT = 1e-9  # of the cube around a mesh: what encloses less has no inside
+_MOST_NAMES = 10_000  # of objects or groups; further ones count as one
 _FARTHEST = 1e9  # in any unit; areas and volumes of such a mesh still fit into a float
 
 
@@ -23,6 +26,17 @@ class Mesh(NamedTuple):
 
     vertices: np.ndarray
     faces: np.ndarray
+
+
+class NamedPieces(NamedTuple):
+    """How a file divides its faces.
+
+    kind: "objects", "groups" and so on. names: of the pieces. of_face: (face,) the number of its piece.
+    """
+
+    kind: str
+    names: list[str]
+    of_face: np.ndarray
 
 
 class MassProperties(NamedTuple):
@@ -45,6 +59,11 @@ def load_mesh(path: str | Path) -> Mesh:
     Vertices are neither merged, reordered nor dropped, so that per-vertex files (part ids, contacts) keep their
     meaning. Raises BadInput on anything that is not a finite triangle mesh.
     """
+    return load_named_mesh(path)[0]
+
+
+def load_named_mesh(path: str | Path) -> tuple[Mesh, list[NamedPieces]]:
+    """The same, and the objects and groups that an OBJ file names: a PLY file has neither."""
     path = Path(path)
     if not path.is_file():
         raise BadInput(path, "a mesh file", "nothing there")
@@ -54,27 +73,66 @@ def load_mesh(path: str | Path) -> Mesh:
     if reader is None:
         raise BadInput(path, "a mesh named .obj or .ply", path.suffix or "no suffix", "convert the mesh")
     try:
-        mesh = reader(path)
+        mesh, pieces = reader(path)
     except (ValueError, OSError) as error:
         raise BadInput(path, "a readable mesh", f"{type(error).__name__}: {error}") from error
-    return checked_mesh(path, mesh)
+    return checked_mesh(path, mesh), pieces
 
 
-def _read_obj(path: Path) -> Mesh:
-    return parse_obj(path.read_text(encoding="utf-8", errors="replace"), path)
+def _read_obj(path: Path) -> tuple[Mesh, list[NamedPieces]]:
+    # A byte order mark, which some programs write, would hide the first line.
+    return _parse_named_obj(path.read_text(encoding="utf-8-sig", errors="replace"), path)
 
 
 def parse_obj(text: str, path: str | Path) -> Mesh:
     """Vertices and triangles of an OBJ file's text, as ``load_mesh`` reads them; ``path`` names it in errors."""
+    return checked_mesh(path, _parse_named_obj(text, path)[0])
+
+
+def _parse_named_obj(text: str, path: str | Path) -> tuple[Mesh, list[NamedPieces]]:
     # Own reader: trimesh splits and reorders vertices where faces carry texture or normal indices.
-    mesh = _plain_triangles(text)
-    return checked_mesh(path, _any_polygons(text, path) if mesh is None else mesh)
+    found = _plain_triangles(text)
+    mesh, names = _any_polygons(text, path) if found is None else found
+    return mesh, [own.pieces(len(mesh.faces)) for own in names.values()]
 
 
-def _plain_triangles(text: str) -> Mesh | None:
+class _Names:
+    """Where the names of objects or of groups begin, in faces. kind: what they are names of."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind, self.name, self.number = kind, "", dict[str, int]()
+        self.begins, self.numbers = array("q"), array("q")
+        self.face = 0
+
+    def begin(self, line: str, face: int) -> None:
+        """Take the name in a line such as "o lid"; it begins with the face of this number."""
+        self._end(face)
+        self.name = " ".join(line.split()[1:])[:60] if len(line) < 1000 else line[1:61].strip()
+        self.face = face
+
+    def _end(self, face: int) -> None:
+        if face == self.face:  # a name without faces is none
+            return
+        if self.name not in self.number and len(self.number) < _MOST_NAMES:
+            self.number[self.name] = len(self.number)
+        self.begins.append(self.face)
+        self.numbers.append(self.number.get(self.name, _MOST_NAMES))
+
+    def pieces(self, n_faces: int) -> NamedPieces:
+        self._end(n_faces)
+        counts = np.diff(np.append(np.array(self.begins, np.int64), n_faces))
+        return NamedPieces(self.kind, list(self.number), np.array(self.numbers, np.int64).repeat(counts))
+
+
+def _obj_names() -> dict[str, _Names]:
+    return {"o": _Names("objects"), "g": _Names("groups")}
+
+
+def _plain_triangles(text: str) -> tuple[Mesh, dict[str, _Names]] | None:
     """What is written as "v x y z" and "f a b c", in half the time of line by line; None of any other file."""
     vertex_lines: list[str] = []
     face_lines: list[str] = []
+    names = _obj_names()
     own = {"v ": (vertex_lines, MOST_VERTICES), "f ": (face_lines, MOST_TRIANGLES)}
     for line in io.StringIO(text, newline=None):
         if (kind := own.get(line[:2])) is not None:
@@ -82,7 +140,9 @@ def _plain_triangles(text: str) -> Mesh | None:
             if len(lines) >= most or (not lines and len(line.split(maxsplit=4)) != 4):
                 return None
             lines.append(line)
-        elif line.split(maxsplit=1)[:1] in (["v"], ["f"]):
+        elif (word := "".join(line.split(maxsplit=1)[:1])) in names:
+            names[word].begin(line, len(face_lines))
+        elif word in ("v", "f"):
             return None
     try:
         faces = np.array(list(map(_position_index, _numbers_of(face_lines))), dtype=np.int64).reshape(-1, 3)
@@ -91,7 +151,7 @@ def _plain_triangles(text: str) -> Mesh | None:
         vertices = np.array(list(map(float, _numbers_of(vertex_lines))), dtype=np.float64).reshape(-1, 3)
     except (ValueError, OverflowError):
         return None
-    return Mesh(vertices, faces - 1)
+    return Mesh(vertices, faces - 1), names
 
 
 def _numbers_of(lines: list[str]) -> list[str]:
@@ -106,12 +166,15 @@ def _numbers_of(lines: list[str]) -> list[str]:
     return words
 
 
-def _any_polygons(text: str, path: str | Path) -> Mesh:
+def _any_polygons(text: str, path: str | Path) -> tuple[Mesh, dict[str, _Names]]:
     """Every vertex and polygon of an OBJ file, line by line. Raises BadInput with the number of a wrong line."""
     vertices: list[list[float]] = []
     faces: list[tuple[int, int, int]] = []
-    for number, line in enumerate(io.StringIO(text, newline=None), 1):
+    names = _obj_names()
+    for number, line in _whole_lines(text):
         words = line.split(maxsplit=MOST_CORNERS + 1)
+        if words and words[0] in names:
+            names[words[0]].begin(line, len(faces))
         if not words or words[0] not in ("v", "f"):
             continue
         if len(words) > MOST_CORNERS + 1 or len(vertices) > MOST_VERTICES or len(faces) > MOST_TRIANGLES:
@@ -128,7 +191,22 @@ def _any_polygons(text: str, path: str | Path) -> Mesh:
             wanted = "3 coordinates per vertex and 3 or more corners per face"
             raise BadInput(f"{path}:{number}", wanted, repr(line[:60].strip()), "export the mesh anew")
         faces.extend((corners[0], corners[i], corners[i + 1]) for i in range(1, len(corners) - 1))
-    return Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3))
+    return Mesh(np.array(vertices, dtype=np.float64), np.array(faces, dtype=np.int64).reshape(-1, 3)), names
+
+
+def _whole_lines(text: str) -> Iterator[tuple[int, str]]:
+    """Lines with their numbers; a vertex or face that ends with a backslash goes on in the next line."""
+    begun: list[str] = []
+    for number, line in enumerate(io.StringIO(text, newline=None), 1):
+        if line.endswith("\\\n") and (begun or line.lstrip()[:1] in ("v", "f")) and len(begun) <= MOST_CORNERS:
+            begun.append(line[:-2])
+        elif begun:
+            yield number, " ".join((*begun, line))
+            begun = []
+        else:
+            yield number, line
+    if begun:
+        yield number, " ".join(begun)
 
 
 def _position_index(word: str) -> int:
@@ -144,8 +222,8 @@ def _obj_index(word: str, n_vertices: int) -> int:
     return index - 1 if index > 0 else n_vertices + index
 
 
-def _read_ply(path: Path) -> Mesh:
-    return Mesh(*parse_ply(path.read_bytes()))
+def _read_ply(path: Path) -> tuple[Mesh, list[NamedPieces]]:
+    return Mesh(*parse_ply(path.read_bytes())), []
 
 
 def checked_mesh(path: str | Path, mesh: Mesh) -> Mesh:

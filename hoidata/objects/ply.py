@@ -4,7 +4,9 @@ Only vertex positions and face corners are kept; colours, normals and textures a
 states is allocated before the file is known to be long enough for it.
 """
 
-from collections.abc import Iterator
+import contextlib
+import struct
+from array import array
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +23,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 MOST_VERTICES, MOST_TRIANGLES = 1_000_000, 3_000_000
 MOST_CORNERS = 10_000  # of one polygon: the lid of a finely cut cylinder may have thousands
 _MOST_WORDS = 16_000_000
-_BLOCK = 1 << 20  # numbers, or bytes, that are looked at together
+_STRUCT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
 
 
 class _Property(NamedTuple):
@@ -38,27 +40,39 @@ class _Element(NamedTuple):
     properties: list[_Property]
 
 
+class _Column(NamedTuple):
+    """One property of an element. lengths: (row,) how many numbers each row has; values: (number,) of all rows."""
+
+    lengths: np.ndarray
+    values: np.ndarray
+
+
 def parse_ply(data: bytes) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (vertex, 3) float64 and triangles (face, 3) int64; polygons become fans.
 
     Vertices are as stored and in order. Raises ValueError when it is no PLY file, ends early or lacks either.
     """
     order, elements, start = _read_header(data)
-    rows = _BinaryRows(data, start, order) if order else _TextRows(data[start:])
-    vertices: list[np.ndarray] = []
-    faces: list[np.ndarray] = []
     stated = {element.name: element.count for element in elements}
-    triangles = 0
     _check_counts(stated.get("vertex", 0), stated.get("face", 0))
-    for element in elements[: _last_needed(elements) + 1]:
-        for columns in _read_rows(rows, element):
-            if element.name == "vertex":
-                vertices.append(_positions(element, columns))
-            elif element.name == "face":
-                faces.append(_fans(element, columns))
-                triangles += len(faces[-1])
-                _check_counts(0, triangles)
-    return np.concatenate([np.zeros((0, 3)), *vertices]), np.concatenate([np.zeros((0, 3), np.int64), *faces])
+    as_stored = elements
+    if not order:
+        data, start, order = _numbers(data[start:]), 0, "<"
+        as_stored = [_as_numbers(element) for element in elements]
+    vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    last = _last_needed(elements)
+    for number, (element, stored) in enumerate(zip(elements, as_stored, strict=True)):
+        if number > last:
+            break
+        if element.name == "vertex":
+            columns, start = _read_rows(data, start, order, stored, _axes(element))
+            vertices = _positions(element, columns)
+        elif element.name == "face":
+            columns, start = _read_rows(data, start, order, stored, [_corner_list(element)])
+            faces = _fans(*columns)
+        else:
+            _, start = _read_rows(data, start, order, stored, [])
+    return vertices, faces
 
 
 def _check_counts(vertices: int, triangles: int) -> None:
@@ -105,119 +119,113 @@ def _last_needed(elements: list[_Element]) -> int:
     return max(names.index("vertex"), names.index("face") if "face" in names else 0)
 
 
-def _read_rows(rows: "_BinaryRows | _TextRows", element: _Element) -> Iterator[list[np.ndarray]]:
-    """The rows of an element in blocks of equal list lengths, (row, number) for each property."""
-    left = chunk = element.count
-    while left and element.properties:
-        lengths = rows.lengths(element)
-        block = rows.block(element, lengths, min(chunk, left))
-        same = np.ones(len(block[0][1]), dtype=bool)
-        for (stated, _), length in zip(block, lengths, strict=True):
-            if stated is not None:
-                same &= stated == length
-        taken = len(same) if same.all() else int(same.argmin())
-        yield [values[:taken] for _, values in block]
-        rows.advance(taken)
-        left -= taken
-        # After a block of mixed lengths try about as many as fitted: reading all that is left again would be quadratic.
-        chunk = 2 * taken
+def _numbers(text: bytes) -> bytes:
+    """The numbers of a text file as float64, up to the first word that is none."""
+    # Counted first: a word takes fifty bytes.
+    if sum(map(text.count, (b" ", b"\n", b"\t", b"\r"))) > _MOST_WORDS:
+        raise ValueError(f"more than {_MOST_WORDS} words: decimate the mesh, or write it in binary")
+    words = text.split()
+    if max(map(len, words), default=0) > _LONGEST_WORD:
+        raise ValueError(f"a word of more than {_LONGEST_WORD} characters among its numbers")
+    numbers = array("d")
+    with contextlib.suppress(ValueError):  # what follows the last needed element may be anything
+        numbers.extend(map(float, words))
+    return numbers.tobytes()
 
 
-class _BinaryRows:
-    """The rows of a file, in order."""
-
-    def __init__(self, data: bytes, start: int, order: str) -> None:
-        self.data, self.offset, self.order = data, start, order
-        self.row_bytes = 0
-
-    def lengths(self, element: _Element) -> list[int]:
-        """How many numbers each property of the next row has."""
-        offset, found = self.offset, []
-        for item in element.properties:
-            length = 1
-            if item.count_kind is not None:
-                kind = np.dtype(self.order + item.count_kind)
-                if offset + kind.itemsize > len(self.data):
-                    raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-                length = _checked_length(np.frombuffer(self.data, kind, 1, offset)[0])
-                offset += kind.itemsize
-            offset += length * np.dtype(item.kind).itemsize
-            found.append(length)
-        if offset > len(self.data):
-            raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-        return found
-
-    def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
-        """Up to ``most`` rows, read as if each had these lengths: per property the stated lengths and (row, number)."""
-        fields = []
-        for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
-            if item.count_kind is not None:
-                fields.append((f"length{number}", self.order + item.count_kind))
-            fields.append((f"values{number}", self.order + item.kind, (length,)))
-        kind = np.dtype(fields)
-        self.row_bytes = kind.itemsize
-        here = (len(self.data) - self.offset) // max(1, kind.itemsize)
-        fitting = min(most, here, 1 + _BLOCK // max(1, kind.itemsize))
-        table = np.frombuffer(self.data, kind, fitting, self.offset)
-        found = []
-        for number, item in enumerate(element.properties):
-            stated = None if item.count_kind is None else table[f"length{number}"]
-            found.append((stated, table[f"values{number}"]))
-        return found
-
-    def advance(self, rows: int) -> None:
-        self.offset += rows * self.row_bytes
+def _as_numbers(element: _Element) -> _Element:
+    """The element of a text file, once its words are float64."""
+    properties = [_Property(item.name, "f8", item.count_kind and "f8") for item in element.properties]
+    return _Element(element.name, element.count, properties)
 
 
-class _TextRows:
-    """As ``_BinaryRows``, of a text file."""
+def _read_rows(data: bytes, start: int, order: str, element: _Element, wanted: list[int]) -> tuple[list[_Column], int]:
+    """The wanted properties of an element, and where the next element starts. Linear in the number of its bytes."""
+    if element.count > MOST_TRIANGLES and any(item.count_kind for item in element.properties):
+        raise ValueError(f"more than {MOST_TRIANGLES} lists: decimate the mesh")
+    first = _walk(data, start, order, element, min(1, element.count))
+    lengths = first.lengths[0].tolist() if element.count else [1] * len(element.properties)
+    equal = _equal_rows(data, start, order, element, lengths, wanted)
+    if equal is not None:
+        return equal
+    rows = _walk(data, start, order, element, element.count)
+    _check_counts(0, int(np.maximum(rows.lengths[:, wanted] - 2, 0).sum()))
+    return [
+        _Column(rows.lengths[:, number], _gathered(data, order + element.properties[number].kind, rows, number))
+        for number in wanted
+    ], rows.end
 
-    def __init__(self, text: bytes) -> None:
-        # Counted first: a word takes fifty bytes.
-        if sum(map(text.count, (b" ", b"\n", b"\t", b"\r"))) > _MOST_WORDS:
-            raise ValueError(f"more than {_MOST_WORDS} words: decimate the mesh, or write it in binary")
-        self.words = text.split()
-        self.offset = self.width = 0
-        if max(map(len, self.words), default=0) > _LONGEST_WORD:
-            raise ValueError(f"a word of more than {_LONGEST_WORD} characters among its numbers")
 
-    def lengths(self, element: _Element) -> list[int]:
-        offset, found = self.offset, []
-        for item in element.properties:
-            length = 1
-            if item.count_kind is not None:
-                if offset >= len(self.words):
-                    raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-                length = _checked_length(float(self.words[offset]))
-                offset += 1
-            offset += length
-            found.append(length)
-        if offset > len(self.words):
-            raise ValueError(f"the file ends within its element {element.name[:40]!r}")
-        return found
+class _Rows(NamedTuple):
+    """Where rows of any length are stored. begins, lengths: (row, property) place of the first number, and how many."""
 
-    def block(self, element: _Element, lengths: list[int], most: int) -> list[tuple[np.ndarray | None, np.ndarray]]:
-        self.width = sum(lengths) + sum(item.count_kind is not None for item in element.properties)
-        here = (len(self.words) - self.offset) // self.width
-        fitting = min(most, here, 1 + _BLOCK // self.width)
-        words = np.array(self.words[self.offset : self.offset + fitting * self.width])
-        with np.errstate(all="ignore"):  # what does not fit its type becomes infinite, and is refused as such
-            return self._columns(element, lengths, words.astype(np.float64).reshape(fitting, self.width))
+    begins: np.ndarray
+    lengths: np.ndarray
+    end: int
 
-    def _columns(
-        self, element: _Element, lengths: list[int], table: np.ndarray
-    ) -> list[tuple[np.ndarray | None, np.ndarray]]:
-        found, column = [], 0
-        for item, length in zip(element.properties, lengths, strict=True):
-            stated = None if item.count_kind is None else table[:, column]
-            column += stated is not None
-            values = table[:, column : column + length].astype(item.kind if item.kind[0] == "f" else np.float64)
-            found.append((stated, values))
-            column += length
-        return found
 
-    def advance(self, rows: int) -> None:
-        self.offset += rows * self.width
+def _walk(data: bytes, start: int, order: str, element: _Element, count: int) -> _Rows:
+    """Find the first ``count`` rows of an element: where a row begins is known once the row before it is read."""
+    properties = [
+        (
+            struct.Struct(order + _STRUCT_CODES[item.count_kind]) if item.count_kind else None,
+            np.dtype(item.kind).itemsize,
+        )
+        for item in element.properties
+    ]
+    begins, lengths, place = array("q"), array("q"), start
+    try:
+        for _ in range(count):
+            for counter, size in properties:
+                length = 1
+                if counter is not None:
+                    length = _checked_length(counter.unpack_from(data, place)[0])
+                    place += counter.size
+                begins.append(place)
+                lengths.append(length)
+                place += length * size
+    except struct.error:
+        place = len(data) + 1
+    if place > len(data):
+        raise ValueError(f"the file ends within its element {element.name[:40]!r}")
+    shape = count, len(properties)
+    return _Rows(np.array(begins, np.int64).reshape(shape), np.array(lengths, np.int64).reshape(shape), place)
+
+
+def _equal_rows(
+    data: bytes, start: int, order: str, element: _Element, lengths: list[int], wanted: list[int]
+) -> tuple[list[_Column], int] | None:
+    """What ``_read_rows`` returns where every row has these lengths; else None. Most meshes are of triangles alone."""
+    fields: list[tuple] = []
+    for number, (item, length) in enumerate(zip(element.properties, lengths, strict=True)):
+        if item.count_kind is not None:
+            fields.append((f"length{number}", order + item.count_kind))
+        fields.append((f"values{number}", order + item.kind, (length,)))
+    kind = np.dtype(fields)
+    end = start + element.count * kind.itemsize
+    if end > len(data):
+        return None
+    table = np.frombuffer(data, kind, element.count if kind.itemsize else 0, start)
+    for number, length in enumerate(lengths):
+        if element.properties[number].count_kind is not None and (table[f"length{number}"] != length).any():
+            return None
+    _check_counts(0, sum(max(lengths[number] - 2, 0) * element.count for number in wanted))
+    return [
+        _Column(np.full(element.count, lengths[number]), table[f"values{number}"].reshape(-1)) for number in wanted
+    ], end
+
+
+def _gathered(data: bytes, kind: str, rows: _Rows, number: int) -> np.ndarray:
+    """(number,) the values of one property, row after row."""
+    size, lengths = np.dtype(kind).itemsize, rows.lengths[:, number]
+    within = np.arange(lengths.sum()) - (np.cumsum(lengths) - lengths).repeat(lengths)
+    places = rows.begins[:, number].repeat(lengths) + within * size
+    values = np.empty(len(places), kind)
+    for shift in range(size):  # values are not aligned: each is one of those that begin ``shift`` bytes further on
+        chosen = places % size == shift
+        if chosen.any():
+            values[chosen] = np.frombuffer(data, kind, (len(data) - shift) // size, shift)[places[chosen] // size]
+    return values
 
 
 def _checked_length(value: float) -> int:
@@ -226,27 +234,45 @@ def _checked_length(value: float) -> int:
     return int(value)
 
 
-def _positions(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
+def _axes(element: _Element) -> list[int]:
+    """The numbers of the properties x, y and z."""
     names = [item.name for item in element.properties]
     numbers = [names.index(axis) for axis in "xyz" if axis in names]
     if len(numbers) < 3 or any(element.properties[number].count_kind is not None for number in numbers):
         raise ValueError("vertices without x, y and z")
-    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one, and is refused as such
-        return np.concatenate([columns[number] for number in numbers], axis=1).astype(np.float64)
+    return numbers
 
 
-def _fans(element: _Element, columns: list[np.ndarray]) -> np.ndarray:
+def _positions(element: _Element, columns: list[_Column]) -> np.ndarray:
+    """(vertex, 3) of the columns x, y and z; numbers in text have the precision of their declared type."""
+    kinds = [element.properties[number].kind for number in _axes(element)]
+    with np.errstate(all="ignore"):  # signalling NaNs become quiet, too large numbers infinite: both are refused later
+        exact = [
+            column.values.astype(kind) if kind[0] == "f" else column.values
+            for kind, column in zip(kinds, columns, strict=True)
+        ]
+        return np.stack([values.astype(np.float64) for values in exact], axis=1)
+
+
+def _corner_list(element: _Element) -> int:
+    """The number of the property that lists a face's corners."""
+    for number, item in enumerate(element.properties):
+        if item.name in _CORNERS and item.count_kind:
+            return number
+    raise ValueError("faces without vertex_indices")
+
+
+def _fans(lists: _Column) -> np.ndarray:
     """Triangles (0, 1, 2), (0, 2, 3) and so on of each polygon."""
-    numbers = [number for number, item in enumerate(element.properties) if item.name in _CORNERS and item.count_kind]
-    if not numbers:
-        raise ValueError("faces without vertex_indices")
-    corners = columns[numbers[0]]
-    if len(corners) and corners.shape[1] < 3:
-        raise ValueError(f"a face of {corners.shape[1]} corners")
+    lengths = lists.lengths
+    if lengths.min(initial=3) < 3:
+        raise ValueError(f"a face of {lengths.min()} corners")
     with np.errstate(invalid="ignore"):
-        whole = np.asarray(corners, dtype=np.float64)
+        whole = lists.values.astype(np.float64)
     if not (np.isfinite(whole).all() and (whole == np.rint(whole)).all() and (np.abs(whole) < 2**53).all()):
         raise ValueError("a corner that is no whole number")
-    first, second, third = whole[:, :1], whole[:, 1:-1], whole[:, 2:]
-    fans = np.stack((np.broadcast_to(first, second.shape), second, third), axis=-1)
-    return fans.reshape(-1, 3).astype(np.int64)
+    corners = whole.astype(np.int64)
+    triangles = lengths - 2
+    first = (np.cumsum(lengths) - lengths).repeat(triangles)
+    second = first + 1 + np.arange(triangles.sum()) - (np.cumsum(triangles) - triangles).repeat(triangles)
+    return np.stack((corners[first], corners[second], corners[second + 1]), axis=1)

@@ -1,20 +1,20 @@
 """An object from a mesh somebody has: its unit, which way is up, its hinge; each is told, or found and said."""
 
-import io
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import trimesh
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, QhullError
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rows import distinct_rows
-from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, checked_mesh, load_mesh
+from hoidata.objects.glb import Glb, parse_glb
+from hoidata.objects.mesh import LARGEST_MESH_BYTES, Mesh, NamedPieces, checked_mesh, load_named_mesh
 from hoidata.objects.model import Hinge, ObjectModel, articulate
+from hoidata.objects.stl import parse_stl
 
 UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "dm": 0.1, "inch": 0.0254}
 SMALLEST_M, LARGEST_M = 0.005, 2.0
@@ -22,7 +22,7 @@ HELD_M = (0.02, 1.0)  # sizes a hand is likely to be asked to hold, for guesses 
 UP_AXES = {
     sign + letter: np.eye(3)[axis] * float(f"{sign}1") for axis, letter in enumerate("xyz") for sign in ("", "-")
 }
-LARGEST_GLB_JSON, MOST_SHOWN = 4 << 20, 5_000_000
+MERGED_PER_UNIT = 1e8  # vertices of STL and GLB are one where they agree to this fraction of the file's unit
 METRES_AND_Y_UP = (".glb",)  # by the glTF 2.0 specification
 NEAR_GROUND = 1 / 50  # of the height: vertices this low carry the object
 SLIGHTLY_RAD, NEARER = 0.3, 0.01  # a turn that shows where a hinge leads, and how much nearer is meant
@@ -44,10 +44,12 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
 
     unit: "m", "cm", "mm", "dm" or "inch"; metres where not told. up: "z", "-y", ...; found where not told (GLB: y).
     hinge: "px,py,pz dx,dy,dz", a point on the axis and its direction in the file's own unit and axes, for a mesh of two
-    pieces of which the second in the file moves.
+    pieces of which the second in the file moves. The pieces are the objects, groups, nodes or solids that the file
+    names where these are two, and else the shells.
     Raises BadInput for a size that cannot be meant, naming the unit that may be, and for a hinge that does not fit.
     """
-    mesh = read_mesh_file(path, joined=not hinge)
+    file = _read(path)
+    mesh, part, pieces = _in_two_pieces(path, file) if hinge else (_joined(file), None, ("", ""))
     scale, notes = _scale(path, mesh, unit), list[str]()
     vertices = mesh.vertices * scale
     if not up:
@@ -57,9 +59,11 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
         raise BadInput("--up", f"one of {', '.join(UP_AXES)}", up, "name the axis of the file that points up")
     turn = _upright_from_file(UP_AXES[up])
     joint = _hinge(hinge, scale, turn) if hinge else None
-    part = _second_piece(path, mesh) if joint else np.zeros(len(vertices), np.uint8)
+    part = np.zeros(len(vertices), np.uint8) if part is None else part
     name = path.stem.encode(errors="backslashreplace").decode()  # bytes that are no text stay legible
     model = ObjectModel(name, vertices @ turn.T, mesh.faces, part, joint)
+    if all(pieces):
+        notes.append(f"{pieces[1]!r} turns about the hinge, {pieces[0]!r} stays")
     if joint and closes(model):
         notes.append("a growing angle brings the two pieces together; if it is to open them, turn its direction round")
     return UserObject(model, tuple(notes))
@@ -107,66 +111,123 @@ def _clustered(model: ObjectModel, cells: int) -> ObjectModel:
     return ObjectModel(model.name, model.vertices_m[first], faces[apart], model.part[first], model.hinge)
 
 
-def read_mesh_file(path: Path, joined: bool = True) -> Mesh:
+def read_mesh_file(path: Path) -> Mesh:
     """Vertices and triangles of an OBJ, PLY, STL or GLB file in its own unit and axes.
 
-    Of STL and GLB, vertices in the same place become one, of different nodes only where ``joined``; a GLB's nodes stand
-    where its scene puts them.
+    Of STL and GLB, vertices in the same place become one; a GLB's nodes stand where its scene puts them.
     Raises BadInput for a file that holds no finite triangle mesh.
     """
-    if path.suffix.lower() not in (".stl", ".glb"):
-        return load_mesh(path)
+    return _joined(_read(path))
+
+
+class _MeshFile(NamedTuple):
+    """mesh: as stored. source: (vertex,) of STL and GLB which solid or node it belongs to; None of OBJ and PLY, whose
+    faces share vertices. pieces: the divisions that the file names.
+    """
+
+    mesh: Mesh
+    source: np.ndarray | None
+    pieces: list[NamedPieces]
+
+
+def _read(path: Path) -> _MeshFile:
+    suffix = path.suffix.lower()
+    if suffix in (".obj", ".ply"):
+        mesh, pieces = load_named_mesh(path)
+        return _MeshFile(mesh, None, pieces)
+    if suffix not in (".stl", ".glb"):
+        raise BadInput(path, "a mesh named .obj, .ply, .stl or .glb", path.suffix or "no suffix", "convert the mesh")
     if not path.is_file():
         raise BadInput(path, "a mesh file", "nothing there", "correct the path")
     if path.stat().st_size > LARGEST_MESH_BYTES:
         raise BadInput(path, f"at most {LARGEST_MESH_BYTES} bytes", f"{path.stat().st_size}", "decimate the mesh")
-    if _is_gltf(path):
-        _check_glb(path)
+    data = path.read_bytes()
+    mesh, pieces = _of_glb(parse_glb(data, path)) if suffix == ".glb" else _of_stl(path, data)
+    checked_mesh(path, mesh)
+    source = np.zeros(len(mesh.vertices), np.int64)
+    source[mesh.faces] = pieces[0].of_face[:, None]
+    return _MeshFile(mesh, source, pieces)
+
+
+def _of_stl(path: Path, data: bytes) -> tuple[Mesh, list[NamedPieces]]:
     try:
-        # From bytes and without a resolver: a GLB cannot make the reader open another file.
-        scene = trimesh.load_scene(io.BytesIO(path.read_bytes()), file_type=path.suffix[1:].lower())
-        pieces = [scene.to_mesh()] if joined else _in_order(scene)
-        for piece in pieces:
-            piece.merge_vertices(merge_tex=True, merge_norm=True)
-        mesh = trimesh.util.concatenate(pieces)
-        assert isinstance(mesh, trimesh.Trimesh)
-    except Exception as error:  # whatever a foreign parser raises on a damaged file
-        got = f"{type(error).__name__}: {str(error)[:200]}"
-        raise BadInput(path, "a readable mesh", got, "export it anew") from error
-    return checked_mesh(path, Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)))
+        corners, solid, names = parse_stl(data)
+    except ValueError as error:
+        raise BadInput(path, "a readable mesh", f"{type(error).__name__}: {error}", "export it again") from error
+    return Mesh(corners, np.arange(len(corners)).reshape(-1, 3)), [NamedPieces("solids", names, solid)]
 
 
-def _in_order(scene: trimesh.Scene) -> list[trimesh.Trimesh]:
-    """The scene's meshes where it puts them, in the order of the file; trimesh walks its nodes the other way round."""
-    order = {name: number for number, name in enumerate(scene.geometry)}
-    meshes = [own for own in scene.dump() if isinstance(own, trimesh.Trimesh)]
-    return sorted(meshes, key=lambda own: order[own.metadata["name"]])
+def _of_glb(glb: Glb) -> tuple[Mesh, list[NamedPieces]]:
+    mesh = Mesh(glb.vertices, glb.faces)
+    return mesh, [NamedPieces("nodes", glb.names, glb.node), NamedPieces("branches of nodes", glb.names, glb.branch)]
 
 
-def _check_glb(path: Path) -> None:
-    """Refuse a GLB that states more numbers than it holds, or shows a mesh again and again: trimesh would make them."""
-    size = path.stat().st_size
-    with open(path, "rb") as stream:
-        length = int.from_bytes(stream.read(20)[12:16], "little")
-        text = stream.read(min(length, LARGEST_GLB_JSON + 1))
-    try:
-        if len(text) > LARGEST_GLB_JSON:
-            raise ValueError(f"more than {LARGEST_GLB_JSON} bytes of JSON")
-        tree = json.loads(text)
-        counts = [int(accessor["count"]) for accessor in tree.get("accessors", ())]
-        sizes = [sum(counts[number] for number in _accessors(mesh)) for mesh in tree.get("meshes", ())]
-        shown = sum(sizes[node["mesh"]] for node in tree.get("nodes", ()) if "mesh" in node)
-        if sum(counts) > size or shown > max(size, MOST_SHOWN):
-            raise ValueError(f"{max(sum(counts), shown)} corners in {size} bytes")
-    except (ValueError, KeyError, IndexError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        got = f"{type(error).__name__}: {str(error)[:200]}"
-        raise BadInput(path, "a readable mesh", got, "export the mesh alone, anew") from error
+def _joined(file: _MeshFile) -> Mesh:
+    """The mesh with the vertices of STL and GLB merged where they coincide; those that no face uses are dropped."""
+    if file.source is None:
+        return file.mesh
+    used, corner = np.unique(file.mesh.faces, return_inverse=True)
+    first, number = distinct_rows(np.round(file.mesh.vertices[used] * MERGED_PER_UNIT))
+    return Mesh(file.mesh.vertices[used[first]], number[corner].reshape(-1, 3))
 
 
-def _accessors(mesh: dict) -> list[int]:
-    """Of a glTF mesh the numbers of the arrays of positions and corners."""
-    named = [(part["attributes"].get("POSITION"), part.get("indices")) for part in mesh["primitives"]]
-    return [number for pair in named for number in pair if number is not None]
+def _in_two_pieces(path: Path, file: _MeshFile) -> tuple[Mesh, np.ndarray, tuple[str, str]]:
+    """The mesh, (vertex,) 1 for the second of its two pieces in the order of the file, and the names of the pieces.
+
+    Vertices that both pieces use are doubled. Raises BadInput where no division of the file gives two pieces.
+    """
+    divisions = _divisions(file)
+    two = _first_of_two(divisions)
+    if two is None:
+        counts = dict.fromkeys((own.kind, len(_order(own))) for own in divisions)
+        got = ", ".join(f"{count} {kind}" for kind, count in counts if count > 1) or "one shell"
+        remedy = "export a base and what moves as two objects or nodes; each may have any number of shells"
+        raise BadInput(path, "two separate pieces for --hinge", got, remedy)
+    moves = two.of_face == _order(two)[1]
+    faces = file.mesh.faces
+    key, place, number = np.unique(
+        2 * _own_vertices(file)[faces] + moves[:, None], return_index=True, return_inverse=True
+    )
+    mesh = Mesh(file.mesh.vertices[faces.ravel()[place]], number.reshape(-1, 3))
+    return mesh, (key % 2).astype(np.uint8), _names(two)
+
+
+def two_pieces(path: Path) -> tuple[str, str] | None:
+    """The names of the two pieces of which ``--hinge`` turns the second ("" where unnamed); None of any other mesh."""
+    two = _first_of_two(_divisions(_read(path)))
+    return None if two is None else _names(two)
+
+
+def _first_of_two(divisions: list[NamedPieces]) -> NamedPieces | None:
+    return next((own for own in divisions if len(_order(own)) == 2), None)
+
+
+def _names(two: NamedPieces) -> tuple[str, str]:
+    first, second = _order(two)
+    return (two.names[first], two.names[second]) if two.names else ("", "")
+
+
+def _order(pieces: NamedPieces) -> list[int]:
+    """The numbers of the pieces in the order of the file."""
+    numbers, first = np.unique(pieces.of_face, return_index=True)
+    return numbers[np.argsort(first)].tolist()
+
+
+def _divisions(file: _MeshFile) -> list[NamedPieces]:
+    """The ways to divide a mesh into pieces, the most telling first: what the file names, then its shells.
+
+    A shell is what shares vertices. Vertices are joined where they coincide, as many files repeat them along seams; if
+    that makes one piece of all, as of a lid that lies on its box, only those that the file itself has as one.
+    """
+    coinciding = distinct_rows(np.round(file.mesh.vertices * MERGED_PER_UNIT)).number
+    return [*file.pieces, *(_shells(file.mesh.faces, own) for own in (coinciding, _own_vertices(file)))]
+
+
+def _own_vertices(file: _MeshFile) -> np.ndarray:
+    """(vertex,) equal for vertices that the file has as one: in STL and GLB, those of a solid or node that coincide."""
+    if file.source is None:
+        return np.arange(len(file.mesh.vertices))
+    return distinct_rows(np.column_stack((np.round(file.mesh.vertices * MERGED_PER_UNIT), file.source))).number
 
 
 def _is_gltf(path: Path) -> bool:
@@ -220,27 +281,12 @@ def _hinge(text: str, scale: float, turn: np.ndarray) -> Hinge:
     return Hinge(turn @ direction / length, turn @ point * scale)
 
 
-def _second_piece(path: Path, mesh: Mesh) -> np.ndarray:
-    """(vertex,) 1 for the second of two pieces that share no vertex, in the order of the file.
-
-    Vertices are joined where they coincide, as many files repeat them along seams; if that makes one piece of all, as
-    of a lid that lies on its box, only those that the file itself has as one.
-    """
-    ways = [_pieces(mesh.faces, own) for own in (distinct_rows(mesh.vertices).number, np.arange(len(mesh.vertices)))]
-    found = [list(dict.fromkeys(piece[mesh.faces[:, 0]].tolist())) for piece in ways]
-    way = 1 if len(found[0]) == 1 else 0
-    if len(found[way]) != 2:
-        remedy = "give a mesh of a base and one moving piece that share no vertex"
-        raise BadInput(path, "two separate pieces for --hinge", f"{len(found[0])}", remedy)
-    return (ways[way] == found[way][1]).astype(np.uint8)
-
-
-def _pieces(faces: np.ndarray, same: np.ndarray) -> np.ndarray:
-    """(vertex,) number of the piece each is of. same: (vertex,), equal for those that are one."""
+def _shells(faces: np.ndarray, same: np.ndarray) -> NamedPieces:
+    """The connected components of a mesh. same: (vertex,), equal for vertices that are one."""
     faces, count = same[faces], int(same.max()) + 1
     rows, columns = faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel()
     links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
-    return connected_components(links, directed=False)[1][same]
+    return NamedPieces("shells", [], connected_components(links, directed=False)[1][faces[:, 0]])
 
 
 def _hull_area(points: np.ndarray) -> float:

@@ -35,6 +35,9 @@ def given_control(found: TrajectoryFile, model: ObjectModel, hands: Mapping[Side
     """A file's trajectories at an object. Raises BadInput where they cannot be meant, with what may have been."""
     if model.is_articulated and found.hinge_rad is None:
         raise BadInput(found.where, "hinge_rad for a hinged object", "none", "add the column")
+    if found.hinge_rad is not None and found.hinge_rad.any() and not model.is_articulated:
+        remedy = 'tell the hinge of a two-piece mesh (--hinge "px,py,pz dx,dy,dz"), or leave the column out'
+        raise BadInput(found.where, "an object with a hinge for hinge_rad", f"{model.name!r}, which is rigid", remedy)
     read = plausible_reading(found, model, hands)
     notes = [
         f"the {side} hand stays {metres:.2f} m away from the object and keeps its neutral pose"

@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections.abc import Hashable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -215,17 +215,18 @@ def read_roots(data: bytes, where: str) -> dict[str, str]:
     ):
         raise BadInput(where, "a dictionary of lists of part ids", repr(value)[:40])
     parent = {child: node for node, children in value.items() for child in children}
-    return {child: _topmost(where, child, parent) for child in parent}
-
-
-def _topmost(where: str, name: str, parent: Mapping[str, str]) -> str:
-    seen: set[Hashable] = set()
-    while name in parent:
-        if name in seen:
-            raise BadInput(where, "a tree of parts", f"{name[:40]!r} below itself")
-        seen.add(name)
-        name = parent[name]
-    return name
+    topmost: dict[str, str] = {}
+    for child in parent:
+        path = dict[str, None]()  # up to a part whose topmost one is known, so that no step is made twice
+        name: str = child
+        while name in parent and name not in topmost:
+            if name in path:
+                raise BadInput(where, "a tree of parts", f"{name[:40]!r} below itself")
+            path[name] = None
+            name = parent[name]
+        root: str = topmost.get(name, name)
+        topmost |= {below: root for below in path}
+    return topmost
 
 
 def _json(data: bytes, where: str) -> Any:

@@ -1,8 +1,10 @@
 """Small files that unpack, nest or repeat to gigabytes or minutes, each as its bytes and what reads such a file."""
 
+import io
 import json
 import pickle
 import struct
+import zipfile
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +17,10 @@ from hoidata.datasets.h2o.files import listed_segments
 from hoidata.datasets.hot3d.files import LARGEST_ROWS, POSE_COLUMNS, hand_poses, object_poses
 from hoidata.datasets.manipnet.adapter import _read_tips
 from hoidata.datasets.manipnet.bvh import ROOT_CHANNELS, parse_bvh, unpack_text
+from hoidata.files.numpy_files import load_npz_arrays, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.files.sealed import read_metadata
+from hoidata.files.torch_pickle import load_torch_pickle
 from hoidata.objects.mesh import LARGEST_MESH_BYTES, load_mesh, parse_obj
 from hoidata.objects.user_mesh import read_user_object
 from models.manipnet.trajectory_files import read_trajectories
@@ -52,6 +56,73 @@ def cyclic() -> bytes:
 
 def many_lists() -> bytes:
     return b"\x80\x04](" + b"]" * 2_900_000 + b"e."
+
+
+def same_hashes(begin: bytes = b"}(", value: bytes = b"N", end: bytes = b"u.") -> bytes:
+    """A dictionary of integers that share one hash: Python takes the remainder by 2^61 - 1."""
+    numbers = ((2**61 - 1) * factor for factor in range(1, 30_000))
+    return b"\x80\x04" + begin + b"".join(pickle.dumps(number, 2)[2:-1] + value for number in numbers) + end
+
+
+def same_hashes_in_text() -> bytes:
+    return b"}(" + b"".join(b"L%dL\nN" % ((2**61 - 1) * factor) for factor in range(1, 30_000)) + b"u."
+
+
+def frozensets() -> bytes:
+    """Sets of the same hash as keys: those of members that share theirs."""
+    numbers = ((2**61 - 1) * factor for factor in range(1, 20_000))
+    keys = (b"(" + pickle.dumps(number, 2)[2:-1] + b"\x91N" for number in numbers)
+    return b"\x80\x04}(" + b"".join(keys) + b"u."
+
+
+DTYPE = b"cnumpy\ndtype\n(X%b%bI0\nI1\ntR(I3\nX\x01\0\0\0<NNNI-1\nI-1\nI0\ntb"
+
+
+def dtype(name: bytes) -> bytes:
+    return DTYPE % (struct.pack("<I", len(name)), name)
+
+
+def complex_keys() -> bytes:
+    """The hash of a complex number is that of its real part and 1000003 times that of the other."""
+    head = b"\x80\x04" + dtype(b"c16") + b"\x940cnumpy.core.multiarray\nscalar\n\x940"
+    numbers = (struct.pack("<dd", -1000003.0 * number, number) for number in range(1, 30_000))
+    return head + b"}(" + b"".join(b"h\x01h\x00C\x10" + number + b"\x86RN" for number in numbers) + b"u."
+
+
+def object_array(items: bytes, count: int) -> bytes:
+    """The opcodes of an array of objects."""
+    head = b"cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\n(I0\ntC\x01b\x87R(K\x01J"
+    return head + struct.pack("<i", count) + b"\x85" + dtype(b"O8") + b"I00\n](" + items + b"etb"
+
+
+def one_array_often() -> bytes:
+    return b"\x80\x04](" + object_array(b"N" * 60_000, 60_000) + b"\x94" + b"h\x00" * 300_000 + b"e."
+
+
+def npy(content: bytes, shape: str = "()", kind: str = "|O") -> bytes:
+    text = f"{{'descr': '{kind}', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + content
+
+
+def npz(member: bytes, times: int = 1) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for number in range(times):
+            archive.writestr(f"{number}.npy", member)
+    return stream.getvalue()
+
+
+def opcodes_npz() -> bytes:
+    return npz(npy(b"\x80\x04" + b"N0" * (30 * MB) + b"N."))
+
+
+def zeros_npz() -> bytes:
+    return npz(npy(bytes(100 * MB), f"({100 * MB // 8},)", "<f8"))
+
+
+def lists_npz() -> bytes:
+    """Sixty members, none of which is too large."""
+    return npz(npy(b"\x80\x04" + object_array(b"]" * 900_000, 900_000) + b"."), 60)
 
 
 def ply(faces: bytes, count: int, index: str = "uchar", order: str = "binary_little_endian") -> bytes:
@@ -99,6 +170,17 @@ def many_nodes() -> bytes:
     return glb({"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(body)}], "bufferViews": views,
                 "accessors": accessors, "meshes": [mesh], "nodes": nodes, "scenes": [{"nodes": [*range(count)]}],
                 "scene": 0}, body)  # fmt: skip
+
+
+def long_strip() -> bytes:
+    """Forty million triangles, of one byte each."""
+    body = struct.pack("<9f", 0, 0, 0, 1, 0, 0, 0, 1, 0) + bytes([0, 1, 2, 1]) * (10 * MB)
+    views = [{"buffer": 0, "byteLength": 36}, {"buffer": 0, "byteOffset": 36, "byteLength": 40 * MB}]
+    accessors = [{"bufferView": 0, "componentType": 5126, "type": "VEC3", "count": 3},
+                 {"bufferView": 1, "componentType": 5121, "type": "SCALAR", "count": 40 * MB}]  # fmt: skip
+    mesh = {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "mode": 5}]}
+    return glb({"asset": {"version": "2.0"}, "buffers": [{"byteLength": len(body)}], "bufferViews": views,
+                "accessors": accessors, "meshes": [mesh], "nodes": [{"mesh": 0}]}, body)  # fmt: skip
 
 
 def header_of_lists() -> bytes:
@@ -158,11 +240,25 @@ ATTACKS: list[Attack] = [
     ("list-of-itself.pkl", cyclic, as_table),
     ("one-text-often.pkl", lambda: repeated("x" * MB, 20_000), as_table),
     ("many-lists.pkl", many_lists, as_table),
+    ("same-hashes.pkl", same_hashes, as_table),
+    ("same-hashes-one-by-one.pkl", lambda: same_hashes(b"}", b"Ns", b"."), as_table),
+    ("same-hashes-set.pkl", lambda: same_hashes(b"\x8f(", b"", b"\x90."), as_table),
+    ("same-hashes-set-2.pkl", lambda: same_hashes(b"cbuiltins\nset\n](", b"", b"e\x85R."), as_table),
+    ("same-hashes-text.pkl", same_hashes_in_text, as_table),
+    ("same-hashes-torch.pkl", same_hashes, lambda path: load_torch_pickle(path, path)),
+    ("frozensets.pkl", frozensets, as_table),
+    ("complex-keys.pkl", complex_keys, as_table),
+    ("one-array-often.pkl", one_array_often, as_table),
+    ("opcodes.npz", opcodes_npz, load_npz_objects),
+    ("zeros.npz", zeros_npz, load_npz_arrays),
+    ("zeros-of-members.npz", lambda: npz(npy(bytes(8 * MB), f"({MB},)", "<f8"), 12), load_npz_objects),
+    ("lists.npz", lists_npz, load_npz_objects),
     ("one-polygon.ply", one_polygon, load_mesh),
     ("words.ply", text_ply, load_mesh),
     ("one-polygon.obj", wide_obj, load_mesh),
     ("empty-accessors.glb", empty_accessors, read_user_object),
     ("many-nodes.glb", many_nodes, read_user_object),
+    ("long-strip.glb", long_strip, read_user_object),
     ("parts.json", lambda: b"[" + b"[]," * 1_800_000 + b"[]]", lambda path: parse_parts(path.read_bytes(), "p", 9)),
     ("action_train.txt", lambda: b"\n" * (5 * MB), listed),
     ("rows.csv", lambda: b"time_s\n" + b"0\n" * (8 * MB), read_trajectories),

@@ -6,6 +6,7 @@ import pytest
 
 from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_npy_object, load_npz_objects
+from hoidata.files.numpy_files import load_npz_arrays
 
 
 def npy_of_numpy_1(value):
@@ -137,3 +138,32 @@ def test_a_missing_file_or_a_folder_is_bad_input(tmp_path, reader):
     for path in (tmp_path / "nothing.npy", tmp_path):
         with pytest.raises(BadInput, match=str(path)):
             reader(path)
+
+
+@pytest.mark.parametrize("reader", [load_npz_arrays, load_npz_objects])
+@pytest.mark.parametrize("pickled", [False, True])
+def test_an_archive_may_unpack_to_eight_times_its_size(tmp_path, monkeypatch, reader, pickled):
+    """Recorded numbers shrink to a half; a megabyte of zeros, which unpacks to a gigabyte, is no recording."""
+    if pickled and reader is load_npz_arrays:
+        pytest.skip("it reads no objects")
+    monkeypatch.setattr("hoidata.files.numpy_files._FREE_BYTES", 1000)
+    recorded, zeros = np.random.default_rng(0).normal(size=(300, 99)).astype(np.float32), np.zeros((3000, 99))
+    for name, array in (("recorded", recorded), ("zeros", zeros)):
+        np.savez_compressed(tmp_path / f"{name}.npz", a=np.array({"x": array}, dtype=object) if pickled else array)
+        np.savez(tmp_path / f"{name}-stored.npz", a=np.array({"x": array}, dtype=object) if pickled else array)
+    for name in ("recorded", "recorded-stored", "zeros-stored"):
+        found = reader(tmp_path / f"{name}.npz")["a"]
+        np.testing.assert_array_equal(found["x"] if pickled else found, zeros if "zeros" in name else recorded)
+    with pytest.raises(BadInput, match=r"when unpacked, got \d+; download it again, or store it uncompressed"):
+        reader(tmp_path / "zeros.npz")
+
+
+def test_the_pickles_of_one_archive_share_a_limit_of_opcodes(tmp_path, monkeypatch):
+    monkeypatch.setattr("hoidata.files.pickle_check._MOST_OPCODES", 700)
+    members = {f"m{number}": np.array([[1] * 40], dtype=object) for number in range(10)}
+    for count in (4, 10):
+        np.savez_compressed(tmp_path / "a.npz", **dict(list(members.items())[:count]))
+        if count == 4:
+            assert len(load_npz_objects(tmp_path / "a.npz")) == 4
+    with pytest.raises(BadInput, match="more than 700 opcodes"):
+        load_npz_objects(tmp_path / "a.npz")

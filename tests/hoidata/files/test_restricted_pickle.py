@@ -241,6 +241,34 @@ def test_a_huge_integer_is_refused():
         restricted_load(pickle.dumps(1 << 4000), ARRAYS)
 
 
+@pytest.mark.parametrize("name", ["frozenset", "number beyond 64 bits", "int", "complex128"])
+def test_keys_whose_hash_a_file_can_choose_are_refused_by_name(name):
+    """Thousands of keys of one hash take quadratic time: each is compared with all before it."""
+    large = pickle.dumps(2**64, 2)[2:-1]
+    data = {
+        "frozenset": b"\x80\x04}(K\x01\x91Ns.",
+        "number beyond 64 bits": b"\x80\x02}" + large + b"Ns.",
+        "int": b"\x80\x02cbuiltins\nset\n](" + large + b"e\x85R.",
+        "complex128": pickle.dumps({np.complex128(1j): None}, 2),
+    }
+    with pytest.raises(BadInput, match=f"{name}( as a key)?, which is not allowed"):
+        restricted_load(data[name], ARRAYS)
+
+
+def test_keys_of_64_bits_and_larger_numbers_that_are_no_keys_are_read():
+    keys = {
+        2**64 - 1: 2**70,
+        -(2**63): -(2**70),
+        1.5: None,
+        "x": True,
+        b"y": frozenset((1,)),
+        np.int64(7): np.float32(1),
+    }
+    for protocol in (2, 4):
+        content = {key: value for key, value in keys.items() if protocol == 4 or not isinstance(value, frozenset)}
+        assert restricted_load(pickle.dumps(content, protocol), ARRAYS) == content
+
+
 def test_text_of_impossible_characters_is_refused():
     """Python raises a SystemError when such text is turned into a string, long after the file was read."""
     data = pickle.dumps(np.array(["cup"]), 5)

@@ -44,6 +44,9 @@ WRITTEN_OTHERWISE = {
     "tabs in some": lambda text: text.replace("v 0.", "v\t0.").replace("f 1", " f\t1"),
     "colours": lambda text: re.sub(r"^(v .*)$", r"\1 0.5 0.5 1", text, flags=re.MULTILINE),
     "a colour": lambda text: text.replace("\nf", " 0.5 0.5 1 0.5\nf", 1),
+    "a byte order mark": lambda text: "\ufeff" + text,
+    "lines that go on": lambda text: re.sub(r"^(\S+ \S+ )(\S+ )", r"\1\\\n\2\\\n", text, flags=re.MULTILINE),
+    "a comment that ends like one": lambda text: text.replace("\nv ", "\n# C:\\meshes\\\nv ", 1),
     "faces first": lambda text: "\n".join(sorted(text.splitlines(), key=lambda line: line[:1] != "f")),
     "counted from the end": lambda text: re.sub(
         r"^f (\d+)", lambda row: f"f {int(row[1]) - 43}", text, flags=re.MULTILINE

@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from hoidata.errors import BadInput
-from hoidata.objects.user_mesh import read_user_object, thinned
+from hoidata.objects.user_mesh import read_mesh_file, read_user_object, thinned, two_pieces
 
 MUG = trimesh.creation.cylinder(radius=0.04, height=0.1, sections=48)
 Y_UP = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])
@@ -119,6 +119,145 @@ def test_a_hinge_that_is_none_is_refused_with_an_example(tmp_path, hinge):
 def test_a_hinge_needs_two_pieces(tmp_path):
     with pytest.raises(BadInput, match="two separate pieces"):
         read_user_object(saved(MUG, tmp_path / "mug.obj"), hinge="0,0,0 1,0,0")
+
+
+def pieces_of_boxes(*corners_m):
+    """Boxes of 2 cm at these corners, in one mesh."""
+    boxes = [trimesh.creation.box((0.02, 0.02, 0.02)).apply_translation(corner) for corner in corners_m]
+    return trimesh.util.concatenate(boxes)
+
+
+BODY = pieces_of_boxes([0, 0, 0], [0.1, 0, 0], [0, 0.1, 0])  # a tray and two feet
+LID = pieces_of_boxes([0, 0, 0.05], [0, 0, 0.1])  # a plate and its knob
+
+
+def obj_text(letter="o", names=("body", "lid"), faces="f {} {} {}\n"):
+    text, start = "", 1
+    for name, piece in zip(names, (BODY, LID), strict=True):
+        text += f"{letter} {name}\n" if name else ""
+        text += "".join(f"v {x} {y} {z}\n" for x, y, z in piece.vertices.tolist())
+        text += "".join(faces.format(*face) for face in (piece.faces + start).tolist())
+        start += len(piece.vertices)
+    return text
+
+
+def stl_text(names=("body", "lid")):
+    pieces = zip(names, (BODY, LID), strict=True)
+    return "".join(trimesh.exchange.stl.export_stl_ascii(mesh).replace("solid ", f"solid {name}", 1).replace(
+        "solid\n", f"solid {name}\n") for name, mesh in pieces)  # fmt: skip
+
+
+def parts_of(path):
+    """Least and greatest height of both parts, in the file's axes."""
+    model = read_user_object(path, up="z", hinge="0,-0.1,0.04 1,0,0").model
+    return [(own[:, 2].min().round(6), own[:, 2].max().round(6)) for own in
+            (model.vertices_m[model.faces_of(part)].reshape(-1, 3) for part in (0, 1))]  # fmt: skip
+
+
+TWO_PARTS = [(-0.01, 0.01), (0.04, 0.11)]
+NAMED = {
+    "objects.obj": obj_text,
+    "objects of corners with normals.obj": lambda: obj_text(faces="f {}//1 {}//1 {}//1\n"),
+    "groups.obj": lambda: obj_text("g"),
+    "groups within one object.obj": lambda: "o box\n" + obj_text("g", ("body outside", "lid")),
+    "one name comes twice.obj": lambda: obj_text().replace("f 5 ", "o lid\no body\nf 5 ", 1),
+    "many groups in two objects.obj": lambda: obj_text(faces="g {0}\nf {0} {1} {2}\n"),
+    "first without a name.obj": lambda: obj_text(names=("", "lid")),
+    "solids.stl": stl_text,
+}
+
+
+@pytest.mark.parametrize("name", NAMED)
+def test_what_a_file_names_are_the_two_parts_however_many_shells_each_has(tmp_path, name):
+    (tmp_path / name).write_text(NAMED[name]())
+    assert parts_of(tmp_path / name) == TWO_PARTS
+
+
+def test_two_nodes_of_a_glb_are_the_two_parts(tmp_path):
+    trimesh.Scene({"body": BODY, "lid": LID}).export(tmp_path / "box.glb")
+    assert parts_of(tmp_path / "box.glb") == TWO_PARTS
+
+
+def test_a_lid_of_several_nodes_under_one_node_is_a_part(tmp_path):
+    scene = trimesh.Scene()
+    for name, piece in (("body", BODY), ("lid", None)):
+        scene.add_geometry(piece, name, name) if piece else scene.graph.update("lid", "world")
+    for number, piece in enumerate(LID.split()):
+        scene.add_geometry(piece, f"piece {number}", f"piece {number}", parent_node_name="lid")
+    scene.export(tmp_path / "box.glb")
+    assert parts_of(tmp_path / "box.glb") == TWO_PARTS
+
+
+def test_pieces_that_share_vertices_are_cut_apart_where_their_names_change(tmp_path):
+    """A cover that is one surface with its back: each part gets its own vertices along the fold."""
+    corners = "v 0 0 0\nv 0.1 0 0\nv 0.1 0.1 0\nv 0 0.1 0\nv 0.1 0.2 0.01\nv 0 0.2 0.01\n"
+    (tmp_path / "cover.obj").write_text(corners + "g back\nf 1 2 3 4\ng front\nf 4 3 5 6\n")
+    model = read_user_object(tmp_path / "cover.obj", up="z", hinge="0,0.1,0 1,0,0").model
+    assert np.bincount(model.part).tolist() == [4, 4]
+    assert [model.vertices_m[model.faces_of(part)][..., 1].max().round(6) for part in (0, 1)] == [0.1, 0.2]
+
+
+def test_the_names_of_what_moves_and_what_stays_are_told(tmp_path):
+    (tmp_path / "box.obj").write_text(obj_text())
+    notes = read_user_object(tmp_path / "box.obj", up="z", hinge="0,-0.1,0.04 1,0,0").notes
+    assert "'lid' turns about the hinge, 'body' stays" in notes
+
+
+def test_without_names_of_two_parts_the_shells_are_counted(tmp_path):
+    (tmp_path / "box.obj").write_text(obj_text(names=("box", "box")))
+    with pytest.raises(BadInput, match="two separate pieces for --hinge, got 5 shells; export a base and what moves"):
+        parts_of(tmp_path / "box.obj")
+    (tmp_path / "box.obj").write_text(obj_text().replace("f 5 ", "o foot\nf 5 ", 1))
+    with pytest.raises(BadInput, match="got 3 objects, 5 shells"):
+        parts_of(tmp_path / "box.obj")
+
+
+def test_the_two_pieces_of_a_mesh_are_named_and_a_mesh_of_one_or_three_has_none(tmp_path):
+    (tmp_path / "box.obj").write_text(obj_text())
+    assert two_pieces(tmp_path / "box.obj") == ("body", "lid")
+    saved(pieces_of_boxes([0, 0, 0], [0.1, 0, 0]), tmp_path / "two.ply")
+    assert two_pieces(tmp_path / "two.ply") == ("", "")
+    for corners in ([[0, 0, 0]], [[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]]):
+        assert two_pieces(saved(pieces_of_boxes(*corners), tmp_path / "other.ply")) is None
+
+
+def test_a_binary_stl_may_begin_with_the_word_of_a_text(tmp_path):
+    data = bytearray(MUG.export(file_type="stl"))
+    data[:80] = b"solid mug".ljust(80)
+    (tmp_path / "mug.stl").write_bytes(data)
+    assert len(read_mesh_file(tmp_path / "mug.stl").faces) == len(MUG.faces)
+
+
+@pytest.mark.parametrize("kind", ["binary", "text"])
+def test_an_stl_file_is_the_mesh_it_was_written_from(tmp_path, kind):
+    MUG.export(tmp_path / "mug.stl", file_type={"binary": "stl", "text": "stl_ascii"}[kind])
+    mesh = read_mesh_file(tmp_path / "mug.stl")
+    assert len(mesh.vertices) == len(MUG.vertices)
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], MUG.triangles, atol=1e-8)
+
+
+@pytest.mark.parametrize(("old", "new"), [("endsolid", "end"), ("vertex", "vertec"), ("vertex ", "vertex a")])
+def test_a_text_of_an_stl_file_with_a_fault_is_refused(tmp_path, old, new):
+    (tmp_path / "mug.stl").write_text(new.join(trimesh.exchange.stl.export_stl_ascii(MUG).rsplit(old, 1)))
+    with pytest.raises(BadInput, match=r"mug\.stl"):
+        read_mesh_file(tmp_path / "mug.stl")
+
+
+def test_other_mesh_formats_are_refused_with_those_that_are_read(tmp_path):
+    MUG.export(tmp_path / "mug.off")
+    with pytest.raises(BadInput, match=r"expected a mesh named \.obj, \.ply, \.stl or \.glb, got \.off"):
+        read_user_object(tmp_path / "mug.off")
+
+
+def test_the_vertices_of_a_glb_stay_joined_along_its_seams_wherever_its_nodes_put_it(tmp_path):
+    """Stored with a normal of its own for each face, so that every corner is repeated; a turn must not part them."""
+    box = trimesh.creation.icosphere(4, 0.05)
+    box.unmerge_vertices()
+    turn = trimesh.transformations.rotation_matrix(0.7, [3, -1, 2], [0.1, 0.2, 0.3])
+    scene = trimesh.Scene()
+    scene.add_geometry(box, transform=turn)
+    scene.export(tmp_path / "ball.glb")
+    assert len(read_mesh_file(tmp_path / "ball.glb").vertices) == len(trimesh.creation.icosphere(4, 0.05).vertices)
 
 
 @pytest.mark.parametrize("suffix", [".stl", ".glb"])

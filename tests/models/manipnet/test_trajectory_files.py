@@ -182,6 +182,17 @@ def test_a_hinged_object_needs_angles_and_an_open_mesh_is_said_to_have_no_inside
     assert any("no inside" in note for note in noted.notes)
 
 
+@pytest.mark.parametrize("angle", ["0", "0.5"])
+def test_angles_of_a_hinge_need_a_mesh_with_one_unless_they_are_all_zero(angle) -> None:
+    head, *rows = table().splitlines()
+    text = "\n".join([f"{head},hinge_rad", *(f"{row},{angle}" for row in rows)])
+    if angle == "0":
+        assert given(text).active == ["right"]
+        return
+    with pytest.raises(BadInput, match=r"which is rigid; tell the hinge of a two-piece mesh \(--hinge"):
+        given(text)
+
+
 def test_an_object_that_swallows_the_hand_is_refused_and_a_palm_on_its_surface_is_not() -> None:
     given(table(), box_model((0.06, 0.06, 0.12)))  # the palm a centimetre in it, as a crude mesh may have it
     with pytest.raises(BadInput, match=r"palm inside it in 100 %.*--unit"):
