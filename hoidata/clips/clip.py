@@ -39,6 +39,7 @@ class HandTrack(Track):
     wrist_m: (frame, 3) world position of joint 0, metres. Not MANO's ``transl``: joint 0 lies exactly here.
     global_orient: (frame, 3) axis-angle, radians, world frame; the hand turns about its wrist joint.
     hand_pose: (frame, 45) axis-angle of the 15 finger joints, absolute (zero is the flat hand), never mean-relative.
+    Adapters give rotations of at most pi. Where one passes pi its axis flips: compare rotations, not these numbers.
     betas: (1, 10) for the whole clip or (frame, 10).
     valid: (frame,) bool; a False frame holds finite numbers that mean nothing.
     template_m: (778, 3) personal rest mesh that replaces the model's template, or None.
