@@ -10,6 +10,7 @@ from hoidata.hands import HandPair
 from hoidata.store.annotated import load_annotated
 from hoidata.store.store import Store, open_store
 from pipelines.pages.clip_page import page_name, write_clip_page
+from pipelines.pages.clip_page_facts import source_frames_text
 from pipelines.pages.dataset_page import write_dataset_page
 from pipelines.pages.player import motion_player, write_page
 from pipelines.params import read_params
@@ -59,7 +60,7 @@ def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) ->
         ("clip", clip_id),
         ("dataset", f"{clip.dataset}, subject {clip.subject}, sequence {clip.sequence}"),
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s"),
-        ("source frames", f"{clip.source_frames[0]:g} to {clip.source_frames[-1]:g} at {clip.source_fps:g} per second"),
+        ("source frames", source_frames_text(clip)),
         ("files", ", ".join(source.path for source in clip.sources) or "none are recorded"),
         ("hand model", hands.name),
         ("licence", str(store.info["licence"])),

@@ -189,8 +189,8 @@ class Clip:
     dataset, subject: names as in the source. sequence: the source sequence the clip was cut from.
     hands: both sides always present; ``valid`` says which frames mean something.
     object: the manipulated object; other_objects: further tracked objects of the scene.
-    source_frames: (frame,) int32 index of each frame in the source file, counted from 0; of a source below 30 fps a
-    frame that was made between two has the number of the one before it (``recorded``).
+    source_frames: (frame,) int32 index of each frame in the source file, counted from 0. A frame that was made between
+    two (a source below 30 fps, a short gap in an object's poses) has the number of the one before it (``recorded``).
     gravity: (3,) unit vector, the direction things fall in the world frame, or None when it is not known.
     gravity_note: empty where the source states gravity; else how it was estimated, or why it is not known.
     verb: the action in words ("take out", "hand over"), or None when the source has no label.

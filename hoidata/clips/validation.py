@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, SourceContact
+from hoidata.clips.clip import SIDES, BodyTrack, CameraTrack, Clip, HandTrack, ObjectTrack, SourceContact
 from hoidata.errors import BadInput
 from hoidata.hands.model import N_VERTICES
 
@@ -19,7 +19,7 @@ def check_clip(clip: Clip) -> Clip:
     Raises BadInput that names the clip and the field.
     """
     n_frames = clip.n_frames
-    if n_frames < 1 or np.any(np.diff(clip.source_frames) < (0 if clip.source_fps < FPS else 1)):
+    if n_frames < 1 or np.any(np.diff(clip.source_frames) < 0):
         raise BadInput(f"{clip.clip_id}: source_frames", "1 or more rising frame numbers", f"{n_frames}", REMEDY)
     if tuple(clip.hands) != SIDES:
         raise BadInput(f"{clip.clip_id}: hands", f"{SIDES}", f"{tuple(clip.hands)}", REMEDY)

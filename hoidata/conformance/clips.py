@@ -130,7 +130,8 @@ def _clock(adapter: Adapter, clip: Clip) -> list[str]:
     if not 1 <= clip.source_fps <= 1000:
         return [f"source_fps is {clip.source_fps}"]
     passed_s = (clip.source_frames - clip.source_frames[0]) / clip.source_fps
-    drift_s = np.abs(passed_s - np.arange(clip.n_frames) / FPS).max()
+    # A made frame has the number of the one before it, so its own time is not told.
+    drift_s = np.abs(passed_s - np.arange(clip.n_frames) / FPS)[clip.recorded].max()
     if drift_s > 1 / FPS + 1e-6:
         seconds = f"{clip.n_frames} frames at {FPS} per second are {(clip.n_frames - 1) / FPS:.2f} s"
         return [f"{seconds}, its source frames at {clip.source_fps:g} {passed_s[-1]:.2f} s"]

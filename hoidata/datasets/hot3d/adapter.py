@@ -20,6 +20,7 @@ from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHan
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import LONGEST_BRIDGED, bridge, has_pose, missing_poses, numbered, trimmed
 from hoidata.datasets.hot3d import umetrack
 from hoidata.datasets.hot3d.files import HandFormat, Poses
 from hoidata.datasets.hot3d.sources import PARTS, Source, read_source
@@ -65,10 +66,18 @@ class _Hands(NamedTuple):
 
 
 class _Thing(NamedTuple):
-    """An object's motion over the whole recording; there: (frame,) bool, where it has a pose."""
+    """An object's motion over the whole recording, short gaps bridged. tracked: (frame,) bool, poses of the source."""
 
     track: ObjectTrack
-    there: np.ndarray
+    tracked: np.ndarray
+
+    @property
+    def has_pose(self) -> np.ndarray:
+        return has_pose(self.tracked)
+
+    def is_known_in(self, frames: slice) -> bool:
+        """Whether it has a pose in every frame, of the source in the first and the last."""
+        return bool(self.has_pose[frames].all() and self.tracked[frames][[0, -1]].all())
 
 
 class _Recording(NamedTuple):
@@ -82,10 +91,14 @@ class _Recording(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """frames: intervals that become clips; short, still: touches too short, or of an object that does not move."""
+    """frames: intervals that become clips; short, still: touches too short, or of an object that does not move.
+
+    cut: touches too short because poses of the object or of a hand are missing before or after them.
+    """
 
     frames: list[Interval]
     short: list[Interval]
+    cut: list[Interval]
     still: list[Interval]
 
 
@@ -168,7 +181,14 @@ class Hot3dAdapter(Described):
         together = np.concatenate(joints, axis=1).astype(np.float64)
         for thing in recording.things:
             name = thing.track.model.name
-            found = self._intervals(thing, thing.there & ~recording.failed, recording.times_ns, together)
+            found = self._intervals(thing, thing.has_pose & ~recording.failed, recording.times_ns, together)
+            gaps = missing_poses(
+                f"{whole.clip_id}/{name}/missing", whole.sequence, name, whole.source_frames, thing.tracked
+            )
+            yield from gaps
+            if found.cut:
+                expected = f"touches of {self.shortest_frames} frames between missing poses of the object or a hand"
+                yield _left_out(whole, f"{name}/cut", expected, found.cut)
             if found.short:
                 yield _left_out(whole, f"{name}/short", f"touches of {self.shortest_frames} frames", found.short)
             if found.still:
@@ -178,10 +198,17 @@ class Hot3dAdapter(Described):
 
     def _clip(self, whole: Clip, interval: Interval, thing: _Thing, recording: _Recording) -> Clip | Quarantined:
         name, frames, error_m = thing.track.model.name, slice(*interval), recording.hands.error_m
-        others = [other.track for other in recording.things if other is not thing and other.there[frames].all()]
+        others = [other for other in recording.things if other is not thing and other.is_known_in(frames)]
         clip_id = f"{whole.clip_id}/{interval.start:05d}-{interval.stop - 1:05d}-{name}"
-        everything = replace(whole, clip_id=clip_id, object=thing.track, other_objects=tuple(others))
-        clip = replace(everything.take(frames), object_words=object_words(name))
+        recorded = np.logical_and.reduce([own.tracked[frames] for own in (thing, *others)])
+        everything = replace(
+            whole, clip_id=clip_id, object=thing.track, other_objects=tuple(other.track for other in others)
+        )
+        clip = replace(
+            everything.take(frames),
+            object_words=object_words(name),
+            source_frames=numbered(whole.source_frames[frames], recorded),
+        )
         if error_m is None:
             return clip
         mean_m = float(np.nanmean(error_m[frames]))
@@ -194,18 +221,20 @@ class Hot3dAdapter(Described):
 
     def _intervals(self, thing: _Thing, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray) -> _Found:
         """Usable frames without a gap in time in which a hand is at the object, in intervals of suitable length."""
-        found, near = _Found([], [], []), _near(thing, joints_m)
+        found, near = _Found([], [], [], []), _near(thing, joints_m)
+        known = np.stack([thing.has_pose, *np.isfinite(joints_m).all(axis=2).reshape(len(times), 2, -1).all(axis=2).T])
         for first, last in _unbroken(times):
             inside = np.zeros(len(times), bool)
             inside[first:last] = usable[first:last]
             for touch in runs(bridged(near & inside, BRIDGE_FRAMES) & inside):
-                interval = widened(touch, self.margin_frames, inside)
+                interval = trimmed(widened(touch, self.margin_frames, inside), thing.tracked)
                 if interval.stop - interval.start < self.shortest_frames:
-                    found.short.append(touch)
+                    (found.cut if _is_cut(touch, known) else found.short).append(touch)
                 elif not _moves(thing.track, interval):
                     found.still.append(touch)
                 else:
-                    found.frames.extend(_divided(interval, self.longest_frames))
+                    pieces = _divided(interval, self.longest_frames)
+                    found.frames.extend(trimmed(piece, thing.tracked) for piece in pieces)
         return found
 
 
@@ -223,7 +252,7 @@ def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
 def frame_times(where: str, times_ns: list[np.ndarray]) -> np.ndarray:
     """(frame,) int64, ns: the first time of each frame; times of one frame lie less than 2 ms apart.
 
-    Raises BadInput where frames are nearer to each other than half of 1/30 s.
+    Up to three frames that no file has are added between those that are there, so that they can be bridged. Raises BadInput where frames are nearer to each other than half of 1/30 s.
     """
     times = np.unique(np.concatenate(times_ns))
     first = times[np.r_[True, np.diff(times) > SAME_NS]]
@@ -232,7 +261,12 @@ def frame_times(where: str, times_ns: list[np.ndarray]) -> np.ndarray:
         at = int(steps.argmin())
         expected = "frames 1/30 s apart, or times of one frame within 2 ms"
         raise BadInput(f"{where}: times", expected, f"{first[at]} and {first[at + 1]} ns")
-    return first
+    lost = np.rint(steps / STEP_NS).astype(int) - 1
+    added = [
+        np.linspace(first[at], first[at + 1], lost[at] + 2)[1:-1].round().astype(np.int64)
+        for at in np.flatnonzero((lost > 0) & (lost <= LONGEST_BRIDGED))
+    ]
+    return np.sort(np.concatenate([first, *added]))
 
 
 def rows_of_frames(frames_ns: np.ndarray, times_ns: np.ndarray) -> np.ndarray:
@@ -292,9 +326,10 @@ def _rows(poses: Poses | None, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _thing(raw: RawTree, name: str, path: str, poses: Poses, times: np.ndarray, world: np.ndarray) -> _Thing:
     place = raw.file(path)
     model = _model(name, place, raw.recorded(path)[0].sha256)
-    rows, there = _rows(poses, times)
+    rows, tracked = _rows(poses, times)
     rotvec = rotmat_to_rotvec(world @ poses.rotation)[rows].astype(np.float32)
-    return _Thing(ObjectTrack(model, rotvec, (poses.translation_m @ world.T)[rows].astype(np.float32)), there)
+    track = ObjectTrack(model, rotvec, (poses.translation_m @ world.T)[rows].astype(np.float32))
+    return _Thing(bridge(track, tracked), tracked)
 
 
 @lru_cache(maxsize=48)
@@ -309,7 +344,7 @@ def _near(thing: _Thing, joints_m: np.ndarray) -> np.ndarray:
     model, pose = thing.track.model, thing.track.world_from_object
     local = (joints_m - pose.translation[:, None]) @ pose.rotation
     low, high = model.vertices_m.min(axis=0) - TOUCH_M, model.vertices_m.max(axis=0) + TOUCH_M
-    asked = ((local >= low) & (local <= high)).all(axis=2) & thing.there[:, None]
+    asked = ((local >= low) & (local <= high)).all(axis=2) & thing.has_pose[:, None]
     near = np.zeros(asked.shape, bool)
     if asked.any():
         near[asked] = closest_points(model.vertices_m, model.faces, local[asked]).distance_m < TOUCH_M
@@ -322,6 +357,15 @@ def _moves(track: ObjectTrack, interval: Interval) -> bool:
     corners = np.array(np.meshgrid(*np.stack([vertices.min(axis=0), vertices.max(axis=0)], axis=1))).reshape(3, -1).T
     placed = track.take(slice(*interval)).world_from_object @ corners
     return bool(np.linalg.norm(placed - placed[:1], axis=2).max() >= MOVED_M)
+
+
+def _is_cut(interval: Interval, known: np.ndarray) -> bool:
+    """Whether what is known in the first or last frame is lost right before or after. known: (object and hands, frame).
+
+    A hand that is not known there may just not be in view: the touch is another's.
+    """
+    ends = (interval.start, interval.start - 1), (interval.stop - 1, interval.stop)
+    return any((known[:, a] & ~known[:, b]).any() for a, b in ends if 0 <= b < known.shape[1])
 
 
 def _unbroken(times: np.ndarray) -> list[Interval]:

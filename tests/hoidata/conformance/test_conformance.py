@@ -181,6 +181,11 @@ WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
         "24 frames at 30 per second are 0.77 s, its source frames at 60 0.38 s",
     ),
     "shift of frames": (lambda c: replace(c, source_frames=c.source_frames // 2 * 2 + np.arange(24) % 2), ""),
+    "made frames": (lambda c: replace(c, source_frames=c.source_frames[[*range(9), 8, 8, 8, *range(12, 24)]]), ""),
+    "every frame twice": (
+        lambda c: replace(c, source_frames=np.repeat(c.source_frames[::2] // 2, 2)),
+        "24 frames at 30 per second are 0.77 s",
+    ),
     "verb": (lambda c: replace(c, verb="Lift_up"), "the verb 'Lift_up'"),
     "noun": (lambda c: replace(c, object_words="cup_01"), "the object 'cup_01'"),
     "gravity": (lambda c: replace(c, gravity=np.array([0.0, -1.0, 0.0])), "up is +z"),
@@ -195,7 +200,8 @@ WRONG_CLIPS: dict[str, tuple[Callable[[Clip], Clip], str]] = {
     "betas without frames": (betas(lambda found: found[0]), "betas: expected shape (24, 10), got (10,)"),
     "NaN": (lambda c: replace(c, object=replace(c.object, rotvec=c.object.rotvec * np.nan)), "finite floats"),
 }
-NO_MISTAKE = {"shift of frames"}  # one source frame early or late, as where clocks differ
+# One source frame early or late, as where clocks differ; three frames that were put between recorded ones.
+NO_MISTAKE = {"shift of frames", "made frames"}
 
 
 @pytest.mark.parametrize("mistake", WRONG_CLIPS)

@@ -1,4 +1,4 @@
-"""Real ARCTIC sequences against published joints; ``HOIDATA_ARCTIC`` names the folder: it is no part of this repository."""
+"""Real ARCTIC sequences against published joints. ``HOIDATA_ARCTIC`` names their folder: they are not part of this."""
 
 import os
 from pathlib import Path
