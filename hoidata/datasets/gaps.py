@@ -55,7 +55,7 @@ def trimmed(interval: tuple[int, int], recorded: np.ndarray) -> Interval:
 
 
 def numbered(source_frames: np.ndarray, recorded: np.ndarray) -> np.ndarray:
-    """Numbers (frame,) in which a frame that is not recorded has that of the recorded one before it (``Clip.recorded``).
+    """(frame,) numbers in which a made frame has that of the recorded one before it, as ``Clip.recorded`` reads them.
 
     recorded: (frame,) bool, True in the first frame.
     """

@@ -79,9 +79,9 @@ class H2OAdapter(Described):
     margin_frames: frames kept before and after each run. shortest_frames: runs must be this long or longer.
     hands: "mano" reads MANO parameters, which need the licensed MANO files; "keypoints" fits the given hand to the 21
     joints instead and needs none.
-    Gaps of at most three frames in the object's poses are bridged. Runs are those of the per-frame action labels; for a sequence without any (subject4, whose labels are withheld) the
+    Runs are those of the per-frame action labels; for a sequence without any (subject4, whose labels are withheld) the
     segments of ``label_split``. A run is split where the tracked object is not the one its label names, or, without
-    a label, not the one that is tracked most.
+    a label, not the one that is tracked most. Up to three frames without an object are bridged.
     """
 
     facts = facts_beside(__file__)

@@ -252,7 +252,8 @@ def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
 def frame_times(where: str, times_ns: list[np.ndarray]) -> np.ndarray:
     """(frame,) int64, ns: the first time of each frame; times of one frame lie less than 2 ms apart.
 
-    Up to three frames that no file has are added between those that are there, so that they can be bridged. Raises BadInput where frames are nearer to each other than half of 1/30 s.
+    Up to three frames that no file has are added between those that are there, so that they can be bridged. Raises
+    BadInput where frames are nearer to each other than half of 1/30 s.
     """
     times = np.unique(np.concatenate(times_ns))
     first = times[np.r_[True, np.diff(times) > SAME_NS]]

@@ -62,8 +62,9 @@ def test_made_frames_have_the_number_of_the_recorded_one_before_them(make_clip) 
     clip = make_clip().take(slice(0, 7))
     marked = check_clip(replace(clip, source_frames=numbers, source_fps=120.0))
     assert np.array_equal(marked.recorded, recorded)
-    with pytest.raises(BadInput, match="rising frame numbers"):
-        check_clip(replace(clip, source_frames=numbers[::-1]))
+    for wrong in (numbers[::-1], np.array([20, 24, 24, 25, 36, 40, 44], np.int32)):  # 25 is one frame after 24, not two
+        with pytest.raises(BadInput, match="rising frame numbers"):
+            check_clip(replace(clip, source_frames=wrong, source_fps=120.0))
 
 
 def test_an_interval_is_trimmed_to_recorded_frames() -> None:
