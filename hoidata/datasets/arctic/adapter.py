@@ -107,7 +107,8 @@ class ArcticAdapter(Described):
         """Descriptions are needed only where clips are cut by them."""
         files = _below_tops("description/s*/*/description.txt")
         where = "Text2HOI's description files (linked from its and ARCTIC's page)"
-        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional=self.clips != "described"))
+        optional = self.clips != "described"
+        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional, "clips=whole"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence that has any of its files; they are paired by name, never by position."""

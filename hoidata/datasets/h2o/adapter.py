@@ -85,6 +85,7 @@ class H2OAdapter(Described):
     """
 
     facts = facts_beside(__file__)
+    without_mano = "hands=keypoints"
     margin_frames: int = 0
     shortest_frames: int = 21
     hands: HandSource = "mano"
@@ -219,7 +220,7 @@ def _tracked_pieces(
     """
     named_frames = f"frames {frames.first + start} to {frames.first + stop - 1}"
     if stop - start < shortest:
-        got, remedy = f"{stop - start} ({named_frames})", "nothing to do: it is left out"
+        got, remedy = f"{stop - start} ({named_frames})", "nothing to do, or lower the setting shortest_frames"
         raise BadInput(where, f"a run of {shortest} frames or more", got, remedy)
     classes = frames.classes[start:stop]
     counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))

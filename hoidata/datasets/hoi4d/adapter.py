@@ -124,7 +124,8 @@ class Hoi4dAdapter(Described):
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
         """Events are needed only where clips are cut by them."""
-        return (*PARTS, DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", optional=self.clips == "whole"))
+        optional = self.clips == "whole"
+        return (*PARTS, DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", optional, "clips=whole"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per recording that has a folder of annotations; its subject is the person, ``H2``."""
@@ -192,6 +193,9 @@ class Hoi4dAdapter(Described):
             _, _, category, *_, task = key.name.split("/")
             return [_Wanted(str(key), 0, n_frames, TASKS.get((category, task)), None)], []
         path = f"{ANNOTATIONS}/{key.name}/action/color.json"
+        if not raw.has(path):
+            remedy = "unpack HOI4D_annotations.zip here, or set clips: whole, which needs no events"
+            raise BadInput(path, "the events of the recording", "no file", remedy)
         wanted, unknown = dict[tuple[int, int], _Wanted](), list[Quarantined]()
         for event in action_events(raw.read(path), path):
             start, stop = event.start, min(event.stop, n_frames)

@@ -39,6 +39,7 @@ SAME_NS = 2_000_000  # the cameras of one Aria look a tenth of a millisecond apa
 TOUCH_M, MOVED_M, BRIDGE_FRAMES = 0.02, 0.02, 10
 # Aria's worlds have z up, those of Quest 3 y, as the makers' viewer says.
 WORLD_FROM = {"Aria": np.eye(3), "Quest3": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
+LOWER = "nothing to do, or lower the setting shortest_frames"
 GRAVITY = np.array([0.0, 0.0, -1.0])
 FRAME = WorldFrame("+z", "stated", "the headset's world, metres, z up; Quest 3's, y up, is turned about x")
 PARAMETERS = HandConvention(
@@ -116,6 +117,7 @@ class Hot3dAdapter(Described):
     """
 
     facts = facts_beside(__file__)
+    without_mano = "hands=umetrack"
     hands: HandFormat = "mano"
     margin_frames: int = 0
     shortest_frames: int = 30
@@ -188,9 +190,9 @@ class Hot3dAdapter(Described):
             yield from gaps
             if found.cut:
                 expected = f"touches of {self.shortest_frames} frames between missing poses of the object or a hand"
-                yield _left_out(whole, f"{name}/cut", expected, found.cut)
+                yield _left_out(whole, f"{name}/cut", expected, found.cut, LOWER)
             if found.short:
-                yield _left_out(whole, f"{name}/short", f"touches of {self.shortest_frames} frames", found.short)
+                yield _left_out(whole, f"{name}/short", f"touches of {self.shortest_frames} frames", found.short, LOWER)
             if found.still:
                 yield _left_out(whole, f"{name}/still", f"an object that moves {100 * MOVED_M:g} cm", found.still)
             for interval in found.frames:
@@ -216,7 +218,11 @@ class Hot3dAdapter(Described):
             return replace(clip, fit_error_m=mean_m)
         expected = f"hands that miss UmeTrack's joints by {self.most_fit_error_mm} mm or less on average"
         return Quarantined(
-            clip_id, recording.source.place, expected, f"{1000 * mean_m:.1f} mm", "nothing to do, or raise the limit"
+            clip_id,
+            recording.source.place,
+            expected,
+            f"{1000 * mean_m:.1f} mm",
+            "nothing to do, or raise the setting most_fit_error_mm",
         )
 
     def _intervals(self, thing: _Thing, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray) -> _Found:
@@ -381,7 +387,9 @@ def _divided(interval: Interval, longest: int) -> list[Interval]:
     return [Interval(a, b) for a, b in pairwise(edges)]
 
 
-def _left_out(whole: Clip, what: str, expected: str, intervals: list[Interval]) -> Quarantined:
+def _left_out(
+    whole: Clip, what: str, expected: str, intervals: list[Interval], remedy: str = "nothing to do"
+) -> Quarantined:
     n_frames = sum(stop - start for start, stop in intervals)
     got = f"{len(intervals)} others, {n_frames} frames, the first frame {intervals[0].start}"
-    return Quarantined(f"{whole.clip_id}/{what}", whole.sequence, expected, got, "nothing to do")
+    return Quarantined(f"{whole.clip_id}/{what}", whole.sequence, expected, got, remedy)
