@@ -6,11 +6,15 @@ from functools import lru_cache
 import orjson
 
 from hoidata.dataset_folders import dataset_folder
+from hoidata.errors import BadInput
 
 
 @dataclass(frozen=True)
 class Published:
-    """sequences: all names, empty where no list is published. without_ground_truth: beginnings of withheld ones.
+    """What ``published.json`` states; what it leaves out is not known.
+
+    source: where the lists are from, or why there is none. sequences: all names. without_ground_truth: beginnings of
+    withheld ones.
 
     motion_files: patterns of the raw files that hold motion; other raw files (meshes, templates) serve many sequences.
     segments, frames: per sequence, where the source tells.
@@ -38,4 +42,7 @@ def published(dataset: str) -> Published:
         return Published("")
     values = orjson.loads(path.read_bytes())
     lists = {key: tuple(value) for key, value in values.items() if key != "source"}
+    if empty := sorted(key for key, value in lists.items() if not value):
+        remedy = "leave it out, and say in its source why there is none"
+        raise BadInput(f"{path}: {empty[0]}", "a list of one entry or more", "an empty one", remedy)
     return Published(values["source"], **lists)
