@@ -8,6 +8,7 @@ from hoidata.dataset_folders import dataset_title
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.store.annotated import load_annotated
+from hoidata.store.info import stand_in_note
 from hoidata.store.store import Store, open_store
 from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.clip_page_facts import source_frames_text
@@ -62,7 +63,7 @@ def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) ->
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s"),
         ("source frames", source_frames_text(clip)),
         ("files", ", ".join(source.path for source in clip.sources) or "none are recorded"),
-        ("hand model", hands.name),
+        ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(store.info))))),
         ("licence", str(store.info["licence"])),
     ]
     player = motion_player(clip, hands, title)

@@ -13,6 +13,7 @@ from hoidata.files.written import read_json, read_table
 from hoidata.hands import JOINT_NAMES, HandPair
 from hoidata.quality.thresholds import CLIP_MEASURES
 from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.info import stand_in_note
 from pipelines.pages.clip_page_series import ClipSeries
 
 Rows = list[tuple[str, ...]]
@@ -175,7 +176,7 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
         ("source frames", source_frames_text(clip)),
         ("gravity", _gravity(clip)),
         ("hands from", _hands_from(clip)),
-        ("hand model", hands.name),
+        ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(annotated.info))))),
         ("camera", _camera(clip)),
         ("also there", _further(clip)),
         ("licence", licence),
