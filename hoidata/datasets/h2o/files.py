@@ -185,7 +185,7 @@ def _frame_files(raw: RawTree, folder: str) -> set[str]:
 
 def _refuse_other_hands(raw: RawTree, folder: str, wanted_folder: str, wanted: HandSource) -> None:
     """Raise BadInput that names the setting where a copy has hands of the other kind alone."""
-    other = next(name for name in HAND_FOLDERS if name != wanted)
+    other: HandSource = "keypoints" if wanted == "mano" else "mano"
     if not _frame_files(raw, wanted_folder) and _frame_files(raw, _folder_of(raw, folder, HAND_FOLDERS[other][0])):
         remedy = f"download the pose archive of this subject, or set hands: {other}, which reads what is there"
         raise BadInput(wanted_folder, "a folder of NNNNNN.txt files", "none", remedy)

@@ -228,7 +228,8 @@ class Hot3dAdapter(Described):
     def _intervals(self, thing: _Thing, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray) -> _Found:
         """Usable frames without a gap in time in which a hand is at the object, in intervals of suitable length."""
         found, near = _Found([], [], [], []), _near(thing, joints_m)
-        known = np.stack([thing.has_pose, *np.isfinite(joints_m).all(axis=2).reshape(len(times), 2, -1).all(axis=2).T])
+        sides = np.split(joints_m, len(SIDES), axis=1)
+        known = np.stack([thing.has_pose, *(np.isfinite(side).all(axis=(1, 2)) for side in sides)])
         for first, last in _unbroken(times):
             inside = np.zeros(len(times), bool)
             inside[first:last] = usable[first:last]

@@ -95,7 +95,7 @@ class TacoAdapter(Described):
         )
         start, stop = _touched(whole, hands)
         clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
-        without_shape = [side for side in SIDES if not _has_shape(raw, key, side)]
+        without_shape: list[Side] = [side for side in SIDES if not _has_shape(raw, key, side)]
         notes = [clip.gravity_note, *(SHAPE_NOTE.format(side=side) for side in without_shape)]
         reasons = [
             Quarantined(
