@@ -193,9 +193,9 @@ class Hoi4dAdapter(Described):
             _, _, category, *_, task = key.name.split("/")
             return [_Wanted(str(key), 0, n_frames, TASKS.get((category, task)), None)], []
         path = f"{ANNOTATIONS}/{key.name}/action/color.json"
-        if not raw.has(path):
+        if not raw.has(path) and path not in (raw.manifest or ()):
             remedy = "unpack HOI4D_annotations.zip here, or set clips: whole, which needs no events"
-            raise BadInput(path, "the events of the recording", "no file", remedy)
+            raise BadInput(path, "a file with the events of the recording", "nothing there", remedy)
         wanted, unknown = dict[tuple[int, int], _Wanted](), list[Quarantined]()
         for event in action_events(raw.read(path), path):
             start, stop = event.start, min(event.stop, n_frames)
