@@ -8,8 +8,10 @@ from hoidata.dataset_folders import dataset_title
 from hoidata.errors import BadInput, MissingResource
 from hoidata.hands import HandPair
 from hoidata.store.annotated import load_annotated
+from hoidata.store.info import stand_in_note
 from hoidata.store.store import Store, open_store
 from pipelines.pages.clip_page import page_name, write_clip_page
+from pipelines.pages.clip_page_facts import source_frames_text
 from pipelines.pages.dataset_page import write_dataset_page
 from pipelines.pages.player import motion_player, write_page
 from pipelines.params import read_params
@@ -59,9 +61,9 @@ def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) ->
         ("clip", clip_id),
         ("dataset", f"{clip.dataset}, subject {clip.subject}, sequence {clip.sequence}"),
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s"),
-        ("source frames", f"{clip.source_frames[0]:g} to {clip.source_frames[-1]:g} at {clip.source_fps:g} per second"),
+        ("source frames", source_frames_text(clip)),
         ("files", ", ".join(source.path for source in clip.sources) or "none are recorded"),
-        ("hand model", hands.name),
+        ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(store.info))))),
         ("licence", str(store.info["licence"])),
     ]
     player = motion_player(clip, hands, title)

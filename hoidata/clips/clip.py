@@ -39,6 +39,7 @@ class HandTrack(Track):
     wrist_m: (frame, 3) world position of joint 0, metres. Not MANO's ``transl``: joint 0 lies exactly here.
     global_orient: (frame, 3) axis-angle, radians, world frame; the hand turns about its wrist joint.
     hand_pose: (frame, 45) axis-angle of the 15 finger joints, absolute (zero is the flat hand), never mean-relative.
+    Adapters give rotations of at most pi. Where one passes pi its axis flips: compare rotations, not these numbers.
     betas: (1, 10) for the whole clip or (frame, 10).
     valid: (frame,) bool; a False frame holds finite numbers that mean nothing.
     template_m: (778, 3) personal rest mesh that replaces the model's template, or None.
@@ -210,8 +211,8 @@ class Clip:
     dataset, subject: names as in the source. sequence: the source sequence the clip was cut from.
     hands: both sides always present; ``valid`` says which frames mean something.
     object: the manipulated object; other_objects: further tracked objects of the scene.
-    source_frames: (frame,) int32 index of each frame in the source file, counted from 0; of a source below 30 fps a
-    frame that was made between two has the number of the one before it (``recorded``).
+    source_frames: (frame,) int32 index of each frame in the source file, counted from 0. A frame that was made between
+    two (a source below 30 fps, a short gap in an object's poses) has the number of the one before it (``recorded``).
     gravity: (3,) unit vector, the direction things fall in the world frame, or None when it is not known.
     gravity_note: empty where the source states gravity; else how it was estimated, or why it is not known.
     verb: the action in words ("take out", "hand over"), or None when the source has no label.

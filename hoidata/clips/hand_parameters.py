@@ -3,7 +3,8 @@
 MANO's ``transl`` places the hand so that its wrist joint lies at ``J0 + transl``, where J0 is the wrist of the shaped
 rest mesh (about 10 cm from the model's origin); the hand turns about J0. Other sources give the wrist itself. Once a
 hand is known by its wrist position, a change of frame is the plain ``R' = A R``, ``wrist' = A wrist + b``.
-Finger angles are added as they are: angles beyond pi survive.
+The mean pose is added to the numbers of the source as they are. Then rotations beyond pi are stored as the equal
+rotations of at most pi (``canonical_rotvec``): numbers of equal poses are near each other, except across pi itself.
 """
 
 from dataclasses import asdict, dataclass, replace
@@ -13,7 +14,7 @@ import numpy as np
 
 from hoidata.clips.clip import HandTrack
 from hoidata.errors import BadInput
-from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import canonical_rotvec, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.hands import HandModel, HandPair
 from hoidata.hands.model import N_POSE
 
@@ -153,11 +154,15 @@ def hand_track(
     valid: np.ndarray | None = None,
     template_m: np.ndarray | None = None,
 ) -> HandTrack:
-    """A HandTrack in float32: zeros where the hand is not valid, one row of betas where they do not vary."""
+    """A HandTrack in float32: zeros where the hand is not valid, one row of betas where they do not vary.
+
+    Rotations beyond pi become the equal ones of at most pi.
+    """
     valid = np.ones(len(wrist_m), dtype=bool) if valid is None else np.asarray(valid, dtype=bool)
+    hand_pose = canonical_rotvec(hand_pose.reshape(len(wrist_m), N_POSE // 3, 3)).reshape(len(wrist_m), N_POSE)
     return HandTrack(
         wrist_m=_float32(wrist_m, valid),
-        global_orient=_float32(global_orient, valid),
+        global_orient=_float32(canonical_rotvec(global_orient), valid),
         hand_pose=_float32(hand_pose, valid),
         betas=_short_betas(np.asarray(betas, dtype=np.float32), valid),
         valid=valid,

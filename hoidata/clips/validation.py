@@ -19,7 +19,7 @@ def check_clip(clip: Clip) -> Clip:
     Raises BadInput that names the clip and the field.
     """
     n_frames = clip.n_frames
-    if n_frames < 1 or np.any(np.diff(clip.source_frames) < (0 if clip.source_fps < FPS else 1)):
+    if n_frames < 1 or not frame_numbers_rise(clip.source_frames, clip.source_fps):
         raise BadInput(f"{clip.clip_id}: source_frames", "1 or more rising frame numbers", f"{n_frames}", REMEDY)
     if tuple(clip.hands) != SIDES:
         raise BadInput(f"{clip.clip_id}: hands", f"{SIDES}", f"{tuple(clip.hands)}", REMEDY)
@@ -36,6 +36,16 @@ def check_clip(clip: Clip) -> Clip:
     if clip.source_contact is not None:
         _check_contact(f"{clip.clip_id}: source_contact", clip.source_contact, n_frames, clip.object)
     return clip
+
+
+def frame_numbers_rise(source_frames: np.ndarray, source_fps: float) -> bool:
+    """Whether numbers (frame,) of source frames rise; made frames repeat the number before them.
+
+    Of a source with 30 frames per second or more as many numbers must be passed over as frames were made.
+    """
+    recorded = np.flatnonzero(np.diff(source_frames, prepend=source_frames[:1] - 1))
+    steps = np.diff(source_frames[recorded])
+    return bool((steps > 0).all() and (source_fps < FPS or (steps >= np.diff(recorded)).all()))
 
 
 def _check_world(clip: Clip) -> None:

@@ -135,7 +135,11 @@ def _picklable(adapter: Adapter) -> list[str]:
 
 def _parts(adapter: Adapter, root: Path) -> list[str]:
     absent = [part for part in adapter.parts if not part.optional and not part.is_in(root)]
-    return [f"no {part.what} ({', '.join(part.patterns)}); it comes from {part.where}" for part in absent]
+    return [
+        f"no {part.what} ({', '.join(part.patterns)}); it comes from {part.where}"
+        + (f"; the setting {part.unneeded_with} does without it" if part.unneeded_with else "")
+        for part in absent
+    ]
 
 
 def _keys(adapter: Adapter, keys: list[SequenceKey]) -> list[str]:

@@ -29,3 +29,8 @@ def finding(rule: str, problems: Sequence[str], outcome: Literal["fail", "warn"]
 
 def skipped(rule: str, why: str) -> Finding:
     return Finding(rule, "skip", why)
+
+
+def undecided(rule: str, why: str) -> Finding:
+    """There is too little in the input for a verdict, good or bad."""
+    return Finding(rule, "skip", f"not decided: {why}")

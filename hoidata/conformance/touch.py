@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
-from hoidata.conformance.report import Finding, finding, skipped
+from hoidata.conformance.report import Finding, finding, skipped, undecided
 from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
 from hoidata.hands import HandModel, HandPair, track_joints
 from hoidata.objects.distance import closest_points
@@ -23,6 +23,8 @@ FAR_M = 0.05
 MOST = 0.6
 MUCH_BETTER = 0.65
 LEAST_TURN_RAD = np.deg2rad(0.5)
+# One clip shows one object in nearly one pose: a wrong reading may fit it by chance. At most 24 frames of each count.
+FEWEST_FRAMES = 40
 MIDDLE_FINGER = (0, 4, 5, 6, 17)
 FIRST_TIP = 16
 FINGERS = (1, 4, 7, 10)  # first joints of index, middle, pinky, ring
@@ -40,14 +42,17 @@ class _Touch:
 
 
 def touch_findings(clips: list[Clip], hands: HandPair) -> list[Finding]:
-    """Rules over at most 24 frames of 12 clips, all warnings: data of an unusual kind may break them rightly."""
+    """Rules over at most 24 frames of 12 clips, all warnings: data of an unusual kind may break them rightly.
+
+    Fewer than 40 frames in which the rule can look at a hand decide nothing, but for the length of hands.
+    """
     some = [clips[i].take(_spread(clips[i].n_frames, MOST_FRAMES)) for i in _spread(len(clips), MOST_CLIPS)]
     try:
         touches = [_touch(clip, hands) for clip in some]
     except Exception as error:  # arrays that check_clip refused, and which another rule reports
         return [skipped("hands hold objects", f"the clips cannot be measured: {error!r}")]
     return [
-        finding("hands are 0.15 to 0.25 m long", _hand_lengths(some, hands), "warn"),
+        _hand_lengths(some, hands),
         _near(
             "wrists are within 0.3 m of the object when it is nearest",
             [touch.wrist_m for touch in touches],
@@ -96,14 +101,23 @@ def _distances(clip: Clip, points_m: np.ndarray) -> np.ndarray:
     return nearest
 
 
-def _hand_lengths(clips: list[Clip], hands: HandPair) -> list[str]:
-    problems = []
+def _too_few(rule: str, what: str, n_frames: int) -> Finding | None:
+    """That a rule is not decided where it rests on fewer than 40 frames. what: which frames count."""
+    if n_frames >= FEWEST_FRAMES:
+        return None
+    remedy = f"{FEWEST_FRAMES} are needed, at most {MOST_FRAMES} of each clip count: load more sequences"
+    return undecided(rule, f"{n_frames} frames {what}; {remedy}")
+
+
+def _hand_lengths(clips: list[Clip], hands: HandPair) -> Finding:
+    rule, problems, measured = "hands are 0.15 to 0.25 m long", [], 0
     for clip in clips:
         for side in SIDES:
             length_m = _hand_length_m(clip, side, hands)
+            measured += length_m is not None
             if length_m is not None and not HAND_LENGTH_M[0] <= length_m <= HAND_LENGTH_M[1]:
                 problems.append(f"{clip.clip_id}: the {side} hand is {length_m:.3g} m long: unit of shape or mesh?")
-    return problems
+    return finding(rule, problems, "warn") if measured else undecided(rule, "no hand is valid in any frame")
 
 
 def _hand_length_m(clip: Clip, side: Side, hands: HandPair) -> float | None:
@@ -117,6 +131,9 @@ def _hand_length_m(clip: Clip, side: Side, hands: HandPair) -> float | None:
 
 def _near(rule: str, distances_m: list[np.ndarray], limit_m: float, question: str) -> Finding:
     """Whether the smallest distance of most clips is within the limit."""
+    n_frames = sum(int(np.isfinite(distance).any(axis=0).sum()) for distance in distances_m)
+    if few := _too_few(rule, "with a hand", n_frames):
+        return few
     nearest = [distance[np.isfinite(distance)].min(initial=np.inf) for distance in distances_m]
     share = np.mean([value <= limit_m for value in nearest])
     text = f"only in {share:.0%} of clips; typically {np.median(nearest) * 100:.2g} cm: {question}"
@@ -126,6 +143,9 @@ def _near(rule: str, distances_m: list[np.ndarray], limit_m: float, question: st
 def _bending(clips: list[Clip], hands: HandPair) -> Finding:
     """Fingers flex towards the palm; exchanged or mirrored sides bend them backwards."""
     rule, problems = "fingers bend towards the palm: a left hand is a left hand", []
+    n_frames = sum(int(track.valid.sum()) for clip in clips for track in clip.hands.values())
+    if few := _too_few(rule, "of hands", n_frames):
+        return few
     for side in SIDES:
         angles = [_flexion_rad(clip, side, hands) for clip in clips if clip.hands[side].valid.any()]
         if angles and np.median(angles) < np.deg2rad(-3):
@@ -152,12 +172,16 @@ def _flexion_rad(clip: Clip, side: Side, hands: HandPair) -> float:
 def _other_readings(clips: list[Clip], touches: list[_Touch], hands: HandPair) -> Finding:
     """Whether fingertips are much nearer the object when the same numbers are read in another way."""
     rule, problems = "no other reading of the numbers brings the fingertips nearer", []
+    n_frames = sum(int(np.isfinite(touch.tips_m).any(axis=0).sum()) for touch in touches)
+    if few := _too_few(rule, "with a hand", n_frames):
+        return few
     for what, reading in READINGS.items():
         pairs = [
             _paired(touch, _touch(reading(clip, hands), hands)) for clip, touch in zip(clips, touches, strict=True)
         ]
         as_is, other = np.mean(pairs, axis=0)
-        if other < MUCH_BETTER * as_is:
+        agrees = [theirs < MUCH_BETTER * ours for ours, theirs in pairs if ours or theirs]
+        if other < MUCH_BETTER * as_is and sum(agrees) > 1:  # what one clip alone says may be chance
             problems.append(f"{other * 1e3:.0f} mm in place of {as_is * 1e3:.0f} mm {what}")
     return finding(rule, problems, "warn")
 
@@ -173,10 +197,11 @@ def _turning(clips: list[Clip], touches: list[_Touch]) -> Finding:
     """A held object turns as the hand does; with transposed rotations it turns the other way."""
     rule = "held objects turn with the hand"
     steps = [_turns(clip, touch) for clip, touch in zip(clips, touches, strict=True)]
-    told = np.concatenate([step for step in steps if len(step)] or [np.zeros((0, 3))])
-    told = told[told[:, 2] > LEAST_TURN_RAD]
-    if len(told) < MOST_FRAMES // 2:
-        return skipped(rule, "no object turns while a hand holds it")
+    turning = [step[step[:, 2] > LEAST_TURN_RAD] for step in steps]
+    told = np.concatenate(turning)
+    if len(told) < MOST_FRAMES // 2 or sum(len(step) > 0 for step in turning) < 2:
+        n_clips = sum(len(step) > 0 for step in turning)
+        return undecided(rule, f"held objects turn in {len(told)} steps of {n_clips} clips: load more sequences")
     as_is, transposed = np.rad2deg(told[:, :2].mean(axis=0))
     if transposed >= MUCH_BETTER * as_is:
         return finding(rule, [])

@@ -14,7 +14,7 @@ from pathlib import Path
 from hoidata.clips.clip import Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conformance.loading import Loaded, first_difference, load_recorded
-from hoidata.conformance.report import Finding, finding, skipped
+from hoidata.conformance.report import Finding, finding, skipped, undecided
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
@@ -99,9 +99,14 @@ class Trials:
                 crashes += crash
                 unclear += vague
                 _link(self.root / file.relative_to(copy), file)
+        rules = (
+            "a damaged file raises BadInput, or gives valid clips",
+            "errors name the file and say what was expected, what came and what to do",
+        )
+        nothing = "the clips name no file that could be damaged"
         return [
-            finding("a damaged file raises BadInput, or gives valid clips", crashes),
-            finding("errors name the file and say what was expected, what came and what to do", unclear),
+            finding(rules[0], crashes) if paths else undecided(rules[0], nothing),
+            finding(rules[1], unclear) if paths else undecided(rules[1], nothing),
             self._others_go_on(copy, item, own),
         ]
 

@@ -23,7 +23,7 @@ from hoidata.datasets.base import Adapter, RawTree, Recorded, SequenceKey
 from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.files.atomic import exclusive, remove_leftovers
 from hoidata.hands import HandPair
-from hoidata.store.info import store_info
+from hoidata.store.info import stand_in_note, store_info
 from hoidata.store.store import open_store, write_store
 from hoidata.workers import WorkerLost, in_workers
 
@@ -36,7 +36,7 @@ class ConversionSummary:
     """What a conversion did.
 
     left_out: every sequence, or stretch of one, that gave no clip, with its reason. taken_up: sequences an interrupted
-    run had finished before.
+    run had finished before. warning: what is wrong with every clip, or "".
     """
 
     dataset: str
@@ -46,13 +46,15 @@ class ConversionSummary:
     left_out: tuple[Quarantined, ...]
     empty_reason: str | None = None
     taken_up: int = 0
+    warning: str = ""
 
     def __str__(self) -> str:
         if self.empty_reason:
             return f"{self.dataset}: empty ({self.empty_reason})"
         head = f"{self.dataset}: {self.clips} clips, {self.frames} frames from {self.sequences} sequences"
         head += f" ({self.taken_up} finished before)" if self.taken_up else ""
-        lines = [f"{head}; {len(self.left_out)} left out{':' if self.left_out else ''}"]
+        lines = [f"warning: {self.warning}"] if self.warning else []
+        lines.append(f"{head}; {len(self.left_out)} left out{':' if self.left_out else ''}")
         for item in self.left_out:
             lines.append(f"  {item.source_key}: {item.where}: expected {item.expected}, got {item.got}; {item.remedy}")
         return "\n".join(lines)
@@ -100,11 +102,15 @@ def convert_dataset(
         work.open(job_of(adapter, hands, root, keys, listed, synthetic))
         taken_up = _convert_all(convert, keys, jobs, lock, progress)
         items = chain(unnamed, (item for key in keys for item in work.read(key)))
-        counts = write_store(out, items, _store_info(adapter, hands, synthetic, reason))
+        info = _store_info(adapter, hands, synthetic, reason)
+        counts = write_store(out, items, info)
         work.remove()
         # Read back: the store leaves out clips of its own accord, too (an id that is given twice).
         left_out = tuple(Quarantined(**row) for row in open_store(out).quarantine.to_dict("records"))
-    summary = ConversionSummary(adapter.name, len(found), counts["clips"], counts["frames"], left_out, reason, taken_up)
+    warning = stand_in_note(info) if counts["clips"] else ""
+    summary = ConversionSummary(
+        adapter.name, len(found), counts["clips"], counts["frames"], left_out, reason, taken_up, warning
+    )
     if progress:
         print(summary, file=sys.stdout)
     return summary

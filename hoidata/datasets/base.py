@@ -46,13 +46,15 @@ class DatasetPart:
     """Files a raw folder must hold: at least one match of one of ``patterns`` (globs below the raw root).
 
     Every file the adapter may read matches a pattern of some part: no other is scanned into a manifest.
-    what: in words; where: the archive or page it comes from. optional: conversion works without it.
+    what: in words; where: the archive or page it comes from. optional: conversion works without it. unneeded_with: the
+    setting of the adapter that makes a required part optional, ``clips=whole``, or "".
     """
 
     what: str
     patterns: tuple[str, ...]
     where: str
     optional: bool = False
+    unneeded_with: str = ""
 
     def is_in(self, root: Path) -> bool:
         return any(next(Path(root).glob(pattern), None) is not None for pattern in self.patterns)
@@ -124,6 +126,8 @@ class Described:
     """The facts of an adapter, as ``facts.toml`` of its folder states them; it declares ``facts`` alone."""
 
     facts: ClassVar[DatasetFacts]
+    # The setting with which no MANO files are needed, where there is one: ``hands=keypoints``.
+    without_mano: ClassVar[str] = ""
 
     name = property(attrgetter("facts.name"))
     version = property(attrgetter("facts.version"))

@@ -57,6 +57,28 @@ def rotmat_to_rotvec(rotmat: Array) -> Array:
     return vectors.astype(np.result_type(source.dtype, np.float32), copy=False)
 
 
+def canonical_rotvec(rotvec: np.ndarray) -> np.ndarray:
+    """The same rotations as axis-angles (..., 3) of at most pi; vectors that are no longer than pi stay bit for bit."""
+    beyond = np.linalg.norm(np.asarray(rotvec, dtype=np.float64), axis=-1) > np.pi
+    if not beyond.any():
+        return rotvec
+    canonical = rotvec.copy()
+    canonical[beyond] = rotmat_to_rotvec(rotvec_to_rotmat(np.asarray(rotvec[beyond], dtype=np.float64)))
+    return canonical
+
+
+def nearest_rotvec(rotvec: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """Axis-angles (..., 3) of the same rotations as ``rotvec``, less or more one full turn if nearer to ``reference``.
+
+    Differences of axis-angles mean something only between such numbers: 179 and -179 degrees are 2 degrees apart.
+    """
+    angle = np.linalg.norm(rotvec, axis=-1, keepdims=True)
+    turn = 2 * np.pi * np.divide(rotvec, angle, out=np.zeros_like(rotvec), where=angle > 0)
+    each = np.stack([rotvec, rotvec - turn, rotvec + turn])
+    nearest = np.linalg.norm(each - reference, axis=-1).argmin(axis=0)
+    return np.take_along_axis(each, nearest[None, ..., None], axis=0)[0]
+
+
 def rotation_angle(rotmat: np.ndarray) -> np.ndarray:
     """Angle of rotation matrices (..., 3, 3), radians in [0, pi]."""
     return np.arccos(np.clip((np.trace(rotmat, axis1=-2, axis2=-1) - 1) / 2, -1, 1))

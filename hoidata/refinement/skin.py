@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from hoidata.clips.clip import HandTrack
-from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import nearest_rotvec, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import N_ROTATIONS, PARENTS, HandModel
 from hoidata.hands.solver import left_jacobian
@@ -39,7 +39,7 @@ class HandPose(NamedTuple):
     def step_to(self, other: "HandPose") -> np.ndarray:
         """(frame, 51) the step that leads to the other pose."""
         turn = rotmat_to_rotvec(other.orient @ self.orient.swapaxes(-1, -2))
-        fingers = (other.fingers - self.fingers).reshape(len(turn), -1)
+        fingers = (nearest_rotvec(other.fingers, self.fingers) - self.fingers).reshape(len(turn), -1)
         return np.concatenate((other.wrist_m - self.wrist_m, turn, fingers), 1)
 
     def seen_from(self, a_from_world: RigidTransform) -> "HandPose":

@@ -12,7 +12,10 @@ from hoidata.settings import build_config
 
 @dataclass(frozen=True)
 class Published:
-    """sequences: all names, empty where no list is published. without_ground_truth: beginnings of withheld ones.
+    """What ``published.json`` states; what it leaves out is not known.
+
+    source: where the lists are from, or why there is none. sequences: all names. without_ground_truth: beginnings of
+    withheld ones.
 
     motion_files: patterns of the raw files that hold motion; other raw files (meshes, templates) serve many sequences.
     segments, frames: per sequence, where the source tells.
@@ -42,4 +45,8 @@ def published(dataset: str) -> Published:
         values = orjson.loads(path.read_bytes())
     except orjson.JSONDecodeError as error:
         raise BadInput(path, "a JSON object", str(error), "correct it") from error
-    return build_config(Published, values, str(path))
+    found = build_config(Published, values, str(path))
+    if empty := sorted(key for key, value in values.items() if value == []):
+        remedy = "leave it out, and say in its source why there is none"
+        raise BadInput(f"{path}: {empty[0]}", "a list of one entry or more", "an empty one", remedy)
+    return found

@@ -1,5 +1,6 @@
 """The facts of a whole store: what its writer has to say, and how they are checked."""
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
@@ -10,6 +11,11 @@ from hoidata.hands import HandPair, load_embedded_hands
 from hoidata.store.fields import INFO, Field, Version, value_at
 
 _WHERE = "meta/info.json"
+# Of real recordings with the embedded hand, compared with published joints of MANO.
+STAND_IN_ERROR = (
+    "joints are off by 21 to 37 mm on average and wrists by 6 to 11 mm, so contact is off too; "
+    "convert with the MANO files (--hand FOLDER)"
+)
 _OF_THE_WRITER = ("schema_version", "fps", "units", "axes", "counts")
 _TYPES: dict[str, type | tuple[type, ...]] = {
     "string": str, "boolean": bool, "integer": int, "number": (int, float), "object": dict,
@@ -45,6 +51,18 @@ def store_info(
         "may_be_shared": may_be_shared,
         **further,
     }
+
+
+def stand_in_note(info: Mapping[str, Any]) -> str:
+    """What to say of a store of MANO parameters that was converted with the embedded hand in MANO's place; else "".
+
+    Generated raw files were made with the embedded hand, and fitted hands are fitted to the hand that is there: both
+    are right with it. info: of a store, or what ``store_info`` gives.
+    """
+    is_right = info["synthetic"] or info["hand_convention"]["shape"] == "fitted"
+    if is_right or info["hand_model"]["name"] != load_embedded_hands().right.name:
+        return ""
+    return f"{info['dataset']} has MANO parameters, and the embedded hand is no MANO: {STAND_IN_ERROR}"
 
 
 def generated_info(dataset: str, hands: HandPair | None = None, **further: Any) -> dict[str, Any]:

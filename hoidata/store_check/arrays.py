@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES
+from hoidata.clips.clip import SIDES
+from hoidata.clips.validation import frame_numbers_rise
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.store.fields import (
@@ -154,7 +155,7 @@ def _frame_problems(clips: list[dict[str, Any]], arrays: Arrays) -> Iterator[Bad
         where = f"{SEQUENCES.path}: {{}} of {row['clip_id']}"
         frames = slice(row["first_row"], row["first_row"] + row["n_frames"])
         source = arrays["source_frames"][frames]
-        if np.any(np.diff(source) < (0 if row["source_fps"] < FPS else 1)):
+        if not frame_numbers_rise(source, row["source_fps"]):
             yield BadInput(f"{FRAMES.path}: source_frames of {row['clip_id']}", "rising numbers", "others", REMEDY)
         found = {
             "first_source_frame": int(source[0]),

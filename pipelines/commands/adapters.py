@@ -62,7 +62,7 @@ def check(
     from hoidata.datasets.registry import get_adapter
 
     adapter = get_adapter(name, **read_settings(setting or []))
-    hands, note = _hands(hand, adapter.needs_mano)
+    hands, note = _hands(hand, adapter.needs_mano and not root.with_suffix(".recipe").is_file())
     with Console(stderr=True).status(f"loading up to {sequences} sequences of {name}, each several times"):
         findings = check_adapter(adapter, root, hands, sequences)
     bad = {"fail", "warn"} if strict else {"fail"}
@@ -87,10 +87,12 @@ def read_settings(pairs: list[str]) -> dict[str, Any]:
 
 def _hands(choice: str, needs_mano: bool) -> "tuple[HandPair, str]":
     """The hand to check with, and what to say about it."""
+    from hoidata.store.info import STAND_IN_ERROR
+
     hands = chosen_hands(choice)
     note = f"hand: {hands.name}"
     if needs_mano and hands.name == "embedded":
-        note += "; on files made with MANO, warnings about touch mean nothing without --hand FOLDER"
+        note += f"; on files made with MANO warnings about touch mean nothing: {STAND_IN_ERROR}"
     return hands, note
 
 

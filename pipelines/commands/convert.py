@@ -38,9 +38,10 @@ def convert(
     adapter = get_adapter(name, **read_settings(setting or []))
     generated = synthetic or root.with_suffix(".recipe").is_file()
     if adapter.needs_mano and not hand and not generated and own_root(HAND) is None:
+        without_mano = getattr(adapter, "without_mano", "")
         raise MissingResource(
             f"{name} holds MANO parameters; say where MANO_RIGHT.pkl and MANO_LEFT.pkl are: --hand FOLDER "
-            "(register at https://mano.is.tue.mpg.de)"
+            "(register at https://mano.is.tue.mpg.de)" + (f", or give --setting {without_mano}" if without_mano else "")
         )
     hands = chosen_hands(hand or ("embedded" if generated else ""))
     found = convert_dataset(adapter, root, hands, out, jobs or cores(), synthetic=generated)

@@ -90,6 +90,10 @@ def _require_parts(adapter, root: Path, also: str = "") -> None:
         what = "; ".join(f"{part.what} ({part.patterns[0]}, from {part.where})" for part in required)
         got = f"no {what}" if what else "none"
         remedy = f"give the folder that {adapter.name} unpacks to; register at {adapter.where_to_register}"
+        if settings := {part.unneeded_with for part in required if part.unneeded_with}:
+            key, _, value = ", ".join(sorted(settings)).partition("=")
+            remedy += f"; or set `{adapter.name}: {{{key}: {value}}}` under `convert.adapters` in params.yaml, "
+            remedy += "which does without"
         remedy += f". Besides, {also}" if also else ""
         raise BadInput(root, f"sequences of {adapter.name}", got, remedy)
     for part in missing:
@@ -153,6 +157,8 @@ def _say_where_to_get(adapter) -> None:
     typer.echo(f"  {adapter.licence}; {adapter.where_to_register}")
     for part in adapter.parts:
         optional = " (optional)" if part.optional else ""
+        if part.unneeded_with and not part.optional:
+            optional = f" (not needed with the setting {part.unneeded_with})"
         typer.echo(f"  missing: {part.what} ({part.patterns[0]}), from {part.where}{optional}")
     typer.echo(f"  once you have it: hoidata raw scan {adapter.name} --root FOLDER")
 

@@ -5,6 +5,7 @@ from typing import Any
 import pandas as pd
 
 from hoidata.clips.clip import FPS, SIDES
+from hoidata.store.info import stand_in_note
 from hoidata.store.migrate import is_current
 from hoidata.store.store import SCHEMA_VERSION, Store
 
@@ -32,13 +33,18 @@ def fact_rows(store: Store) -> Rows:
         ("raw files", f"{counts['files']:,}, {store.files['size'].sum() / 1e6:,.1f} MB"),
         ("world frame", _frame(info["frame"])),
         ("gravity of the clips", _gravity(store.sequences)),
-        ("hand model", f"{info['hand_model']['name']} {info['hand_model']['digest'][:12]}"),
+        ("hand model", _hand_model(info)),
         ("source's hands", _convention(info["hand_convention"])),
         ("stored hands", "absolute axis-angles, wrist joint in the world"),
         ("valid frames", ", ".join(f"{side} {100 * share:.1f} %" for side, share in valid.items())),
         ("also there", _further(store.sequences)),
         ("left out", f"{counts['quarantined']:,}"),
     ]
+
+
+def _hand_model(info: dict[str, Any]) -> str:
+    note = stand_in_note(info)
+    return f"{info['hand_model']['name']} {info['hand_model']['digest'][:12]}" + (f"; warning: {note}" if note else "")
 
 
 def _frame(frame: dict[str, Any]) -> str:

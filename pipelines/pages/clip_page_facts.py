@@ -12,6 +12,7 @@ from hoidata.files.written import read_table, require_output
 from hoidata.hands import JOINT_NAMES, HandPair
 from hoidata.quality.thresholds import CLIP_MEASURES
 from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.info import stand_in_note
 from pipelines.pages.clip_page_series import ClipSeries
 from pipelines.pages.quality import read_limits
 
@@ -171,10 +172,10 @@ def clip_facts(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Rows:
         ("object", f"{clip.object_words} ({model.name}), {kind}, {len(model.faces):,} triangles"),
         ("other objects", ", ".join(track.model.name for track in clip.other_objects) or NOTHING),
         ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s at {FPS} per second"),
-        ("source frames", _source_frames(clip)),
+        ("source frames", source_frames_text(clip)),
         ("gravity", _gravity(clip)),
         ("hands from", _hands_from(clip)),
-        ("hand model", hands.name),
+        ("hand model", "; ".join(filter(None, (hands.name, stand_in_note(annotated.info))))),
         ("camera", _camera(clip)),
         ("also there", _further(clip)),
         ("licence", licence),
@@ -194,11 +195,14 @@ def _verb(annotated: AnnotatedStore, clip: Clip) -> str:
     return clip.verb or "no label in the source"
 
 
-def _source_frames(clip: Clip) -> str:
-    first, last = int(clip.source_frames[0]), int(clip.source_frames[-1])
-    steps = np.unique(np.diff(clip.source_frames)).tolist()
+def source_frames_text(clip: Clip) -> str:
+    """Which frames of the source a clip has, and how many frames were made between them."""
+    recorded = clip.source_frames[clip.recorded]
+    steps = np.unique(np.diff(recorded)).tolist()
     every = "" if steps == [1] or not steps else f", in steps of {' or '.join(map(str, steps[:3]))}"
-    return f"{first} to {last}{every}; the source has {clip.source_fps:g} per second"
+    made = clip.n_frames - len(recorded)
+    note = f"; {made} of {clip.n_frames} frames are interpolated" if made else ""
+    return f"{recorded[0]} to {recorded[-1]}{every}; the source has {clip.source_fps:g} per second{note}"
 
 
 def _gravity(clip: Clip) -> str:

@@ -11,6 +11,7 @@ from hoidata.dataset_folders import dataset_title
 from hoidata.files import atomic_file
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.info import stand_in_note
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
@@ -58,6 +59,13 @@ class Section:
     missing: list[tuple[str, str]] = field(default_factory=list)
 
 
+# Text encoders that are not CLIP, which Text2HOI has.
+ENCODERS = {
+    "use": "the Universal Sentence Encoder (offline), in the place of Text2HOI's CLIP",
+    "hash": "hashed words, which know no meaning, in the place of Text2HOI's CLIP",
+}
+
+
 def write_report(
     out: str | Path,
     profile: str,
@@ -81,7 +89,7 @@ def write_report(
     page = render_page(
         "report.html", title=f"hoidata report: {profile}", profile=profile, sections=sections,
         empty_sections=[section for section in all_sections if section.facts.empty], synthetic=synthetic,
-        hand_model=hands.name, has_players=has_players,
+        hand_model=hands.name, has_players=has_players, stand_ins=_stand_ins(sections),
     )  # fmt: skip
     for section in sections:
         if section.page:
@@ -90,6 +98,16 @@ def write_report(
     with atomic_file(path) as part:
         part.write_text(page, encoding="utf-8")
     return path
+
+
+def _stand_ins(sections: Sequence[Section]) -> list[str]:
+    """What stands in the place of what a dataset or a method was made with, in sentences."""
+    infos = [section.facts.info for section in sections if section.facts.info]
+    notes = [note for info in infos if (note := stand_in_note(info))]
+    every = [section.facts.annotated.annotation_info for section in sections if section.facts.annotated]
+    names = {str(info["encoder"]["name"]) for info in every}
+    notes += [f"sentences are encoded by {ENCODERS[name]}" for name in sorted(names & ENCODERS.keys())]
+    return notes
 
 
 def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: HandPair) -> Section:

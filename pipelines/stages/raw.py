@@ -54,12 +54,15 @@ def write_generated(paths: StagePaths, manifest: Manifest, root: Path) -> None:
 
 def require_hand(paths: StagePaths) -> None:
     """Refuse a dataset of MANO parameters without MANO files, saying where to register and what to set."""
-    if not configured_adapter(paths.dataset).needs_mano or hand_is_present(paths.profile):
+    adapter = configured_adapter(paths.dataset)
+    if not adapter.needs_mano or hand_is_present(paths.profile):
         return
+    key, _, value = getattr(adapter, "without_mano", "").partition("=")
+    setting = f"; or set `{paths.dataset}: {{{key}: {value}}}` under `convert.adapters` in params.yaml" if key else ""
     raise MissingResource(
         f"{paths.dataset} holds MANO parameters and no MANO files are registered. Register at "
         f"https://mano.is.tue.mpg.de, put MANO_RIGHT.pkl and MANO_LEFT.pkl into one folder, then run "
-        f"`hoidata raw scan mano --root FOLDER` (it can also be named in {root_variable('hand')})"
+        f"`hoidata raw scan mano --root FOLDER` (it can also be named in {root_variable('hand')}){setting}"
     )
 
 

@@ -24,6 +24,7 @@ from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, 
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npy_object
+from hoidata.geometry.rotations import canonical_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.mesh import Mesh
 from hoidata.objects.model import Hinge, ObjectModel
@@ -114,7 +115,8 @@ class ArcticAdapter(Described):
         """Descriptions are needed only where clips are cut by them."""
         files = _below_tops("description/s*/*/description.txt")
         where = "Text2HOI's description files (linked from its and ARCTIC's page)"
-        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional=self.clips != "described"))
+        optional = self.clips != "described"
+        return (*MOTION_PARTS, DatasetPart("segments and words", files, where, optional, "clips=whole"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per sequence that has any of its files; they are paired by name, never by position."""
@@ -250,7 +252,7 @@ def _read_motion(raw: RawTree, key: SequenceKey, hands: HandPair, with_body: boo
     name = re.sub(r"\d+$", "", key.name.partition("/")[2].split("_")[0])
     track = ObjectTrack(
         _object_model(raw, name),
-        rotvec=pose[:, 1:4].astype(np.float32),
+        rotvec=canonical_rotvec(pose[:, 1:4]).astype(np.float32),
         translation_m=(pose[:, 4:7] * MILLIMETRES).astype(np.float32),
         hinge_rad=pose[:, 0].astype(np.float32),
     )

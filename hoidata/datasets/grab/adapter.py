@@ -18,6 +18,7 @@ from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.files import load_npz_objects
 from hoidata.files.array_pieces import npz_members
+from hoidata.geometry.rotations import canonical_rotvec
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 
@@ -178,7 +179,7 @@ def _object_track(file: _SequenceFile, member: str, model: ObjectModel, frames: 
     where, pose = f"{file.path}: {member}", file.params(member)
     orient = checks.table(f"{where}.global_orient", pose["global_orient"], 3, file.n_frames)[frames]
     transl = checks.table(f"{where}.transl", pose["transl"], 3, file.n_frames)[frames]
-    return ObjectTrack(model, -orient.astype(np.float32), transl.astype(np.float32))
+    return ObjectTrack(model, -canonical_rotvec(orient).astype(np.float32), transl.astype(np.float32))
 
 
 def _table(raw: RawTree, file: _SequenceFile, frames: np.ndarray) -> tuple[ObjectTrack, ...]:

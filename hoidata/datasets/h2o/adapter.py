@@ -17,6 +17,7 @@ from hoidata.clips.hand_parameters import HandConvention
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
     LISTS,
@@ -80,10 +81,11 @@ class H2OAdapter(Described):
     joints instead and needs none.
     Runs are those of the per-frame action labels; for a sequence without any (subject4, whose labels are withheld) the
     segments of ``label_split``. A run is split where the tracked object is not the one its label names, or, without
-    a label, not the one that is tracked most.
+    a label, not the one that is tracked most. Up to three frames without an object are bridged.
     """
 
     facts = facts_beside(__file__)
+    without_mano = "hands=keypoints"
     margin_frames: int = 0
     shortest_frames: int = 21
     hands: HandSource = "mano"
@@ -135,14 +137,19 @@ class H2OAdapter(Described):
                         raise BadInput(where, "each stretch once", f"{clip_id} twice", "correct the list")
                     known.add((piece.start, piece.stop))
                     yield piece
+                tracked, inside = frames.classes == frames.classes[piece.start], slice(start, stop)
+                numbers, noun = frames.first + np.arange(len(frames))[inside], OBJECTS[frames.classes[piece.start]]
+                yield from missing_poses(
+                    f"{clip_id}/missing", f"{frames.folder}/obj_pose_rt", noun, numbers, tracked[inside]
+                )
             except BadInput as problem:
                 yield Quarantined.from_error(clip_id, problem)
 
     def _clip(self, sequence: _Sequence, run: _Run) -> Clip:
         frames = sequence.frames
-        same = frames.classes == frames.classes[run.start]
-        start, stop = widened(Interval(run.start, run.stop), self.margin_frames, same)
-        world_from_object = frames.camera[start:stop] @ frames.objects[start:stop]
+        tracked = frames.classes == frames.classes[run.start]
+        start, stop = widened(Interval(run.start, run.stop), self.margin_frames, tracked)
+        world_from_object = frames.camera[start:stop] @ _poses(frames)[start:stop]
         tracks, fit_error_m = sequence.hands.tracks(start, stop)
         source_frames = np.arange(frames.first + start, frames.first + stop, dtype=np.int32)
         return Clip(
@@ -151,12 +158,15 @@ class H2OAdapter(Described):
             subject=sequence.key.subject,
             sequence=sequence.key.name,
             hands=tracks,
-            object=ObjectTrack(
-                sequence.objects[run.noun].model,
-                rotmat_to_rotvec(world_from_object[:, :3, :3]).astype(np.float32),
-                world_from_object[:, :3, 3].astype(np.float32),
+            object=bridge(
+                ObjectTrack(
+                    sequence.objects[run.noun].model,
+                    rotmat_to_rotvec(world_from_object[:, :3, :3]).astype(np.float32),
+                    world_from_object[:, :3, 3].astype(np.float32),
+                ),
+                tracked[start:stop],
             ),
-            source_frames=source_frames,
+            source_frames=numbered(source_frames, tracked[start:stop]),
             gravity=sequence.gravity.direction,
             gravity_note=sequence.gravity.note,
             verb=run.verb,
@@ -210,12 +220,14 @@ def _tracked_pieces(
     """
     named_frames = f"frames {frames.first + start} to {frames.first + stop - 1}"
     if stop - start < shortest:
-        got, remedy = f"{stop - start} ({named_frames})", "nothing to do: it is left out"
+        got, remedy = f"{stop - start} ({named_frames})", "nothing to do, or lower the setting shortest_frames"
         raise BadInput(where, f"a run of {shortest} frames or more", got, remedy)
     classes = frames.classes[start:stop]
     counts = np.bincount(classes[classes > 0], minlength=len(OBJECTS))
     wanted = int(counts.argmax()) if label is None else OBJECTS.index(ACTIONS[label][1])
-    long = [(first, last) for first, last in runs(classes == wanted) if last - first >= shortest]
+    # Short gaps are bridged, but not frames in which another object is said to be tracked.
+    known = has_pose(classes == wanted) & np.isin(classes, (0, wanted))
+    long = [(first, last) for first, last in runs(known) if last - first >= shortest]
     if not counts.any() or not long:
         thing = "one object" if label is None else f"class {wanted} ({OBJECTS[wanted]}), the object of action {label},"
         got = f"classes {np.unique(classes).tolist()} ({named_frames})"
@@ -236,11 +248,15 @@ def _camera_track(frames: SequenceFrames, start: int, stop: int, images: np.ndar
 
 
 def _tracked_objects(frames: SequenceFrames, objects: dict[str, _Object]) -> list[TrackedObject]:
-    # A frame without an object may hold anything.
-    poses = frames.camera @ np.where(frames.classes[:, None, None] == 0, np.eye(4), frames.objects)
+    poses = frames.camera @ _poses(frames)
     return [
         TrackedObject(thing.footing, frames.classes == OBJECTS.index(noun), poses) for noun, thing in objects.items()
     ]
+
+
+def _poses(frames: SequenceFrames) -> np.ndarray:
+    """(frame, 4, 4) camera from object; the identity in frames without an object, which may hold anything."""
+    return np.where(frames.classes[:, None, None] == 0, np.eye(4), frames.objects)
 
 
 def _mesh_path(raw: RawTree, name: str) -> str:

@@ -67,6 +67,7 @@ def read_frames(raw: RawTree, folder: str, hands: HandSource) -> SequenceFrames:
     hand_folder, hand_columns = HAND_FOLDERS[hands]
     kinds = {kind: _folder_of(raw, folder, kind) for kind in ("cam_pose", hand_folder, "obj_pose_rt", "action_label")}
     labelled = bool(_frame_files(raw, kinds["action_label"]))
+    _refuse_other_hands(raw, folder, kinds[hand_folder], hands)
     files = _common_files(raw, [place for kind, place in kinds.items() if labelled or kind != "action_label"])
     camera = _read(raw, kinds["cam_pose"], files, 16).reshape(-1, 4, 4)
     objects = _read(raw, kinds["obj_pose_rt"], files, 17)
@@ -180,6 +181,14 @@ def _folder_of(raw: RawTree, folder: str, kind: str) -> str:
 
 def _frame_files(raw: RawTree, folder: str) -> set[str]:
     return {name for name in raw.names(folder) if _FRAME_FILE.fullmatch(name)}
+
+
+def _refuse_other_hands(raw: RawTree, folder: str, wanted_folder: str, wanted: HandSource) -> None:
+    """Raise BadInput that names the setting where a copy has hands of the other kind alone."""
+    other: HandSource = "keypoints" if wanted == "mano" else "mano"
+    if not _frame_files(raw, wanted_folder) and _frame_files(raw, _folder_of(raw, folder, HAND_FOLDERS[other][0])):
+        remedy = f"download the pose archive of this subject, or set hands: {other}, which reads what is there"
+        raise BadInput(wanted_folder, "a folder of NNNNNN.txt files", "none", remedy)
 
 
 def _common_files(raw: RawTree, folders: list[str]) -> list[str]:

@@ -16,6 +16,7 @@ from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHan
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered, trimmed
 from hoidata.datasets.gravity import TrackedObject, estimate_gravity
 from hoidata.datasets.hinge import box_corners, fit_hinge, hinged_model
 from hoidata.datasets.hoi4d.files import (
@@ -74,10 +75,14 @@ Cut = Literal["described", "whole"]
 
 
 class _Object(NamedTuple):
-    """track, tracked (frame,): at 30 fps. note: how boxes and hinge fit. left_out: frames too far off the hinge."""
+    """track, tracked (frame,): at 30 fps, short gaps bridged and poses of the source or made between two of them.
+
+    recorded: (frame,) poses of the source. note: how boxes and hinge fit. left_out: frames too far off the hinge.
+    """
 
     track: ObjectTrack
     tracked: np.ndarray
+    recorded: np.ndarray
     note: str
     left_out: list[Quarantined]
 
@@ -119,7 +124,8 @@ class Hoi4dAdapter(Described):
     @property
     def parts(self) -> tuple[DatasetPart, ...]:
         """Events are needed only where clips are cut by them."""
-        return (*PARTS, DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", optional=self.clips == "whole"))
+        optional = self.clips == "whole"
+        return (*PARTS, DatasetPart("events", EVENT_FILES, "HOI4D_annotations.zip", optional, "clips=whole"))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per recording that has a folder of annotations; its subject is the person, ``H2``."""
@@ -148,7 +154,7 @@ class Hoi4dAdapter(Described):
             sequence=key.name,
             hands=tracks,
             object=thing.track,
-            source_frames=eyes.images,
+            source_frames=numbered(eyes.images, thing.recorded),
             gravity=gravity,
             gravity_note=f"{gravity_note}; {thing.note}",
             verb=None,
@@ -157,15 +163,20 @@ class Hoi4dAdapter(Described):
             source_fps=self.source_fps,
             camera=eyes,
         )
-        return [*results, *thing.left_out, *unknown, *self._cut(whole, wanted, thing.tracked)]
+        return [*results, *thing.left_out, *unknown, *self._cut(whole, eyes.images, wanted, thing)]
 
-    def _cut(self, whole: Clip, wanted: list[_Wanted], tracked: np.ndarray) -> Iterator[Clip | Quarantined]:
-        """The stretches of each wanted range in which the object is tracked."""
+    def _cut(
+        self, whole: Clip, numbers: np.ndarray, wanted: list[_Wanted], thing: _Object
+    ) -> Iterator[Clip | Quarantined]:
+        """The stretches of each wanted range in which the object has a pose. numbers: (frame,) frames of the source."""
         for item in wanted:
             start, stop = max(0, 2 * item.start - self.margin_frames), 2 * item.stop - 1 + self.margin_frames
-            # From the first recorded frame of each to the last: a made one lies between two.
-            found = [(start + a, start + b) for a, b in runs(tracked[start:stop])]
-            pieces = [(a + a % 2, b - (b - 1) % 2) for a, b in found]
+            inside, where = slice(start, stop), f"{ANNOTATIONS}/{whole.sequence}/objpose"
+            found = [(start + a, start + b) for a, b in runs(has_pose(thing.tracked)[inside])]
+            pieces = [trimmed(piece, thing.recorded) for piece in found]
+            yield from missing_poses(
+                f"{item.clip_id}/missing", where, "the object", numbers[inside], thing.tracked[inside]
+            )
             long = [piece for piece in pieces if piece[1] - piece[0] >= self.shortest_frames]
             if not long:
                 got = f"{max((b - a for a, b in pieces), default=0)} in frames {item.start} to {item.stop - 1}"
@@ -182,6 +193,9 @@ class Hoi4dAdapter(Described):
             _, _, category, *_, task = key.name.split("/")
             return [_Wanted(str(key), 0, n_frames, TASKS.get((category, task)), None)], []
         path = f"{ANNOTATIONS}/{key.name}/action/color.json"
+        if not raw.has(path) and path not in (raw.manifest or ()):
+            remedy = "unpack HOI4D_annotations.zip here, or set clips: whole, which needs no events"
+            raise BadInput(path, "a file with the events of the recording", "nothing there", remedy)
         wanted, unknown = dict[tuple[int, int], _Wanted](), list[Quarantined]()
         for event in action_events(raw.read(path), path):
             start, stop = event.start, min(event.stop, n_frames)
@@ -323,7 +337,9 @@ def _placed(
     )
     both = np.zeros(track.n_frames, bool)
     both[::2], both[1::2] = tracked, tracked[:-1] & tracked[1:]
-    return _Object(track, both, note, left_out)
+    recorded = np.zeros(track.n_frames, bool)
+    recorded[::2] = tracked
+    return _Object(bridge(track, both), both, recorded, note, left_out)
 
 
 def _hands(

@@ -20,6 +20,7 @@ from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHan
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import LONGEST_BRIDGED, bridge, has_pose, missing_poses, numbered, trimmed
 from hoidata.datasets.hot3d import umetrack
 from hoidata.datasets.hot3d.files import HandFormat, Poses
 from hoidata.datasets.hot3d.sources import PARTS, Source, read_source
@@ -38,6 +39,7 @@ SAME_NS = 2_000_000  # the cameras of one Aria look a tenth of a millisecond apa
 TOUCH_M, MOVED_M, BRIDGE_FRAMES = 0.02, 0.02, 10
 # Aria's worlds have z up, those of Quest 3 y, as the makers' viewer says.
 WORLD_FROM = {"Aria": np.eye(3), "Quest3": np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])}
+LOWER = "nothing to do, or lower the setting shortest_frames"
 GRAVITY = np.array([0.0, 0.0, -1.0])
 FRAME = WorldFrame("+z", "stated", "the headset's world, metres, z up; Quest 3's, y up, is turned about x")
 PARAMETERS = HandConvention(
@@ -65,10 +67,18 @@ class _Hands(NamedTuple):
 
 
 class _Thing(NamedTuple):
-    """An object's motion over the whole recording; there: (frame,) bool, where it has a pose."""
+    """An object's motion over the whole recording, short gaps bridged. tracked: (frame,) bool, poses of the source."""
 
     track: ObjectTrack
-    there: np.ndarray
+    tracked: np.ndarray
+
+    @property
+    def has_pose(self) -> np.ndarray:
+        return has_pose(self.tracked)
+
+    def is_known_in(self, frames: slice) -> bool:
+        """Whether it has a pose in every frame, of the source in the first and the last."""
+        return bool(self.has_pose[frames].all() and self.tracked[frames][[0, -1]].all())
 
 
 class _Recording(NamedTuple):
@@ -82,10 +92,14 @@ class _Recording(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """frames: intervals that become clips; short, still: touches too short, or of an object that does not move."""
+    """frames: intervals that become clips; short, still: touches too short, or of an object that does not move.
+
+    cut: touches too short because poses of the object or of a hand are missing before or after them.
+    """
 
     frames: list[Interval]
     short: list[Interval]
+    cut: list[Interval]
     still: list[Interval]
 
 
@@ -103,6 +117,7 @@ class Hot3dAdapter(Described):
     """
 
     facts = facts_beside(__file__)
+    without_mano = "hands=umetrack"
     hands: HandFormat = "mano"
     margin_frames: int = 0
     shortest_frames: int = 30
@@ -168,9 +183,16 @@ class Hot3dAdapter(Described):
         together = np.concatenate(joints, axis=1).astype(np.float64)
         for thing in recording.things:
             name = thing.track.model.name
-            found = self._intervals(thing, thing.there & ~recording.failed, recording.times_ns, together)
+            found = self._intervals(thing, thing.has_pose & ~recording.failed, recording.times_ns, together)
+            gaps = missing_poses(
+                f"{whole.clip_id}/{name}/missing", whole.sequence, name, whole.source_frames, thing.tracked
+            )
+            yield from gaps
+            if found.cut:
+                expected = f"touches of {self.shortest_frames} frames between missing poses of the object or a hand"
+                yield _left_out(whole, f"{name}/cut", expected, found.cut, LOWER)
             if found.short:
-                yield _left_out(whole, f"{name}/short", f"touches of {self.shortest_frames} frames", found.short)
+                yield _left_out(whole, f"{name}/short", f"touches of {self.shortest_frames} frames", found.short, LOWER)
             if found.still:
                 yield _left_out(whole, f"{name}/still", f"an object that moves {100 * MOVED_M:g} cm", found.still)
             for interval in found.frames:
@@ -178,10 +200,17 @@ class Hot3dAdapter(Described):
 
     def _clip(self, whole: Clip, interval: Interval, thing: _Thing, recording: _Recording) -> Clip | Quarantined:
         name, frames, error_m = thing.track.model.name, slice(*interval), recording.hands.error_m
-        others = [other.track for other in recording.things if other is not thing and other.there[frames].all()]
+        others = [other for other in recording.things if other is not thing and other.is_known_in(frames)]
         clip_id = f"{whole.clip_id}/{interval.start:05d}-{interval.stop - 1:05d}-{name}"
-        everything = replace(whole, clip_id=clip_id, object=thing.track, other_objects=tuple(others))
-        clip = replace(everything.take(frames), object_words=object_words(name))
+        recorded = np.logical_and.reduce([own.tracked[frames] for own in (thing, *others)])
+        everything = replace(
+            whole, clip_id=clip_id, object=thing.track, other_objects=tuple(other.track for other in others)
+        )
+        clip = replace(
+            everything.take(frames),
+            object_words=object_words(name),
+            source_frames=numbered(whole.source_frames[frames], recorded),
+        )
         if error_m is None:
             return clip
         mean_m = float(np.nanmean(error_m[frames]))
@@ -189,23 +218,30 @@ class Hot3dAdapter(Described):
             return replace(clip, fit_error_m=mean_m)
         expected = f"hands that miss UmeTrack's joints by {self.most_fit_error_mm} mm or less on average"
         return Quarantined(
-            clip_id, recording.source.place, expected, f"{1000 * mean_m:.1f} mm", "nothing to do, or raise the limit"
+            clip_id,
+            recording.source.place,
+            expected,
+            f"{1000 * mean_m:.1f} mm",
+            "nothing to do, or raise the setting most_fit_error_mm",
         )
 
     def _intervals(self, thing: _Thing, usable: np.ndarray, times: np.ndarray, joints_m: np.ndarray) -> _Found:
         """Usable frames without a gap in time in which a hand is at the object, in intervals of suitable length."""
-        found, near = _Found([], [], []), _near(thing, joints_m)
+        found, near = _Found([], [], [], []), _near(thing, joints_m)
+        sides = np.split(joints_m, len(SIDES), axis=1)
+        known = np.stack([thing.has_pose, *(np.isfinite(side).all(axis=(1, 2)) for side in sides)])
         for first, last in _unbroken(times):
             inside = np.zeros(len(times), bool)
             inside[first:last] = usable[first:last]
             for touch in runs(bridged(near & inside, BRIDGE_FRAMES) & inside):
-                interval = widened(touch, self.margin_frames, inside)
+                interval = trimmed(widened(touch, self.margin_frames, inside), thing.tracked)
                 if interval.stop - interval.start < self.shortest_frames:
-                    found.short.append(touch)
+                    (found.cut if _is_cut(touch, known) else found.short).append(touch)
                 elif not _moves(thing.track, interval):
                     found.still.append(touch)
                 else:
-                    found.frames.extend(_divided(interval, self.longest_frames))
+                    pieces = _divided(interval, self.longest_frames)
+                    found.frames.extend(trimmed(piece, thing.tracked) for piece in pieces)
         return found
 
 
@@ -223,7 +259,8 @@ def _recording(raw: RawTree, source: Source, hands: HandPair) -> _Recording:
 def frame_times(where: str, times_ns: list[np.ndarray]) -> np.ndarray:
     """(frame,) int64, ns: the first time of each frame; times of one frame lie less than 2 ms apart.
 
-    Raises BadInput where frames are nearer to each other than half of 1/30 s.
+    Up to three frames that no file has are added between those that are there, so that they can be bridged. Raises
+    BadInput where frames are nearer to each other than half of 1/30 s.
     """
     times = np.unique(np.concatenate(times_ns))
     first = times[np.r_[True, np.diff(times) > SAME_NS]]
@@ -232,7 +269,12 @@ def frame_times(where: str, times_ns: list[np.ndarray]) -> np.ndarray:
         at = int(steps.argmin())
         expected = "frames 1/30 s apart, or times of one frame within 2 ms"
         raise BadInput(f"{where}: times", expected, f"{first[at]} and {first[at + 1]} ns")
-    return first
+    lost = np.rint(steps / STEP_NS).astype(int) - 1
+    added = [
+        np.linspace(first[at], first[at + 1], lost[at] + 2)[1:-1].round().astype(np.int64)
+        for at in np.flatnonzero((lost > 0) & (lost <= LONGEST_BRIDGED))
+    ]
+    return np.sort(np.concatenate([first, *added]))
 
 
 def rows_of_frames(frames_ns: np.ndarray, times_ns: np.ndarray) -> np.ndarray:
@@ -292,9 +334,10 @@ def _rows(poses: Poses | None, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _thing(raw: RawTree, name: str, path: str, poses: Poses, times: np.ndarray, world: np.ndarray) -> _Thing:
     place = raw.file(path)
     model = _model(name, place, raw.recorded(path)[0].sha256)
-    rows, there = _rows(poses, times)
+    rows, tracked = _rows(poses, times)
     rotvec = rotmat_to_rotvec(world @ poses.rotation)[rows].astype(np.float32)
-    return _Thing(ObjectTrack(model, rotvec, (poses.translation_m @ world.T)[rows].astype(np.float32)), there)
+    track = ObjectTrack(model, rotvec, (poses.translation_m @ world.T)[rows].astype(np.float32))
+    return _Thing(bridge(track, tracked), tracked)
 
 
 @lru_cache(maxsize=48)
@@ -309,7 +352,7 @@ def _near(thing: _Thing, joints_m: np.ndarray) -> np.ndarray:
     model, pose = thing.track.model, thing.track.world_from_object
     local = (joints_m - pose.translation[:, None]) @ pose.rotation
     low, high = model.vertices_m.min(axis=0) - TOUCH_M, model.vertices_m.max(axis=0) + TOUCH_M
-    asked = ((local >= low) & (local <= high)).all(axis=2) & thing.there[:, None]
+    asked = ((local >= low) & (local <= high)).all(axis=2) & thing.has_pose[:, None]
     near = np.zeros(asked.shape, bool)
     if asked.any():
         near[asked] = closest_points(model.vertices_m, model.faces, local[asked]).distance_m < TOUCH_M
@@ -324,6 +367,15 @@ def _moves(track: ObjectTrack, interval: Interval) -> bool:
     return bool(np.linalg.norm(placed - placed[:1], axis=2).max() >= MOVED_M)
 
 
+def _is_cut(interval: Interval, known: np.ndarray) -> bool:
+    """Whether what is known in the first or last frame is lost right before or after. known: (object and hands, frame).
+
+    A hand that is not known there may just not be in view: the touch is another's.
+    """
+    ends = (interval.start, interval.start - 1), (interval.stop - 1, interval.stop)
+    return any((known[:, a] & ~known[:, b]).any() for a, b in ends if 0 <= b < known.shape[1])
+
+
 def _unbroken(times: np.ndarray) -> list[Interval]:
     """Frames that follow each other at 30 a second."""
     edges = np.flatnonzero(np.diff(times) > 1.5 * STEP_NS) + 1
@@ -336,7 +388,9 @@ def _divided(interval: Interval, longest: int) -> list[Interval]:
     return [Interval(a, b) for a, b in pairwise(edges)]
 
 
-def _left_out(whole: Clip, what: str, expected: str, intervals: list[Interval]) -> Quarantined:
+def _left_out(
+    whole: Clip, what: str, expected: str, intervals: list[Interval], remedy: str = "nothing to do"
+) -> Quarantined:
     n_frames = sum(stop - start for start, stop in intervals)
     got = f"{len(intervals)} others, {n_frames} frames, the first frame {intervals[0].start}"
-    return Quarantined(f"{whole.clip_id}/{what}", whole.sequence, expected, got, "nothing to do")
+    return Quarantined(f"{whole.clip_id}/{what}", whole.sequence, expected, got, remedy)

@@ -166,7 +166,9 @@ class ManipNetAdapter(Described):
             verb = motion_verb(lift_m[frames], centre_m[frames], recording.rotation[frames])
             length = stretch.stop - stretch.start
             if length < SHORTEST_FRAMES:
-                results.append(_left_out(key, start, stop + 1, f"{SHORTEST_FRAMES} frames or more", f"{length}"))
+                ends = [frame for frame in (stretch.start - 1, stretch.stop) if 0 <= frame < len(usable)]
+                got = f"{length}" if usable[ends].all() else f"{length}, next to frames that are left out"
+                results.append(_left_out(key, start, stop + 1, f"{SHORTEST_FRAMES} frames or more", got))
             elif verb is None:
                 results.append(_left_out(key, start, stop + 1, "an object that moves", "one that stays on the table"))
             else:

@@ -17,6 +17,7 @@ from hoidata.clips.hand_parameters import HandConvention, to_track
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
+from hoidata.datasets.gaps import has_pose, missing_poses, numbered, trimmed
 from hoidata.datasets.oakink2.files import LARGEST_JSON_BYTES, STEP, Range, Segment, read_annotation, read_program
 from hoidata.datasets.oakink2.scene import OBJECTS, TREE, Scene, Thing, object_names
 from hoidata.datasets.oakink2.words import verb_of
@@ -107,14 +108,19 @@ class Oakink2Adapter(Described):
                 source_fps=self.source_fps,
                 gravity_note="; ".join([GRAVITY_NOTE, *(thing.note for thing in things if thing.note)]),
             )
-            results += self._cut(whole, where, segment.span, np.logical_and.reduce([own.tracked for own in things]))
+            results += self._cut(whole, where, segment.span, things)
         results += scene.left_out
         return [replace(item, sources=raw.sources) if isinstance(item, Clip) else item for item in results]
 
-    def _cut(self, whole: Clip, where: str, span: Range, tracked: np.ndarray) -> Iterator[Clip | Quarantined]:
-        """The intervals of a primitive in which its objects are tracked."""
+    def _cut(self, whole: Clip, where: str, span: Range, things: list[Thing]) -> Iterator[Clip | Quarantined]:
+        """The intervals of a primitive in which its objects have poses."""
         frames, margin = whole.source_frames, self.margin_frames * STEP
-        found = runs((frames >= span[0] - margin) & (frames < span[1] + margin) & tracked)
+        inside = (frames >= span[0] - margin) & (frames < span[1] + margin)
+        known, recorded = (np.logical_and.reduce([of(own.tracked) for own in things]) for of in (has_pose, np.asarray))
+        found = [trimmed(piece, recorded) for piece in runs(inside & known)]
+        for thing in things:
+            name, tracked = thing.track.model.name, thing.tracked[inside]
+            yield from missing_poses(f"{whole.clip_id}/missing {name}", where, name, frames[inside], tracked)
         long = [piece for piece in found if piece.stop - piece.start >= self.shortest_frames]
         if not long:
             got = f"{max((b - a for a, b in found), default=0)} in mocap frames {span[0]} to {span[1] - 1}"
@@ -122,7 +128,8 @@ class Oakink2Adapter(Described):
             yield Quarantined(whole.clip_id, where, expected, got, "nothing to do, or lower shortest_frames")
         for start, stop in long:
             own = "" if len(long) == 1 else f"/{frames[start]:06d}"
-            yield replace(whole.take(slice(start, stop)), clip_id=f"{whole.clip_id}{own}")
+            clip = replace(whole.take(slice(start, stop)), clip_id=f"{whole.clip_id}{own}")
+            yield replace(clip, source_frames=numbered(frames[start:stop], recorded[start:stop]))
 
 
 def _reason(segment: Segment, things: list[Thing]) -> tuple[str, str] | None:

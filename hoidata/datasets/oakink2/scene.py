@@ -9,6 +9,7 @@ import numpy as np
 from hoidata.clips.clip import ObjectTrack
 from hoidata.clips.quarantine import Quarantined
 from hoidata.datasets.base import RawTree
+from hoidata.datasets.gaps import bridge
 from hoidata.datasets.hinge import HingeFit, box_corners, hinge_between, hinged_model
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.datasets.oakink2.files import LARGEST_JSON_BYTES, Annotation, read_names, read_roots
@@ -23,7 +24,10 @@ TREE = "object_affordance/object_part_tree.json"
 
 
 class Thing(NamedTuple):
-    """A part, or two with a hinge. words: None where it has no name. note: how the parts keep to the hinge, or ""."""
+    """A part, or two with a hinge, short gaps in its poses bridged. tracked: (frame,) bool, poses of the source.
+
+    words: None where it has no name. note: how the parts keep to the hinge, or "".
+    """
 
     track: ObjectTrack
     tracked: np.ndarray
@@ -89,7 +93,7 @@ class Scene:
     def _part(self, name: str) -> Thing:
         mesh, poses = self._mesh(name), self.seen.parts[name]
         model = ObjectModel(name, mesh.vertices, mesh.faces, np.zeros(len(mesh.vertices), np.uint8))
-        return Thing(_track(model, poses.world_from_part), poses.tracked, self._words(name))
+        return Thing(bridge(_track(model, poses.world_from_part), poses.tracked), poses.tracked, self._words(name))
 
     def _hinged(self, root: str, pair: list[str]) -> Thing | None:
         """Two parts as one object, the one with the bigger surface as its base; None where no hinge fits them.
@@ -120,10 +124,10 @@ class Scene:
         good[frames[off]] = False
         name = f"{self.key}/hinge of {model.name}"
         left_out = (fit.left_out(name, self.path, self.seen.frames[frames], *limits),) if off.any() else ()
-        # Frames in which one of both is not tracked repeat the one before; no clip has them.
+        # Frames in which one of both is not tracked repeat the one before, until short gaps are bridged.
         source = np.clip(np.searchsorted(frames, np.arange(len(tracked)), side="right") - 1, 0, None)
         track = _track(model, fit.world_from_object[source], fit.hinge_rad[source])
-        return Thing(track, good, words, f"{model.name}: {fit.note}", left_out)
+        return Thing(bridge(track, good), good, words, f"{model.name}: {fit.note}", left_out)
 
 
 def _surface_m2(mesh: Mesh) -> float:

@@ -31,6 +31,7 @@ TOUCH_M = 0.02
 HANDS, OBJECTS, MODELS = "Hand_Poses", "Object_Poses", "Object_Models"
 FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, or a word before it
 FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
+SHAPE_NOTE = "no {side}_hand_shape.pkl: its betas are zero, as in TACO's own loader"
 GRAVITY_NOTE = "TACO's world frame differs from day to day and its axes are not documented"
 CONVENTION = HandConvention(
     translation="wrist",
@@ -94,7 +95,19 @@ class TacoAdapter(Described):
         )
         start, stop = _touched(whole, hands)
         clip = whole.take(slice(max(0, start - self.margin_frames), stop + self.margin_frames))
-        return [replace(clip, sources=raw.sources)]
+        without_shape: list[Side] = [side for side in SIDES if not _has_shape(raw, key, side)]
+        notes = [clip.gravity_note, *(SHAPE_NOTE.format(side=side) for side in without_shape)]
+        reasons = [
+            Quarantined(
+                f"{key}/{side}-shape",
+                _shape_path(key, side),
+                "the shape of the hand",
+                "no file",
+                "nothing to do: the clip has zero betas, as TACO's own loader gives them",
+            )
+            for side in without_shape
+        ]
+        return [replace(clip, sources=raw.sources, gravity_note="; ".join(notes)), *reasons]
 
 
 def frames_of(where: str, keys: Mapping[Side, list[Hashable]], n_frames: int) -> dict[Side, dict[Hashable, int]]:
@@ -150,23 +163,39 @@ def _hands(raw: RawTree, key: SequenceKey, tool: ObjectTrack) -> dict[Side, Sour
     folder = f"{HANDS}/{key.name}"
     poses: dict[Side, Poses] = {side: _dictionary(raw, f"{folder}/{side}_hand.pkl") for side in SIDES}
     frames = frames_of(folder, {side: list(poses[side]) for side in SIDES}, tool.n_frames)
-    return {side: _hand(raw, folder, side, poses[side], frames[side], tool.n_frames) for side in SIDES}
+    return {side: _hand(raw, key, side, poses[side], frames[side], tool.n_frames) for side in SIDES}
+
+
+def _shape_path(key: SequenceKey, side: Side) -> str:
+    return f"{HANDS}/{key.name}/{side}_hand_shape.pkl"
+
+
+def _has_shape(raw: RawTree, key: SequenceKey, side: Side) -> bool:
+    """Whether a hand's shape is there, or is listed in the manifest and so has to be."""
+    path = _shape_path(key, side)
+    return raw.has(path) or path in (raw.manifest or ())
+
+
+def _betas(raw: RawTree, key: SequenceKey, side: Side) -> np.ndarray:
+    """(1, 10), zero where there is no file: so reads TACO's own loader (``read_hand_shape`` of its dataset_utils)."""
+    if not _has_shape(raw, key, side):
+        return np.zeros((1, 10))
+    path = _shape_path(key, side)
+    return _row(f"{path}: hand_shape", checks.entry(path, _dictionary(raw, path), "hand_shape"), 10)[None]
 
 
 def _hand(
-    raw: RawTree, folder: str, side: Side, poses: Poses, frames: Mapping[Hashable, int], n_frames: int
+    raw: RawTree, key: SequenceKey, side: Side, poses: Poses, frames: Mapping[Hashable, int], n_frames: int
 ) -> SourceHand:
-    where, shape_path = f"{folder}/{side}_hand.pkl", f"{folder}/{side}_hand_shape.pkl"
+    where = f"{HANDS}/{key.name}/{side}_hand.pkl"
     pose, translation_m = np.zeros((n_frames, 48)), np.zeros((n_frames, 3))
     valid = np.zeros(n_frames, dtype=bool)
-    for key, frame in frames.items():
-        place = f"{where}: {key}"
-        pose[frame] = _row(f"{place}.hand_pose", checks.entry(place, poses[key], "hand_pose"), 48)
-        translation_m[frame] = _row(f"{place}.hand_trans", checks.entry(place, poses[key], "hand_trans"), 3)
+    for frame_key, frame in frames.items():
+        place, entry = f"{where}: {frame_key}", poses[frame_key]
+        pose[frame] = _row(f"{place}.hand_pose", checks.entry(place, entry, "hand_pose"), 48)
+        translation_m[frame] = _row(f"{place}.hand_trans", checks.entry(place, entry, "hand_trans"), 3)
         valid[frame] = True
-    shape = checks.entry(shape_path, _dictionary(raw, shape_path), "hand_shape")
-    betas = _row(f"{shape_path}: hand_shape", shape, 10)[None]
-    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], betas, valid)
+    return SourceHand(translation_m, pose[:, :3], pose[:, 3:], _betas(raw, key, side), valid)
 
 
 def _dictionary(raw: RawTree, path: str) -> Mapping[Hashable, Any]:

@@ -122,14 +122,25 @@ class TestFingers:
         np.testing.assert_allclose(track.hand_pose, expected, atol=1e-6)
 
     @pytest.mark.parametrize("fingers", ["absolute", "mean-relative"])
-    def test_angles_beyond_pi_survive(self, model, fingers):
+    def test_angles_beyond_pi_are_the_same_rotations_stored_as_at_most_pi(self, model, fingers):
+        """The mean pose is added to the numbers as they are, not to shorter ones of the same rotation."""
         source = source_hand()
         source.fingers[:, 21:24] = (0.0, 0.0, 6.6)
-        convention = replace(PLAIN, fingers=fingers)
-        track = to_track(source, convention, model)
-        assert track.hand_pose[:, 23].min() > 6
-        mean = model.mean_pose if fingers == "mean-relative" else 0
-        np.testing.assert_allclose(track.hand_pose - mean, source.fingers, atol=1e-6)
+        track = to_track(source, replace(PLAIN, fingers=fingers), model)
+        meant = source.fingers + (model.mean_pose if fingers == "mean-relative" else 0)
+        stored, meant = (array.astype(np.float64).reshape(-1, 15, 3) for array in (track.hand_pose, meant))
+        assert np.linalg.norm(meant, axis=2).max() > 6
+        assert np.linalg.norm(stored, axis=2).max() <= np.pi + 1e-6
+        apart = Rotation.from_rotvec(stored.reshape(-1, 3)) * Rotation.from_rotvec(meant.reshape(-1, 3)).inv()
+        assert apart.magnitude().max() < 1e-6
+        others = np.arange(15) != 7
+        np.testing.assert_allclose(stored[:, others], meant[:, others], atol=1e-6)
+
+    def test_orientations_beyond_pi_are_stored_as_at_most_pi_too(self, model):
+        source = source_hand()
+        source.global_orient[:] = (0.0, 5.0, 0.0)
+        track = to_track(source, PLAIN, model)
+        np.testing.assert_allclose(track.global_orient, np.tile((0, 5.0 - 2 * np.pi, 0), (N_FRAMES, 1)), atol=1e-6)
 
     @pytest.mark.parametrize(("components", "columns"), [(0, 44), (24, 45), (45, 24), (6, 1)])
     def test_another_number_of_columns_is_refused(self, model, components, columns):

@@ -4,7 +4,9 @@ import torch
 from scipy.linalg import expm
 
 from hoidata.geometry.rotations import (
+    canonical_rotvec,
     mirror_rotvec_x,
+    nearest_rotvec,
     rot6d_to_rotmat,
     rotmat_to_rot6d,
     rotmat_to_rotvec,
@@ -108,3 +110,22 @@ def test_skew_is_the_cross_product():
 def test_no_rotations_give_no_rotations():
     assert rotvec_to_rotmat(np.zeros((0, 16, 3))).shape == (0, 16, 3, 3)
     assert rotmat_to_rotvec(np.zeros((0, 3, 3))).shape == (0, 3)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_canonical_axis_angles_are_the_same_rotations_of_at_most_pi_and_shorter_ones_stay_bit_for_bit(dtype):
+    vectors = rotvecs((0.0, 0.5, 3.14159, 3.2, 4.0, 6.2, 6.4, 8.6, 12.0)).astype(dtype)
+    found, exact = canonical_rotvec(vectors), 1e-6 if dtype == np.float32 else 1e-12
+    for vector, canonical in zip(vectors.astype(np.float64), found.astype(np.float64), strict=True):
+        np.testing.assert_allclose(expm(cross_matrix(canonical)), expm(cross_matrix(vector)), atol=10 * exact)
+    assert np.linalg.norm(found, axis=1).max() <= np.pi + exact
+    short = np.linalg.norm(vectors, axis=1) < 3.15
+    assert found[short].tobytes() == vectors[short].tobytes()
+    assert found.dtype == dtype
+
+
+def test_an_axis_angle_nearest_to_a_reference_is_the_same_rotation_across_pi():
+    degrees = np.deg2rad([[[179.0, 0, 0], [0, -179.0, 0], [0, 0, 30.0], [0, 0, 0]]])
+    reference = np.deg2rad([[[-179.0, 0, 0], [0, 178.0, 0], [0, 0, -20.0], [0, 0, 170.0]]])
+    wanted = np.deg2rad([[[-181.0, 0, 0], [0, 181.0, 0], [0, 0, 30.0], [0, 0, 0]]])
+    np.testing.assert_allclose(nearest_rotvec(degrees, reference), wanted, atol=1e-12)

@@ -130,3 +130,12 @@ def test_squares_of_scattered_residuals_add_up_as_their_products_do():
         own = frame == one
         assert np.tril(matrix[one]) == pytest.approx(np.tril((row[own].T * weight[own]) @ row[own]))
         assert vector[one] == pytest.approx(-row[own].T @ (weight[own] * miss[own]))
+
+
+def test_the_step_between_two_finger_poses_on_either_side_of_pi_is_the_short_one() -> None:
+    """Stored rotations are at most pi, so 179 degrees may be followed by -179: 2 degrees apart, not 358."""
+    before, after = any_pose(), any_pose()
+    before.fingers[:, 4], after.fingers[:, 4] = np.deg2rad((0, 0, 179.0)), np.deg2rad((0, 0, -179.0))
+    step = before.step_to(after)[:, 6:].reshape(-1, 15, 3)
+    np.testing.assert_allclose(step[:, 4], np.deg2rad([(0, 0, 2.0)] * FRAMES), atol=1e-12)
+    assert np.abs(step[:, np.arange(15) != 4]).max() == 0

@@ -3,10 +3,11 @@
 import hashlib
 from collections import Counter
 
+import orjson
 import pandas as pd
 import pytest
 
-from hoidata.dataset_folders import built_in_names, dataset_facts
+from hoidata.dataset_folders import BUILT_IN, built_in_names, dataset_facts
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.errors import BadInput
 from hoidata.splits.definitions import OF_ANY_DATASET, choose, definitions_for
@@ -81,6 +82,26 @@ def test_h2os_official_split_counts_sequences_segments_and_frames_as_its_lists_d
         frames[found[sequence]] += n_frames
     assert segments == {"train": 569, "validation": 122, "test": 242}
     assert frames == {"train": 68929, "validation": 14676, "test": 30724}
+
+
+@pytest.mark.parametrize("dataset", built_in_names())
+def test_what_the_makers_publish_is_a_list_or_a_reason_why_there_is_none(dataset):
+    """An empty list would say that a dataset has no sequences."""
+    values = orjson.loads((BUILT_IN / dataset / "published.json").read_bytes())
+    assert all(values.values())
+    assert "sequences" in values or "no list of sequences is" in values["source"]
+    rules = {name: definition.rule.as_json() for name, definition in definitions_for(dataset).items()}
+    assert [name for name, rule in rules.items() if rule.get("train") == [] or rule.get("test") == []] == []
+
+
+def test_an_empty_list_of_sequences_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "attic").mkdir()
+    (tmp_path / "attic/facts.toml").write_bytes((BUILT_IN / "grab/facts.toml").read_bytes())
+    (tmp_path / "attic/adapter.py").write_text("")
+    (tmp_path / "attic/published.json").write_text('{"source": "nobody knows", "sequences": []}')
+    monkeypatch.setenv("HOIDATA_DATASETS", str(tmp_path / "attic"))
+    with pytest.raises(BadInput, match="leave it out, and say in its source why there is none"):
+        published("attic")
 
 
 def test_grabs_official_split_is_by_object():

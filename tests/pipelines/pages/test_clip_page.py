@@ -262,6 +262,16 @@ def test_fit_to_keypoints_is_told_with_its_error_in_millimetres(dataset, hands):
     assert said == "a hand model fitted to the source's keypoints, mean error 4.2 mm"
 
 
+def test_frames_that_were_interpolated_are_counted(dataset, hands):
+    clip = dataset.clip("test/s2/box")
+    numbers = np.arange(clip.n_frames, dtype=np.int32)
+    numbers[[4, 5, 9]] = 3, 3, 8
+    said = [dict(clip_facts(dataset, replace(clip, source_frames=own), hands))["source frames"]
+            for own in (np.arange(clip.n_frames, dtype=np.int32), numbers)]  # fmt: skip
+    assert "interpolated" not in said[0]
+    assert said[1].endswith(f"; 3 of {clip.n_frames} frames are interpolated")
+
+
 def test_page_says_where_annotator_and_distances_disagree(page):
     text = page("test/s1/lid").read_text()
     assert "annotator named: right, which DISAGREES" in text

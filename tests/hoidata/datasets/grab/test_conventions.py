@@ -140,6 +140,12 @@ def test_objects_turn_about_the_origin_of_their_mesh_not_its_middle(load):
     agrees(found, row_vectors(MUG_M, MUG_ORIENT, MUG_PLACE), about_middle)
 
 
+def test_an_object_turned_beyond_pi_is_stored_as_the_same_rotation_of_at_most_pi(load):
+    """Row vectors: the stored rotation is the transpose of 5 rad about z, -(5 - 2 pi)."""
+    clip = load(lambda data: data["object"]["params"].update(global_orient=np.tile((0.0, 0.0, 5.0), (N_FRAMES, 1))))
+    np.testing.assert_allclose(clip.object.rotvec, [(0, 0, 2 * np.pi - 5.0)] * clip.n_frames, atol=EXACT_M)
+
+
 def test_the_table_is_turned_as_row_vectors(load):
     (table,) = load().other_objects
     assert table.model.name == "table"

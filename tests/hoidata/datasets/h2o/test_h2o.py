@@ -79,6 +79,27 @@ def test_a_run_is_cut_to_the_frames_in_which_its_object_is_tracked(root, load_al
     assert clip.source_frames[[0, -1]].tolist() == [4, 26]
 
 
+def test_three_frames_without_the_object_are_bridged_and_marked_and_four_are_named_as_missing_poses(root, load_all):
+    for frame in (8, 9, 10, 15):
+        write_text(root / f"subject2/k1/3/cam4/obj_pose_rt/{frame:06d}.txt", [0, *np.zeros(16)])
+    (clip,) = load_all(H2OAdapter(), root)
+    made = [8, 9, 10, 15]
+    assert clip.camera.images.tolist() == list(range(3, 25))
+    assert (np.flatnonzero(~clip.recorded) + 3).tolist() == made
+    assert clip.source_frames.tolist() == [7 if at in (8, 9, 10) else 14 if at == 15 else at for at in range(3, 25)]
+    for frame in made:
+        truth = camera(frame) @ object_in_camera(frame)
+        assert np.abs(clip.object.translation_m[frame - 3] - truth[:3, 3]).max() < 1e-3
+        turn = Rotation.from_rotvec(clip.object.rotvec[frame - 3]) * Rotation.from_matrix(truth[:3, :3]).inv()
+        assert np.rad2deg(turn.magnitude()) < 0.2
+    write_text(root / "subject2/k1/3/cam4/obj_pose_rt/000011.txt", [0, *np.zeros(16)])
+    found = load_all(H2OAdapter(shortest_frames=4), root)
+    assert [clip.source_frames[[0, -1]].tolist() for clip in found[:2]] == [[3, 7], [12, 24]]
+    assert isinstance(found[2], Quarantined)
+    assert "poses of chips without a gap of more than 3 frames" in found[2].expected
+    assert found[2].got == "none in source frames 8 to 11"
+
+
 def test_the_old_name_of_an_object_folder_is_known(root, load_all):
     (root / "object" / "chips" / "chips.obj").rename(root / "object" / "chips" / "pringles.obj")
     (root / "object" / "chips").rename(root / "object" / "pringles")

@@ -134,16 +134,35 @@ def test_made_frames_lie_between_and_no_figure_looks_at_them(root):
     )
 
 
-@pytest.mark.parametrize("missing", [(), (9,)])
+@pytest.mark.parametrize("missing", [(), (9, 10)])
 def test_frames_without_an_object_file_divide_a_clip(root, tmp_path, missing):
     made = recording(MUG, 4, 40)
     write_recording(tmp_path, replace(made, events=(("Pickup", 0, 40), ("rest", 3, 9))))
     for frame in missing:
         (tmp_path / ANNOTATIONS / MUG / f"objpose/{frame}.json").unlink()
-    clips = [item for item in load(tmp_path, MUG, shortest_frames=10) if isinstance(item, Clip)]
+    results = load(tmp_path, MUG, shortest_frames=10)
+    clips = [item for item in results if isinstance(item, Clip)]
     spans = [(int(clip.source_frames[0]), int(clip.source_frames[-1])) for clip in clips]
-    assert spans == ([(0, 8), (10, 39)] if missing else [(0, 39)])
+    assert spans == ([(0, 8), (11, 39)] if missing else [(0, 39)])
     assert all(clip.recorded[0] and clip.recorded[-1] for clip in clips)
+    named = [item for item in results if isinstance(item, Quarantined) and "poses of the object" in item.expected]
+    assert [item.got for item in named] == (["none in source frames 8 to 10"] if missing else [])
+
+
+def test_one_frame_without_an_object_file_is_bridged_and_marked(root, tmp_path):
+    """At 15 frames a second it and the made frames on both sides of it are three frames at 30."""
+    made = recording(MUG, 4, 40)
+    write_recording(tmp_path, replace(made, events=(("Pickup", 0, 40),)))
+    whole = the_clip(load(tmp_path, MUG))
+    (tmp_path / ANNOTATIONS / MUG / "objpose/9.json").unlink()
+    clip = the_clip(load(tmp_path, MUG))
+    assert clip.n_frames == whole.n_frames == 79
+    assert np.flatnonzero(whole.recorded & ~clip.recorded).tolist() == [18]
+    assert clip.source_frames[15:22].tolist() == [7, 8, 8, 8, 8, 10, 10]
+    assert clip.camera.images.tolist() == whole.camera.images.tolist()
+    assert np.abs(clip.object.translation_m - whole.object.translation_m).max() < 2e-3
+    apart = Rotation.from_rotvec(clip.object.rotvec) * Rotation.from_rotvec(whole.object.rotvec).inv()
+    assert np.rad2deg(apart.magnitude().max()) < 1
 
 
 # --- parts and hinge

@@ -128,20 +128,84 @@ def test_frames_that_the_makers_refused_are_left_out_and_counted(root: Path) -> 
     assert only_clip(root).n_frames == N_FRAMES
 
 
-def test_frames_without_the_object_and_times_that_are_missing_end_an_interval(root: Path) -> None:
-    edit_rows(root, lambda frame, row: None if frame == 33 else row)
-    assert [clip.n_frames for clip in load(root) if isinstance(clip, Clip)] == [33]
+def without_times(root: Path, frames: range) -> None:
+    """No file has anything in these frames."""
     hands = root / ARIA / hot3d.MANO_FILE
     lines = hands.read_text().splitlines(keepends=True)
-    hands.write_text("".join([*lines[:62], *lines[66:]]))
-    edit_rows(root, lambda frame, row: None if frame in (31, 32) else row)
-    edit_rows(root, lambda frame, row: None if frame in (31, 32) else row, KEYBOARD)
-    assert [clip.n_frames for clip in load(root) if isinstance(clip, Clip)] == [31]
+    hands.write_text("".join([*lines[: 2 * frames.start], *lines[2 * frames.stop :]]))
+    for uid in (MUG, KEYBOARD):
+        edit_rows(root, lambda frame, row: None if frame in frames else row, uid)
+
+
+def test_frames_without_the_object_and_times_that_are_missing_end_an_interval(root: Path) -> None:
+    edit_rows(root, lambda frame, row: None if 32 <= frame < 36 else row)
+    assert [clip.n_frames for clip in load(root) if isinstance(clip, Clip)] == [32]
+    without_times(root, range(28, 32))
+    assert [clip.n_frames for clip in load(root, shortest_frames=20) if isinstance(clip, Clip)] == [28]
+
+
+def close_to_truth(clip: Clip, made: list[int]) -> None:
+    """Made frames are marked, and their object is where it was; the truth moves evenly."""
+    truth = hot3d.truth("Aria", "mano", 0)
+    assert np.flatnonzero(~clip.recorded).tolist() == made
+    assert np.abs(clip.object.translation_m[made] - truth.place[made]).max() < 1e-4
+    turned = np.linalg.norm((np.array([t.as_rotvec() for t in truth.turn]) - clip.object.rotvec)[made], axis=1)
+    assert np.rad2deg(turned.max()) < 1
+
+
+def test_short_gaps_in_the_objects_poses_are_bridged_and_marked(root: Path) -> None:
+    gaps = {9, 19, 20, 29, 30, 31}
+    edit_rows(root, lambda frame, row: None if frame in gaps else row)
+    clip = only_clip(root)
+    close_to_truth(clip, sorted(gaps))
+    assert clip.n_frames == N_FRAMES
+    assert clip.source_frames[[8, 9, 10, 18, 19, 20, 21]].tolist() == [8, 8, 10, 18, 18, 18, 21]
+    assert all(track.valid.all() for track in clip.hands.values())
+
+
+def test_frames_that_no_file_has_are_added_where_three_or_fewer_are_lost(root: Path) -> None:
+    without_times(root, range(12, 15))
+    clip = only_clip(root)
+    close_to_truth(clip, [12, 13, 14])
+    assert np.flatnonzero(~clip.hands["left"].valid).tolist() == [12, 13, 14]
+
+
+def test_a_long_gap_is_reported_as_missing_poses_and_not_as_short_touches(root: Path) -> None:
+    edit_rows(root, lambda frame, row: None if 12 <= frame < 20 else row)
+    missing, cut = load(root)
+    assert isinstance(missing, Quarantined)
+    assert missing.source_key == f"hot3d/{ARIA}/mug_white/missing"
+    assert (missing.expected, missing.got) == (
+        "poses of mug_white without a gap of more than 3 frames at 30 per second",
+        "none in source frames 12 to 19",
+    )
+    assert isinstance(cut, Quarantined)
+    assert "between missing poses of the object or a hand" in cut.expected
+    assert cut.got == "2 others, 28 frames, the first frame 0"
+
+
+def test_a_hand_that_is_lost_while_it_holds_is_named_too(root: Path) -> None:
+    lines = (root / ARIA / hot3d.MANO_FILE).read_text().splitlines()
+    lost = [json.dumps({**json.loads(line), "hand_poses": {}}) for line in lines[24:48]]
+    (root / ARIA / hot3d.MANO_FILE).write_text("\n".join([*lines[:24], *lost, *lines[48:]]))
+    (cut,) = load(root)
+    assert isinstance(cut, Quarantined)
+    assert cut.source_key == f"hot3d/{ARIA}/mug_white/cut"
+
+
+def test_a_clip_begins_and_ends_with_a_recorded_frame(root: Path) -> None:
+    edit_rows(root, lambda frame, row: None if frame in (17, 18) else row)
+    clips = [clip for clip in load(root, longest_frames=18) if isinstance(clip, Clip)]
+    assert [clip.source_frames[[0, -1]].tolist() for clip in clips] == [[0, 16], [19, 35]]
 
 
 def test_another_object_is_beside_a_clip_only_where_it_is_known_throughout(root: Path) -> None:
     edit_rows(root, lambda frame, row: None if frame == 9 else row, KEYBOARD)
-    assert only_clip(root).other_objects == ()
+    clip = only_clip(root)
+    assert np.flatnonzero(~clip.recorded).tolist() == [9]
+    assert len(clip.other_objects) == 1
+    edit_rows(root, lambda frame, row: None if 9 <= frame < 13 else row, KEYBOARD)
+    assert next(item for item in load(root) if isinstance(item, Clip)).other_objects == ()
 
 
 def test_an_object_that_is_touched_and_does_not_move_gives_no_clip(root: Path) -> None:

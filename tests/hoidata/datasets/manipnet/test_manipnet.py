@@ -82,6 +82,17 @@ def test_frozen_and_jumping_stretches_are_cut_out_and_listed(tmp_path: Path) -> 
 
 
 @pytest.mark.slow
+def test_a_touch_that_is_short_because_tracking_failed_says_so(tmp_path: Path) -> None:
+    left, right, thing = lift_rows(280)
+    for frame in range(140, len(thing)):  # the object jumps 1.5 cm: touches of 34 frames on both sides
+        thing[frame][1] += 0.15
+    _, left_out = load(write_tree(tmp_path, left, right, thing))
+    short = [item.got for item in left_out if item.expected == "45 frames or more"]
+    assert len(short) == 2
+    assert all(got.endswith(", next to frames that are left out") for got in short)
+
+
+@pytest.mark.slow
 def test_a_wrist_far_from_the_object_is_cut_out(tmp_path: Path) -> None:
     left, right, thing = lift_rows()
     for frame in range(500, 600):

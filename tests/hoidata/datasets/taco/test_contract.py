@@ -26,7 +26,7 @@ from tests.builders.spoilt import (
 from tests.hoidata.datasets.contract import AdapterContract, Row
 
 NAME = taco.NAMES[0]
-HAND, SHAPE = f"Hand_Poses/{NAME}/right_hand.pkl", f"Hand_Poses/{NAME}/left_hand_shape.pkl"
+HAND = f"Hand_Poses/{NAME}/right_hand.pkl"
 TOOL, TARGET = f"Object_Poses/{NAME}/tool_012.npy", f"Object_Poses/{NAME}/target_105.npy"
 MESH = "Object_Models/012_cm.obj"
 FAR_AWAY = np.float32([[0, 0, 0, 2], [0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]])
@@ -87,7 +87,6 @@ class TestTaco(AdapterContract):
         by_rows = at(TOOL, in_array(lambda poses: poses.transpose(0, 2, 1)))
         mirrored = at(TOOL, in_array(lambda poses: poses * [[[-1], [1], [1], [1]]]))
         yield Row("no hand file", HAND, removed(HAND), "expected a file")
-        yield Row("no shape file", SHAPE, removed(SHAPE), "expected a file")
         yield Row("a list", HAND, holding(HAND, pickle.dumps([1, 2])), "expected a dictionary, got list")
         yield Row("an entry that is a tensor", "00003", tensor, "dictionary")
         yield Row("no translation", "00003", edited(lambda data: data["00003"].pop("hand_trans")), "'hand_trans'")

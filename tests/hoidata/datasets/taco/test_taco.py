@@ -13,9 +13,9 @@ from hoidata.annotation.sentences import four_sentences
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.validation import check_clip
 from hoidata.conversion.convert import convert_dataset
-from hoidata.datasets import RawTree
+from hoidata.datasets import Quarantined, RawTree
 from hoidata.datasets.taco.adapter import TacoAdapter, frames_of, triplet
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.store.store import open_store
 from tests.builders.taco import HANDS, KEY, N_FRAMES, NAMES, dump, write_taco
 
@@ -64,6 +64,30 @@ def test_a_clip_names_the_eight_files_it_was_made_from(root: Path) -> None:
     objects = [f"Object_Poses/{NAMES[0]}/{name}.npy" for name in ("target_105", "tool_012")]
     models = [f"Object_Models/{name}_cm.obj" for name in ("012", "105")]
     assert [source.path for source in load(root).sources] == sorted(hands + objects + models)
+
+
+def test_a_missing_shape_file_means_zero_betas_as_in_the_makers_loader_and_is_told(root: Path) -> None:
+    path = hand_file(root, "left").with_name("left_hand_shape.pkl")
+    whole = load(root)
+    path.unlink()
+    clip, reason = TacoAdapter().load(RawTree(root), KEY, HANDS)
+    assert isinstance(clip, Clip)
+    np.testing.assert_array_equal(check_clip(clip).hands["left"].betas, np.zeros((1, 10)))
+    np.testing.assert_array_equal(clip.hands["right"].betas, whole.hands["right"].betas)
+    assert whole.hands["right"].betas.any()
+    assert clip.gravity_note.endswith("; no left_hand_shape.pkl: its betas are zero, as in TACO's own loader")
+    assert "betas" not in whole.gravity_note
+    assert isinstance(reason, Quarantined)
+    assert reason.where.endswith("left_hand_shape.pkl")
+    assert "the clip has zero betas" in reason.remedy
+
+
+def test_a_shape_file_that_the_manifest_lists_and_that_is_gone_is_an_error(root: Path) -> None:
+    raw = RawTree(root)
+    TacoAdapter().load(raw, KEY, HANDS)
+    hand_file(root, "left").with_name("left_hand_shape.pkl").unlink()
+    with pytest.raises(ChangedMeanwhile, match=r"left_hand_shape\.pkl"):
+        TacoAdapter().load(RawTree(root, {source.path: source for source in raw.sources}), KEY, HANDS)
 
 
 def test_a_hand_without_an_entry_for_a_frame_is_not_valid_there(root: Path) -> None:

@@ -1,0 +1,82 @@
+"""Gaps in an object's poses: what is bridged, how closely, how it is marked, and what is reported."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips.clip import ObjectTrack
+from hoidata.clips.validation import check_clip
+from hoidata.datasets.gaps import LONGEST_BRIDGED, bridge, has_pose, missing_poses, numbered, trimmed
+from hoidata.errors import BadInput
+
+N_FRAMES = 40
+
+
+def truth(model) -> ObjectTrack:
+    """A place on cubics, a turn at a constant rate through pi about a slanted axis, and a hinge on a parabola."""
+    time = np.linspace(0, 1, N_FRAMES)
+    place = np.stack([time**3, 0.2 - time**2, 0.5 * time], axis=1)
+    turn = Rotation.from_rotvec(np.outer(2.5 + 1.5 * time, (0.6, 0.0, 0.8)))
+    return ObjectTrack(model, turn.as_rotvec(), place, time**2 if model.is_articulated else None)
+
+
+def without(track: ObjectTrack, tracked: np.ndarray) -> ObjectTrack:
+    """The track with something else in the frames without a pose."""
+    spoilt = {name: np.where(tracked.reshape(-1, *[1] * (array.ndim - 1)), array, 9.0)
+              for name in track.PER_FRAME if (array := getattr(track, name)) is not None}  # fmt: skip
+    return replace(track, **spoilt)
+
+
+def flags(*missing: int) -> np.ndarray:
+    return ~np.isin(np.arange(N_FRAMES), missing)
+
+
+@pytest.mark.parametrize("articulated", [False, True])
+@pytest.mark.parametrize("missing", [(5,), (1, 38), (10, 11, 12), (19, 20, 23, 24), tuple(range(1, 39, 2))])
+def test_smooth_motion_comes_back_in_short_gaps(make_clip, articulated: bool, missing: tuple[int, ...]) -> None:
+    whole, tracked = truth(make_clip(articulated=articulated).object.model), flags(*missing)
+    found = bridge(without(whole, tracked), tracked)
+    assert np.abs(found.translation_m - whole.translation_m).max() < 1e-4
+    apart = Rotation.from_rotvec(found.rotvec) * Rotation.from_rotvec(whole.rotvec).inv()
+    assert apart.magnitude().max() < 1e-6
+    assert np.linalg.norm(found.rotvec, axis=1).max() <= np.pi + 1e-9
+    if articulated:
+        assert found.hinge_rad == pytest.approx(whole.hinge_rad, abs=1e-6)
+
+
+def test_four_frames_and_the_ends_are_not_bridged(make_clip) -> None:
+    tracked = flags(0, 1, 10, 11, 12, 13, 38, 39)
+    spoilt = without(truth(make_clip().object.model), tracked)
+    found = bridge(spoilt, tracked)
+    assert np.array_equal(found.translation_m, spoilt.translation_m)
+    assert np.array_equal(has_pose(tracked), tracked)
+    assert LONGEST_BRIDGED == 3
+
+
+def test_made_frames_have_the_number_of_the_recorded_one_before_them(make_clip) -> None:
+    recorded = np.array([True, False, False, True, True, False, True])
+    numbers = numbered(np.array([20, 24, 28, 32, 36, 40, 44], np.int32), recorded)
+    assert numbers.tolist() == [20, 20, 20, 32, 36, 36, 44]
+    clip = make_clip().take(slice(0, 7))
+    marked = check_clip(replace(clip, source_frames=numbers, source_fps=120.0))
+    assert np.array_equal(marked.recorded, recorded)
+    for wrong in (numbers[::-1], np.array([20, 24, 24, 25, 36, 40, 44], np.int32)):  # 25 is one frame after 24, not two
+        with pytest.raises(BadInput, match="rising frame numbers"):
+            check_clip(replace(clip, source_frames=wrong, source_fps=120.0))
+
+
+def test_an_interval_is_trimmed_to_recorded_frames() -> None:
+    recorded = flags(3, 4, 8, 9)
+    assert trimmed((3, 10), recorded) == (5, 8)
+    assert trimmed((3, 5), recorded) == (3, 3)
+
+
+def test_long_gaps_are_named_by_source_frames_and_untracked_ends_are_none() -> None:
+    tracked, numbers = flags(0, 1, 2, 3, 4, 9, 12, 13, 14, 15, 30, 31, 32, 33, 34), 4 * np.arange(N_FRAMES)
+    (reason,) = missing_poses("a/b/missing", "b.pkl", "the mug", numbers, tracked)
+    assert reason.got == "none in source frames 48 to 60, 120 to 136"
+    assert "poses of the mug" in reason.expected
+    assert missing_poses("a/b/missing", "b.pkl", "the mug", numbers, flags(0, 1, 2, 3, 4, 9)) == []
+    assert missing_poses("a/b/missing", "b.pkl", "the mug", numbers, np.zeros(N_FRAMES, bool)) == []
