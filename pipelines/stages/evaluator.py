@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-from hoidata.files.atomic import atomic_folder
 from models.evaluator.settings import EvaluatorSettings
 from pipelines.lineage.graph import producers, written_graph
-from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, note_empty, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_empty
 
 OFF = "off: params.yaml names no networks under evaluator"
 
@@ -24,17 +23,16 @@ def run(paths: StagePaths) -> None:
 
     make_repeatable(threads=1)
     stage = producers(written_graph(Path()))[paths.evaluators.as_posix()].name
-    with atomic_folder(paths.evaluators) as part:
-        found = train_evaluators(
-            paths.data,
-            part,
-            settings,
-            load_hands(paths.profile),
-            jobs=jobs(),
-            provenance=lambda facts: build_provenance(Path(), stage, facts),
-        )
-        if isinstance(found, str):
-            note_empty(part, found)
-            return
+    found = train_evaluators(
+        paths.data,
+        paths.evaluators,
+        settings,
+        load_hands(paths.profile),
+        jobs=jobs(),
+        provenance=lambda facts: build_provenance(Path(), stage, facts),
+    )
+    if isinstance(found, str):
+        write_empty(paths.evaluators, found)
+        return
     for name, known in found["evaluators"].items():
         print(f"{paths}: {name}: {known.get('accuracy') or known['loss']}")

@@ -13,12 +13,14 @@ import pytest
 import torch
 from safetensors import safe_open
 from safetensors.torch import load_file
+from torch.multiprocessing.spawn import ProcessException
 
 from hoidata.batches.dataset import HoiDataset
 from hoidata.errors import BadInput
 from hoidata.store.annotated import AnnotatedStore
 from models.common.corpus import Wanted, batches
 from models.common.family import Network, Setup
+from models.common.progress import Progress, State
 from models.common.team import Team, run_team
 from models.common.training import train_network
 from models.registry import load_network
@@ -87,6 +89,62 @@ def test_a_training_killed_three_times_writes_the_bytes_of_an_undisturbed_one(
         assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
     assert not (out / "progress").exists()
     assert ("goes on after step" in capfd.readouterr().err) == (done > 0)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("name", ["contact", "length"])
+def test_a_short_training_is_saved_by_time_and_goes_on_with_the_same_bytes(
+    annotated_root: Path, out: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    """Its steps are fewer than save_every; here each of them takes longer than the time between two saves."""
+    monkeypatch.setattr("models.common.progress.SAVE_AFTER_S", 0.0)
+    monkeypatch.setattr("models.common.progress.SAVE_SHARE", 0)
+    settings = {"steps": STEPS, "validate_every": 3, "keep_best": True, "ema_decay": 0.9}
+    train(name, annotated_root, out / "whole", **settings)
+    killed(name, annotated_root, out / "broken", progress=out / "progress", die_at=6, **settings)
+    train(name, annotated_root, out / "broken", progress=out / "progress", **settings)
+    assert "goes on after step 5" in capfd.readouterr().err
+    for file in ("model.safetensors", "log.csv"):
+        assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
+
+
+def test_saving_takes_a_fiftieth_of_the_time_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of one second; a save takes three: the first one after ten seconds, then one each 150 seconds."""
+    now, saved = [0.0], []
+    monkeypatch.setattr("models.common.progress.time.monotonic", lambda: now[0])
+    network = torch.nn.Linear(1, 1)
+    state = State(network, network, torch.optim.AdamW(network.parameters()))
+    progress = Progress(tmp_path, "")
+
+    def save(state: State) -> None:
+        saved.append(now[0])
+        now[0] += 3
+
+    monkeypatch.setattr(progress, "save", save)
+    for step in range(1, 401):
+        now[0], state.step = now[0] + 1, step
+        progress.keep(state, 1000)
+    assert saved == [10, 163, 316]
+
+
+@pytest.mark.slow
+def test_what_two_processes_log_does_not_depend_on_a_kill(
+    annotated_root: Path, out: Path, capfd: pytest.CaptureFixture
+) -> None:
+    """The losses since the last validation are those of both processes, in what is saved between two validations."""
+    run_team(train_in_parts, 2, out / "meeting", annotated_root, out / "whole", out / "other", 0)
+    with pytest.raises(ProcessException):
+        run_team(train_in_parts, 2, out / "second", annotated_root, out / "broken", out / "progress", 6)
+    run_team(train_in_parts, 2, out / "third", annotated_root, out / "broken", out / "progress", 0)
+    assert "goes on after step 5" in capfd.readouterr().err
+    for file in ("model.safetensors", "log.csv"):
+        assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
+
+
+def train_in_parts(root: Path, out: Path, progress: Path, die_at: int) -> None:
+    torch.set_num_threads(1)
+    settings = {"steps": STEPS, "save_every": 1, "validate_every": 4, "parts": 2}
+    train("length", root, out, progress=progress, die_at=die_at, **settings)
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
