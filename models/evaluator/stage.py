@@ -1,19 +1,23 @@
 """The evaluator of one dataset: every network trained, weighed on recorded clips, and written with what is known."""
 
+import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
-from hoidata.files import atomic_folder
-from hoidata.files.digest import canonical_json
+from hoidata.files import atomic_folder, canonical_json, sha256_bytes, write_whole
+from hoidata.files.sealed import METADATA_KEY
 from hoidata.hands import HandPair
 from hoidata.metrics.encoded import UNKNOWN
 from hoidata.metrics.majority import majority_rows
+from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.workers import in_workers
 from models.common.checkpoints import save_checkpoint
@@ -42,19 +46,40 @@ class Trained(NamedTuple):
 
 @dataclass(frozen=True)
 class Training:
-    """Trains the network of a name from a seed, here or in a worker.
+    """Trains the network of a name from a seed, here or in a worker; one that a killed run had finished is read.
 
-    is_worker: the process is one of its own, whose settings may be fixed.
+    is_worker: the process is one of its own, whose settings may be fixed. finished: folder for finished trainings of
+    the same settings, clips and code, or None.
     """
 
     parts: dict[str, Examples]
     settings: EvaluatorSettings
     is_worker: bool
+    finished: Path | None
 
     def __call__(self, item: tuple[NetworkName, int]) -> Trained:
         if self.is_worker:
             make_repeatable(threads=1)
-        return _trained(*item, self.parts, self.settings)
+        name, seed = item
+        path = None if self.finished is None else self.finished / f"{name}-{seed}.safetensors"
+        if path and (found := _read_finished(path, seed)):
+            return found
+        trained = _trained(name, seed, self.parts, self.settings)
+        if path:
+            known = {"chosen_by": trained.chosen_by, "figures": trained.figures}
+            write_whole(path, save(load(trained.weights), metadata={METADATA_KEY: canonical_json(known)}))
+        return trained
+
+
+def _read_finished(path: Path, seed: int) -> Trained | None:
+    """The training in a file, or None where there is none that can be read."""
+    try:
+        with safe_open(path, framework="pt") as stored:
+            known = json.loads((stored.metadata() or {})[METADATA_KEY])
+            weights = save({name: stored.get_tensor(name) for name in stored.keys()})  # noqa: SIM118
+        return Trained(seed, weights, known["chosen_by"], known["figures"])
+    except (OSError, SafetensorError, KeyError, ValueError):
+        return None
 
 
 def train_evaluators(
@@ -65,6 +90,8 @@ def train_evaluators(
     *,
     jobs: int = 1,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+    progress: str | Path | None = None,
+    code: str = "",
 ) -> dict[str, Any] | str:
     """Write ``out/<network>/model.safetensors`` and ``out/info.json``; what stands there, or why nothing was written.
 
@@ -72,6 +99,8 @@ def train_evaluators(
     network is trained once per seed on the training part and chosen on validation; test clips are only weighed. Without
     validation clips of a label that was trained the last weights of the first seed are kept. jobs: trainings at once,
     in processes of their own; the bytes do not depend on it. The folder ``out`` appears whole or not at all.
+    progress: a folder where a killed run leaves its finished trainings. code: a digest of what runs; trainings of other
+    settings, clips or code are not read.
     """
     annotated = load_annotated(annotated_root, hands)
     parts = {split: Examples.of(annotated, split) for split in SPLITS}
@@ -85,7 +114,11 @@ def train_evaluators(
         "evaluators": {},
     }
     wanted = [(name, seed) for name in settings.networks for seed in settings.seeds]
-    found = dict(in_workers(Training(parts, settings, jobs > 1), wanted, jobs))
+    finished = None
+    if progress is not None:
+        made_from = [code, plain_config(settings), *(examples.digest() for examples in parts.values())]
+        finished = Path(progress) / sha256_bytes(canonical_json(made_from).encode())[:16]
+    found = dict(in_workers(Training(parts, settings, jobs > 1, finished), wanted, jobs))
     with atomic_folder(out) as partial:
         for name in settings.networks:
             trainings = [found[name, seed] for seed in settings.seeds]
@@ -103,6 +136,8 @@ def train_evaluators(
                 "by_seed": by_seed,
             }
         (partial / "info.json").write_text(canonical_json(info) + "\n")
+    if progress is not None:
+        shutil.rmtree(progress, ignore_errors=True)
     return info
 
 

@@ -1,11 +1,14 @@
 """Stage evaluator: the networks that tell what a motion shows, trained on recorded clips of one dataset."""
 
+from dataclasses import replace
 from pathlib import Path
 
+from hoidata.files import sha256_file
 from models.evaluator.settings import EvaluatorSettings
 from pipelines.lineage.graph import producers, written_graph
 from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_empty
 
+CODE = Path("code/evaluator.json")
 OFF = "off: params.yaml names no networks under evaluator"
 
 
@@ -30,6 +33,8 @@ def run(paths: StagePaths) -> None:
         load_hands(paths.profile),
         jobs=jobs(),
         provenance=lambda facts: build_provenance(Path(), stage, facts),
+        progress=replace(paths, model="evaluator").training,
+        code=sha256_file(CODE) if CODE.is_file() else "",
     )
     if isinstance(found, str):
         write_empty(paths.evaluators, found)
