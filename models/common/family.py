@@ -47,7 +47,10 @@ class Objective(Protocol):
         ...
 
     def validation(self, network: nn.Module) -> Tensor:
-        """() the loss on held-out clips, always with the same draws; network is in evaluation mode."""
+        """() the loss on held-out clips, always with the same draws; network is in evaluation mode.
+
+        Called only where there are validation clips (``Corpus.held_out``).
+        """
         ...
 
 

@@ -72,7 +72,7 @@ def out(trained: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("name", ["contact", "length"])
+@pytest.mark.parametrize("name", [pytest.param("contact", marks=pytest.mark.slow), "length"])
 def test_a_training_stops_at_the_first_loss_that_is_no_number_and_keeps_the_best_weights(
     annotated_root: Path, out: Path, name: str
 ) -> None:
