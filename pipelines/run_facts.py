@@ -1,6 +1,7 @@
 """What a person reads after a run: clips, what was left out, leading figures of every row, where the pages are."""
 
 from pathlib import Path
+from typing import Any
 
 from hoidata.files.written import read_json
 from pipelines.figures import LEADING, read_metrics
@@ -11,26 +12,33 @@ from pipelines.params import read_params
 def describe_results(project: Path, profile: str) -> str:
     """Markdown: a row of counts per dataset, a table of leading figures for each that was measured, and the report."""
     params = read_params(project)
+    notes: list[str] = []
     lines = ["| dataset | clips | left out while converting | train | validation | test |", "|---|---|---|---|---|---|"]
     tables: list[str] = []
     for dataset in params["datasets"]:
         data, metrics = project / "data" / profile / dataset, project / "metrics" / profile / dataset
         if (data / "clips/meta/info.json").is_file():
             lines.append(_counts(dataset, data))
+            notes += [f"{dataset}: {words}." for words in _splits(data).get("missing", {}).values()]
         families = [name for name in params["families"] if _measured(metrics / f"{name}.json")]
         if families:
             tables += [f"### {dataset}", markdown_table(metrics, families, LEADING)]
     report = project / "report" / profile / "index.html"
     where = f"Report: {report.resolve()}" if report.is_file() else "The report has not been made yet."
-    return "\n\n".join(["\n".join(lines), *tables, where])
+    return "\n\n".join(["\n".join(lines), *notes, *tables, where])
 
 
 def _counts(dataset: str, data: Path) -> str:
     counts = read_json(data / "clips/meta/info.json", {"counts": {"clips": int, "quarantined": int}})["counts"]
-    splits = data / "splits/info.json"
-    parts = read_json(splits, {"chosen": {"clips": {}}})["chosen"]["clips"] if splits.is_file() else {}
+    parts = _splits(data).get("chosen", {}).get("clips", {})
     numbers = [parts.get(name, "") for name in ("train", "validation", "test")]
     return f"| {' | '.join(map(str, (dataset, counts['clips'], counts['quarantined'], *numbers)))} |"
+
+
+def _splits(data: Path) -> dict[str, Any]:
+    """What the stage split says of a dataset; nothing where it has not run."""
+    path = data / "splits/info.json"
+    return read_json(path, {"chosen": {"clips": {}}}) if path.is_file() else {}
 
 
 def _measured(path: Path) -> bool:

@@ -1,6 +1,6 @@
 """Files written whole or not at all, read without executing anything, and known by their content."""
 
-from hoidata.files.atomic import atomic_file, atomic_folder, write_whole
+from hoidata.files.atomic import atomic_file, atomic_folder, remove_dead_leftovers, write_whole
 from hoidata.files.digest import canonical_json, sha256_bytes, sha256_file
 from hoidata.files.numpy_files import load_npy, load_npy_object, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
@@ -16,6 +16,7 @@ __all__ = [
     "load_npy_object",
     "load_npz_objects",
     "load_torch_pickle",
+    "remove_dead_leftovers",
     "restricted_load",
     "sha256_bytes",
     "sha256_file",

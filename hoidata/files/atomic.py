@@ -1,10 +1,12 @@
 """Writing that leaves either the old file or the whole new one, never half of one; and one writer at a time."""
 
+import hashlib
 import os
 import re
 import shutil
+import socket
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,7 +23,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     """Give a temporary path beside ``path``; rename it over ``path`` when the block ends without an error."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
+    handle, name = tempfile.mkstemp(prefix=f".{path.name}.{_writer()}-", suffix=".part", dir=path.parent)
     os.close(handle)
     partial = Path(name)
     partial.chmod(0o644)
@@ -44,10 +46,12 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Give an empty temporary folder beside ``path``; put it in the place of ``path`` when the block ends well.
 
     The old folder is moved aside whole before it is deleted: a process killed meanwhile leaves nothing of it here.
+    What writers of ``path`` that were killed left beside it is deleted first.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent))
+    remove_dead_leftovers(path)
+    partial = Path(tempfile.mkdtemp(prefix=f".{path.name}.{_writer()}-", suffix=".part", dir=path.parent))
     partial.chmod(0o755)
     try:
         yield partial
@@ -65,19 +69,54 @@ def remove_leftovers(path: str | Path) -> None:
 
     Only for the one who holds ``exclusive(path)``: a living writer's files look the same.
     """
-    path = Path(path)
+    _remove(Path(path), _leftovers(Path(path)))
+
+
+def remove_dead_leftovers(path: str | Path) -> None:
+    """As ``remove_leftovers``, of those writers alone whose process on this machine has ended. For everyone."""
+    _remove(Path(path), [left for left in _leftovers(Path(path)) if _is_dead(left.name)])
+
+
+def _leftovers(path: Path) -> list[Path]:
+    """Temporary files and folders of writers of ``path``, killed or at work."""
     if not path.parent.is_dir():
-        return
+        return []
     pattern = re.compile(rf"\.{re.escape(path.name)}\.[^.]+\.(part|old)")
-    left = sorted(item for item in path.parent.iterdir() if pattern.fullmatch(item.name))
+    return sorted(item for item in path.parent.iterdir() if pattern.fullmatch(item.name))
+
+
+def _remove(path: Path, left: Iterable[Path]) -> None:
     for item in left:
         if item.suffix == ".old" and not path.exists():
             os.replace(item, path)
     for item in left:
         if item.is_dir() and not item.is_symlink():
-            shutil.rmtree(item)
+            shutil.rmtree(item, ignore_errors=True)  # another process may delete it at this moment
         else:
             item.unlink(missing_ok=True)
+
+
+def _machine() -> str:
+    return hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
+
+
+def _writer() -> str:
+    """Part of the names of temporary files: this machine and process."""
+    return f"{_machine()}-{os.getpid()}"
+
+
+def _is_dead(name: str) -> bool:
+    """Whether the writer in a temporary file's name was a process of this machine and has ended."""
+    writer = re.search(rf"\.{_machine()}-([0-9]+)-[^.]+\.(part|old)$", name)
+    if not writer:
+        return False
+    try:
+        os.kill(int(writer[1]), 0)
+    except ProcessLookupError:
+        return True
+    except (PermissionError, OverflowError):
+        return False
+    return False
 
 
 @contextmanager

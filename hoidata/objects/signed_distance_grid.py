@@ -127,7 +127,8 @@ class DistanceFields:
         inside = torch.minimum(torch.maximum(points, low), high)
         beyond = points - inside
         node = (inside - low) / (high - low) * (self.resolution - 1)
-        corner = node.detach().floor().clamp_(0, self.resolution - 2)
+        # A point that is no number has no corner; its weight, and so its distance, stays no number.
+        corner = node.detach().nan_to_num().floor().clamp_(0, self.resolution - 2)
         weight = node - corner
         x, y, z = corner.long().unbind(-1)
         first = (

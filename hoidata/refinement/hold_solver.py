@@ -273,7 +273,7 @@ class HandInTime:
                 if cost_moved < cost or damping > _MOST_DAMPING:
                     break
                 damping *= 10
-            if cost_moved >= cost:
+            if not cost_moved < cost:  # also where it is no finite number
                 break
             gain, state, unknowns = 1 - cost_moved / cost, moved, further
             cost, damping = cost_moved, damping / 10

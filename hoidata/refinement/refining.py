@@ -124,7 +124,7 @@ class _Motion:
                 if moved.cost < seen.cost or damping > 1e4:
                     break
                 damping *= 10
-            if moved.cost >= seen.cost:
+            if not moved.cost < seen.cost:  # also where it is no finite number
                 break
             gain, seen, damping = 1 - moved.cost / seen.cost, moved, damping / 10
             if gain < self.settings.enough:

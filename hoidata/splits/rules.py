@@ -31,6 +31,12 @@ HELD_OUT = ("drawn-object", "composition")
 DRAWN = ("drawn", "drawn-per-object")
 BY_SHARE = (*IN_TIME, *DRAWN, *HELD_OUT)  # rules that list no names
 REST = "rest"
+# What a split without clips of a part means for what comes after it.
+WITHOUT: dict[Part, str] = {
+    "train": "no training clips: nothing is trained",
+    "validation": "no validation clips: no threshold, seed or stopping point is chosen; the last weights are kept",
+    "test": "no test clips: no motions are sampled and nothing is measured",
+}
 ROUND: tuple[Part, ...] = ("train", "train", "train", "validation", "test")
 REMEDY = "mend params.yaml"
 # What objects lie on belongs to the room: GRAB's table stands in every clip and is no reason to keep two apart.
@@ -114,6 +120,11 @@ def _names(part: str, value: Any) -> tuple[str, ...]:
     if isinstance(value, str) or not isinstance(value, list | tuple) or not all(isinstance(v, str) for v in value):
         raise BadInput(f"split rule: {part}", "a list of names", repr(value), REMEDY)
     return tuple(value)
+
+
+def missing_parts(clips: Mapping[str, int]) -> dict[str, str]:
+    """By part of a split that has no clips, what that means. clips: how many each part has."""
+    return {part: words for part, words in WITHOUT.items() if not clips[part]}
 
 
 def assign_split(sequences: pd.DataFrame, rule: SplitRule) -> pd.Series:

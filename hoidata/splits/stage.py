@@ -3,7 +3,8 @@
     splits.parquet    clip_id, one column per named split the dataset has (of any dataset's, those for which it has
                       clips enough; none that is written only where it is chosen), and `split`, the chosen one: train,
                       validation, test, or null for a clip without sentences or that no part covers; one row per clip
-    info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is
+    info.json         chosen and every split: definition, clips per part, leak check; how complete the dataset is;
+                      missing: which parts of the chosen split have no clips and what that means, where there are any
     statistics.json   of every stored quantity, over the training part of the chosen split (``training_statistics``)
 
 ``hoidata.store.annotated`` reads the chosen split from here.
@@ -27,7 +28,7 @@ from hoidata.files.written import read_table
 from hoidata.splits.definitions import Definition, choose, definitions_for
 from hoidata.splits.leaks import Leaks, find_leaks
 from hoidata.splits.published import published
-from hoidata.splits.rules import PARTS, assign_split
+from hoidata.splits.rules import PARTS, assign_split, missing_parts
 from hoidata.splits.statistics import training_statistics
 from hoidata.store.store import Store, open_store
 
@@ -67,6 +68,8 @@ def split_store(
         "without_sentences": len(store) - len(used),
         "published": _completeness(store, dataset),
     }
+    if missing := missing_parts(info["chosen"]["clips"]):
+        info["missing"] = missing
     train = [clip_id for clip_id in used if parts[chosen][clip_id] == "train"]
     statistics = {"dataset": dataset, "split": chosen.name, **training_statistics(store, train, hand_types)}
     with atomic_folder(out_folder) as folder:

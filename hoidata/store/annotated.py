@@ -104,6 +104,11 @@ class AnnotatedStore:
             raise BadInput("split", f"one of {', '.join(SUBSETS)}, or None for all clips", repr(split), "correct it")
         return [key for key in self._sentences if split is None or self.splits[key] == split]
 
+    @property
+    def missing_subsets(self) -> dict[str, str]:
+        """Subsets of the chosen split without clips, with what that means in words."""
+        return self.split_info.get("missing", {})
+
     def split_ids(self, split: str) -> list[str]:
         """Clips of one subset of the chosen split, in the store's order."""
         return self.ids(split)

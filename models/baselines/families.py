@@ -12,10 +12,11 @@ from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.lookups import matched_rows, train_clips
-from models.common.family import Family, motion_clip
+from models.common.family import Family, LeftOut, motion_clip
 from models.common.features import proper_hands, proper_object
 
 TIME_BINS = 50
+NO_MEAN = "no training clip in which a hand asked for acts"
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,14 @@ class GroundTruth:
 class MeanMotion:
     """The mean of the training clips, over equal intervals of each clip's own time.
 
-    hands (2, bin, 99), objects (bin, 10): features in the model frame; one bin is the mean pose.
+    hands (2, bin, 99), objects (bin, 10): features in the model frame; one bin is the mean pose. seen: (2,) bool, the
+    hands that act in a training clip; the others have no mean.
     """
 
     hands: np.ndarray
     objects: np.ndarray
     synthetic: bool
+    seen: np.ndarray
 
     @classmethod
     def of(cls, train: Sequence[ClipSample], bins: int) -> "MeanMotion":
@@ -73,12 +76,14 @@ class MeanMotion:
                 np.add.at(hands[side], rows[there], sample.hands[side][frames[there]])
                 np.add.at(n_hands[side], rows[there], 1.0)
         synthetic = any(sample.synthetic for sample in train)
-        return cls(_means(hands, n_hands), _means(objects, n_objects), synthetic)
+        return cls(_means(hands, n_hands), _means(objects, n_objects), synthetic, n_hands[:, :, 0].sum(axis=1) > 0)
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self._motion(request) for request in requests]
 
-    def _motion(self, request: Request) -> Clip:
+    def _motion(self, request: Request) -> Clip | LeftOut:
+        if (request.active_hands & ~self.seen).any():
+            return LeftOut(request.motion_id, NO_MEAN)
         rows = matched_rows(request.n_frames, len(self.objects))
         hands, objects = torch.from_numpy(self.hands[:, rows]), torch.from_numpy(self.objects[rows])
         return motion_clip(request, proper_hands(hands), proper_object(objects), self.synthetic)

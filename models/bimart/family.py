@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
+from hoidata.batches.dataset import ClipSample
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.clips.features import GLOBAL_ORIENT_6D, HAND_FEATURES
@@ -26,10 +27,11 @@ from models.bimart.network import MotionModel
 from models.bimart.sampler import BimArt, Made, Path, preset_of, sampling_of
 from models.bimart.scene import Scene
 from models.common.checkpoints import FILE_NAME, load_checkpoint
-from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
+from models.common.family import Family, Figures, LeftOut, Sources, motion_clip, refuse_not_finite
 from models.common.features import proper_hands
 
 NO_OBJECT_MOTION = "it makes hands for the motion of an object, and none was given"
+NO_OTHER = {"other path": "no training clip of its object", "other object": "all training clips are of its object"}
 AT_ONCE = 16  # motions of one length that share a batch
 Change = Literal["none", "other path", "other object", "zero map", "no map"]
 
@@ -87,7 +89,7 @@ class HandsForPaths:
         for rows in self._alike(requests):
             found |= zip(rows, self.made([requests[row] for row in rows]), strict=True)
         answers: list[Clip | LeftOut] = [
-            self.clip(request, found[row]) if row in found else LeftOut(request.motion_id, NO_OBJECT_MOTION)
+            self.clip(request, found[row]) if row in found else LeftOut(request.motion_id, self._why_not(request))
             for row, request in enumerate(requests)
         ]
         told = self.model.config.with_map and self.model.motion.config.features.between == "map"
@@ -99,10 +101,22 @@ class HandsForPaths:
 
     def _alike(self, requests: Sequence[Request]) -> list[list[int]]:
         """Rows of requests of one length, at most so many together."""
-        rows = [row for row, request in enumerate(requests) if request.trajectories is not None]
+        rows = [row for row, request in enumerate(requests) if not self._why_not(request)]
         rows.sort(key=lambda row: requests[row].n_frames)
         groups = [list(own) for _, own in groupby(rows, key=lambda row: requests[row].n_frames)]
         return [own[first : first + AT_ONCE] for own in groups for first in range(0, len(own), AT_ONCE)]
+
+    def _why_not(self, request: Request) -> str:
+        """Why a request has no answer; "" for one that has."""
+        if request.trajectories is None:
+            return NO_OBJECT_MOTION
+        return NO_OTHER[self.change] if self.change in NO_OTHER and not self._others(request) else ""
+
+    def _others(self, request: Request) -> list[ClipSample]:
+        """Training clips whose motion, or whose object, a control takes for the request's."""
+        assert self.annotated is not None
+        is_same, name = self.change == "other path", request.object.name
+        return [clip for clip in training_clips(self.annotated) if (clip.object_model.name == name) == is_same]
 
     def made(self, requests: Sequence[Request]) -> list[Made]:
         """Maps, keypoints and ways to the object for requests of one length, canonical frame."""
@@ -118,11 +132,9 @@ class HandsForPaths:
         basis, thing = self.model.motion.config.features.basis, _path(request)
         if self.change in ("none", "zero map", "no map"):
             return self._true_scene(request)
-        assert self.annotated is not None
-        alike, clips = self.change == "other path", training_clips(self.annotated)
-        others = [clip for clip in clips if (clip.object_model.name == request.object.name) == alike] or clips
+        others = self._others(request)
         other = others[request.seed % len(others)]
-        if alike:  # a shorter motion stays where it ends
+        if self.change == "other path":  # a shorter motion stays where it ends
             rows = np.minimum(np.arange(request.n_frames), other.length - 1)
             return Scene.of(request.object, other.object[rows], basis)
         return Scene.of(other.object_model, thing, basis)
@@ -139,6 +151,8 @@ class HandsForPaths:
     def generated(self, request: Request, made: Made) -> dict[Side, GeneratedHand]:
         """Keypoints and ways to the object in the world, of the hands that take part."""
         world = world_from_canonical(request, self._true_scene(request))
+        # A fit takes a keypoint that is no number for a frame without this hand.
+        refuse_not_finite(request, made.keypoints_m[request.active_hands], made.to_object_m[request.active_hands])
         return {
             side: GeneratedHand(
                 world @ made.keypoints_m[row].astype(np.float64),

@@ -114,10 +114,10 @@ class Objective:
         self.network = network.to(setup.device)
         held = [recorded_clip(sample, pair, features) for sample in setup.corpus.held_out]
         middles = [(clip, start) for clip in held for start in middle_start(clip, self.length)]
-        if not middles:
+        if held and not middles:
             remedy = "put other clips into the validation part"
             raise BadInput("validation", "a window of a clip without a jump", f"none in {len(held)} clips", remedy)
-        self.held_out = targets_of(network, middles).to(self.device)
+        self.held_out = targets_of(network, middles).to(self.device) if middles else None
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         drawn = [one for sample in batch.samples for one in self._drawn(sample.clip_id, generator)]
@@ -129,6 +129,7 @@ class Objective:
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, Denoiser)
         generator, held = torch.Generator().manual_seed(0), self.held_out
+        assert held is not None
         clean, total = normalised(network, held), torch.zeros((), device=self.device)
         for step in VALIDATION_STEPS:
             steps = torch.full((len(clean),), step, device=self.device)

@@ -15,6 +15,7 @@ from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from hoidata.geometry.transform import RigidTransform
 from hoidata.sensors.part_bps import BasisSettings
 from hoidata.store.annotated import AnnotatedStore
+from models.baselines.families import NO_MEAN
 from models.bimart.scene import Scene
 from models.common.family import Family, LeftOut, Sources, motion_clip
 from models.common.features import proper_hands
@@ -70,6 +71,8 @@ class NearestWindow:
     @classmethod
     def load(cls, sources: Sources, drawn: bool = False) -> "NearestWindow":
         samples = training_clips(sources.annotated)
+        if not samples:
+            return cls({}, np.zeros(0), np.ones(0), False, drawn)
         scenes = [Scene.of(sample.object_model, sample.object, BASIS) for sample in samples]
         rows = [told(scene) for scene in scenes]
         every = np.concatenate(rows)
@@ -123,10 +126,11 @@ class NearestWindow:
 
 @dataclass(frozen=True)
 class MeanPose:
-    """The mean hand at the object, canonical frame. hands: (2, 99)."""
+    """The mean hand at the object, canonical frame. hands: (2, 99). seen: (2,) bool, that act in a training clip."""
 
     hands: np.ndarray
     synthetic: bool
+    seen: np.ndarray
 
     @classmethod
     def load(cls, sources: Sources) -> "MeanPose":
@@ -138,7 +142,7 @@ class MeanPose:
             known = (sample.valid & sample.active_hands[:, None])[..., None]
             total, count = total + (own * known).sum(axis=1), count + known.sum(axis=1)
         hands = proper_hands(torch.from_numpy(total / count.clip(1))).numpy()
-        return cls(hands, any(sample.synthetic for sample in samples))
+        return cls(hands, any(sample.synthetic for sample in samples), count[:, 0] > 0)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self._answer(request) for request in requests]
@@ -146,6 +150,8 @@ class MeanPose:
     def _answer(self, request: Request) -> Clip | LeftOut:
         if request.trajectories is None:
             return LeftOut(request.motion_id, "no motion of an object")
+        if (request.active_hands & ~self.seen).any():
+            return LeftOut(request.motion_id, NO_MEAN)
         thing = request.trajectories.object[: request.n_frames]
         scene = Scene.of(request.object, thing, BASIS)
         hands = np.repeat(self.hands[:, None], len(thing), axis=1)

@@ -28,7 +28,7 @@ from hoidata.store.annotated import AnnotatedStore
 from models.bimart.family import clip_without_hands, world_from_canonical
 from models.bimart.scene import Scene, hand_vertices_m
 from models.common.checkpoints import load_checkpoint
-from models.common.family import Family, LeftOut, Losses, Network, Setup, Sources
+from models.common.family import Family, LeftOut, Losses, Network, Setup, Sources, refuse_not_finite
 
 FINGERS, JOINTS = 5, 21
 TOUCH_M = 0.02  # from the middle of a finger tip to a vertex of the part
@@ -145,7 +145,8 @@ class CamsObjective:
         self.network, self.loss, self.device = CamsNetwork(setup.network).to(setup.device), setup.loss, setup.device
         self.basis, train = setup.network.basis, setup.corpus.train
         self.rows = {own: self._rows(train.whole(own)) for own in train.ids}
-        self.held_out = _together([self._rows(sample) for sample in setup.corpus.held_out], self.device)
+        held = [self._rows(sample) for sample in setup.corpus.held_out]
+        self.held_out = _together(held, self.device) if held else None
 
     def _rows(self, sample: ClipSample) -> tuple[np.ndarray, np.ndarray]:
         scene = Scene.of(sample.object_model, sample.object, self.basis)
@@ -161,6 +162,7 @@ class CamsObjective:
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, CamsNetwork)
+        assert self.held_out is not None
         noise = torch.randn(len(self.held_out[0]), network.config.latent, generator=torch.Generator().manual_seed(0))
         return network.losses(*self.held_out, self.loss, noise.to(self.device))["total"]
 
@@ -203,6 +205,7 @@ class CamsHands:
         for side in np.flatnonzero(request.active_hands).tolist():
             skin = canonical_from_model[0] @ hand_vertices_m(self.pair, side, recorded)[0].astype(np.float64)
             hands[side] = carried(skin[ids], np.searchsorted(ids, TIP_VERTICES), drawn[:, side], stages, scene, side)
+        refuse_not_finite(request, hands)
         world, there = world_from_canonical(request, scene), np.ones(len(thing), bool)
         generated: dict[Side, GeneratedHand] = {
             side: GeneratedHand(world @ hands[row], np.zeros_like(hands[row]), there)

@@ -75,7 +75,10 @@ def checkpoint_file(folder: str | Path) -> Path:
 
 
 def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.device | str = "cpu") -> Checkpoint:
-    """The checkpoint of ``network`` in ``folder``, or of a file. Raises BadInput where there is none, or of another."""
+    """The checkpoint of ``network`` in ``folder``, or of a file.
+
+    Raises BadInput where there is none, one of another network, or one with weights that are not finite.
+    """
     path = checkpoint_file(folder)
     if not path.is_file():
         raise BadInput(path, "a trained model", empty_reason(path.parent) or "no file", "run `dvc repro`")
@@ -91,6 +94,9 @@ def load_checkpoint(folder: str | Path, network: StoredNetwork, device: torch.de
         module.load_state_dict(_below(tensors, _WEIGHTS))
     except RuntimeError as error:
         raise BadInput(path, "weights that fit its config", str(error).splitlines()[0], "train it again") from error
+    if spoilt := [name for name, tensor in tensors.items() if not bool(tensor.isfinite().all())]:
+        got = f"NaN or infinity in {len(spoilt)} tensors, such as {spoilt[0]}"
+        raise BadInput(path, "finite weights", got, "train it again with a lower learning rate")
     normaliser = _below(tensors, _NORMALISER)
     return Checkpoint(
         module.to(device).eval().requires_grad_(False),

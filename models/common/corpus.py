@@ -62,15 +62,13 @@ class Corpus:
 
     @property
     def held_out(self) -> list[ClipSample]:
-        """Validation clips; training clips (cropped to the start) where the dataset is too small to have any."""
-        if len(self.validation):
-            return list(self.validation)
-        return list(HoiDataset(self.annotated, "train", crop="start"))
+        """Validation clips, none where the split has none: nothing is chosen then."""
+        return list(self.validation)
 
     def digest(self) -> str:
         """SHA-256 of all that training and validation see of the clips: arrays, words and meshes."""
-        found, validation = sha256(), self.validation if len(self.validation) else self.train
-        for sample in itertools.chain.from_iterable(map(split.whole, split.ids) for split in (self.train, validation)):
+        found, subsets = sha256(), (self.train, self.validation)
+        for sample in itertools.chain.from_iterable(map(subset.whole, subset.ids) for subset in subsets):
             model, entries = sample.object_model, sample.distances
             words = (sample.clip_id, sample.hand_type, sample.verb, *sample.sentences, len(sample.object))
             found.update(canonical_json(words).encode())

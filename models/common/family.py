@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import ClipBatch
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack
+from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore
@@ -46,7 +47,10 @@ class Objective(Protocol):
         ...
 
     def validation(self, network: nn.Module) -> Tensor:
-        """() the loss on held-out clips, always with the same draws; network is in evaluation mode."""
+        """() the loss on held-out clips, always with the same draws; network is in evaluation mode.
+
+        Called only where there are validation clips (``Corpus.held_out``).
+        """
         ...
 
 
@@ -139,8 +143,10 @@ class Family:
 def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: bool) -> Clip:
     """Features (2, F, 99) and (F, 10) of the model frame as the clip that was asked for.
 
-    A hand that takes no part is invalid in every frame. synthetic: whether the model learnt from generated data.
+    A hand that takes no part is invalid in every frame. synthetic: whether the model learnt from generated data. Raises
+    BadInput where a number of an active hand or of the object is not finite.
     """
+    refuse_not_finite(request, hands[torch.from_numpy(request.active_hands).to(hands.device)], objects)
     hands, objects = hands[:, : request.n_frames].cpu().double(), objects[: request.n_frames].cpu().double()
     rotation, origin = request.world_from_model[:3, :3], request.world_from_model[:3, 3]
     hinge = object_hinge_rad(objects).float().numpy() if request.object.is_articulated else None
@@ -166,6 +172,14 @@ def motion_clip(request: Request, hands: Tensor, objects: Tensor, synthetic: boo
         object_words=request.object_words or request.object.name,
         synthetic=synthetic,
     )
+
+
+def refuse_not_finite(request: Request, *made: Tensor | np.ndarray) -> None:
+    """Raise BadInput that names the request where a model's answer holds a number that is not finite."""
+    if not all(bool(torch.isfinite(torch.as_tensor(values)).all()) for values in made):
+        asked = f" ({request.sentence.words})" if request.sentence else ""
+        remedy = "lower the guidance (--scale), try another seed, or train the network again"
+        raise BadInput(f"motion {request.motion_id}{asked}", "finite numbers", "NaN or infinity", remedy)
 
 
 def _track(

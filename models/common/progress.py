@@ -5,6 +5,7 @@ import json
 import math
 import shutil
 import sys
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +16,25 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from hoidata.files import atomic_file, write_whole
+from hoidata.files import atomic_file, remove_dead_leftovers, write_whole
 
 STATE_NAME, LOG_NAME = "state.safetensors", "log.csv"
-Row = dict[str, float]
+# Seconds between two saves, and how many times longer than the last save they are at least: saving a large network
+# takes at most a fiftieth of the time.
+SAVE_AFTER_S, SAVE_SHARE = 10.0, 50
+Row = dict[str, float | None]
+WEIGHTS = "weights that are not finite"
+
+
+class Diverged(Exception):
+    """A training met a number that is not finite, so no further step can help.
+
+    step: of the training. what: the quantity, for instance "a loss of nan". state: the training at that moment.
+    """
+
+    def __init__(self, step: int, what: str, state: "State") -> None:
+        super().__init__(f"{what} at step {step}")
+        self.step, self.what, self.state = step, what, state
 
 
 @dataclass
@@ -26,7 +42,7 @@ class State:
     """Where a training stands after ``step``; with (seed, step) it is all that the next step depends on.
 
     kept: running average of the network's weights. best: weights at the lowest validation loss, which was ``best_loss``
-    ``since`` validations ago. log: a row per validation. running: losses added up since the last row.
+    ``since`` validations ago. log: a row per validation. running: losses added up since the last row, over the team.
     """
 
     network: nn.Module
@@ -75,48 +91,65 @@ class State:
         self.best_loss = math.inf if numbers["best_loss"] is None else numbers["best_loss"]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Progress:
     """folder: of this training alone. digest: of everything it is made from; a state of another is not taken up.
 
-    writes: whether this process is the one of its team that writes.
+    writes: whether this process is the one of its team that writes. next_save_s: when time alone is a reason to save,
+    by the clock ``time.monotonic``.
     """
 
     folder: Path
     digest: str
     writes: bool = True
+    next_save_s: float = field(default_factory=lambda: time.monotonic() + SAVE_AFTER_S)
+
+    @property
+    def state_file(self) -> Path:
+        return self.folder / STATE_NAME
 
     def load(self, state: State) -> None:
         """Go on from what was saved; where it belongs to another training, or cannot be read, start anew and say so."""
-        path = self.folder / STATE_NAME
-        if not path.is_file():
+        if self.writes:
+            remove_dead_leftovers(self.state_file)
+            remove_dead_leftovers(self.folder / LOG_NAME)
+        if not self.state_file.is_file():
             return
         try:
-            with safe_open(path, framework="pt") as stored:
-                numbers = json.loads((stored.metadata() or {})["hoidata"])
-                if numbers["digest"] == self.digest:
-                    tensors = {name: stored.get_tensor(name) for name in stored.keys()}  # noqa: SIM118
-                    state.restore(tensors, numbers)
-                    return self._say(f"goes on after step {state.step}")
+            if self.read(state):
+                return self._say(f"goes on after step {state.step}")
         except (OSError, SafetensorError, KeyError, ValueError) as error:
-            return self._say(f"starts anew: {path} cannot be read ({type(error).__name__})")
-        self._say(f"starts anew: {path} is of other settings, data or code")
+            return self._say(f"starts anew: {self.state_file} cannot be read ({type(error).__name__})")
+        self._say(f"starts anew: {self.state_file} is of other settings, data or code")
+
+    def read(self, state: State) -> bool:
+        """Restore what was saved; False where it belongs to another training."""
+        with safe_open(self.state_file, framework="pt") as stored:
+            numbers = json.loads((stored.metadata() or {})["hoidata"])
+            if is_same := numbers["digest"] == self.digest:
+                state.restore({name: stored.get_tensor(name) for name in stored.keys()}, numbers)  # noqa: SIM118
+        return is_same
 
     def keep(self, state: State, every: int) -> None:
-        """After a step: the log where it has grown, and everything after each ``every`` steps."""
+        """After a step: the log where it has grown, and everything after ``every`` steps or when it is time."""
         if self.writes and state.log and state.log[-1]["step"] == state.step:
             write_log(self.folder / LOG_NAME, state.log)
-        if self.writes and state.step % every == 0:
+        if self.writes and (state.step % every == 0 or time.monotonic() >= self.next_save_s):
+            start = time.monotonic()
             self.save(state)
+            took = time.monotonic() - start
+            self.next_save_s = start + took + max(SAVE_AFTER_S, SAVE_SHARE * took)
 
     def save(self, state: State) -> None:
-        """Everything, whole or not at all."""
+        """Everything, whole or not at all. Raises Diverged where a weight is no finite number: none such is kept."""
         best_loss = None if math.isinf(state.best_loss) else state.best_loss
         numbers = {"digest": self.digest, "step": state.step, "since": state.since, "best_loss": best_loss}
         numbers["losses"] = list(state.running)  # in the order of the log's columns
         tensors = {name: value.detach().cpu().contiguous() for name, value in sorted(state.tensors().items())}
+        if not all_finite(tensors):
+            raise Diverged(state.step, WEIGHTS, state)
         metadata = {"hoidata": json.dumps({**numbers, "log": state.log})}  # losses may be no number
-        write_whole(self.folder / STATE_NAME, save(tensors, metadata=metadata))
+        write_whole(self.state_file, save(tensors, metadata=metadata))
 
     def clear(self) -> None:
         """Nothing is left to go on with."""
@@ -127,9 +160,14 @@ class Progress:
             print(f"training in {self.folder} {what}", file=sys.stderr)
 
 
+def all_finite(tensors: Mapping[str, Tensor]) -> bool:
+    """Whether every number is finite; the host waits for the device here."""
+    return all(bool(value.isfinite().all()) for value in tensors.values())
+
+
 def write_log(path: Path, log: list[Row]) -> None:
-    """log.csv: step, validation loss, and the mean training losses since the row before."""
+    """log.csv: step, validation loss (empty without validation clips), mean training losses since the row before."""
     with atomic_file(path) as partial, open(partial, "w", newline="") as stream:
         writer = csv.DictWriter(stream, list(log[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: f"{value:.6g}" for name, value in row.items()} for row in log)
+        writer.writerows({name: "" if value is None else f"{value:.6g}" for name, value in row.items()} for row in log)

@@ -3,16 +3,20 @@
 What a step computes depends on the number of parts alone, so any number of processes gives the same weights.
 """
 
+import multiprocessing
+import os
+import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from multiprocessing.queues import SimpleQueue
 from pathlib import Path
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
-from torch.multiprocessing.spawn import spawn
+from torch.multiprocessing.spawn import ProcessException, spawn
 
-from hoidata.errors import BadInput
+from hoidata.errors import BadInput, HoidataError
 
 
 @dataclass(frozen=True)
@@ -61,13 +65,31 @@ def run_team(work: Callable[..., None], size: int, meeting: Path, *given: object
     """
     if size == 1:
         work(*given)
-    else:
-        spawn(_member, (work, size, meeting.absolute().as_uri(), given), size)
+        return
+    errors = multiprocessing.get_context("spawn").SimpleQueue()
+    try:
+        spawn(_member, (work, size, meeting.absolute().as_uri(), errors, given), size)
+    except ProcessException:
+        if errors.empty():
+            raise
+        raise errors.get() from None
 
 
-def _member(rank: int, work: Callable[..., None], size: int, meeting: str, given: tuple) -> None:
+def _member(rank: int, work: Callable[..., None], size: int, meeting: str, errors: SimpleQueue, given: tuple) -> None:
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=size)
     try:
         work(*given)
+    except HoidataError as error:
+        errors.put(error)
+        raise
     finally:
         dist.destroy_process_group()
+
+
+def _end_with_parent() -> None:
+    """End this process when its parent has ended: torch asks for SIGINT then, which may be ignored or swallowed."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

@@ -6,6 +6,7 @@ called ``make_repeatable`` equal inputs give equal bytes on one machine, however
 
 import copy
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,16 +14,17 @@ from typing import Any, Literal
 
 import torch
 from rich.progress import track
-from torch import nn
+from torch import Tensor, nn
 from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 from hoidata.batches.dataset import ClipBatch
 from hoidata.errors import BadInput
-from hoidata.files import canonical_json, sha256_bytes, sha256_file
+from hoidata.files import atomic_folder, canonical_json, sha256_bytes, sha256_file
 from hoidata.hands import HandPair
 from hoidata.settings import at_least, build_config, key_in_file, plain_config, refuse_unknown
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import (
+    EMPTY_NAME,
     FILE_NAME,
     checkpoint_file,
     empty_reason,
@@ -32,11 +34,16 @@ from models.common.checkpoints import (
 )  # fmt: skip
 from models.common.corpus import Balance, Corpus, Wanted, batches
 from models.common.family import Network, Objective, Setup
-from models.common.features import Hands
+from models.common.features import Hands, Normaliser
 from models.common.precision import Precision, compute_in
-from models.common.progress import LOG_NAME, Progress, Row, State, write_log
+from models.common.progress import LOG_NAME, WEIGHTS, Diverged, Progress, Row, State, all_finite, write_log
 from models.common.repeatable import own_draws, seed_draws
 from models.common.team import Team
+
+# Folder, in that of the progress, with the last good checkpoint of a training that diverged.
+LAST_GOOD = "last_good"
+# Steps between two looks at the losses. The CPU has them at once; another device is waited for.
+CHECK_EVERY_ON_CPU, CHECK_EVERY = 1, 50
 
 
 @dataclass(frozen=True)
@@ -46,14 +53,15 @@ class TrainingConfig:
     schedule: "constant", or "cosine" to zero after ``warmup`` steps. ema_decay: of the running average of the weights
     that is kept (0: the weights themselves). adam_beta2: of AdamW's running mean of squared gradients; at .999 the
     large gradients of the first steps slow a thousand more, which a short training does not have. keep_best: keep the
-    step with the lowest validation loss, not the last.
+    step with the lowest validation loss, not the last. Without validation clips the last step is kept.
     patience: stop after so many validations without a lower loss (0: never). balance: draw clips evenly, or verbs.
     mirror: every other clip is seen in a mirror, where the other hand is known to do the same (``batches.mirror``).
     augmented_copies: how many copies of every clip are seen beside it, with other paths, turns and moments
     (``common.augmentation``); they are kept in memory, each as large as its clip.
     precision: of Transformers and point networks, where the time is; all else stays float32. parts: of a batch, whose
     gradients (and statistics of batch norms) are averaged; they take turns, or are shared by ``train.processes``.
-    save_every: steps after which all is written down that a killed training needs to go on.
+    save_every: steps after which all is written down that a killed training needs to go on; long steps sooner, by time
+    (``progress.SAVE_AFTER_S``).
     """
 
     steps: int = 30_000
@@ -121,6 +129,7 @@ def train_network(
     device: str = "cpu",
     progress: str | Path | None = None,
     code: str = "",
+    full_key: Callable[[str], str] = str,
 ) -> Path:
     """Train one network on the training clips of one dataset; the path of what was written.
 
@@ -128,10 +137,12 @@ def train_network(
     hands: the hand model of the clips where it is not the embedded one. provenance: from facts to what is stored.
     needed: the checkpoint folder of every network that ``network.needs`` names. device: as torch names it; recorded.
     progress: a folder where a killed training leaves what it needs to go on, and its losses so far. code: a digest of
-    what runs; a training of other code, data or settings is not taken up.
+    what runs; a training of other code, data or settings is not taken up. full_key: from a key of ``params``, such as
+    ``training.learning_rate``, to the one that the user has to edit.
 
     Reads the train split, and validation for choosing; never test. Writes ``model.safetensors`` and ``log.csv``, or
-    ``empty.json`` with the reason where there is nothing to train on. In a :class:`Team` only one process writes.
+    ``empty.json`` with the reason where there is nothing to train on; the folder appears whole or not at all, at the
+    end. In a :class:`Team` only one process writes. Raises BadInput at the first loss that is no finite number.
     """
     plan, needed, team = Plan.of(network, params), needed or {}, Team.joined()
     if missing := set(network.needs) - {other.name for other in needed}:
@@ -139,11 +150,13 @@ def train_network(
         raise BadInput(f"training of {network.name}", "checkpoint folders", got, "pass needed")
     folders = [*(Path(annotated_root) / name for name in ("clips", "annotation", "contact")), *needed.values()]
     if reason := next(filter(None, map(empty_reason, folders)), None):
-        return write_empty(out_folder, reason)
+        return _write_empty(out_folder, reason, team)
     annotated = load_annotated(annotated_root, hands)
     corpus = Corpus.of(annotated, plan.seed, crop=network.crop)
     if not len(corpus.train):
-        return write_empty(out_folder, f"{annotated_root}: no training clips")
+        return _write_empty(out_folder, f"{annotated_root}: no training clips", team)
+    if not len(corpus.validation) and team.writes:
+        print(f"{network.name}: no validation clips; nothing is chosen, the last weights are kept", file=sys.stderr)
     pair, where = annotated.store.hand_pair(), torch.device(device)
     trained = {other.name: load_checkpoint(folder, other, where) for other, folder in needed.items()}
     with own_draws(where):
@@ -155,23 +168,84 @@ def train_network(
             made_from = [network.name, code, corpus.digest(), pair.digest, where.type, asdict(plan)]
             made_from += [sha256_file(checkpoint_file(folder)) for folder in needed.values()]
             kept_there = Progress(Path(progress), sha256_bytes(canonical_json(made_from).encode()), team.writes)
-        kept, log = fit(objective, corpus, plan.training, plan.seed, where, kept_there)
-    facts = {"model": network.name, "seed": plan.seed, "steps": int(log[-1]["step"]), "device": where.type}
-    facts |= corpus.facts(pair)
-    info = {
-        "facts": facts,
-        "training": plain_config(plan.training),
-        "loss": plain_config(plan.loss) if plan.loss else {},
-        "results": {"validation_loss": log[-1]["validation"], **network.results(kept, corpus)},
-        "provenance": provenance(facts) if provenance else {},
-    }
+        info = Info(network, plan, corpus, corpus.facts(pair) | {"device": where.type}, provenance)
+        try:
+            kept, log = fit(objective, corpus, plan.training, plan.seed, where, kept_there)
+        except Diverged as diverged:
+            raise _explained(diverged, info, normaliser, kept_there, full_key) from diverged
     if not team.writes:
         return Path(out_folder) / FILE_NAME
-    path = save_checkpoint(out_folder, network.name, kept, normaliser, info)
-    write_log(Path(out_folder) / LOG_NAME, log)
+    with atomic_folder(out_folder) as partial:
+        save_checkpoint(partial, network.name, kept, normaliser, info.of(kept, log))
+        write_log(partial / LOG_NAME, log)
     if kept_there:
         kept_there.clear()
-    return path
+    return Path(out_folder) / FILE_NAME
+
+
+@dataclass(frozen=True)
+class Info:
+    """What a checkpoint records of its training, but for what is known at the end alone."""
+
+    network: Network
+    plan: Plan
+    corpus: Corpus
+    facts: dict[str, Any]
+    provenance: Callable[[dict[str, Any]], dict[str, Any]] | None
+
+    def of(self, kept: nn.Module, log: list[Row]) -> dict[str, Any]:
+        """For the weights that are kept, with the log up to them."""
+        end, plan = log[-1], self.plan
+        facts = {"model": self.network.name, "seed": plan.seed, "steps": int(end["step"] or 0), **self.facts}
+        return {
+            "facts": facts,
+            "training": plain_config(plan.training),
+            "loss": plain_config(plan.loss) if plan.loss else {},
+            "results": {"validation_loss": end["validation"], **self.network.results(kept, self.corpus)},
+            "provenance": self.provenance(facts) if self.provenance else {},
+        }
+
+
+def _write_empty(out_folder: str | Path, reason: str, team: Team) -> Path:
+    if team.writes:
+        with atomic_folder(out_folder) as partial:
+            write_empty(partial, reason)
+    return Path(out_folder) / EMPTY_NAME
+
+
+def _explained(
+    diverged: Diverged,
+    info: Info,
+    normaliser: Normaliser | None,
+    progress: Progress | None,
+    full_key: Callable[[str], str],
+) -> BadInput:
+    """The error for the user; the last good weights are written as a checkpoint before."""
+    training, name = info.plan.training, info.network.name
+    rate, clip = full_key("training.learning_rate"), full_key("training.clip_norm")
+    got = f"{diverged.what} at step {diverged.step} of {training.steps}"
+    remedy = f"lower {rate} ({training.learning_rate:g}) or set {clip} (now {training.clip_norm:g}; 0 is off)"
+    if diverged.step == 1:  # before the optimiser has changed a weight
+        remedy = "look for clips with numbers that are not finite (`hoidata validate`), or for a loss weighted too high"
+    kept = "nothing was kept: no weights were saved or validated before"
+    state = diverged.state
+    if progress and (good := _last_good(state, progress)):
+        path, log = progress.folder / LAST_GOOD, good
+        if progress.writes:
+            save_checkpoint(path, name, state.kept, normaliser, info.of(state.kept, log))
+        kept = f"the last good weights, of step {log[-1]['step']:g}, are kept in {path / FILE_NAME}"
+    return BadInput(f"training of {name}", "finite losses and weights", got, f"{remedy}; {kept}")
+
+
+def _last_good(state: State, progress: Progress) -> list[Row]:
+    """Put the best weights, or those that were saved last, into ``state.kept``; the log up to them, or nothing."""
+    if state.best:
+        best = next(number for number, row in enumerate(state.log) if row["validation"] == state.best_loss)
+        state.kept.load_state_dict(state.best)
+        return state.log[: best + 1]
+    if not progress.state_file.is_file() or not progress.read(state):
+        return []
+    return [*state.log, {"step": state.step, "validation": None}]
 
 
 def fit(
@@ -196,18 +270,24 @@ def fit(
         objective.frames, objective.entries, *shared, config.balance, config.mirror, config.augmented_copies
     )
     stream = batches(corpus.train, config.batch, seed, wanted, state.step)
-    remaining = range(state.step + 1, config.steps + 1)
+    remaining, losses = range(state.step + 1, config.steps + 1), dict[int, Tensor]()
+    check_every = CHECK_EVERY_ON_CPU if device.type == "cpu" else CHECK_EVERY
     for step in track(remaining, description=type(network).__name__, transient=True, disable=not team.writes):
         if config.patience and state.since >= config.patience:
             break
         optimiser.zero_grad(set_to_none=True)
-        _add_gradients(state, objective, next(stream), (seed, step, config.parts), device, team)
+        losses[step] = _add_gradients(state, objective, next(stream), (seed, step, config.parts), device, team)
+        is_validated = step % config.validate_every == 0 or step == config.steps
+        if is_validated or step % check_every == 0:
+            _refuse_not_finite(losses, state)
         _update(state, learnt, config)
         state.step = step
-        if step % config.validate_every == 0 or step == config.steps:
-            _validate(state, objective, config, team)
+        if is_validated:
+            _validate(state, objective if len(corpus.validation) else None, config)
         if progress:
             progress.keep(state, config.save_every)
+    if not all_finite(state.kept.state_dict()):
+        raise Diverged(state.step, WEIGHTS, state)
     if state.best:
         state.kept.load_state_dict(state.best)
     return state.kept, state.log
@@ -220,16 +300,18 @@ def _add_gradients(
     numbers: tuple[int, int, int],
     device: torch.device,
     team: Team,
-) -> None:
+) -> Tensor:
     """Gradients of one step, the mean over all parts of its batch. numbers: seed, step, and how many parts there are.
 
-    Every part starts with the same statistics of batch norms; the mean of what they become is kept.
+    Gives () the loss, the same in every process of the team, on the device. Every part starts with the same statistics
+    of batch norms; the mean of what they become is kept.
     """
     seed, step, of = numbers
     buffers = list(state.network.buffers()) if of > 1 else []
     before = [buffer.clone() for buffer in buffers]
     statistics = [buffer for buffer in buffers if buffer.is_floating_point()]
     after = [torch.zeros_like(buffer) for buffer in statistics]
+    losses = dict[str, Tensor]()
     for part, batch in parts:
         for buffer, old in zip(buffers, before, strict=True):
             buffer.copy_(old)
@@ -238,14 +320,25 @@ def _add_gradients(
         for total, buffer in zip(after, statistics, strict=True):
             total += buffer / of
         for name, value in found.items():
-            state.running[name] = state.running.get(name, 0) + value.detach() / of
+            losses[name] = losses.get(name, 0) + value.detach() / of
     learnt = [parameter for parameter in state.network.parameters() if parameter.requires_grad]
     for parameter in learnt:
         # What a batch did not use (hands that are in none of its clips) has moments like all else, in every process.
         parameter.grad = torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
-    team.add_up([*after, *(parameter.grad for parameter in learnt if parameter.grad is not None)])
+    team.add_up([*after, *losses.values(), *(parameter.grad for parameter in learnt if parameter.grad is not None)])
     for buffer, total in zip(statistics, after, strict=True):
         buffer.copy_(total)
+    for name, value in losses.items():
+        state.running[name] = state.running.get(name, 0) + value
+    return losses["total"]
+
+
+def _refuse_not_finite(losses: dict[int, Tensor], state: State) -> None:
+    """Raise Diverged at the first of these steps whose loss is no finite number; forget them otherwise."""
+    for step, loss in zip(losses, torch.stack(list(losses.values())).tolist(), strict=True):
+        if not math.isfinite(loss):
+            raise Diverged(step, f"a loss of {loss:g}", state)
+    losses.clear()
 
 
 def _update(state: State, learnt: list[nn.Parameter], config: TrainingConfig) -> None:
@@ -258,14 +351,18 @@ def _update(state: State, learnt: list[nn.Parameter], config: TrainingConfig) ->
     _follow(state.kept, state.network, config.ema_decay if state.step >= config.warmup else 0.0)
 
 
-def _validate(state: State, objective: Objective, config: TrainingConfig, team: Team) -> None:
-    """A row of the log; the weights and the loss where they are the best so far."""
-    team.add_up(state.running.values())
-    steps = state.step - (int(state.log[-1]["step"]) if state.log else 0)
-    row = {f"train_{name}": float(value) / steps for name, value in state.running.items()}
-    loss = float(objective.validation(state.kept))
+def _validate(state: State, objective: Objective | None, config: TrainingConfig) -> None:
+    """A row of the log; the weights and the loss where they are the best so far. objective: None without clips."""
+    steps = state.step - (int(state.log[-1]["step"] or 0) if state.log else 0)
+    row: Row = {f"train_{name}": float(value) / steps for name, value in state.running.items()}
+    loss = None if objective is None else float(objective.validation(state.kept))
+    if loss is not None and not math.isfinite(loss):
+        raise Diverged(state.step, f"a validation loss of {loss:g}", state)
     state.log.append({"step": state.step, "validation": loss, **row})
-    state.running, better = {}, loss < state.best_loss
+    state.running = {}
+    if loss is None:
+        return
+    better = loss < state.best_loss
     state.since = 0 if better else state.since + 1
     state.best_loss = loss if better else state.best_loss
     if better and config.keep_best:

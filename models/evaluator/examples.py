@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 
 import numpy as np
 import torch
@@ -9,6 +10,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from hoidata.actions.action import verb_of
+from hoidata.files import canonical_json
 from hoidata.metrics.encoded import UNKNOWN, label_words, recorded
 from hoidata.metrics.paths import FRAMES, even_frames, joints_and_presence
 from hoidata.store.annotated import AnnotatedStore
@@ -49,6 +51,13 @@ class Examples:
             annotated.store.sequences.loc[ids, "object_words"].tolist(),
             [annotated.hand_type(clip_id) for clip_id in ids],
         )
+
+    def digest(self) -> str:
+        """SHA-256 of everything that is here."""
+        found = sha256(canonical_json([self.ids, self.verbs, self.objects, self.hands]).encode())
+        for array in (*self.steps, *(part for own in self.joints for part in own), self.text):
+            found.update(np.ascontiguousarray(array).data)
+        return found.hexdigest()
 
     def label_words(self, kind: str) -> list[str | None]:
         return label_words(kind, self.verbs, self.objects)

@@ -1,19 +1,23 @@
 """The evaluator of one dataset: every network trained, weighed on recorded clips, and written with what is known."""
 
+import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load, save
 from torch import Tensor
 
-from hoidata.files import atomic_file
-from hoidata.files.digest import canonical_json
+from hoidata.files import atomic_folder, canonical_json, sha256_bytes, write_whole
+from hoidata.files.sealed import METADATA_KEY
 from hoidata.hands import HandPair
 from hoidata.metrics.encoded import UNKNOWN
 from hoidata.metrics.majority import majority_rows
+from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.workers import in_workers
 from models.common.checkpoints import save_checkpoint
@@ -32,29 +36,50 @@ Figures = dict[str, Any]
 
 
 class Trained(NamedTuple):
-    """One training. weights: as safetensors; chosen_by: on the held-out clips, higher is better."""
+    """One training. weights: as safetensors; chosen_by: on validation clips, higher is better; None without any."""
 
     seed: int
     weights: bytes
-    chosen_by: float
+    chosen_by: float | None
     figures: Figures
 
 
 @dataclass(frozen=True)
 class Training:
-    """Trains the network of a name from a seed, here or in a worker.
+    """Trains the network of a name from a seed, here or in a worker; one that a killed run had finished is read.
 
-    is_worker: the process is one of its own, whose settings may be fixed.
+    is_worker: the process is one of its own, whose settings may be fixed. finished: folder for finished trainings of
+    the same settings, clips and code, or None.
     """
 
     parts: dict[str, Examples]
     settings: EvaluatorSettings
     is_worker: bool
+    finished: Path | None
 
     def __call__(self, item: tuple[NetworkName, int]) -> Trained:
         if self.is_worker:
             make_repeatable(threads=1)
-        return _trained(*item, self.parts, self.settings)
+        name, seed = item
+        path = None if self.finished is None else self.finished / f"{name}-{seed}.safetensors"
+        if path and (found := _read_finished(path, seed)):
+            return found
+        trained = _trained(name, seed, self.parts, self.settings)
+        if path:
+            known = {"chosen_by": trained.chosen_by, "figures": trained.figures}
+            write_whole(path, save(load(trained.weights), metadata={METADATA_KEY: canonical_json(known)}))
+        return trained
+
+
+def _read_finished(path: Path, seed: int) -> Trained | None:
+    """The training in a file, or None where there is none that can be read."""
+    try:
+        with safe_open(path, framework="pt") as stored:
+            known = json.loads((stored.metadata() or {})[METADATA_KEY])
+            weights = save({name: stored.get_tensor(name) for name in stored.keys()})  # noqa: SIM118
+        return Trained(seed, weights, known["chosen_by"], known["figures"])
+    except (OSError, SafetensorError, KeyError, ValueError):
+        return None
 
 
 def train_evaluators(
@@ -65,12 +90,17 @@ def train_evaluators(
     *,
     jobs: int = 1,
     provenance: Callable[[dict[str, Any]], dict[str, Any]] | None = None,
+    progress: str | Path | None = None,
+    code: str = "",
 ) -> dict[str, Any] | str:
     """Write ``out/<network>/model.safetensors`` and ``out/info.json``; what stands there, or why nothing was written.
 
     annotated_root: clips, annotation, contact and splits of one dataset. provenance: from facts to what is stored. Each
-    network is trained once per seed on the training part and chosen on validation; test clips are only weighed. jobs:
-    trainings at once, in processes of their own; the bytes do not depend on it.
+    network is trained once per seed on the training part and chosen on validation; test clips are only weighed. Without
+    validation clips of a label that was trained the last weights of the first seed are kept. jobs: trainings at once,
+    in processes of their own; the bytes do not depend on it. The folder ``out`` appears whole or not at all.
+    progress: a folder where a killed run leaves its finished trainings. code: a digest of what runs; trainings of other
+    settings, clips or code are not read.
     """
     annotated = load_annotated(annotated_root, hands)
     parts = {split: Examples.of(annotated, split) for split in SPLITS}
@@ -84,24 +114,30 @@ def train_evaluators(
         "evaluators": {},
     }
     wanted = [(name, seed) for name in settings.networks for seed in settings.seeds]
-    found = dict(in_workers(Training(parts, settings, jobs > 1), wanted, jobs))
-    for name in settings.networks:
-        trainings = [found[name, seed] for seed in settings.seeds]
-        kept = sorted(trainings, key=lambda one: (one.chosen_by, -one.seed))[len(trainings) // 2]
-        by_seed = {str(one.seed): one.figures for one in trainings}
-        facts = _facts(name, kept, parts, settings, annotated, info["labels"])
-        stored = {"facts": facts, "results": kept.figures, "provenance": provenance(facts) if provenance else {}}
-        network = _network(name, kept, parts["train"], settings)
-        save_checkpoint(Path(out) / name, stored_network(name).name, network, None, stored)
-        info["evaluators"][name] = {
-            "digest": weights_digest(network),
-            "parameters": sum(weight.numel() for weight in network.parameters()),
-            "seed": kept.seed,
-            **kept.figures,
-            "by_seed": by_seed,
-        }
-    with atomic_file(Path(out) / "info.json") as part:
-        part.write_text(canonical_json(info) + "\n")
+    finished = None
+    if progress is not None:
+        made_from = [code, plain_config(settings), *(examples.digest() for examples in parts.values())]
+        finished = Path(progress) / sha256_bytes(canonical_json(made_from).encode())[:16]
+    found = dict(in_workers(Training(parts, settings, jobs > 1, finished), wanted, jobs))
+    with atomic_folder(out) as partial:
+        for name in settings.networks:
+            trainings = [found[name, seed] for seed in settings.seeds]
+            kept = _chosen(trainings)
+            by_seed = {str(one.seed): one.figures for one in trainings}
+            facts = _facts(name, kept, parts, settings, annotated, info["labels"])
+            stored = {"facts": facts, "results": kept.figures, "provenance": provenance(facts) if provenance else {}}
+            network = _network(name, kept, parts["train"], settings)
+            save_checkpoint(partial / name, stored_network(name).name, network, None, stored)
+            info["evaluators"][name] = {
+                "digest": weights_digest(network),
+                "parameters": sum(weight.numel() for weight in network.parameters()),
+                "seed": kept.seed,
+                **kept.figures,
+                "by_seed": by_seed,
+            }
+        (partial / "info.json").write_text(canonical_json(info) + "\n")
+    if progress is not None:
+        shutil.rmtree(progress, ignore_errors=True)
     return info
 
 
@@ -114,20 +150,27 @@ def _why_not(train: Examples, settings: EvaluatorSettings) -> str | None:
     )
 
 
+def _chosen(trainings: Sequence[Trained]) -> Trained:
+    """The training in the middle by validation; without validation clips the first."""
+    ranks = [(own.chosen_by, -own.seed, own) for own in trainings if own.chosen_by is not None]
+    return sorted(ranks, key=lambda rank: rank[:2])[len(ranks) // 2][2] if ranks else trainings[0]
+
+
 def _trained(name: NetworkName, seed: int, parts: dict[str, Examples], settings: EvaluatorSettings) -> Trained:
     train = parts["train"]
-    held_out = parts["validation"] if len(parts["validation"]) else train
     with own_draws():
         torch.manual_seed(seed)
         task, network = _task(name, train, settings), MotionEncoder(config_of(name, train, settings.labels))
+        known = {split: examples for split, examples in parts.items() if task.can_weigh(examples)}
+        held_out = known.get("validation")
         fit(network, task, train, held_out, RECIPES[name], seed, settings.most_steps)
+    weights = save(network.state_dict())
     if isinstance(task, Classification):
-        found = {split: _accuracies(network, task, examples) for split, examples in parts.items() if len(examples)}
-        chosen_by = _accuracies(network, task, held_out)["top1"]
-        return Trained(seed, save(network.state_dict()), chosen_by, {"accuracy": found})
-    losses = {split: held_out_loss(network, task, examples) for split, examples in parts.items() if len(examples)}
+        found = {split: _accuracies(network, task, examples) for split, examples in known.items()}
+        return Trained(seed, weights, found["validation"]["top1"] if held_out else None, {"accuracy": found})
+    losses = {split: held_out_loss(network, task, examples) for split, examples in known.items()}
     rounded = {split: round(loss, DIGITS) for split, loss in losses.items()}
-    return Trained(seed, save(network.state_dict()), -held_out_loss(network, task, held_out), {"loss": rounded})
+    return Trained(seed, weights, -losses["validation"] if held_out else None, {"loss": rounded})
 
 
 def _network(name: NetworkName, trained: Trained, train: Examples, settings: EvaluatorSettings) -> MotionEncoder:

@@ -11,6 +11,7 @@ from typing import Protocol
 import torch
 from torch import Tensor, nn
 
+from hoidata.errors import BadInput
 from hoidata.metrics.encoded import UNKNOWN
 from models.evaluator.examples import Examples
 from models.evaluator.networks import MotionEncoder, turned
@@ -52,6 +53,10 @@ class Task(Protocol):
         """What is asked of each clip; tensors whose first axis counts clips."""
         ...
 
+    def can_weigh(self, examples: Examples) -> bool:
+        """Whether there is a clip among them of which something is asked."""
+        ...
+
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None
     ) -> Tensor:
@@ -80,6 +85,10 @@ class Classification:
     def targets(self, examples: Examples) -> tuple[Tensor, ...]:
         return (examples.labels(self.label_kind, self.labels),)
 
+    def can_weigh(self, examples: Examples) -> bool:
+        """Whether one of them has a label of the training clips."""
+        return bool((self.targets(examples)[0] != UNKNOWN).any())
+
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None
     ) -> Tensor:
@@ -97,6 +106,9 @@ class Pairing:
     def targets(self, examples: Examples) -> tuple[Tensor, ...]:
         return torch.from_numpy(examples.text), examples.prompts()
 
+    def can_weigh(self, examples: Examples) -> bool:
+        return len(examples) > 0
+
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None
     ) -> Tensor:
@@ -112,9 +124,18 @@ class Pairing:
 
 
 def fit(
-    network: MotionEncoder, task: Task, train: Examples, held_out: Examples, recipe: Recipe, seed: int, most_steps: int
+    network: MotionEncoder,
+    task: Task,
+    train: Examples,
+    held_out: Examples | None,
+    recipe: Recipe,
+    seed: int,
+    most_steps: int,
 ) -> MotionEncoder:
-    """The network as it was at the lowest loss on ``held_out``, in evaluation mode."""
+    """The network as it was at the lowest loss on ``held_out``, in evaluation mode; without those clips at the end.
+
+    Raises BadInput at the first loss that is no finite number.
+    """
     generator, trunk, targets = torch.Generator().manual_seed(seed), network.config.trunk, task.targets(train)
     optimiser = torch.optim.AdamW(network.parameters(), lr=recipe.learning_rate, weight_decay=recipe.weight_decay)
     best, best_loss, since, steps = copy.deepcopy(network.state_dict()), math.inf, 0, 0
@@ -125,21 +146,36 @@ def fit(
                 motion = turned(motion, 2 * math.pi * torch.rand(len(rows), generator=generator))
             optimiser.zero_grad(set_to_none=True)
             logits = network.train()(motion, lengths)[1]
-            task.loss(network, logits, tuple(target[rows] for target in targets), generator).backward()
+            loss = task.loss(network, logits, tuple(target[rows] for target in targets), generator)
+            _refuse_not_finite(float(loss.detach()), f"training loss at step {steps + 1}", best_loss)
+            loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_norm)
             optimiser.step()
             steps += 1
-        found = held_out_loss(network, task, held_out)
-        since = 0 if found < best_loss else since + 1
-        if found < best_loss:
-            best, best_loss = copy.deepcopy(network.state_dict()), found
-        elif since % SLOWER_AFTER == 0:
-            for group in optimiser.param_groups:
-                group["lr"] *= recipe.plateau
+        if held_out is not None:
+            found = held_out_loss(network, task, held_out)
+            _refuse_not_finite(found, f"validation loss after step {steps}", best_loss)
+            since = 0 if found < best_loss else since + 1
+            if found < best_loss:
+                best, best_loss = copy.deepcopy(network.state_dict()), found
+            elif since % SLOWER_AFTER == 0:
+                for group in optimiser.param_groups:
+                    group["lr"] *= recipe.plateau
         if since >= recipe.patience or steps >= most_steps:
             break
-    network.load_state_dict(best)
+    if held_out is None:
+        # Nothing has looked at the weights after the last step.
+        _refuse_not_finite(held_out_loss(network, task, train), f"training loss after step {steps}", best_loss)
+    else:
+        network.load_state_dict(best)
     return network.eval()
+
+
+def _refuse_not_finite(loss: float, what: str, best_loss: float) -> None:
+    if not math.isfinite(loss):
+        best = "" if math.isinf(best_loss) else f" (the best validation loss before was {best_loss:g})"
+        remedy = "look for clips with numbers that are not finite (`hoidata validate`), or leave the network out"
+        raise BadInput("evaluator", "finite losses", f"a {what} of {loss:g}{best}", f"{remedy} of evaluator.networks")
 
 
 @torch.no_grad()

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from hoidata.batches.dataset import ClipBatch, ClipSample
 from hoidata.clips.clip import FPS, SIDES
 from hoidata.devices import send
+from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.surface_index import surface_index
 from models.common.family import Losses, Network, Setup
@@ -87,7 +88,10 @@ class FingersObjective:
         known = [one for clip in self.examples.values() for kinds in clip for one in kinds]
         self.network = prepared(replace(setup.network, features=settings), hand, known).to(setup.device)
         held = [one for sample in setup.corpus.held_out for one in clip_examples(sample, pair, settings)]
-        self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in LEARNT]
+        if setup.corpus.held_out and not held:
+            expected = "a hand that is seen in two frames in a row"
+            raise BadInput("validation", expected, "none in its clips", "put other clips into the validation part")
+        self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in LEARNT] if held else None
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         drawn = [pair for sample in batch.samples for pair in self._drawn(sample, generator)]
@@ -114,6 +118,7 @@ class FingersObjective:
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ManipNet)
+        assert self.held_out is not None
         inputs, made = (send(torch.from_numpy(rows), self.device) for rows in self.held_out)
         return step_loss(network, inputs, made)
 

@@ -1,6 +1,7 @@
 """Training of the contact network: what one step and one validation are, and what is found on validation clips."""
 
 from collections.abc import Callable
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -14,7 +15,12 @@ from models.common.family import Losses, Network, Objective, Setup
 from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss
 from models.text2hoi.contact import ContactModel, contact_loss, turned_and_scaled
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.thresholds import ContactNetwork, choose_contact_threshold, choose_draw_threshold
+from models.text2hoi.thresholds import (
+    UNCHOSEN_THRESHOLD,
+    ContactNetwork,
+    choose_contact_threshold,
+    choose_draw_threshold,
+)  # fmt: skip
 
 DrawContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
 
@@ -25,8 +31,11 @@ class ContactObjective:
     frames = entries = 0
 
     def __init__(self, network: nn.Module, weights: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.weights, self.device = network, weights, device
-        self.held_out = collate(corpus.held_out).to(device)
+        self.network, self.weights, self.corpus, self.device = network, weights, corpus, device
+
+    @cached_property
+    def held_out(self) -> ClipBatch:
+        return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
@@ -57,7 +66,10 @@ def contact_network(config: ContactConfig) -> ContactModel | AnchoredContact:
 
 
 def contact_threshold(checkpoint: Checkpoint) -> float:
-    """The mean probability of samples from which a point counts as touched, chosen on validation clips."""
+    """The mean probability of samples from which a point counts as touched.
+
+    Chosen on validation clips; ``UNCHOSEN_THRESHOLD`` without any.
+    """
     return float(checkpoint.info["results"]["contact_threshold"])
 
 
@@ -107,9 +119,12 @@ def _objective(setup: Setup) -> tuple[Objective, None]:
 
 def _results(network: nn.Module, corpus: Corpus) -> dict[str, float]:
     assert isinstance(network, ContactModel | AnchoredContact)
-    found = {"contact_threshold": choose_contact_threshold(network, corpus.held_out)}
+    held_out = corpus.held_out
+    if not held_out:
+        return {"contact_threshold": UNCHOSEN_THRESHOLD}
+    found = {"contact_threshold": choose_contact_threshold(network, held_out)}
     if isinstance(network, AnchoredContact):
-        found["draw_threshold"] = choose_draw_threshold(network, corpus.held_out)
+        found["draw_threshold"] = choose_draw_threshold(network, held_out)
     return found
 
 

@@ -48,12 +48,11 @@ class OwnContact:
 
     told_otherwise: OtherPrompt
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
-        model = self.told_otherwise.model
-        return model.sample_asked(self.told_otherwise.told(requests), contact_maps=model.contact_maps(requests))
+    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip | LeftOut], list[np.ndarray | None]]:
+        return self.told_otherwise.sample_asked(requests, self.told_otherwise.model.contact_maps(requests))
 
 
 def other_contact_maps(sources: Sources) -> dict[str, Tensor]:

@@ -14,7 +14,14 @@ from models.common.point_net import normalised_points
 from models.text2hoi.contact_training import CONTACT, contact_threshold
 from models.text2hoi.length import LengthModel
 from models.text2hoi.length_training import LENGTH
-from models.text2hoi.thresholds import ContactNetwork, best_threshold, contact_probabilities, mean_f1, true_maps
+from models.text2hoi.thresholds import (
+    UNCHOSEN_THRESHOLD,
+    ContactNetwork,
+    best_threshold,
+    contact_probabilities,
+    mean_f1,
+    true_maps,
+)  # fmt: skip
 
 CONTACT_SAMPLES = 32
 
@@ -25,7 +32,7 @@ def diagnose(sources: Sources) -> Figures:
         list(HoiDataset(sources.annotated, split, crop="start")) for split in ("train", "validation", "test")
     )
     figures = {
-        "contact": contact_figures(sources, train, validation or train, test),
+        "contact": contact_figures(sources, train, validation, test),
         "length": length_figures(sources, train, test),
     }
     return {name: {key: round(float(value), 6) for key, value in rows.items()} for name, rows in figures.items()}
@@ -34,14 +41,19 @@ def diagnose(sources: Sources) -> Figures:
 def contact_figures(
     sources: Sources, train: list[ClipSample], held_out: list[ClipSample], test: list[ClipSample]
 ) -> dict[str, float]:
-    """F1 of the mean of samples at the checkpoint's threshold, beside mean maps at thresholds chosen alike."""
+    """F1 of the mean of samples at the checkpoint's threshold, beside mean maps at thresholds chosen alike.
+
+    held_out: validation clips, on which thresholds of mean maps are chosen; ``UNCHOSEN_THRESHOLD`` without any.
+    """
     checkpoint = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
     assert isinstance(checkpoint.network, ContactNetwork)
     threshold = contact_threshold(checkpoint)
     f1 = mean_f1(contact_probabilities(checkpoint.network, test, CONTACT_SAMPLES, 0), true_maps(test), threshold)
     baselines = {}
     for kind in ("index", "position", "object"):
-        chosen = best_threshold(mean_maps(train, held_out, kind), true_maps(held_out))
+        chosen = UNCHOSEN_THRESHOLD
+        if held_out:
+            chosen = best_threshold(mean_maps(train, held_out, kind), true_maps(held_out))
         baselines[kind] = mean_f1(mean_maps(train, test, kind), true_maps(test), chosen)
     mean_map = max(baselines["index"], baselines["position"])
     return {

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -134,7 +135,11 @@ class DiffusionObjective:
         shares = feature_shares(weights.weighting, device, network.code.object_features)
         self.hand_shares, self.object_shares = (share / network.config.signal_scale**2 for share in shares)
         self.features: dict[str, Tensor] = {}
-        self.held_out = collate(corpus.held_out).to(device)
+        self.corpus = corpus
+
+    @cached_property
+    def held_out(self) -> ClipBatch:
+        return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         weights, target = self.weights, self.targets.of(batch)

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from torch import Tensor
 
 from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.settings import build_config
-from models.common.family import Family, Sources
+from models.common.family import Family, LeftOut, Sources
 from models.common.predicting import first_sentence
 from models.text2hoi.diagnostics import diagnose
 from models.text2hoi.networks import NETWORKS
@@ -19,6 +20,7 @@ from models.text2hoi.sampler import SamplingConfig, Text2Hoi
 
 NAMES = tuple(network.name for network in NETWORKS)
 WITHOUT_FILES = ("use", "hash")
+NO_OTHER_SENTENCE = "all test clips have its sentence"
 
 
 def load_text2hoi(sources: Sources) -> Text2Hoi:
@@ -50,17 +52,28 @@ class BeforeRefiner:
 class OtherPrompt:
     """Text2HOI told another clip's sentence: what is then as good does not come from the words.
 
-    other: the clip whose sentence to use instead, by clip.
+    other: the clip whose sentence to use instead, by clip; a clip without another sentence has no answer.
     """
 
     model: Text2Hoi
     other: dict[str, ClipSample]
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip]:
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
 
-    def sample_asked(self, requests: Sequence[Request]) -> tuple[list[Clip], list[np.ndarray]]:
-        return self.model.sample_asked(self.told(requests))
+    def sample_asked(
+        self, requests: Sequence[Request], contact_maps: Sequence[Tensor] | None = None
+    ) -> tuple[list[Clip | LeftOut], list[np.ndarray | None]]:
+        """contact_maps: as in ``Text2Hoi.motions``."""
+        answers: list[Clip | LeftOut] = [LeftOut(request.motion_id, NO_OTHER_SENTENCE) for request in requests]
+        maps: list[np.ndarray | None] = [None] * len(requests)
+        rows = [row for row, request in enumerate(requests) if request.clip_id in self.other]
+        given = None if contact_maps is None else [contact_maps[row] for row in rows]
+        if rows:
+            made = self.model.sample_asked(self.told([requests[row] for row in rows]), contact_maps=given)
+            for row, clip, contact_map in zip(rows, *made, strict=True):
+                answers[row], maps[row] = clip, contact_map
+        return answers, maps
 
     def told(self, requests: Sequence[Request]) -> list[Request]:
         """The requests with the other sentences."""
@@ -72,12 +85,17 @@ class OtherPrompt:
 
 
 def other_prompts(sources: Sources) -> dict[str, ClipSample]:
-    """For every test clip another whose first sentence it is told: other verb and object if there is one such."""
+    """For every test clip another whose first sentence it is told: other verb and object if there is one such.
+
+    A clip is absent where all test clips have its sentence.
+    """
     test = list(HoiDataset(sources.annotated, "test", crop="start"))
     draws, chosen = np.random.default_rng(0), {}
     for sample in test:
         other = [s for s in test if s.verb != sample.verb and s.object_key != sample.object_key]
-        other = other or [s for s in test if s.sentences[0] != sample.sentences[0]] or [sample]
+        other = other or [s for s in test if s.sentences[0] != sample.sentences[0]]
+        if not other:
+            continue
         same_hand = [s for s in other if s.hand_type == sample.hand_type] or other
         chosen[sample.clip_id] = same_hand[int(draws.integers(len(same_hand)))]
     return chosen

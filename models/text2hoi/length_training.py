@@ -1,6 +1,7 @@
 """Training of the length network: what one step and one validation are."""
 
 from dataclasses import replace
+from functools import cached_property
 
 import torch
 from torch import Tensor, nn
@@ -26,8 +27,11 @@ class LengthObjective:
     frames = entries = 0
 
     def __init__(self, network: LengthModel, loss: LengthLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.loss, self.device = network, loss, device
-        self.held_out = collate(corpus.held_out).to(device)
+        self.network, self.loss, self.corpus, self.device = network, loss, corpus, device
+
+    @cached_property
+    def held_out(self) -> ClipBatch:
+        return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
         frames = jittered_frames(batch.lengths, self.loss.jitter, generator)

@@ -107,8 +107,10 @@ class RefinerObjective:
         for kind in kinds:
             for sample, coarse in zip(train, self._make(train, kind, draws), strict=True):
                 self.pool[sample.clip_id].append(coarse)
-        held = self._make(held_out, kinds[-1], torch.Generator().manual_seed(0))
-        self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
+        self.held_out: _Comparison | None = None
+        if held_out:
+            held = self._make(held_out, kinds[-1], torch.Generator().manual_seed(0))
+            self.held_out = self._batch(collate(held_out, self._sight(held_out)).to(device), held)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         numbers = np.random.default_rng(generator.initial_seed()).integers(self.weights.samples, size=len(batch))
@@ -118,6 +120,7 @@ class RefinerObjective:
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, RefinerModel)
+        assert self.held_out is not None
         return self._losses(network, self.held_out, torch.Generator().manual_seed(0))["total"]
 
     def _sight(self, samples: list[ClipSample]) -> Sight:

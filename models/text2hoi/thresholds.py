@@ -12,6 +12,7 @@ from models.text2hoi.contact import ContactModel
 
 ContactNetwork = ContactModel | AnchoredContact
 
+UNCHOSEN_THRESHOLD = 0.5  # without validation clips: touched where that is likelier than not
 THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
 
 

@@ -33,6 +33,11 @@ class DatasetFacts:
     info: dict
 
     @property
+    def missing_subsets(self) -> list[str]:
+        """What it means that parts of the chosen split have no clips."""
+        return [] if self.annotated is None else list(self.annotated.missing_subsets.values())
+
+    @property
     def reasons(self) -> list[tuple[str, int]]:
         """What the sequences left out should have been, most frequent first."""
         return _frequent([row["expected"] for row in self.quarantine], "")

@@ -8,14 +8,20 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.contact.maps import contact_maps, distance_entries
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import HandPair, track_joints
-from hoidata.store.annotated import AnnotatedStore
+from hoidata.store.annotated import SUBSETS, AnnotatedStore
 from hoidata.store.store import open_store
 from pipelines.pages.surface import ContactPaint
 
 
+def shown_subset(annotated: AnnotatedStore) -> str:
+    """The subset that examples are of: test, else validation, else train; "" without clips."""
+    return next((subset for subset in reversed(SUBSETS) if annotated.split_ids(subset)), "")
+
+
 def shown_ids(annotated: AnnotatedStore, count: int) -> list[str]:
-    """Up to ``count`` test clips (validation, then training, where there are none), of different objects first."""
-    ids = next((ids for split in ("test", "validation", "train") if (ids := annotated.split_ids(split))), [])
+    """Up to ``count`` clips of ``shown_subset``, of different objects first."""
+    subset = shown_subset(annotated)
+    ids = annotated.split_ids(subset) if subset else []
     first_of_object = list({annotated.object_key(clip_id): clip_id for clip_id in reversed(ids)}.values())[::-1]
     rest = [clip_id for clip_id in ids if clip_id not in first_of_object]
     return (first_of_object + rest)[:count]

@@ -15,7 +15,7 @@ from hoidata.store.info import stand_in_note
 from pipelines.pages.curves import Panel, log_curves, panels_svg, read_log
 from pipelines.pages.dataset_facts import DatasetFacts, read_dataset, reason_for_nothing
 from pipelines.pages.dataset_page import can_be_shown, write_dataset_page
-from pipelines.pages.examples import first_motion, motion_contact, shown_ids, true_contact
+from pipelines.pages.examples import first_motion, motion_contact, shown_ids, shown_subset, true_contact
 from pipelines.pages.metrics_table import CONTROLS, LOOKUPS, MetricsTable, metrics_tables
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.quality import QualityFacts, read_quality
@@ -134,8 +134,9 @@ def _section(name: str, folders: ReportFolders, families: Sequence[str], hands: 
 
 
 def _what_is_shown(facts: DatasetFacts) -> str:
-    held_out = facts.annotated is not None and bool(facts.annotated.split_ids("test"))
-    return "A clip of the test split" if held_out else "A clip (this dataset has no test split)"
+    subset = "" if facts.annotated is None else shown_subset(facts.annotated)
+    names = {"test": "A clip of the test split", "validation": "A validation clip (no clips test)"}
+    return names.get(subset, "A training clip (no clips test or validate)")
 
 
 def _rivals(samples: Path, family: str) -> dict[str, Path]:

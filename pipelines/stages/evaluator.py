@@ -1,12 +1,14 @@
 """Stage evaluator: the networks that tell what a motion shows, trained on recorded clips of one dataset."""
 
+from dataclasses import replace
 from pathlib import Path
 
-from hoidata.files.atomic import atomic_folder
+from hoidata.files import sha256_file
 from models.evaluator.settings import EvaluatorSettings
 from pipelines.lineage.graph import producers, written_graph
-from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, note_empty, write_empty
+from pipelines.stages.base import StagePaths, empty_reason, jobs, load_hands, load_settings, write_empty
 
+CODE = Path("code/evaluator.json")
 OFF = "off: params.yaml names no networks under evaluator"
 
 
@@ -24,17 +26,18 @@ def run(paths: StagePaths) -> None:
 
     make_repeatable(threads=1)
     stage = producers(written_graph(Path()))[paths.evaluators.as_posix()].name
-    with atomic_folder(paths.evaluators) as part:
-        found = train_evaluators(
-            paths.data,
-            part,
-            settings,
-            load_hands(paths.profile),
-            jobs=jobs(),
-            provenance=lambda facts: build_provenance(Path(), stage, facts),
-        )
-        if isinstance(found, str):
-            note_empty(part, found)
-            return
+    found = train_evaluators(
+        paths.data,
+        paths.evaluators,
+        settings,
+        load_hands(paths.profile),
+        jobs=jobs(),
+        provenance=lambda facts: build_provenance(Path(), stage, facts),
+        progress=replace(paths, model="evaluator").training,
+        code=sha256_file(CODE) if CODE.is_file() else "",
+    )
+    if isinstance(found, str):
+        write_empty(paths.evaluators, found)
+        return
     for name, known in found["evaluators"].items():
         print(f"{paths}: {name}: {known.get('accuracy') or known['loss']}")

@@ -1,5 +1,7 @@
 """Stage split: the parts of every named split, the chosen one, its leak check, and the training statistics."""
 
+import sys
+
 from pipelines.stages.base import StagePaths, empty_reason, print_counts, read_section, write_empty
 
 
@@ -10,6 +12,10 @@ def run(paths: StagePaths) -> None:
     if reason := empty_reason(paths.annotation):
         write_empty(paths.splits, reason)
         return
+    from hoidata.splits.rules import missing_parts
     from hoidata.splits.stage import split_store
 
-    print_counts(paths, split_store(paths.clips, paths.annotation, paths.splits, wanted))
+    counts = split_store(paths.clips, paths.annotation, paths.splits, wanted)
+    print_counts(paths, counts)
+    for words in missing_parts(counts).values():
+        print(f"{paths}: {words}; choose another split under split.{paths.dataset} of params.yaml", file=sys.stderr)

@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from hoidata.files.atomic import atomic_folder
 from models.bimart_tables.variants import VARIANTS, variant_of
 from pipelines.params import laid_over
 from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
@@ -20,12 +19,5 @@ def run(paths: StagePaths) -> None:
         write_empty(paths.table_network, reason)
         return
     params = laid_over(load_settings(TrainParams, "train").of(paths.model), networks[paths.model])
-    with atomic_folder(paths.table_network) as partial:
-        train_into(
-            partial,
-            paths,
-            {**params, "seed": seed},
-            paths.table_network,
-            paths.table_training,
-            CODE / f"{paths.model}.json",
-        )
+    code = CODE / f"{paths.model}.json"
+    train_into(paths.table_network, paths, {**params, "seed": seed}, paths.table_training, code)

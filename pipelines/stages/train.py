@@ -1,17 +1,18 @@
 """Stage train: one network on one dataset, with the record of what it was made from."""
 
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.files import sha256_file
-from hoidata.files.atomic import atomic_folder
 from models.registry import load_network
 from pipelines.lineage.graph import producers, written_graph
 from pipelines.lineage.provenance import build_provenance
-from pipelines.params import laid_over, read_params
+from pipelines.params import laid_over, read_file, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
 from pipelines.stages.listed import off_reason
 
@@ -51,19 +52,43 @@ def run(paths: StagePaths) -> None:
         return
     from models.common.team import run_team
 
-    with atomic_folder(paths.checkpoint) as partial, tempfile.TemporaryDirectory() as meeting:
-        run_team(train, load_settings(TrainParams, "train").processes, Path(meeting) / "team", paths, partial)
+    processes = load_settings(TrainParams, "train").processes
+    meeting = tempfile.TemporaryDirectory() if processes > 1 else nullcontext("")
+    with meeting as folder:
+        run_team(train, processes, Path(folder) / "team", paths)
 
 
-def train(paths: StagePaths, out: Path) -> None:
-    """One process of the training of ``paths.model`` into ``out``."""
+def train(paths: StagePaths) -> None:
+    """One process of the training of ``paths.model``."""
     params = load_settings(TrainParams, "train").of(paths.model)
     code = Path("code", "train", f"{paths.model}.json")
-    train_into(out, paths, params, paths.checkpoint, paths.training, code)
+    train_into(paths.checkpoint, paths, params, paths.training, code)
 
 
-def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], made: Path, progress: Path, code: Path) -> None:
-    """Train ``paths.model`` by its settings. made: the output by which its stage is known; progress: of a killed one.
+def full_key(network: str, key: str, path: Path = Path("params.yaml")) -> str:
+    """The key of params.yaml that decides a setting of a network, such as ``train.small.length.training.steps``.
+
+    The one of the size where nothing is said: what is written there is laid over the preset.
+    """
+    values, chosen = read_file(path), load_settings(TrainParams, "train", path)
+    profile = ("profiles", str(values.get("profile")))
+    places = [(*at, "train", own, network) for own in (chosen.size, chosen.preset) for at in (profile, ())]
+    for place in places:
+        if _is_said(values, (*place, *key.split("."))):
+            return ".".join((*place, key))
+    return ".".join((*places[1], key))
+
+
+def _is_said(values: Any, names: Sequence[str]) -> bool:
+    for name in names:
+        if not isinstance(values, Mapping) or name not in values:
+            return False
+        values = values[name]
+    return True
+
+
+def train_into(made: Path, paths: StagePaths, params: Mapping[str, Any], progress: Path, code: Path) -> None:
+    """Train ``paths.model`` by its settings into the output ``made``. progress: of a killed training.
 
     code: the file with the digests of what runs.
     """
@@ -78,7 +103,7 @@ def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], made: Pa
     train_network(
         network,
         paths.data,
-        out,
+        made,
         params,
         load_hands(paths.profile),
         needed={load_network(name): paths.checkpoints / name for name in network.needs},
@@ -86,4 +111,5 @@ def train_into(out: Path, paths: StagePaths, params: Mapping[str, Any], made: Pa
         device=Team.joined().device(chosen_device(read_params(Path()).get("device", "auto"))),
         progress=progress,
         code=sha256_file(code) if code.is_file() else "",
+        full_key=partial(full_key, network.name),
     )

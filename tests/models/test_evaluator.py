@@ -17,6 +17,7 @@ from hoidata.metrics.pair import Motion
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from models.common.repeatable import make_repeatable
+from models.evaluator import stage
 from models.evaluator.encoders import MotionEvaluator, load_evaluators, weights_digest
 from models.evaluator.examples import Examples, padded
 from models.evaluator.inputs import CORRECTED_SIZE, OBJECT, corrected_input, drawn_frames
@@ -226,6 +227,42 @@ def test_equal_trainings_give_equal_bytes_and_another_seed_other_weights(annotat
 
     make_repeatable(threads=1)
     assert files("one", 0) == files("again", 0) == files("two at once", 0, jobs=2) != files("other", 1)
+
+
+@pytest.mark.slow
+def test_trainings_that_a_killed_run_had_finished_are_not_done_again_and_the_bytes_are_the_same(
+    annotated_root, tmp_path, monkeypatch
+):
+    settings = EvaluatorSettings(("corrected",), seeds=(0, 1, 2), most_steps=3)
+    done, fitted = [], stage._trained
+
+    def killed_in_the_third(name, seed, *given):
+        done.append(seed)
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        return fitted(name, seed, *given)
+
+    train_evaluators(annotated_root, tmp_path / "whole", settings)
+    monkeypatch.setattr(stage, "_trained", killed_in_the_third)
+    with pytest.raises(KeyboardInterrupt):
+        train_evaluators(annotated_root, tmp_path / "out", settings, progress=tmp_path / "progress")
+    assert not (tmp_path / "out").exists()
+    train_evaluators(annotated_root, tmp_path / "out", settings, progress=tmp_path / "progress")
+    assert done == [0, 1, 2, 2]
+    whole, found = ([path.read_bytes() for path in sorted((tmp_path / one).rglob("*.*"))] for one in ("whole", "out"))
+    assert whole == found
+    assert not (tmp_path / "progress").exists()
+
+
+@pytest.mark.slow
+def test_finished_trainings_of_other_settings_or_code_are_not_read(annotated_root, tmp_path, monkeypatch):
+    settings = EvaluatorSettings(("corrected",), most_steps=3)
+    done, fitted = [], stage._trained
+    monkeypatch.setattr(stage, "_trained", lambda *given: done.append(given[1]) or fitted(*given))
+    monkeypatch.setattr(stage.shutil, "rmtree", lambda *_, **__: None)  # as if each run were killed at its end
+    for changed, code in ((settings, "a"), (settings, "a"), (settings, "b"), (replace(settings, most_steps=2), "b")):
+        train_evaluators(annotated_root, tmp_path / "out", changed, progress=tmp_path / "progress", code=code)
+    assert len(done) == 3
 
 
 def test_nothing_is_written_where_there_is_nothing_to_tell_apart(tmp_path, make_clip):

@@ -4,9 +4,11 @@ import json
 import multiprocessing
 import os
 import signal
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,8 +21,9 @@ from hoidata.errors import BadInput
 from hoidata.store.annotated import AnnotatedStore
 from models.common.corpus import Wanted, batches
 from models.common.family import Network, Setup
+from models.common.progress import Progress, State
 from models.common.team import Team, run_team
-from models.common.training import train_network
+from models.common.training import _add_gradients, train_network
 from models.registry import load_network
 from tests.models.toy import BUDGET, PARAMS
 
@@ -87,6 +90,62 @@ def test_a_training_killed_three_times_writes_the_bytes_of_an_undisturbed_one(
         assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
     assert not (out / "progress").exists()
     assert ("goes on after step" in capfd.readouterr().err) == (done > 0)
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize("name", [pytest.param("contact", marks=pytest.mark.slow), "length"])
+def test_a_short_training_is_saved_by_time_and_goes_on_with_the_same_bytes(
+    annotated_root: Path, out: Path, name: str, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    """Its steps are fewer than save_every; here each of them takes longer than the time between two saves."""
+    monkeypatch.setattr("models.common.progress.SAVE_AFTER_S", 0.0)
+    monkeypatch.setattr("models.common.progress.SAVE_SHARE", 0)
+    settings = {"steps": STEPS, "validate_every": 3, "keep_best": True, "ema_decay": 0.9}
+    train(name, annotated_root, out / "whole", **settings)
+    killed(name, annotated_root, out / "broken", progress=out / "progress", die_at=6, **settings)
+    train(name, annotated_root, out / "broken", progress=out / "progress", **settings)
+    assert "goes on after step 5" in capfd.readouterr().err
+    for file in ("model.safetensors", "log.csv"):
+        assert (out / "broken" / file).read_bytes() == (out / "whole" / file).read_bytes(), file
+
+
+def test_saving_takes_a_fiftieth_of_the_time_at_most(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of one second; a save takes three: the first one after ten seconds, then one each 150 seconds."""
+    now, saved = [0.0], []
+    monkeypatch.setattr("models.common.progress.time.monotonic", lambda: now[0])
+    network = torch.nn.Linear(1, 1)
+    state = State(network, network, torch.optim.AdamW(network.parameters()))
+    progress = Progress(tmp_path, "")
+
+    def save(state: State) -> None:
+        saved.append(now[0])
+        now[0] += 3
+
+    monkeypatch.setattr(progress, "save", save)
+    for step in range(1, 401):
+        now[0], state.step = now[0] + 1, step
+        progress.keep(state, 1000)
+    assert saved == [10, 163, 316]
+
+
+def test_the_losses_that_are_saved_and_looked_at_are_those_of_the_whole_team(
+    annotated: AnnotatedStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two processes that compute the same, sums are twice one's: also between two validations, where one saves."""
+
+    def twice(team: Team, tensors: Iterable[torch.Tensor]) -> None:
+        for tensor in tensors:
+            tensor *= 2
+
+    monkeypatch.setattr(Team, "add_up", twice)
+    network = torch.nn.Linear(1, 1)
+    objective = SimpleNamespace(losses=lambda batch, generator: {"total": network.weight.sum() * 0 + 3.0})
+    state = State(network, network, torch.optim.AdamW(network.parameters()))
+    batch = next(batches(HoiDataset(annotated, "train"), 2, 0))
+    device = torch.device("cpu")
+    losses = [_add_gradients(state, objective, batch, (0, step, 1), device, Team()) for step in (1, 2)]  # type: ignore[arg-type]
+    assert [float(loss) for loss in losses] == [6, 6]
+    assert float(state.running["total"]) == 12
 
 
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")

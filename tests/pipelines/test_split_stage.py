@@ -52,6 +52,15 @@ def test_a_name_or_a_rule_of_the_users_own_decides(folder):
     assert json.loads((GRAB.splits / "info.json").read_text())["chosen"]["name"] == "params.yaml"
 
 
+def test_parts_without_clips_are_said_with_the_setting(folder, capsys):
+    choose_split(folder, {"by": "subject", "train": "rest", "validation": ["s7"], "test": ["s10"]})
+    split.run(GRAB)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("embedded-grab: no validation clips: ")
+    assert "split.grab of params.yaml" in said[0]
+
+
 def test_a_name_that_is_not_there_lists_those_that_are(folder):
     choose_split(folder, "text2hio")
     with pytest.raises(BadInput, match=r"params.yaml: split.grab: expected one of: composition, .*official, text2hoi"):

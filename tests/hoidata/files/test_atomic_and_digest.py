@@ -2,14 +2,16 @@ import hashlib
 import math
 import os
 import shutil
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from hoidata.errors import BadInput
 from hoidata.files import atomic_file, atomic_folder, canonical_json, sha256_bytes, sha256_file
-from hoidata.files.atomic import exclusive, remove_leftovers
+from hoidata.files.atomic import exclusive, remove_dead_leftovers, remove_leftovers
 
 
 def write_half_a_file(target):
@@ -80,6 +82,34 @@ def test_leftovers_of_killed_writers_are_removed_and_nothing_else(tmp_path):
     remove_leftovers(target)
     assert {path.name for path in tmp_path.iterdir()} == {"clips", *others}
     remove_leftovers(tmp_path / "nowhere" / "clips")
+
+
+def killed_writer(target: Path) -> None:
+    """A process that is killed while it writes a folder and a file."""
+    code = (
+        "import os, signal, sys\n"
+        "from hoidata.files import atomic_file, atomic_folder\n"
+        "with atomic_folder(sys.argv[1]) as part, atomic_file(sys.argv[1] + '.json'):\n"
+        "    (part / 'half').write_text('x')\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code, str(target)], check=False).returncode == -signal.SIGKILL
+
+
+def test_the_next_writer_of_a_folder_removes_what_killed_ones_left_and_nothing_of_living_ones(tmp_path):
+    target = tmp_path / "length"
+    killed_writer(target)
+    killed_writer(tmp_path / "contact")
+    assert len(list(tmp_path.glob(".length.[!j]*.part"))) == 1
+    with atomic_folder(target):
+        living = list(tmp_path.glob(".length.[!j]*.part"))
+        assert len(living) == 1
+        with atomic_folder(target) as second:  # another writer of the same folder
+            (second / "new").write_text("2")
+        assert living[0].is_dir()
+    remove_dead_leftovers(tmp_path / "length.json")
+    left = sorted(path.name.split(".")[1] for path in tmp_path.iterdir() if path.name.startswith("."))
+    assert left == ["contact", "contact"]
 
 
 def test_an_old_folder_that_was_moved_aside_goes_back_to_its_place(tmp_path):

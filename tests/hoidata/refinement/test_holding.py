@@ -448,3 +448,13 @@ def test_only_holds_in_which_the_hinge_moves_are_passed():
     assert np.flatnonzero(passed).tolist() == list(range(20, 40))
     assert _passed(thing, holds[:1]) is None
     assert _passed(ObjectTrack(BOX, still, still), holds) is None
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_a_correction_that_is_no_number_is_never_taken(pushed, monkeypatch):
+    """A solver that diverges at once leaves numbers that are finite."""
+    monkeypatch.setattr(
+        "hoidata.refinement.hold_solver.solve_damped", lambda blocks, vector, damping: np.full_like(vector, np.nan)
+    )
+    for track in hold_hands(PAIR, pushed[0], AS_GENERATED).values():
+        assert all(np.isfinite(array).all() for array in (track.wrist_m, track.global_orient, track.hand_pose))

@@ -200,3 +200,14 @@ def test_arrays_that_do_not_fit_each_other_are_an_answer(scene):
     nowhere = replace(generated["left"], keypoints_m=np.full((FRAMES, len(IDS), 3), np.nan))
     with pytest.raises(BadInput, match="leave this hand out"):
         fit_hands(PAIR, BETAS, IDS, {"left": nowhere})
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+def test_a_step_that_is_no_number_is_never_taken(scene, monkeypatch):
+    """A solver that diverges at once leaves the hands as they were fitted, however often it is asked."""
+    monkeypatch.setattr(
+        "hoidata.refinement.refining.solve_damped", lambda blocks, vector, damping: np.full_like(vector, np.nan)
+    )
+    found = refined(scene["generated"], scene["fitted"])
+    for side in SIDES:
+        np.testing.assert_allclose(skin(side, found[side]), skin(side, scene["fitted"][side]), atol=1e-6)

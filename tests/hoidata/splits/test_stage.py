@@ -206,3 +206,24 @@ def test_motion_is_told_apart_by_every_number_of_a_hand(make_clip, side, moved):
     values[3] = ~values[3] if moved == "valid" else values[3] + np.float32(0.01)
     other = replace(clip, hands={**clip.hands, side: replace(track, **{moved: values})})
     assert motion_digest(clip) != motion_digest(other)
+
+
+@pytest.mark.parametrize(
+    ("rule", "missing"),
+    [
+        ({"by": "subject", "train": ["s1"], "validation": ["s7"], "test": ["s10"]}, ["validation"]),
+        ({"by": "subject", "train": "rest", "validation": ["s9"]}, ["test"]),
+        ({"by": "subject", "train": ["s7"], "test": ["s10"]}, ["train", "validation"]),
+    ],
+)
+def test_a_part_without_clips_is_named_with_what_follows_from_it(clips, tmp_path, rule, missing):
+    info = json.loads((write(tmp_path, clips, wanted=rule) / "info.json").read_text())
+    assert list(info["missing"]) == sorted(missing)
+    assert all(
+        words.startswith(f"no {'training' if part == 'train' else part} clips: ")
+        for part, words in info["missing"].items()
+    )
+
+
+def test_nothing_is_said_to_be_missing_where_every_part_has_clips(clips, tmp_path):
+    assert "missing" not in json.loads((write(tmp_path, clips) / "info.json").read_text())

@@ -13,6 +13,7 @@ from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_lo
 from pipelines.pages.examples import shown_ids
 from pipelines.pages.player import three_javascript
 from pipelines.pages.report import ReportFolders, write_report
+from pipelines.run_facts import describe_results
 from tests.builders.stores import write_annotated, write_clips
 
 HELD_OUT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
@@ -62,6 +63,14 @@ def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, han
     assert '<td class="number ">0.610</td>' in text
     assert "not evaluated, not evaluated" in text
     assert text.count("<svg") == 1
+
+
+def test_a_split_without_validation_clips_is_said_beside_the_figures_and_after_a_run(folders, hands, tmp_path):
+    words = "no validation clips: no threshold, seed or stopping point is chosen; the last weights are kept"
+    text = write(folders, hands, tmp_path / "report", "grab")
+    assert text.index("Held-out figures") < text.index(f"The split has {words}.") < text.index("What is in it")
+    (tmp_path / "params.yaml").write_text("profile: embedded\ndatasets: [grab]\nfamilies: [ground-truth]\n")
+    assert f"grab: {words}." in describe_results(tmp_path, "embedded").splitlines()
 
 
 @pytest.mark.slow

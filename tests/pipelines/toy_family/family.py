@@ -39,15 +39,14 @@ class ToyObjective:
     frames = entries = 0
 
     def __init__(self, setup: Setup) -> None:
-        self.network = ToyNetwork(setup.network).to(setup.device)
-        self.held_out = collate(setup.corpus.held_out).to(setup.device)
+        self.network, self.setup = ToyNetwork(setup.network).to(setup.device), setup
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         return {"total": self._error(self.network, batch)}
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
-        return self._error(network, self.held_out)
+        return self._error(network, collate(self.setup.corpus.held_out).to(self.setup.device))
 
     def _error(self, network: nn.Module, batch: ClipBatch) -> Tensor:
         assert isinstance(network, ToyNetwork)
