@@ -91,7 +91,7 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
     asked = asked_motion(wish, profile, datasets, hands)
     paths, sampler = chosen_networks(wish.model, profile, datasets, hands)
     motions = hands_for(sampler, asked.thing, asked.wish)
-    made_from = {f"{paths.checkpoints}/{name}/{FILE_NAME}": _digest(paths, name) for name in BIMART.uses}
+    made_from = {f"{paths.checkpoints}/{name}/{FILE_NAME}": _digest(paths, name) for name in sampler.used}
     facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} ({_known(paths)})")]
     notes = [*asked.notes, *_notes(motions)]
     return WrittenHands(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)

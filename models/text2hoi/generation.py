@@ -40,7 +40,7 @@ class GeneratedMotion:
     sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "unusual": what
     of it lies outside the bounds of the verb's training clips, in words; "told": the sentence the networks were told,
     not the user's where they would take that for another verb ("plainly_read_as"); "unseen": what of the sentence was
-    never in training, in words.
+    never in training, in words; "checkpoints": SHA-256 of each network that had a part in it.
     """
 
     clip: Clip
@@ -137,13 +137,18 @@ class Generator:
             "trained_on": self.model.facts["datasets"],
             "synthetic": bool(self.model.facts["synthetic"]),
             "contact_threshold_m": self.model.facts["contact_threshold_m"],
-            "checkpoints": self.checkpoints,
+            "checkpoints": self._used(wish),
             "refined_by": self.model.refined_by,
         }
         # One by one: the last bits of a matrix product depend on how many rows it has.
         answers = [self.model.answers([request])[0] for request in requests]
         made = zip(requests, answers, strict=True)
         return [self._generated(request, answer, points, evidence) for request, answer in made]
+
+    def _used(self, wish: Wish) -> dict[str, str]:
+        """SHA-256 of the networks that make the motions: a length that is asked for needs no length network."""
+        used = (*self.model.used, *(("length",) if wish.frames is None else ()))
+        return {name: digest for name, digest in self.checkpoints.items() if name in used}
 
     def _unseen(self, text: str, verb: str | None, thing: str | None, hand: HandType) -> list[str]:
         return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)

@@ -1,5 +1,6 @@
 """Training and generation on the toy dataset, and what their files promise."""
 
+import hashlib
 import json
 import os
 import subprocess
@@ -198,6 +199,30 @@ def test_a_mesh_file_whose_name_is_no_text_is_read_and_its_name_stays_legible(tr
     generate_files(Asked("Lift a box.", mesh, models=models, wish=Wish(frames=8)), tmp_path / "out")
     assert (tmp_path / "out/index.html").is_file()
     assert read_user_object(mesh).model.name == "b\\udcffx"
+
+
+@pytest.mark.parametrize(
+    ("refined_by", "frames", "used"),
+    [
+        ("hold", None, {"contact", "diffusion", "length"}),
+        ("hold", 8, {"contact", "diffusion"}),
+        ("network", 8, {"contact", "diffusion", "refiner"}),
+    ],
+)
+def test_a_motion_names_the_networks_that_had_a_part_in_it_and_no_other(
+    trained: Path, tmp_path: Path, refined_by: Any, frames: int | None, used: set[str]
+) -> None:
+    trimesh.creation.box((0.05, 0.08, 0.1)).export(tmp_path / "box.stl")
+    sampling = SamplingConfig(refined_by=refined_by, draws=1)
+    models = Models(trained, load_embedded_hands(), load_encoder("hash"), sampling=sampling)
+    asked = Asked("Lift a box.", tmp_path / "box.stl", models=models, wish=Wish(frames=frames))
+    generate_files(asked, tmp_path / "out")
+    named = json.loads(str(np.load(tmp_path / "out" / "motion.npz")["checkpoints"]))
+    files = {name: trained / name / "model.safetensors" for name in PARAMS}
+    digests = {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}
+    assert named == {str(files[name]): digests[name] for name in used}
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert {name for name, digest in digests.items() if f"{name} {digest[:12]}" in page} == used
 
 
 def test_what_training_never_had_is_said(trained: Path) -> None:
