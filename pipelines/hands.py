@@ -29,7 +29,7 @@ from models.bimart.hands import MadeHands, MotionWish, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
-from pipelines.objects import MeshWish
+from pipelines.objects import MeshWish, mesh_notes
 from pipelines.pages.hands_page import write_hands
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -169,10 +169,8 @@ def _known(paths: StagePaths) -> str:
 
 
 def _notes(motions: list[MadeHands]) -> list[str]:
-    """What a person should know of the motions: an open mesh, a hand that never touches."""
-    first, notes = motions[0], []
-    if first.standing.deepest_m is None:
-        notes.append("the mesh is open and has no inside: hands are drawn to its surface, not pushed out of it")
+    """What a person should know of the motions: an open or repaired mesh, a hand that never touches."""
+    notes = mesh_notes(motions[0].clip.object.model)
     for motion in motions:
         idle = [side for side, touching in motion.standing.touching.items() if not touching.any()]
         if idle:

@@ -6,6 +6,7 @@ from pathlib import Path
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import surface_index
 from hoidata.store.store import open_store
 
 
@@ -26,3 +27,10 @@ def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
         raise BadInput("--object", expected, name, "correct the name or path")
     return store.object_model(name)
+
+
+def mesh_notes(model: ObjectModel) -> list[str]:
+    """What was repaired of a mesh, and which parts of it have no inside that hands could be kept out of."""
+    index = surface_index(model)
+    note = [] if index.solid_note is None else [f"mesh: {index.solid_note}"]
+    return note if index.is_solid else [f"{note[0]}; hands are drawn to its surface, not kept out of it"]

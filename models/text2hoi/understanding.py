@@ -2,8 +2,9 @@
 
 Networks of `ours` read the verb of a sentence from its features, learnt on sentences that name a hand and objects of
 training. A sentence without a hand, or of a strange object, may be read as another verb though its own was learnt.
-Such a sentence is told with the hand in words, or with an object that its verb was learnt with. A recorded clip's
-sentence is told as a person's is, so that figures are of what a person gets.
+Such a sentence is told with the hand in words, with an object that its verb was learnt with, or in a training clip's
+words: its verb decides what is made, whatever else it says. A recorded clip's sentence is told as a person's is, so
+that figures are of what a person gets.
 """
 
 import re
@@ -16,6 +17,7 @@ import torch
 
 from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import PHRASES, select_hand
+from hoidata.annotation.sentences import four_sentences
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, HandType
 from models.common.checkpoints import Checkpoint
@@ -113,14 +115,14 @@ class Teller:
 
 
 def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vocabulary) -> Sequence[list[str]]:
-    """The sentence with the hand in words; then that with objects of training in the place of its own."""
+    """The sentence with the hand in words; then with objects of training in place of its own; then training's own."""
     named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!?')} {PHRASES[hand]}."
     place = re.compile(rf"\b(an?\s+)?{re.escape(thing)}\b", re.IGNORECASE) if thing else None
-    if place is None or not place.search(named):
-        return [[named]]
-    others = {other for own_verb, other, _ in known.counts if own_verb == verb and other not in ("", thing)}
-    swapped = [place.sub(partial(_in_its_place, other), named) for other in sorted(others)[:MOST_OBJECTS]]
-    return [[named], swapped] if swapped else [[named]]
+    others = sorted({other for own_verb, other, _ in known.counts if own_verb == verb and other})
+    learnt = [text for other in others[:MOST_OBJECTS] for text in four_sentences(verb, other, hand)]
+    others = [other for other in others if other != thing][:MOST_OBJECTS]
+    swapped = [place.sub(partial(_in_its_place, other), named) for other in others if place and place.search(named)]
+    return [sentences for sentences in ([named], swapped, learnt) if sentences]
 
 
 def _in_its_place(other: str, found: re.Match[str]) -> str:
