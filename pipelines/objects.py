@@ -1,6 +1,7 @@
 """The object a command is told: the user's mesh file, or one of a dataset."""
 
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 
 from hoidata.errors import BadInput
@@ -25,7 +26,8 @@ def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
     names = list(store.objects["object"])
     if name not in names:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
-        raise BadInput("--object", expected, name, "correct the name or path")
+        near = get_close_matches(name, names, 1)
+        raise BadInput("--object", expected, name, f"did you mean {near[0]!r}?" if near else "correct the name or path")
     return store.object_model(name)
 
 

@@ -11,13 +11,13 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 import torch
 
 from hoidata.annotation.encoders import TextEncoder, refuse_other_encoder
 from hoidata.annotation.hand_choice import PHRASES, select_hand
-from hoidata.annotation.sentences import four_sentences
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import SIDES, HandType
 from models.common.checkpoints import Checkpoint
@@ -119,7 +119,11 @@ def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vo
     named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!?')} {PHRASES[hand]}."
     place = re.compile(rf"\b(an?\s+)?{re.escape(thing)}\b", re.IGNORECASE) if thing else None
     others = sorted({other for own_verb, other, _ in known.counts if own_verb == verb and other})
-    learnt = [text for other in others[:MOST_OBJECTS] for text in four_sentences(verb, other, hand)]
+    # Training's own words with any hand: which hands act is told apart from the sentence.
+    learnt = [
+        f"{verb.capitalize()} {_with_article(other)} {phrase}."
+        for other, phrase in product(others[:MOST_OBJECTS], dict.fromkeys([PHRASES[hand], *PHRASES.values()]))
+    ]
     others = [other for other in others if other != thing][:MOST_OBJECTS]
     swapped = [place.sub(partial(_in_its_place, other), named) for other in others if place and place.search(named)]
     return [sentences for sentences in ([named], swapped, learnt) if sentences]
@@ -127,5 +131,8 @@ def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vo
 
 def _in_its_place(other: str, found: re.Match[str]) -> str:
     """Another object's words, with the article they take where there was one."""
-    article = "an " if other[0] in "aeiou" else "a "
-    return (article if found.group(1) else "") + other
+    return _with_article(other) if found.group(1) else other
+
+
+def _with_article(other: str) -> str:
+    return f"{'an' if other[0] in 'aeiou' else 'a'} {other}"

@@ -81,7 +81,7 @@ def test_what_nothing_helps_is_told_as_it_is(verb: str | None, thing: str | None
     [("Screw the lid off with my right hand.", "lid"), ("Screw it.", None), ("With a hand, screw!", None)],
 )
 def test_a_verb_that_no_other_words_bring_out_is_told_in_a_training_clips_own(sentence: str, thing: str | None) -> None:
-    learnt = "The right hand screws an apple."
+    learnt = "Screw an apple with the right hand."
     assert told(sentence, "screw", thing, {learnt: ("screw", 0.6)}).sentence == learnt
 
 
