@@ -29,7 +29,7 @@ from models.bimart.hands import MadeHands, MotionWish, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
-from pipelines.objects import MeshWish, mesh_notes
+from pipelines.objects import MeshWish, mesh_notes, nearest_name
 from pipelines.pages.hands_page import write_hands
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -204,7 +204,8 @@ def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Han
             return _recorded(store, wish.object, limits)
     names = sorted({name for store in stores for name in store.objects["object"]})
     expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
-    raise BadInput("object", expected, wish.object, "correct the name or path" if names else "correct the path")
+    remedy = nearest_name(wish.object, names) or ("correct the name or path" if names else "correct the path")
+    raise BadInput("object", expected, wish.object, remedy)
 
 
 def _converted(names: tuple[str, ...], profile: str, hands: HandPair) -> list[Store]:

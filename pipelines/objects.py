@@ -1,5 +1,6 @@
 """The object a command is told: the user's mesh file, or one of a dataset."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -26,9 +27,14 @@ def stored_object(name: str, clips: Path, hands: HandPair) -> ObjectModel:
     names = list(store.objects["object"])
     if name not in names:
         expected = f"a mesh file (.obj, .ply, .stl, .glb) or one of: {', '.join(names)}"
-        near = get_close_matches(name, names, 1)
-        raise BadInput("--object", expected, name, f"did you mean {near[0]!r}?" if near else "correct the name or path")
+        raise BadInput("--object", expected, name, nearest_name(name, names) or "correct the name or path")
     return store.object_model(name)
+
+
+def nearest_name(name: str, names: Sequence[str]) -> str:
+    """Which of the names was likely meant, as a question; empty where none is near."""
+    near = get_close_matches(name, names, 1)
+    return f"did you mean {near[0]!r}?" if near else ""
 
 
 def mesh_notes(model: ObjectModel) -> list[str]:
