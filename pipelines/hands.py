@@ -29,7 +29,7 @@ from models.bimart.hands import MadeHands, MotionWish, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
-from pipelines.objects import MeshWish
+from pipelines.objects import MeshWish, mesh_notes, nearest_name
 from pipelines.pages.hands_page import write_hands
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -91,7 +91,7 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
     asked = asked_motion(wish, profile, datasets, hands)
     paths, sampler = chosen_networks(wish.model, profile, datasets, hands)
     motions = hands_for(sampler, asked.thing, asked.wish)
-    made_from = {f"{paths.checkpoints}/{name}/{FILE_NAME}": _digest(paths, name) for name in BIMART.uses}
+    made_from = {f"{paths.checkpoints}/{name}/{FILE_NAME}": _digest(paths, name) for name in sampler.used}
     facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} ({_known(paths)})")]
     notes = [*asked.notes, *_notes(motions)]
     return WrittenHands(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)
@@ -169,10 +169,8 @@ def _known(paths: StagePaths) -> str:
 
 
 def _notes(motions: list[MadeHands]) -> list[str]:
-    """What a person should know of the motions: an open mesh, a hand that never touches."""
-    first, notes = motions[0], []
-    if first.standing.deepest_m is None:
-        notes.append("the mesh is open and has no inside: hands are drawn to its surface, not pushed out of it")
+    """What a person should know of the motions: an open or repaired mesh, a hand that never touches."""
+    notes = mesh_notes(motions[0].clip.object.model)
     for motion in motions:
         idle = [side for side, touching in motion.standing.touching.items() if not touching.any()]
         if idle:
@@ -206,7 +204,8 @@ def _object(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Han
             return _recorded(store, wish.object, limits)
     names = sorted({name for store in stores for name in store.objects["object"]})
     expected = "a mesh file (.obj, .ply, .stl, .glb)" + (f" or one of: {', '.join(names)}" if names else "")
-    raise BadInput("object", expected, wish.object, "correct the name or path" if names else "correct the path")
+    remedy = nearest_name(wish.object, names) or ("correct the name or path" if names else "correct the path")
+    raise BadInput("object", expected, wish.object, remedy)
 
 
 def _converted(names: tuple[str, ...], profile: str, hands: HandPair) -> list[Store]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hoidata.actions.words import beside_usual
+from hoidata.actions.words import beside_usual, is_seen
 from hoidata.clips.clip import FPS, SIDES, ObjectTrack
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs
@@ -164,7 +164,14 @@ class Actions:
     def unusual(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
         """The numbers, in words, that lie outside the verb's ``usual`` bounds; none where it or they are not known."""
         limits = self.usual.get(verb, {})
-        return tuple(beside_usual(name, numbers[name], *limits[name]) for name in self.beyond(verb, numbers))
+        said = (beside_usual(name, numbers[name], *limits[name]) for name in self.beyond(verb, numbers))
+        return tuple(filter(None, said))
+
+    def seen(self, verb: str, numbers: Mapping[str, float]) -> tuple[str, ...]:
+        """Those of ``unusual`` that a person who watches the motion sees."""
+        limits = self.usual.get(verb, {})
+        seen = [name for name in self.beyond(verb, numbers) if is_seen(name, numbers[name], *limits[name])]
+        return tuple(filter(None, (beside_usual(name, numbers[name], *limits[name]) for name in seen)))
 
     def beyond(self, verb: str, numbers: Mapping[str, float]) -> dict[str, float]:
         """By how much numbers lie outside the verb's ``usual`` bounds, in widths of these; without those inside."""

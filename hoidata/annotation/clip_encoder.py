@@ -1,4 +1,4 @@
-"""CLIP ViT-B/32's text tower from safetensors weights, through open_clip (optional extra ``hoidata[clip]``).
+"""CLIP ViT-B/32's text tower from a file of weights, through open_clip (optional extra ``hoidata[clip]``).
 
 Only the tower is built, and a sentence is encoded at its own length, at most 24 tokens: CLIP's attention is causal and
 features are read at the end-of-text token, so padding behind it changes nothing and costs most of the time. A prompt of
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from hoidata.annotation.clip_tensors import read_tower
 from hoidata.annotation.clip_weights import ARCHITECTURE, WeightsName, missing_file, tagged_weights
 from hoidata.annotation.encoders import DIMENSIONS, Identity
 from hoidata.errors import BadInput, MissingResource
@@ -30,9 +31,10 @@ _registered: list[torch.library.Library] = []
 class ClipEncoder:
     """Un-normalised 512-d text features, as Text2HOI uses them.
 
-    weights: an open_clip ViT-B/32 state dict in safetensors, whole or text keys alone, or a tag of open_clip's. Towers
-    of other width and depth are built as their weights are, as long as they give 512 numbers. QuickGELU is right for
-    OpenAI's weights, not for LAION's; a wrong choice goes unnoticed by the network, so it is part of the identity.
+    weights: a ViT-B/32 state dict by the names of open_clip, OpenAI or transformers, whole or the text tower alone, in
+    safetensors or a zip file of ``torch.save``; or a tag of open_clip's. Towers of other width and depth are built as
+    their weights are, as long as they give 512 numbers. QuickGELU is right for OpenAI's weights, not for LAION's; a
+    wrong choice goes unnoticed by the network, so it is part of the identity.
     Raises MissingResource when weights or open_clip are missing, BadInput when the file is not such a state dict.
     """
 
@@ -100,7 +102,8 @@ def _declare_torchvision_operators() -> None:
 
 
 def _load_tower(open_clip: Any, weights: Path, quick_gelu: bool) -> Any:
-    state = _text_state(weights)
+    state = read_tower(weights)
+    state["positional_embedding"] = state.get("positional_embedding", torch.zeros(0))[:CONTEXT_TOKENS].clone()
     text = {**open_clip.get_model_config(ARCHITECTURE)["text_cfg"], **_size(weights, state)}
     try:
         tower = open_clip.model._build_text_tower(DIMENSIONS, text, quick_gelu=quick_gelu)
@@ -126,18 +129,3 @@ def _size(weights: Path, state: dict[str, torch.Tensor]) -> dict[str, int]:
         "heads": width // HEAD_WIDTH,
         "layers": len(layers),
     }
-
-
-def _text_state(weights: Path) -> dict[str, torch.Tensor]:
-    """The text tower's tensors as float32; the image tower is never read."""
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(weights, framework="pt") as archive:
-            names = [name for name in archive.keys() if not name.startswith(("visual.", "logit_"))]  # noqa: SIM118
-            state = {name: archive.get_tensor(name).float() for name in names}
-    except SafetensorError as error:
-        raise BadInput(weights, "a safetensors file", str(error), "convert the weights with open_clip") from error
-    if "positional_embedding" in state:
-        state["positional_embedding"] = state["positional_embedding"][:CONTEXT_TOKENS].clone()
-    return state

@@ -10,7 +10,7 @@ from hoidata.annotation.grammar import Grammar, default_grammar
 from hoidata.annotation.hand_choice import HandChoice, select_hand
 from hoidata.annotation.reference_mode import ACTIONS, JOINED
 
-_HAND_PHRASE = re.compile(
+HAND_PHRASE = re.compile(
     r"\b(?:(?:with|by|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
     r"\b(?:(?:with|by|using)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
@@ -64,7 +64,7 @@ class Lexicon:
         Hand phrases are passed over. Of all pairs of a known verb form and a known noun that do not overlap, the pair
         that covers most of the sentence wins; among equals the one whose verb stands first.
         """
-        rest = " ".join(_HAND_PHRASE.sub(" ¤ ", text.lower()).split())
+        rest = " ".join(HAND_PHRASE.sub(" ¤ ", text.lower()).split())
         verbs, nouns = self._verbs.matches(rest), self._nouns.matches(rest)
         pairs = [(verb, noun) for verb in verbs for noun in nouns if not verb.overlaps(noun)]
         if pairs:

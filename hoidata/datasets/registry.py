@@ -17,7 +17,6 @@ from typing import Any
 from hoidata.dataset_folders import built_in_names, dataset_folder, outside_folders
 from hoidata.datasets.base import Adapter
 from hoidata.errors import BadInput, MissingResource
-from hoidata.settings import build_config
 
 ENTRY_POINT_GROUP = "hoidata.adapters"
 # What an adapter states about its dataset; its other fields are settings.
@@ -61,8 +60,7 @@ def get_adapter(name: str, **settings: Any) -> Adapter:
     if unknown:
         expected = f"some of {', '.join(known)}" if known else "none: it has no settings"
         raise BadInput(f"settings of the adapter {name}", expected, ", ".join(unknown), "correct it")
-    where = f"settings of the adapter {name}"
-    return build_config(kind, settings, where) if is_dataclass(kind) else kind(**settings)  # pyright: ignore[reportArgumentType]
+    return kind(**settings)
 
 
 def _registered(name: str) -> Registered:

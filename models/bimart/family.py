@@ -77,6 +77,11 @@ class HandsForPaths:
         config = replace(config, refined=config.refined and refined)
         return cls(model, sources.hands, config, synthetic, change, sources.annotated)
 
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the networks that make its motions: without contact maps the contact network has no part in them."""
+        return (CONTACT.name, MOTION.name) if self.model.config.with_map else (MOTION.name,)
+
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
 

@@ -20,11 +20,11 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 from hoidata.batches.dataset import ClipBatch
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json, sha256_bytes, sha256_file
+from hoidata.files.written import EMPTY
 from hoidata.hands import HandPair
 from hoidata.settings import at_least, build_config, key_in_file, plain_config, refuse_unknown
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import (
-    EMPTY_NAME,
     FILE_NAME,
     checkpoint_file,
     empty_reason,
@@ -210,7 +210,7 @@ def _write_empty(out_folder: str | Path, reason: str, team: Team) -> Path:
     if team.writes:
         with atomic_folder(out_folder) as partial:
             write_empty(partial, reason)
-    return Path(out_folder) / EMPTY_NAME
+    return Path(out_folder) / EMPTY
 
 
 def _explained(

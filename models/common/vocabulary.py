@@ -23,6 +23,9 @@ class Vocabulary:
         """From what a checkpoint records."""
         return cls({(verb, thing, hand): count for verb, thing, hand, count in facts.get("vocabulary", [])})
 
+    def __add__(self, other: "Vocabulary") -> "Vocabulary":
+        return Vocabulary(Counter(self.counts) + Counter(other.counts))
+
     @property
     def rows(self) -> list[list[str | int]]:
         """What a checkpoint records: verb, object, hand type, clips."""
@@ -43,6 +46,11 @@ class Vocabulary:
         return found
 
     def knows(self, verb: str | None, object_words: str | None) -> int:
-        """How many training clips are about this verb and object; a verb alone counts a little, an object less."""
-        both = sum(count for key, count in self.counts.items() if key[:2] == (verb, object_words))
-        return 4 * bool(both) + 2 * (verb in self.verbs) + (object_words in self.objects)
+        """How well training clips fit a sentence. Its verb counts most: one of training beats any object.
+
+        Then an object that was seen with this verb, seen at all, or of the same kind ("bottle" and "water bottle").
+        """
+        both = any(key[:2] == (verb, object_words) for key in self.counts)
+        kind = (object_words or "").split()[-1:]
+        alike = bool(kind) and any(other.split()[-1:] == kind for other in self.objects)
+        return 8 * (verb in self.verbs) + 4 * both + 2 * (object_words in self.objects) + alike

@@ -24,10 +24,13 @@ from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import POINT_COUNT, SampledPoints, sample_points
 from models.common.checkpoints import FILE_NAME, Checkpoint
 from models.common.vocabulary import Vocabulary
+from models.text2hoi.faults import visible_faults
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
-from models.text2hoi.sentences import read_sentence, unseen_words
-from models.text2hoi.understanding import reading_of, understand
+from models.text2hoi.sentences import unseen_words
+from models.text2hoi.understanding import Reading, reading_of, understand
+from models.text2hoi.verb_check import VerbCheck
+from models.text2hoi.wording import understood_words
 
 
 @dataclass(frozen=True)
@@ -38,9 +41,10 @@ class GeneratedMotion:
     the hand type was chosen, the length, seed, trained dataset and whether its data was synthetic; "read_as": the verb
     of training the diffusion network takes the sentence for, with its probability, or None where it is told the
     sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "unusual": what
-    of it lies outside the bounds of the verb's training clips, in words; "told": the sentence the networks were told,
-    not the user's where they would take that for another verb ("plainly_read_as"); "unseen": what of the sentence was
-    never in training, in words.
+    of it lies outside the bounds of the verb's training clips, in words; "faults": what a person would see to be wrong
+    with it, in words; "told": the sentence the networks were told, not the user's where they would take that for
+    another verb ("plainly_read_as"); "unseen": what of the sentence was never in training, in words; "checkpoints":
+    SHA-256 of each network that had a part in it.
     """
 
     clip: Clip
@@ -109,12 +113,14 @@ class Generator:
 
         Raises BadInput for no English sentence, and for a length no model was trained for.
         """
-        verb, thing = read_sentence(text)
+        wording = understood_words(text, self.vocabulary, lambda: self.encoder, force=True)
+        verb, thing = wording.verb, wording.thing
         choice = self._hand(text, wish)
         assert choice.hand is not None  # a prior decides last
         points, read = sample_points(object, self.points), reading_of(self.model.trained["diffusion"])
         encode = self.encoder.encode
-        told = understand(text, encode([text])[0], verb, thing, choice.hand, self.vocabulary, encode, read)
+        own = encode([wording.text])[0]
+        told = understand(wording.text, own, verb, thing, choice.hand, self.vocabulary, encode, read)
         first = Request(
             motion_id=f"generated/{object.name}",
             object=object,
@@ -133,11 +139,11 @@ class Generator:
             "plainly_read_as": told.plainly,
             "seed": wish.seed,
             "hand": asdict(choice),
-            "unseen": self._unseen(text, verb, object_words or thing, choice.hand),
+            "unseen": unseen_words(self.vocabulary, text, verb, object_words or thing, choice.hand, self.encoder),
             "trained_on": self.model.facts["datasets"],
             "synthetic": bool(self.model.facts["synthetic"]),
             "contact_threshold_m": self.model.facts["contact_threshold_m"],
-            "checkpoints": self.checkpoints,
+            "checkpoints": self._used(wish),
             "refined_by": self.model.refined_by,
         }
         # One by one: the last bits of a matrix product depend on how many rows it has.
@@ -145,8 +151,10 @@ class Generator:
         made = zip(requests, answers, strict=True)
         return [self._generated(request, answer, points, evidence) for request, answer in made]
 
-    def _unseen(self, text: str, verb: str | None, thing: str | None, hand: HandType) -> list[str]:
-        return unseen_words(self.vocabulary, text, verb, thing, hand, self.encoder)
+    def _used(self, wish: Wish) -> dict[str, str]:
+        """SHA-256 of the networks that make the motions: a length that is asked for needs no length network."""
+        used = (*self.model.used, *(("length",) if wish.frames is None else ()))
+        return {name: digest for name, digest in self.checkpoints.items() if name in used}
 
     def _hand(self, text: str, wish: Wish) -> HandChoice:
         """The hand asked for; else by the rules, and where the text names none by the share among training clips."""
@@ -185,9 +193,14 @@ class Generator:
             "draws": answer.draws,
             "moved_as": answer.moved_as,
             "unusual": list(answer.unusual),
+            "faults": list(self._faults(request, answer.clip, evidence["read_as"])),
         }
         coarse = self.model.clips([request], [motion], refined=False)[0]
         return GeneratedMotion(answer.clip, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
+
+    def _faults(self, request: Request, clip: Clip, read_as: Reading | None) -> tuple[str, ...]:
+        check = VerbCheck.of(self.model.trained["diffusion"], self.hands)
+        return visible_faults(clip, request.points, self.hands, check, read_as[0] if read_as else None)
 
 
 def _refuse_others(checkpoint: Checkpoint, hands: HandPair, encoder: TextEncoder, where: Path) -> None:

@@ -35,6 +35,7 @@ WIDTH, LAYERS = 512, 8
 # One layer of each kind of file, and the last one it must have; by these a file is told.
 KINDS = {"point_net": "stn.fc3.weight", "contact": "decoder.MLP.3.0.weight", "generator": "out_fc_obj.fc.weight"}
 UNKNOWN = "unknown"
+PARALLEL = "module."
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,12 @@ def read_weights(path: Path) -> Weights:
         isinstance(name, str) and isinstance(value, Tensor) for name, value in model.items()
     ):
         raise BadInput(path, "weights by name under 'model'", str(type(stored).__name__), "pass Text2HOI's files")
-    return {name: value.float() if value.is_floating_point() else value for name, value in model.items()}
+    # DataParallel, under which some people train, puts a prefix before every name.
+    prefix = PARALLEL if all(name.startswith(PARALLEL) for name in model) else ""
+    return {
+        name.removeprefix(prefix): value.float() if value.is_floating_point() else value
+        for name, value in model.items()
+    }
 
 
 def wrist_normaliser(hands: HandPair) -> Normaliser:

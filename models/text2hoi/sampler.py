@@ -134,6 +134,11 @@ class Text2Hoi:
         code = motion_generator(self.trained["diffusion"]).network.code.config
         return "hold" if code.hand_frame == "object" else "network"
 
+    @property
+    def used(self) -> tuple[str, ...]:
+        """Names of the networks that make refined motions of a given length."""
+        return "contact", "diffusion", *(("refiner",) if self.refined_by == "network" else ())
+
     def sample(self, requests: Sequence[Request]) -> list[Clip]:
         """Refined motions."""
         return self.sample_asked(requests)[0]

@@ -17,9 +17,13 @@ KNOWN_SHARE = 0.6
 NAMED = 3
 # What the dictionary, which inflects, does not list.
 _FUNCTION_WORDS = """the a an with of to from in on onto into at and or then while it its your my his her their this
-that these those as if for until without using only one two three four five both each every no not"""
+that these those as if for until without using only one two three four five both each every no not towards toward
+beside against but because than nor per upon beneath during ok
+six seven eight nine ten twenty thirty forty fifty sixty ninety"""
 _BETWEEN_CLAUSES = re.compile(r"[,;.&]|\band/or\b|\b(?:and|then)\b")
 _ADVERBS = frozenset({"also", "again", "now", "next", "please", "first"})
+# Words of which a noun follows, however it is written: "a drink" is no verb.
+LEFT_OF_NOUNS = ("a", "an", "the", "this", "that", "these", "those", "my", "your", "his", "her", "their", "its", "our")
 FUNCTION_WORDS = frozenset(re.findall(r"\w+", _FUNCTION_WORDS))
 
 
@@ -30,7 +34,7 @@ def unseen_words(
     thing = thing or _known_object(known, text)
     notes = []
     if not verb or verb not in known.verbs:
-        word = verb or _first_verb(text)
+        word = verb or first_verb(text)
         notes.append(_stranger("verb", word, known.verbs, encoder))
     if not thing or thing not in known.objects:
         notes.append(_stranger("object", thing, known.objects, encoder))
@@ -126,10 +130,13 @@ def nearest_words(word: str, known: list[str], encoder: TextEncoder) -> list[str
     return [known[row] for row in order]
 
 
-def _first_verb(text: str) -> str | None:
-    """The first word that the dictionary knows as a verb, in its base form."""
+def first_verb(text: str) -> str | None:
+    """The first word that the dictionary knows as a verb and that follows no article, in its base form."""
+    before = ""
     for word in text.lower().split():
-        lemmas = getAllLemmas("".join(filter(str.isalpha, word))).get("VERB")
-        if lemmas and word not in FUNCTION_WORDS:
+        word = "".join(filter(str.isalpha, word))
+        lemmas = getAllLemmas(word).get("VERB")
+        if lemmas and word not in FUNCTION_WORDS and before not in LEFT_OF_NOUNS and word not in ("left", "right"):
             return lemmas[0]
+        before = word if word not in ("left", "right") else before  # "the right hand"
     return None

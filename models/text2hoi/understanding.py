@@ -2,14 +2,16 @@
 
 Networks of `ours` read the verb of a sentence from its features, learnt on sentences that name a hand and objects of
 training. A sentence without a hand, or of a strange object, may be read as another verb though its own was learnt.
-Such a sentence is told with the hand in words, or with an object that its verb was learnt with. A recorded clip's
-sentence is told as a person's is, so that figures are of what a person gets.
+Such a sentence is told with the hand in words, with an object that its verb was learnt with, or in a training clip's
+words: its verb decides what is made, whatever else it says. A recorded clip's sentence is told as a person's is, so
+that figures are of what a person gets.
 """
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -113,17 +115,24 @@ class Teller:
 
 
 def _like(sentence: str, verb: str, thing: str | None, hand: HandType, known: Vocabulary) -> Sequence[list[str]]:
-    """The sentence with the hand in words; then that with objects of training in the place of its own."""
+    """The sentence with the hand in words; then with objects of training in place of its own; then training's own."""
     named = sentence if select_hand(sentence).hand else f"{sentence.rstrip(' .!?')} {PHRASES[hand]}."
     place = re.compile(rf"\b(an?\s+)?{re.escape(thing)}\b", re.IGNORECASE) if thing else None
-    if place is None or not place.search(named):
-        return [[named]]
-    others = {other for own_verb, other, _ in known.counts if own_verb == verb and other not in ("", thing)}
-    swapped = [place.sub(partial(_in_its_place, other), named) for other in sorted(others)[:MOST_OBJECTS]]
-    return [[named], swapped] if swapped else [[named]]
+    others = sorted({other for own_verb, other, _ in known.counts if own_verb == verb and other})
+    # Training's own words with any hand: which hands act is told apart from the sentence.
+    learnt = [
+        f"{verb.capitalize()} {_with_article(other)} {phrase}."
+        for other, phrase in product(others[:MOST_OBJECTS], dict.fromkeys([PHRASES[hand], *PHRASES.values()]))
+    ]
+    others = [other for other in others if other != thing][:MOST_OBJECTS]
+    swapped = [place.sub(partial(_in_its_place, other), named) for other in others if place and place.search(named)]
+    return [sentences for sentences in ([named], swapped, learnt) if sentences]
 
 
 def _in_its_place(other: str, found: re.Match[str]) -> str:
     """Another object's words, with the article they take where there was one."""
-    article = "an " if other[0] in "aeiou" else "a "
-    return (article if found.group(1) else "") + other
+    return _with_article(other) if found.group(1) else other
+
+
+def _with_article(other: str) -> str:
+    return f"{'an' if other[0] in 'aeiou' else 'a'} {other}"

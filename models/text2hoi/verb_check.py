@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
-from hoidata.actions.words import beside_usual
+from hoidata.actions.words import beside_usual, is_seen
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
@@ -93,7 +93,15 @@ class VerbCheck:
         """Which numbers, in words, lie outside the bounds of the training clips of the verb asked for, or of all."""
         found = () if asked is None else self.actions.unusual(asked, numbers)
         above = {name: most for name, most in self._most(asked).items() if numbers[name] > most}
-        return (*found, *(beside_usual(name, numbers[name], 0.0, most) for name, most in above.items()))
+        said = (beside_usual(name, numbers[name], 0.0, most) for name, most in above.items())
+        return (*found, *filter(None, said))
+
+    def seen(self, asked: str | None, numbers: Mapping[str, float]) -> tuple[str, ...]:
+        """Those of ``unusual`` that a person who watches the motion sees."""
+        found = () if asked is None else self.actions.seen(asked, numbers)
+        above = {name: most for name, most in self._most(asked).items() if is_seen(name, numbers[name], 0.0, most)}
+        said = (beside_usual(name, numbers[name], 0.0, most) for name, most in above.items())
+        return (*found, *filter(None, said))
 
     def beyond(self, asked: str | None, numbers: Mapping[str, float]) -> float:
         """How unusual the most unusual number is: outside its bounds by so many of their widths; 0 where none is."""

@@ -58,6 +58,9 @@ def generate(
     encoder: Annotated[
         str, typer.Option(help="Of --models that read CLIP's features: clip:FILE.safetensors or clip:openai.")
     ] = "",
+    force: Annotated[
+        bool, typer.Option("--force", help="Generate even where words of the sentence are unknown.")
+    ] = False,
 ) -> None:
     """Text -> hands, length, contact, motion, refinement; writes arrays, an animated GLB and a page that plays it."""
     mesh = Path(object).resolve() if isfile(object) else None
@@ -89,6 +92,7 @@ def generate(
             wish=wish,
             mesh=MeshWish(unit, up, hinge),
             sampler={name: value for name, value in told.items() if value is not None},
+            force=force,
             **where,
         ),
         out,

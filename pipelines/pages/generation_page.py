@@ -147,14 +147,26 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
         *([("read as", f"{read_as[0]} ({read_as[1]:.0%})")] if read_as else []),
-        *([("told", evidence["told"])] if evidence["told"] != evidence["text"] else []),
+        *([("rephrased for the networks", evidence["told"])] if evidence["told"] != evidence["text"] else []),
         ("seed", str(evidence["seed"])),
+        *[
+            ("compared with training", f"sample {shown.evidence['number'] + 1}: {words}")
+            for shown in motions
+            if (words := _compared(shown))
+        ],
         *([("drawn again", "; ".join(drawn))] if drawn else []),
         ("trained on", clips),
         ("refined by", {"hold": "a hold against the object", "network": "the refiner network"}[evidence["refined_by"]]),
         ("checkpoints", f"{checkpoints} (sha256: {digests})"),
         *[("never seen", note) for note in evidence["unseen"]],
     ]
+
+
+def _compared(motion: GeneratedMotion) -> str:
+    """What lies outside the bounds of the verb's training clips, however little, and which verb it is most like."""
+    read_as, moved_as = motion.evidence["read_as"], motion.evidence["moved_as"]
+    other = [f"moves most like {moved_as!r}"] if read_as and moved_as and moved_as != read_as[0] else []
+    return ", ".join([*other, *motion.evidence["unusual"]])
 
 
 def checkpoint_digests(motion: GeneratedMotion, folder: str) -> dict[str, str]:

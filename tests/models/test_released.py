@@ -21,7 +21,7 @@ from models.text2hoi.contact_training import CONTACT
 from models.text2hoi.diffusion import Condition
 from models.text2hoi.diffusion_training import DIFFUSION
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
-from models.text2hoi.released import import_released
+from models.text2hoi.released import import_released, read_weights
 from pipelines.lineage.tree import lineage_tree
 
 D, HEADS, LAYERS = 512, 4, 8
@@ -309,3 +309,14 @@ def test_files_that_are_cut_foreign_or_malicious_are_refused_and_say_why(tmp_pat
     with pytest.raises(BadInput, match="none of contact, generator"):
         import_released([good], tmp_path / "out", "grab", hands)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("prefix", ["", "module."])
+def test_weights_trained_in_parallel_have_the_names_of_those_that_were_not(prefix: str, tmp_path: Path) -> None:
+    weights = {f"{prefix}stn.fc3.weight": torch.ones(2, dtype=torch.float64), f"{prefix}bn1.steps": torch.tensor(7)}
+    torch.save({"model": weights}, tmp_path / "network.pth")
+    read = read_weights(tmp_path / "network.pth")
+    assert {name: value.dtype for name, value in read.items()} == {
+        "stn.fc3.weight": torch.float32,
+        "bn1.steps": torch.int64,
+    }

@@ -76,6 +76,15 @@ def test_what_nothing_helps_is_told_as_it_is(verb: str | None, thing: str | None
     assert told(sentence, verb, thing, {}).sentence == sentence
 
 
+@pytest.mark.parametrize(
+    ("sentence", "thing"),
+    [("Screw the lid off with my right hand.", "lid"), ("Screw it.", None), ("With a hand, screw!", None)],
+)
+def test_a_verb_that_no_other_words_bring_out_is_told_in_a_training_clips_own(sentence: str, thing: str | None) -> None:
+    learnt = "Screw an apple with the right hand."
+    assert told(sentence, "screw", thing, {learnt: ("screw", 0.6)}).sentence == learnt
+
+
 def test_networks_that_are_told_features_get_the_sentence_as_it_is() -> None:
     text = ENCODER.encode(["Screw a box."])[0]
     found = understand("Screw a box.", text, "screw", "box", "right", KNOWN, ENCODER.encode, lambda text: None)

@@ -7,9 +7,10 @@ import yaml
 from typer.testing import CliRunner
 
 from hoidata.errors import BadInput, MissingResource
+from models.common.vocabulary import Vocabulary
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.cli import app
-from pipelines.generation import Asked, Models, _of_project, chosen_model
+from pipelines.generation import Asked, Models, _clips_with, _of_project, chosen_model
 from pipelines.hands import _script_text
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
@@ -84,6 +85,50 @@ def test_a_dataset_without_models_is_told_with_those_that_have_them(monkeypatch)
         chosen_model(Asked("Lift a box.", "box", "embedded", ("h2o", "grab"), model="nope"), "lift", "box")
     with pytest.raises(MissingResource, match=r"embedded-h2o: not there$"):
         chosen_model(Asked("Lift a box.", "box", "embedded", ("h2o",)), "lift", "box")
+
+
+@pytest.fixture
+def three_datasets(monkeypatch) -> tuple[str, ...]:
+    """Three trained datasets, by their clips of verb and noun, and by the objects they have."""
+    counts = {
+        "h2o": {("take out", "bottle", "left"): 9, ("open", "milk", "left"): 2},
+        "grab": {("pour", "mug", "left"): 2, ("lift", "box", "right"): 1},
+        "arctic": {("pour", "kettle", "right"): 3, ("open", "box", "right"): 4},
+    }
+    objects = {"h2o": {"bottle", "milk"}, "grab": {"mug"}, "arctic": {"kettle"}}
+    monkeypatch.setattr("pipelines.generation.why_not_trained", lambda paths: None)
+    monkeypatch.setattr("pipelines.generation._vocabulary", lambda path: Vocabulary(counts[path.name]))
+    monkeypatch.setattr("pipelines.generation._has_object", lambda paths, name: name in objects[paths.dataset])
+    return tuple(counts)
+
+
+@pytest.mark.parametrize(
+    ("verb", "thing", "name", "dataset"),
+    [
+        ("pour", "bottle", "file.stl", "arctic"),  # no dataset pours from a bottle, and arctic pours most
+        ("pour", "mug", "file.stl", "grab"),
+        ("pour", "milk bottle", "bottle", "arctic"),  # of two that pour neither has the object
+        ("pour", None, "mug", "grab"),
+        ("pour", "kettle", "mug", "grab"),
+        ("open", "box", "milk", "h2o"),
+        ("open", None, "file.stl", "arctic"),
+        (None, "milk", "file.stl", "h2o"),
+        ("take out", "box", "kettle", "h2o"),
+        ("juggle", None, "kettle", "arctic"),
+    ],
+)
+def test_the_verb_chooses_the_models_then_the_named_object_then_the_noun(
+    verb: str | None, thing: str | None, name: str, dataset: str, three_datasets
+) -> None:
+    asked = Asked("", name, "embedded", three_datasets)
+    paths, why = chosen_model(asked, verb, thing)
+    assert paths.dataset == dataset
+    assert ("clips of" in why) == (verb in ("pour", "open", "take out"))
+    holder = next(
+        (run for run in three_datasets if name in {"h2o": ("bottle", "milk"), "grab": ("mug",)}.get(run, ())), ""
+    )
+    expected = StagePaths("embedded", holder or ("arctic" if name == "kettle" else dataset))
+    assert _clips_with(asked, paths) == expected.clips
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from hoidata.object_paths import scripted_path
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from pipelines.hands import Asked, HandsWish, asked_motion, chosen_networks, hinge_range
-from pipelines.objects import MeshWish
+from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.motion_files import mesh_arrays, motion_arrays
 from tests.builders.clips import clip_of
 from tests.builders.objects import hinged_box
@@ -83,6 +83,12 @@ def test_datasets_that_are_not_converted_are_passed_over_and_unknown_ones_are_na
     assert asked_motion(HandsWish(object=name, script="hold"), "embedded", names, HANDS).thing.model.name == name
     with pytest.raises(BadInput, match=f"one of: {name}"):
         asked_motion(HandsWish(object="bananas", script="hold"), "embedded", names, HANDS)
+    for look_up in (
+        lambda near: asked_motion(HandsWish(object=near, script="hold"), "embedded", names, HANDS),
+        lambda near: stored_object(near, tmp_path / "data/embedded/arctic/clips", HANDS),
+    ):
+        with pytest.raises(BadInput, match=f"did you mean '{name}'"):
+            look_up(f"{name}s")
     with pytest.raises(BadInput, match="did you mean 'arctic'"):
         asked_motion(HandsWish(object=name, script="hold", model="acrtic"), "embedded", names, HANDS)
     with pytest.raises(BadInput, match="a dataset: grab, arctic, got nothing"):

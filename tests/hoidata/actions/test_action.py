@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.actions.action import LEARNT, NUMBERS, Actions, action_numbers, learn_actions, written_limits
-from hoidata.actions.words import WORDS, beside_usual
+from hoidata.actions.words import WORDS, beside_usual, is_seen
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.errors import BadInput
 from tests.builders.clips import in_another_world
@@ -220,3 +220,27 @@ def test_every_number_that_may_be_unusual_has_words_of_its_own():
     assert beside_usual("reversals_per_s", 2.0, -0.5, 0.5) == "turns back 2 times a second (usual: at most 0.5)"
     assert beside_usual("hand_changes", 1.0, 1.5, 2.5) == "hands that take or give 1 (usual: 2 to 2)"
     assert beside_usual("path_m", 12.344, 0.2, 1.0) == "length of the path 1234 cm (usual: 20 to 100)"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "most"),
+    [("turn_deg", 27.14, 27.12), ("rise_m", 0.12341, 0.1234), ("slip_cm_s", 0.026501, 0.0265)],
+)
+def test_a_number_that_reads_as_its_bound_is_not_said(name: str, value: float, most: float) -> None:
+    """It would be "27.1 degrees (usual: at most 27.1)"."""
+    assert beside_usual(name, value, 0.0, most) is None
+    assert beside_usual(name, value + WORDS[name].seen, 0.0, most) is not None
+    actions = Actions({}, {}, {}, {}, {"pour": {name: (0.0, most)}})
+    assert actions.unusual("pour", {name: value}) == ()
+    assert actions.beyond("pour", {name: value})
+
+
+@pytest.mark.parametrize("name", sorted(WORDS))
+def test_a_difference_is_seen_from_its_own_size_on_either_side(name: str) -> None:
+    seen = WORDS[name].seen
+    assert [is_seen(name, 2 + share * seen, 1.0, 2.0) for share in (0.0, 0.9, 1.01)] == [False, False, True]
+    assert [is_seen(name, 1 - share * seen, 1.0, 2.0) for share in (0.0, 0.9, 1.01)] == [False, False, True]
+    assert not is_seen(name, 1.5, 1.0, 2.0)
+    actions = Actions({}, {}, {}, {}, {"pour": {name: (1.0, 2.0)}})
+    assert len(actions.seen("pour", {name: 2 + 1.01 * seen})) == 1
+    assert actions.seen("pour", {name: 2 + 0.9 * seen}) == actions.seen("lift", {name: 2 + 9 * seen}) == ()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from hoidata.annotation import clip_weights
+from hoidata.annotation.clip_tensors import read_tower
 from hoidata.annotation.clip_weights import is_reachable, parse_weights_name, tagged_weights
 from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput, MissingResource
@@ -167,3 +168,132 @@ def test_other_weights_are_refused(tmp_path: Path) -> None:
     for name in ("large", "parts", "text"):
         with pytest.raises(BadInput, match=f"{name}.safetensors"):
             load_encoder(f"clip:{tmp_path / name}.safetensors")
+
+
+def transformers_names(state: dict) -> dict:
+    """A tower of open_clip's by the names and shapes that transformers gives a CLIPModel's, with an image tower."""
+    import torch
+
+    own = {
+        "text_projection.weight": state["text_projection"].T,
+        "vision_model.embeddings.class_embedding": torch.ones(2),
+    }
+    own |= {"logit_scale": torch.zeros(()), "text_model.embeddings.position_ids": torch.arange(77)[None]}
+    own["text_model.embeddings.token_embedding.weight"] = state["token_embedding.weight"]
+    own["text_model.embeddings.position_embedding.weight"] = state["positional_embedding"]
+    for kind in ("weight", "bias"):
+        own[f"text_model.final_layer_norm.{kind}"] = state[f"ln_final.{kind}"]
+        for layer in range(sum(name.endswith("ln_1.weight") for name in state)):
+            there, here = f"text_model.encoder.layers.{layer}", f"transformer.resblocks.{layer}"
+            query, key, value = state[f"{here}.attn.in_proj_{kind}"].chunk(3)
+            own |= {f"{there}.self_attn.q_proj.{kind}": query, f"{there}.self_attn.k_proj.{kind}": key}
+            own |= {f"{there}.self_attn.v_proj.{kind}": value}
+            own[f"{there}.self_attn.out_proj.{kind}"] = state[f"{here}.attn.out_proj.{kind}"]
+            own[f"{there}.layer_norm1.{kind}"] = state[f"{here}.ln_1.{kind}"]
+            own[f"{there}.layer_norm2.{kind}"] = state[f"{here}.ln_2.{kind}"]
+            own[f"{there}.mlp.fc1.{kind}"] = state[f"{here}.mlp.c_fc.{kind}"]
+            own[f"{there}.mlp.fc2.{kind}"] = state[f"{here}.mlp.c_proj.{kind}"]
+    return own
+
+
+def below(prefix: str):
+    return lambda state: {prefix + name: tensor for name, tensor in state.items()}
+
+
+# As transformers' CLIPModel, open_clip's CLIP and CustomTextCLIP, and torch's DistributedDataParallel write them.
+NAMINGS = {
+    "transformers": transformers_names,
+    "transformers, wrapped": lambda state: below("module.")(transformers_names(state)),
+    "open_clip's own text tower": below("text."),
+    "transformers' text model alone": lambda state: {
+        name.removeprefix("text_model."): tensor
+        for name, tensor in transformers_names(state).items()
+        if not name.startswith("vision")
+    },
+    "wrapped twice": below("module.text."),
+    "OpenAI's": lambda state: state | {"visual.proj": state["ln_final.bias"], "logit_scale": state["ln_final.bias"]},
+}
+
+
+@pytest.fixture(scope="module")
+def tiny_tower() -> dict:
+    """Random tensors of a tower of two layers and 64 numbers, by open_clip's names."""
+    import torch
+
+    draws, layer = torch.Generator().manual_seed(0), "transformer.resblocks"
+    shapes = {"token_embedding.weight": (30, 64), "positional_embedding": (77, 64), "text_projection": (64, 512)}
+    for kind, rows in (("weight", (64,)), ("bias", ())):
+        shapes[f"ln_final.{kind}"] = (64,)
+        for number in range(2):
+            shapes[f"{layer}.{number}.attn.in_proj_{kind}"] = (192, *rows)
+            shapes[f"{layer}.{number}.attn.out_proj.{kind}"] = (64, *rows)
+            shapes[f"{layer}.{number}.mlp.c_fc.{kind}"] = (256, *rows)
+            shapes[f"{layer}.{number}.mlp.c_proj.{kind}"] = (64, *(256,) * len(rows))
+            shapes |= {f"{layer}.{number}.ln_1.{kind}": (64,), f"{layer}.{number}.ln_2.{kind}": (64,)}
+    return {name: torch.randn(shape, generator=draws) for name, shape in shapes.items()}
+
+
+def contiguous(tensors: dict) -> dict:
+    return {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
+
+
+@pytest.mark.parametrize("naming", NAMINGS)
+@pytest.mark.parametrize("kind", ["safetensors", "torch", "training"])
+def test_a_text_tower_is_read_by_the_names_of_every_library(tiny_tower, naming: str, kind: str, tmp_path: Path) -> None:
+    import torch
+    from safetensors.torch import save_file
+
+    tensors = contiguous(NAMINGS[naming](tiny_tower))
+    if kind == "safetensors":
+        save_file(tensors, tmp_path / "weights")
+    else:
+        torch.save(tensors if kind == "torch" else {"epoch": 3, "state_dict": tensors}, tmp_path / "weights")
+    read = read_tower(tmp_path / "weights")
+    assert read.keys() == tiny_tower.keys()
+    assert all(torch.equal(read[name], tensor) for name, tensor in tiny_tower.items())
+
+
+def test_half_precision_is_read_as_float32(tiny_tower, tmp_path: Path) -> None:
+    import torch
+
+    torch.save({name: tensor.half() for name, tensor in tiny_tower.items()}, tmp_path / "half.pt")
+    assert {tensor.dtype for tensor in read_tower(tmp_path / "half.pt").values()} == {torch.float32}
+
+
+def test_what_is_no_whole_text_tower_is_refused_with_its_reason(tiny_tower, tmp_path: Path) -> None:
+    import zipfile
+
+    import torch
+
+    def refused(tensors: dict, says: str) -> None:
+        torch.save(contiguous(tensors), tmp_path / "weights.bin")
+        with pytest.raises(BadInput, match=says):
+            read_tower(tmp_path / "weights.bin")
+
+    theirs = transformers_names(tiny_tower)
+    refused({name: own for name, own in theirs.items() if name != "text_projection.weight"}, "CLIPTextModelWithProj")
+    refused({name: own for name, own in theirs.items() if "k_proj" not in name}, "q_proj, k_proj and v_proj")
+    refused({"bert.encoder.weight": torch.ones(1)}, "names of open_clip, OpenAI or transformers, got tensors bert.enc")
+    refused(tiny_tower | below("text.")(tiny_tower), "got 2 of them")
+    for name in ("archive/data.pkl", "archive/constants.pkl"):
+        with zipfile.ZipFile(tmp_path / "script.pt", "a") as archive:
+            archive.writestr(name, "")
+    with pytest.raises(BadInput, match="a TorchScript archive, which holds code; write the weights' state_dict"):
+        read_tower(tmp_path / "script.pt")
+    torch.save(contiguous(tiny_tower), tmp_path / "old.pt", _use_new_zipfile_serialization=False)
+    with pytest.raises(BadInput, match=r"a safetensors file, or a zip file of torch\.save"):
+        read_tower(tmp_path / "old.pt")
+    (tmp_path / "cut.pt").write_bytes((tmp_path / "weights.bin").read_bytes()[:3000])
+    with pytest.raises(BadInput, match=r"cut\.pt"):
+        read_tower(tmp_path / "cut.pt")
+
+
+@pytest.mark.slow
+@needs_open_clip
+def test_weights_by_transformers_names_give_the_same_features(towers, tmp_path: Path) -> None:
+    from safetensors.torch import load_file, save_file
+
+    path, expected = towers["tiny"]
+    save_file(contiguous(transformers_names(load_file(path))), tmp_path / "model.safetensors")
+    encoder = load_encoder(f"clip:{tmp_path / 'model.safetensors'}")
+    np.testing.assert_allclose(encoder.encode(SENTENCES), expected, atol=1e-5)

@@ -34,7 +34,8 @@ def motion(page_clip):
         "read_as": ("lift", 0.97),
         "told": "Lift a <b>jar</b> with the left hand.",
         "draws": 3,
-        "moved_as": "lift",
+        "moved_as": "pour",
+        "unusual": ["highest rise 15.8 cm (usual: <19.1> to 23.7)"],
         "synthetic": True,
         "unseen": ["the object 'vase' was never in training"],
         "contact_threshold_m": 0.02,
@@ -106,6 +107,7 @@ def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, wri
         "Lift a box &amp; hold it",
         "Lift a &lt;b&gt;jar&lt;/b&gt; with the left hand.",
         "sample 1: the best of 3 motions",
+        "sample 1: moves most like &#39;pour&#39;, highest rise 15.8 cm (usual: &lt;19.1&gt; to 23.7)",
     ):
         assert words in page, words
 

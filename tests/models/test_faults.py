@@ -1,0 +1,104 @@
+"""What a person would see to be wrong with a motion is told; a difference of some centimetres is not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hoidata.actions.action import learn_actions
+from hoidata.batches.requests import ObjectPoints
+from hoidata.clips.clip import SIDES, Clip, HandTrack
+from hoidata.hands import load_embedded_hands, track_vertices
+from hoidata.objects.sampling import sample_points
+from models.text2hoi.faults import visible_faults
+from models.text2hoi.verb_check import VerbCheck
+from tests.builders.clips import DOWN, clip_of, flat_hand, still_object
+from tests.builders.objects import box_model
+
+HANDS, FRAMES = load_embedded_hands(), 30
+BOX = box_model((0.10, 0.10, 0.10))
+RISE = 0.2 * np.clip(np.linspace(-0.5, 1.5, FRAMES), 0, 1)
+
+
+def right_hand(depth_m: float, rise_m: np.ndarray) -> HandTrack:
+    """One that lies on the box with its lowest vertex, or ``depth_m`` deep in it, and moves with it."""
+    wrist = np.zeros((FRAMES, 3))
+    skin = track_vertices(flat_hand(wrist), HANDS.right)[0]
+    lowest = skin[skin[:, 2].argmin()]
+    return flat_hand(wrist - lowest + [0, 0, 0.05 - depth_m] + np.outer(rise_m, [0, 0, 1]))
+
+
+def lift(depth_m: float = 0.0, rise_m: np.ndarray = RISE, hand_rise_m: np.ndarray | None = None) -> Clip:
+    track = still_object(BOX, FRAMES)
+    track = replace(track, translation_m=np.outer(rise_m, [0, 0, 1]).astype(np.float32))
+    hand = right_hand(depth_m, rise_m if hand_rise_m is None else hand_rise_m)
+    away = flat_hand(np.zeros((FRAMES, 3)), np.zeros(FRAMES, bool))
+    return clip_of("generated/box", track, {"left": away, "right": hand}, gravity=DOWN)
+
+
+@pytest.fixture(scope="module")
+def points() -> ObjectPoints:
+    sampled = sample_points(BOX, 256)
+    return ObjectPoints(sampled.points_m, sampled.normals, sampled.part)
+
+
+@pytest.fixture(scope="module")
+def check(points: ObjectPoints) -> VerbCheck:
+    """Of lifts, usually by 19 to 21 cm, and of objects that nobody moved."""
+    nothing = VerbCheck(learn_actions({}), 0.02, HANDS)
+    clips = {"lift": [lift(rise_m=share * RISE) for share in (0.95, 1.0, 1.05)], "touch": [lift(rise_m=0 * RISE)] * 3}
+    numbers = {verb: [nothing.numbers(clip, points) for clip in own] for verb, own in clips.items()}
+    usual = {"lift": {"rise_m": (0.19, 0.21), "path_m": (0.19, 0.21)}}
+    return VerbCheck(replace(learn_actions(numbers), usual=usual), 0.02, HANDS, 1.0)
+
+
+@pytest.mark.parametrize("share", [0.7, 0.95, 1.0, 1.3])
+def test_nothing_is_said_of_a_lift_or_of_one_a_little_higher_or_lower(
+    share: float, points: ObjectPoints, check: VerbCheck
+) -> None:
+    clip = lift(rise_m=share * RISE)
+    assert visible_faults(clip, points, HANDS, check, "lift") == ()
+    unusual = check.unusual("lift", check.numbers(clip, points))
+    assert bool(unusual) == (share in (0.7, 1.3))  # which the page has in numbers
+
+
+@pytest.mark.parametrize("share", [0.3, 2.0])
+def test_a_lift_that_is_seen_to_be_another_is_told_with_its_numbers(
+    share: float, points: ObjectPoints, check: VerbCheck
+) -> None:
+    (fault,) = visible_faults(lift(rise_m=share * RISE), points, HANDS, check, "lift")
+    assert fault.startswith("unlike 'lift' in training")
+    assert f"highest rise {20 * share:.3g} cm (usual: " in fault
+    assert (", more like 'touch': " in fault) == (share == 0.3)
+
+
+def test_an_object_that_stays_is_told_where_the_verb_moves_it(points: ObjectPoints, check: VerbCheck) -> None:
+    still = lift(rise_m=0 * RISE)
+    assert visible_faults(still, points, HANDS, check, "lift") == ("the object does not move",)
+    assert visible_faults(still, points, HANDS, check, "touch") == ()
+    assert visible_faults(still, points, HANDS, None, None) == ()
+
+
+@pytest.mark.parametrize("gap_m", [0.008, 0.012, 0.3])
+def test_a_hand_that_never_touches_is_told_from_a_centimetre_on(gap_m: float, points: ObjectPoints) -> None:
+    said = visible_faults(lift(-gap_m), points, HANDS, None, None)
+    expected = (f"the right hand never touches the object ({gap_m * 100:.1f} cm away)",)
+    assert said == (expected if gap_m > 0.01 else ())
+
+
+def test_a_hand_as_deep_as_a_finger_is_thick_is_told_with_its_depth(points: ObjectPoints) -> None:
+    shallow, deep = (visible_faults(lift(depth), points, HANDS, None, None) for depth in (0.015, 0.025))
+    assert shallow == ()
+    assert deep == (f"the right hand is up to 2.5 cm inside the object in {FRAMES} frames",)
+
+
+def test_an_object_that_floats_is_told(points: ObjectPoints) -> None:
+    """The hand lies on the box first, then rises faster than it does."""
+    floats = int((RISE > 0.02).sum())
+    expected = f"the object is in the air and no hand touches it in {floats} frames"
+    assert visible_faults(lift(hand_rise_m=3 * RISE), points, HANDS, None, None) == (expected,)
+
+
+def test_hands_that_take_no_part_are_not_asked_for(points: ObjectPoints) -> None:
+    assert not any(lift().hands[side].valid.any() for side in SIDES[:1])
+    assert visible_faults(lift(), points, HANDS, None, None) == ()
