@@ -9,7 +9,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Any
 
 from hoidata.cluster import is_used_for, on_cluster
 from hoidata.errors import BadInput, HoidataError
+from hoidata.lifetime import end_with_starter
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -209,7 +209,7 @@ def _serve(connection: Connection, lock: _Descriptor) -> None:
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
     # Ctrl-C reaches the whole group: the parent decides.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_starter()
     try:
         function = connection.recv()
     except EOFError:  # the parent is gone
@@ -237,10 +237,3 @@ def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
         return None, error
     except Exception:
         return None, RuntimeError(f"{item}: {traceback.format_exc()}")
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

@@ -18,6 +18,7 @@ from hoidata.conformance.report import Finding, finding, skipped
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
+from hoidata.lifetime import end_with_starter
 
 MOST_DAMAGED = 6
 DAMAGES = ("removed", "emptied", "cut in half")
@@ -58,7 +59,7 @@ class Trials:
         rule, item = "a worker process gives the same", self.loaded[0]
         context = multiprocessing.get_context("spawn")
         try:
-            with ProcessPoolExecutor(1, mp_context=context) as pool:
+            with ProcessPoolExecutor(1, context, end_with_starter) as pool:
                 there = pool.submit(load_recorded, self.adapter, self.root, item.key, self.hands).result()
         except Exception as error:  # an adapter that cannot be imported or pickled there breaks the pool
             return finding(rule, [f"it cannot be sent there: {error!r}"])
