@@ -11,12 +11,15 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
 from types import FrameType
 from typing import NoReturn
 
 PR_SET_PDEATHSIG = 1  # of linux/prctl.h
 GRACE_S = 8.0
+LOOK_S = 0.2
 INTERRUPTED = "interrupted: nothing that was there is lost; run it again"
 _received: list[int] = []
 
@@ -40,14 +43,39 @@ def end_with_starter() -> None:
     _end_after(starter.join)
 
 
+def begin_worker() -> None:
+    """The beginning of a worker process: it ends with its starter, which alone decides what Ctrl-C ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    end_with_starter()
+
+
+@contextmanager
+def ctrl_c_blocked() -> Iterator[None]:
+    """Processes of ``multiprocessing`` that start meanwhile see no Ctrl-C until they unblock it.
+
+    In a terminal Ctrl-C reaches all processes of a command, and an interpreter that starts would print a traceback.
+    This process gets it after the block.
+    """
+    resource_tracker.ensure_running()  # which unblocks Ctrl-C in this thread when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def end_with_process(pid: int) -> None:
     """Kill this process when any other process ends, however it ends."""
     import psutil
 
-    try:
-        _end_after(psutil.Process(pid).wait)
-    except psutil.NoSuchProcess:
-        os.kill(os.getpid(), signal.SIGKILL)
+    def wait() -> None:
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(pid)
+            while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                time.sleep(LOOK_S)
+
+    _end_after(wait)
 
 
 def _end_after(wait: Callable[[], object]) -> None:
@@ -86,6 +114,14 @@ def end_on_signals() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, _interrupt)
+    sys.unraisablehook = _on_unraisable
+
+
+def _on_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Python prints and drops what is raised while it deletes an object: also the interrupt."""
+    if _received and isinstance(unraisable.exc_value, KeyboardInterrupt):
+        _end_now(_received[0])
+    sys.__unraisablehook__(unraisable)
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -112,5 +148,6 @@ def _end_later(number: int) -> None:
 
 
 def _end_now(number: int) -> NoReturn:
-    os.write(2, f"{INTERRUPTED}\n".encode())
+    with suppress(OSError):  # nobody reads it
+        os.write(2, f"{INTERRUPTED}\n".encode())
     os._exit(128 + number)

@@ -20,7 +20,7 @@ from typing import Any
 
 from hoidata.cluster import is_used_for, on_cluster
 from hoidata.errors import BadInput, HoidataError
-from hoidata.lifetime import end_with_starter
+from hoidata.lifetime import begin_worker, ctrl_c_blocked
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -150,7 +150,8 @@ def _start(function: Function, lock: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, _Descriptor(lock)), daemon=True)
-    process.start()
+    with ctrl_c_blocked():
+        process.start()
     theirs.close()
     # Not among the arguments: a process that died before it read more of them than a pipe holds would be waited for.
     with contextlib.suppress(ConnectionError):
@@ -207,9 +208,7 @@ def _received(copy: Any) -> _Descriptor:
 def _serve(connection: Connection, lock: _Descriptor) -> None:
     """A worker's life. ``lock`` is held by being open until the process ends."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
-    # Ctrl-C reaches the whole group: the parent decides.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    end_with_starter()
+    begin_worker()
     try:
         function = connection.recv()
     except EOFError:  # the parent is gone
