@@ -42,7 +42,7 @@ test-long: install-dev
 
 # Every situation that may stop a run, three times each; `make test` has a share of it.
 chaos: install-dev
-	OMP_NUM_THREADS=1 HOIDATA_CHAOS=3 pytest tests/pipelines/test_chaos.py tests/hoidata/test_cluster.py
+	OMP_NUM_THREADS=1 HOIDATA_CHAOS=3 pytest tests/pipelines/test_chaos.py tests/pipelines/test_interrupts.py tests/hoidata/test_cluster.py
 
 # 50,000 damaged files for each parser, over a million in all; inputs that fail are kept in .fuzz/.
 fuzz: install-dev

@@ -16,11 +16,13 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 
 from bench.corpus import PAPER, embedded_root, replicate
 from bench.growth import show_growth
 from bench.harness import TreeMemory, show
+from hoidata.lifetime import end_with_parent
 from hoidata.store.mapped import map_npz
 from hoidata.store.store import open_store
 
@@ -85,7 +87,8 @@ def measured(stage: str, name: str, raw: Path, out: Path) -> Measured:
     """Run one stage of one dataset in a process of its own."""
     command = [sys.executable, "-m", "bench.scale", "--stage", stage, name, str(raw), str(out)]
     before, start = os.times(), time.perf_counter()
-    process = subprocess.Popen(command, env={**os.environ, "OMP_NUM_THREADS": "1"}, stdout=sys.stderr)
+    environment, end = {**os.environ, "OMP_NUM_THREADS": "1"}, partial(end_with_parent, os.getpid())
+    process = subprocess.Popen(command, env=environment, stdout=sys.stderr, preexec_fn=end)
     with TreeMemory(process.pid) as memory:
         code = process.wait()
     if code:

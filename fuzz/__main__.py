@@ -14,6 +14,7 @@ from pathlib import Path
 
 from fuzz.engine import Outcome, check_call, fuzz
 from fuzz.targets import all_targets, scratch_folder
+from hoidata.lifetime import begin_worker
 
 LEAST_LINES = 0.9
 MOST_MIB = 1024
@@ -30,7 +31,7 @@ def main() -> int:
     started = time.perf_counter()
     names = arguments.only or list(all_targets())
     # Forked: what all parsers import is imported once.
-    with ProcessPoolExecutor(arguments.jobs, multiprocessing.get_context("fork")) as pool:
+    with ProcessPoolExecutor(arguments.jobs, multiprocessing.get_context("fork"), begin_worker) as pool:
         outcomes = []
         for outcome in pool.map(_fuzzed, names, [arguments] * len(names)):
             outcomes.append(outcome)

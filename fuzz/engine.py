@@ -27,6 +27,7 @@ from fuzz.coverage import code_objects, lines_of, lines_reached
 from fuzz.structure import LONGEST, NUMBERS, Bytes
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files import sha256_bytes
+from hoidata.lifetime import end_with_parent
 
 SLOWEST_S = 1.0
 HANG_S = 30
@@ -91,6 +92,9 @@ def fuzz(target: Target, seed: int, executions: int, seconds: float, folder: Pat
 
 def _run(target: Target, seed: int, executions: int, seconds: float, own: Path) -> None:
     """In the child: hands the process to libFuzzer, which ends it."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end_with_parent(int(parent.pid or 0))
     log = os.open(own / "log", os.O_CREAT | os.O_WRONLY)
     os.dup2(log, 1)
     os.dup2(log, 2)

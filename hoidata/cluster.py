@@ -101,7 +101,9 @@ def _client(jobs: int) -> Any:
     from distributed import Client
 
     if _chosen[0] == DASK:
-        return Client(n_workers=jobs, threads_per_worker=1, dashboard_address=None, set_as_default=False)
+        # security: TLS with new certificates. Without it any user of this machine could run code as this one.
+        started = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None, "security": True}
+        return Client(**started, set_as_default=False)
     try:
         return Client(_chosen[0], timeout=PATIENCE_S, set_as_default=False)
     except OSError as error:

@@ -9,7 +9,6 @@ import multiprocessing
 import os
 import signal
 import sys
-import threading
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Any
 
 from hoidata.cluster import is_used_for, on_cluster
 from hoidata.errors import BadInput, HoidataError
+from hoidata.lifetime import begin_worker, ctrl_c_blocked
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -150,7 +150,8 @@ def _start(function: Function, lock: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     process = context.Process(target=_serve, args=(theirs, _Descriptor(lock)), daemon=True)
-    process.start()
+    with ctrl_c_blocked():
+        process.start()
     theirs.close()
     # Not among the arguments: a process that died before it read more of them than a pipe holds would be waited for.
     with contextlib.suppress(ConnectionError):
@@ -207,9 +208,7 @@ def _received(copy: Any) -> _Descriptor:
 def _serve(connection: Connection, lock: _Descriptor) -> None:
     """A worker's life. ``lock`` is held by being open until the process ends."""
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read by libraries that the function loads later
-    # Ctrl-C reaches the whole group: the parent decides.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    begin_worker()
     try:
         function = connection.recv()
     except EOFError:  # the parent is gone
@@ -237,10 +236,3 @@ def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
         return None, error
     except Exception:
         return None, RuntimeError(f"{item}: {traceback.format_exc()}")
-
-
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)

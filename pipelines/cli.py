@@ -76,7 +76,7 @@ def _check_what_is_read() -> None:
 
 def main() -> None:
     """Run the command. Exit code 1 and one line on stderr when something is wrong with what it was given, or with the
-    machine (a full disk, a folder that cannot be written); 130 after Ctrl-C."""
+    machine (a full disk, a folder that cannot be written)."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8

@@ -3,23 +3,61 @@
 (Entry point group ``prefect.plugins``, switched on in prefect.toml.) Prefect wants FLOW/DEPLOYMENT and has no setting
 for less, so its look-up by name is wrapped; the form with a slash always works. And this project's server lets nobody
 in without its key, which the hook takes from ``.prefect/``.
+
+The hook also guards a flow run before it contacts the server. The run ends with its worker, because it would obey
+whoever listens at the server's address next. And no process loads results that a server points to, because reading
+them can run code.
 """
 
 import os
+import signal
 import sys
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NoReturn
 
+import psutil
 from prefect.plugins import SetupResult, register_hook
 
+from hoidata.errors import BadInput
+from hoidata.lifetime import end_with_parent
 from pipelines.prefect_key import is_loopback, read_key
+
+WORKER = "HOIDATA_PREFECT_WORKER"
 
 
 @register_hook
 def setup_environment(*, ctx) -> SetupResult | None:
     """Called once when Prefect is imported; Prefect reads its settings again when variables are returned."""
+    end_flow_run_with_worker()
+    refuse_stored_results()
     accept_bare_names(ctx)
     return key_for(ctx.api_url)
+
+
+def end_flow_run_with_worker() -> None:
+    """A worker leaves its process id to the processes of its flow runs, which the kernel then ends with it.
+
+    A process whose worker ended while Prefect was imported ends now.
+    """
+    if "PREFECT__FLOW_RUN_ID" not in os.environ:
+        os.environ[WORKER] = str(os.getpid())
+        return
+    worker = int(os.environ.get(WORKER, os.getppid()))
+    end_with_parent(os.getppid())
+    if worker not in (process.pid for process in psutil.Process().parents()):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def refuse_stored_results() -> None:
+    """Our flows store no results. A state of the server may name any file as one, and pickle as its format."""
+    from prefect.results import ResultRecord
+
+    def refuse(*_: object, **__: object) -> NoReturn:
+        raise BadInput("a state of the Prefect server", "no stored result", "one to be loaded", "start the run again")
+
+    ResultRecord.deserialize = refuse
+    ResultRecord.deserialize_from_result_and_metadata = refuse
 
 
 def key_for(url: str | None) -> SetupResult | None:

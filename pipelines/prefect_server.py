@@ -7,7 +7,6 @@ command, an environment or a folder of its own. And since the worker obeys whoev
 server may, as long as the worker lives.
 """
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -16,7 +15,10 @@ import time
 import tomllib
 import urllib.error
 import urllib.request
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import psutil
@@ -24,12 +26,12 @@ import psutil
 from hoidata.beside import python_path
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import exclusive
+from hoidata.lifetime import end_with_parent
 from pipelines.deployments import write_deployments
 from pipelines.prefect_key import KEY_FILE, is_loopback, write_key
 
 START_TIMEOUT_S = 180
-STOP_TIMEOUT_S = 15
-PR_SET_PDEATHSIG = 1  # of linux/prctl.h
+STOP_TIMEOUT_S = {"worker": 4, "server": 3}  # together less than what Ctrl-C leaves a command
 POOL = "local"
 POOL_TEMPLATE = Path(__file__).with_name("prefect_pool.json")
 
@@ -37,7 +39,6 @@ POOL_TEMPLATE = Path(__file__).with_name("prefect_pool.json")
 def serve() -> int:
     """Start the server, deploy, and work until interrupted; server and worker end together. Returns the exit code."""
     url = api_url()
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     with exclusive(KEY_FILE, wait_s=0):
         if _answers(f"{url}/health"):
             raise MissingResource(f"another server answers at {url}; stop it, or set PREFECT_API_URL to a free port")
@@ -45,24 +46,22 @@ def serve() -> int:
 
 
 def _serve(url: str, environment: dict[str, str]) -> int:
-    running = [_start_server(url, environment)]
+    server, worker = _start_server(url, environment), None
     try:
-        wait_until_healthy(url, running[0])
+        wait_until_healthy(url, server)
         deploy(environment)
-        worker = _prefect("worker", "start", "--pool", POOL)
-        running.append(subprocess.Popen(worker, env=environment, preexec_fn=_end_with_parent))
+        worker = _start(_prefect("worker", "start", "--pool", POOL), environment)
         print(f"{_origin(url)} asks for a password: the text in {KEY_FILE}, new at every start")
         print("ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder", flush=True)
-        while all(process.poll() is None for process in running):
-            time.sleep(0.5)
-        return next(process.returncode or 1 for process in running if process.returncode is not None)
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)  # until server or worker ends
+        return server.poll() or worker.poll() or 1
     except KeyboardInterrupt:
         return 0
     finally:
-        for sent in (signal.SIGTERM, signal.SIGINT):  # whoever asks again must not leave the worker behind
-            signal.signal(sent, signal.SIG_IGN)
-        for process in reversed(running):
-            _stop(process)
+        if worker is not None:
+            # Without its server it would obey whoever listens at the address next, and so would the flow it runs.
+            _stop(worker, STOP_TIMEOUT_S["worker"] if server.poll() is None else 0)
+        _stop(server, STOP_TIMEOUT_S["server"])
 
 
 def stop_running() -> bool:
@@ -71,16 +70,17 @@ def stop_running() -> bool:
         with exclusive(KEY_FILE, wait_s=0):
             return False
     except BadInput:
-        os.kill(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()), signal.SIGTERM)
-        with exclusive(KEY_FILE, wait_s=3 * STOP_TIMEOUT_S):
+        with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended by itself
+            os.kill(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()), signal.SIGTERM)
+        with exclusive(KEY_FILE, wait_s=3 * sum(STOP_TIMEOUT_S.values())):
             return True
 
 
-def _stop(process: subprocess.Popen) -> None:
-    """Ask a process to end; one that waits for its clients longer than STOP_TIMEOUT_S is ended."""
+def _stop(process: subprocess.Popen, patience_s: float) -> None:
+    """Ask a process to end; one that has not ended after ``patience_s`` is killed."""
     process.terminate()
     try:
-        process.wait(STOP_TIMEOUT_S)
+        process.wait(patience_s)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -112,6 +112,8 @@ def server_environment(url: str, key: str) -> dict[str, str]:
         "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": _origin(url),
         "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
         "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",
+        "PREFECT_PLUGINS_ENABLED": "true",  # pipelines.prefect_names guards the processes of flow runs
+        "PREFECT_PLUGINS_SAFE_MODE": "false",
     }
     home = os.environ.get("PREFECT_HOME", str(Path(".prefect").resolve()))
     quiet = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
@@ -125,7 +127,7 @@ def deploy(environment: dict[str, str]) -> None:
     deployments = _prefect("--no-prompt", "deploy", "--all", "--prefect-file", str(write_deployments(Path())))
     abandoned = [sys.executable, "-m", "pipelines.prefect_abandoned"]
     for command in (abandoned, pool, deployments):
-        code = subprocess.run(command, env=environment, stdin=subprocess.DEVNULL).returncode
+        code = _start(command, environment, stdin=subprocess.DEVNULL).wait()
         if code:
             raise MissingResource(f"`{' '.join(command[2:])}` ended with exit code {code}; its output says why")
 
@@ -161,16 +163,12 @@ def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
     address = urlsplit(url)
     where = ("--host", str(address.hostname), "--port", str(address.port))
     command = _prefect("server", "start", *where, "--analytics-off")
-    return subprocess.Popen(command, env=environment, umask=0o077, preexec_fn=_end_with_parent)
+    return _start(command, environment, umask=0o077)
 
 
-def _end_with_parent() -> None:
-    """In a new process: have the kernel end it when ``hoidata up`` is killed, which can clear nothing away itself.
-
-    A worker that stayed would obey whoever listens at the address next. Linux alone knows how.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+def _start(command: list[str], environment: dict[str, str], **options: Any) -> subprocess.Popen:
+    """A process that ends with this one: alone it would send the key to whoever listens at the address next."""
+    return subprocess.Popen(command, env=environment, preexec_fn=partial(end_with_parent, os.getpid()), **options)
 
 
 def _prefect(*arguments: str) -> list[str]:

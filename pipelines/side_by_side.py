@@ -14,14 +14,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from multiprocessing import connection
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from hoidata.errors import BadInput, told_in_words
 from hoidata.files.atomic import exclusive, write_whole
+from hoidata.lifetime import ctrl_c_blocked, end_with_starter
 from pipelines.warm import WarmProcess
 
 CODE = "pipelines/dvc.yaml:code"
@@ -32,6 +34,7 @@ DURATIONS = Path(".hoidata/durations.json")
 # What every run of a single stage would import anew, about a second each time.
 PRELOADED = ["dvc.cli", "dvc.commands.repro", "dvc.repo.reproduce", "dvc.output", "dvc.stage.run"]
 TAIL = 15
+STOP_S = 5.0
 _STARTING = threading.Lock()
 _ROOM = 1 << 20  # bytes that must fit beside the cache before anything is begun
 Upstream = Mapping[str, frozenset[str]]
@@ -244,7 +247,7 @@ class _Children:
     """Processes that run DVC for one stage each, forked from one that has it loaded; none outlives this one's end."""
 
     def __init__(self, cores: int) -> None:
-        self.cores = cores
+        self.cores, self.ends = cores, False
         self.context = multiprocessing.get_context("forkserver")
         self.processes: set[Any] = set()
         self.forced: set[str] = set()
@@ -252,16 +255,33 @@ class _Children:
 
     def __enter__(self) -> "_Children":
         self.context.set_forkserver_preload(PRELOADED)
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, _stop)
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Stop what is still at work, as after Ctrl-C: the outputs of unfinished stages stay what they were."""
-        for process in self.processes:
-            if process.is_alive():
-                os.killpg(process.pid, signal.SIGINT)
+        """Stop what is still at work, as after Ctrl-C: the outputs of unfinished stages stay what they were.
+
+        A stage that has not ended after STOP_S is killed.
+        """
+        with _STARTING:
+            self.ends = True
+        for number, seconds in ((signal.SIGINT, STOP_S), (signal.SIGKILL, 0)):
+            for process in self._at_work(0):
+                _signal_group(process.pid, number)
+            self._at_work(seconds)
         self.warm.close()
+
+    def _at_work(self, seconds: float) -> list[Any]:
+        """The processes that have not ended, after up to so many seconds in which all of them might.
+
+        Their exit codes are left to the threads that wait for them: a second reader would get none.
+        """
+        deadline, processes = time.monotonic() + seconds, list(self.processes)
+        while processes:
+            ended = connection.wait([process.sentinel for process in processes], max(0, deadline - time.monotonic()))
+            processes = [process for process in processes if process.sentinel not in ended]
+            if not ended:
+                break
+        return processes
 
     def run(self, name: str) -> int:
         """DVC's exit code for one stage; what it prints goes to the stage's log."""
@@ -271,14 +291,21 @@ class _Children:
             target=_run_single_stage, args=(Path.cwd(), name, name in self.forced, environment)
         )
         with _without_main():
-            process.start()
-        self.processes.add(process)
+            if self.ends:
+                return 128 + signal.SIGINT
+            with ctrl_c_blocked():
+                process.start()
+            self.processes.add(process)
         process.join()
         return process.exitcode or 0
 
 
-def _stop(*_: object) -> None:
-    raise KeyboardInterrupt
+def _signal_group(leader: int, number: int) -> None:
+    with suppress(ProcessLookupError):  # it has just ended
+        try:
+            os.killpg(leader, number)
+        except ProcessLookupError:  # it has just started, has no group yet and runs no stage
+            os.kill(leader, signal.SIGKILL)
 
 
 @contextmanager
@@ -292,23 +319,17 @@ def _without_main() -> Iterator[None]:
             sys.modules["__main__"] = main
 
 
-def _end_with_parent() -> None:
-    """Interrupt this stage when the run it belongs to is gone, however it ended: nobody would wait for it."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os.killpg(0, signal.SIGINT)
-
-
 def _run_single_stage(project: Path, name: str, force: bool, environment: dict[str, str]) -> None:
     """In the child: its own group of processes, so that a signal for one stage reaches all of it."""
     from dvc.cli import main
 
-    os.setpgrp()
-    threading.Thread(target=_end_with_parent, daemon=True).start()
     os.chdir(project)
     os.environ.update(environment)
     with log_of(name).open("wb") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in `hoidata repro &` of a script
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    os.setpgrp()
+    end_with_starter()
     sys.exit(main(["--wait-for-lock", "repro", "--single-item", *["--force"] * force, name]))

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.beside import python_path
+from hoidata.lifetime import end_on_signals
 from hoidata.processor import same_kernels
 
 SOCKET = "HOIDATA_WARM"
@@ -117,6 +118,8 @@ def _end_with_input() -> None:
 def _answer(connection: socket.socket) -> None:
     """In the fork: run what is asked and send its exit code; a fork that was killed sends nothing."""
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started all this to ignore it
+    end_on_signals()
     os.setpgrp()
     code = 1
     try:

@@ -18,6 +18,7 @@ from hoidata.conformance.report import Finding, finding, skipped, undecided
 from hoidata.datasets.base import Adapter, SequenceKey
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
+from hoidata.lifetime import begin_worker, ctrl_c_blocked
 
 MOST_DAMAGED = 6
 DAMAGES = ("removed", "emptied", "cut in half")
@@ -58,8 +59,10 @@ class Trials:
         rule, item = "a worker process gives the same", self.loaded[0]
         context = multiprocessing.get_context("spawn")
         try:
-            with ProcessPoolExecutor(1, mp_context=context) as pool:
-                there = pool.submit(load_recorded, self.adapter, self.root, item.key, self.hands).result()
+            with ProcessPoolExecutor(1, context, begin_worker) as pool:
+                with ctrl_c_blocked():
+                    future = pool.submit(load_recorded, self.adapter, self.root, item.key, self.hands)
+                there = future.result()
         except Exception as error:  # an adapter that cannot be imported or pickled there breaks the pool
             return finding(rule, [f"it cannot be sent there: {error!r}"])
         return finding(rule, _compared(item, there))

@@ -17,11 +17,7 @@ def repro(
     from pipelines.repro import reproduce
     from pipelines.side_by_side import describe_run
 
-    try:
-        run = reproduce(targets or [], jobs, force=force)
-    except KeyboardInterrupt:
-        typer.echo("interrupted; all outputs are whole, old or new: run it again, it goes on from there", err=True)
-        raise typer.Exit(130) from None
+    run = reproduce(targets or [], jobs, force=force)
     print(describe_run(run))
     raise typer.Exit(1 if run.failed else 0)
 

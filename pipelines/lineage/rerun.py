@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from hoidata.errors import BadInput, HoidataError
 from hoidata.files.sealed import payload_digest
+from hoidata.lifetime import end_with_parent
 from hoidata.machine_folder import SETTINGS
 from pipelines.lineage.locks import read_locks
 from pipelines.lineage.targets import WEIGHTS, Target
@@ -77,7 +79,8 @@ def _link_inputs(root: Path, clone: Path, out: Path) -> None:
 
 def _run(folder: Path, *command: str) -> None:
     environment = {**os.environ, "PYTHONPATH": str(folder.resolve())}
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment)
+    end = partial(end_with_parent, os.getpid())
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, env=environment, preexec_fn=end)
     if done.returncode:
         lines = (done.stderr or done.stdout).strip().splitlines()
         raise HoidataError(f"{' '.join(command)}: exit code {done.returncode}: {lines[-1] if lines else ''}")

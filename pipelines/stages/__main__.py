@@ -8,6 +8,9 @@ from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
 
+import psutil
+
+from hoidata.lifetime import end_with_process, run_interruptibly
 from pipelines.warm import ENVIRONMENT, run_warm
 
 STAGES = (
@@ -33,7 +36,12 @@ STAGES = (
 
 
 def main() -> int:
-    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do; 130: Ctrl-C."""
+    """Run one stage in the current folder; the exit code is 0, or 1 with one line that says what to do.
+
+    A stage that DVC started ends with it, however DVC ends.
+    """
+    if "DVC_STAGE" in os.environ:
+        _end_with_dvc()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file name need not be UTF-8
@@ -53,6 +61,14 @@ def main() -> int:
         print(f"{error}. Activate the environment first: source .venv/bin/activate", file=sys.stderr)
         return 1
     return _run(module, options)
+
+
+def _end_with_dvc() -> None:
+    """DVC started this process, or a shell that has this stage as its only command and that DVC started."""
+    parent = psutil.Process(os.getppid())
+    end_with_process(parent.pid)
+    if " ".join(sys.argv[1:]) in " ".join(parent.cmdline()[-1:]):
+        end_with_process(parent.ppid())
 
 
 def _run(module, options: argparse.Namespace) -> int:
@@ -78,8 +94,4 @@ def _run(module, options: argparse.Namespace) -> int:
 
 
 if __name__ == "__main__":
-    try:
-        sys.exit(main())
-    except KeyboardInterrupt:
-        print(f"{' '.join(sys.argv[1:])}: interrupted; run it again, nothing that was there is lost", file=sys.stderr)
-        sys.exit(130)
+    run_interruptibly(main)

@@ -101,6 +101,19 @@ def test_a_sequence_that_ends_every_worker_is_left_out_and_the_others_are_not(co
     assert "several workers" in left_out.got
 
 
+def test_nobody_else_on_this_machine_gets_into_a_cluster_started_here():
+    cluster.choose_workers("dask")
+    try:
+        with cluster._client(1) as client:
+            address = client.scheduler.address
+            assert client.submit(doubled, 2).result() == 4
+            for theirs, at in ((None, address.replace("tls:", "tcp:")), (distributed.Security.temporary(), address)):
+                with pytest.raises(OSError):  # noqa: PT011 - of the handshake, in words of the system
+                    distributed.Client(at, security=theirs, timeout=2, set_as_default=False)
+    finally:
+        cluster.choose_workers("local")
+
+
 def doubled(number: int) -> int:
     if number < 0:
         raise BadInput("number", "0 or more", str(number), "correct it")

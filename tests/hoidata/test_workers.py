@@ -3,7 +3,10 @@
 import multiprocessing
 import os
 import signal
+import subprocess
+import sys
 import threading
+import time
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -98,6 +101,53 @@ def test_what_the_function_raises_names_the_item_and_ends_the_workers():
     with pytest.raises(RuntimeError, match=r"3: Traceback(?s:.)*ZeroDivisionError"):
         list(in_workers(broken, range(6), 2))
     assert not multiprocessing.active_children()
+
+
+WORKERS = """
+import os, time
+from hoidata.workers import in_workers
+def work(item):
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+if __name__ == "__main__":
+    list(in_workers(work, range(2), 2))
+"""
+POOL = """
+import os, time
+from pathlib import Path
+from types import SimpleNamespace
+from hoidata import lifetime
+from hoidata.conformance.trials import Trials
+class Key:
+    def __reduce__(self):
+        return waiting, ()
+def waiting():
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+def main():
+    Trials(None, Path(), Path(), [SimpleNamespace(key=Key(), needed=[])], None).in_worker()
+if __name__ == "__main__":
+    lifetime.GRACE_S = 1
+    lifetime.run_interruptibly(main)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("code", "count"), [(WORKERS, 2), (POOL, 1)], ids=["workers", "pool of the adapters' check"])
+@pytest.mark.parametrize("sent", [signal.SIGKILL, signal.SIGINT])
+def test_worker_processes_end_with_the_one_that_started_them(tmp_path, code, count, sent):
+    (tmp_path / "script.py").write_text(code)
+    starter = subprocess.Popen(
+        [sys.executable, tmp_path / "script.py"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    workers = [psutil.Process(int(starter.stdout.readline())) for _ in range(count)]
+    starter.send_signal(sent)
+    deadline = time.monotonic() + 30
+    while any(worker.is_running() and worker.status() != psutil.STATUS_ZOMBIE for worker in workers):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    starter.kill()
+    starter.communicate()
 
 
 def test_one_job_works_here():

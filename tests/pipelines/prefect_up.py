@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
+import psutil
+
 START_S = 600  # a busy machine takes its time
 STOP_S = 60
 
@@ -29,6 +31,20 @@ def hoidata_up(project: Path, tools: SimpleNamespace) -> Iterator[SimpleNamespac
     finally:
         up.send_signal(signal.SIGTERM)
         up.wait(STOP_S)
+
+
+def running_engine(project: Path, tools: SimpleNamespace, up: SimpleNamespace) -> psutil.Process:
+    """Start the deployment annotate-arctic; the process of its flow, once it has begun to run stages."""
+    asked = tools.run(project, "prefect", "deployment", "run", "annotate-arctic", **up.settings)
+    assert asked.returncode == 0, asked.stdout + asked.stderr
+    wait_until(lambda: any(engine.children() for engine in engines(up)), START_S, up.process, up.log)
+    return next(engine for engine in engines(up) if engine.children())
+
+
+def engines(up: SimpleNamespace) -> list[psutil.Process]:
+    """The processes of flow runs."""
+    family = psutil.Process(up.process.pid).children(recursive=True)
+    return [process for process in family if "prefect.engine" in process.cmdline()]
 
 
 def wait_until(holds, seconds: float, process: subprocess.Popen, log: Path) -> None:

@@ -26,7 +26,7 @@ from pipelines.prefect_key import KEY_FILE, is_loopback, read_key, write_key
 from pipelines.prefect_names import key_for
 from pipelines.prefect_server import api_url, stop_running, wait_until_healthy
 from pipelines.side_by_side import CODE
-from tests.pipelines.prefect_up import hoidata_up, wait_until
+from tests.pipelines.prefect_up import hoidata_up, running_engine, wait_until
 
 FOREIGN = "http://evil.example"
 SOCKETS = (
@@ -129,6 +129,32 @@ def test_hoidata_down_ends_what_holds_the_folders_key_and_says_when_nothing_does
         time.sleep(0.05)
     assert stop_running()
     assert up.wait(5) == -signal.SIGTERM
+
+
+@pytest.mark.parametrize("left", ["the number of one that has ended", "nothing"])
+def test_hoidata_down_goes_on_where_what_it_stops_ends_by_itself_at_that_moment(tmp_path, monkeypatch, left):
+    monkeypatch.chdir(tmp_path)
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    lock = KEY_FILE.parent / f".{KEY_FILE.name}.lock"
+    lock.parent.mkdir()
+    if left != "nothing":
+        lock.write_text(str(gone.pid))
+    monkeypatch.setattr("pipelines.prefect_server.exclusive", held_once())
+    assert stop_running()
+
+
+def held_once():
+    """In place of ``exclusive``: somebody holds it when first asked, and nobody when asked again."""
+    answers = iter([BadInput("key", "nobody", "somebody", "wait"), None])
+
+    @contextmanager
+    def asked(*_, **__):
+        if (answer := next(answers)) is not None:
+            raise answer
+        yield 0
+
+    return asked
 
 
 def test_a_stranger_at_the_port_is_not_taken_for_our_server(monkeypatch):
@@ -363,9 +389,11 @@ def test_what_is_typed_in_the_folder_still_runs_and_is_all_that_ran(up, project_
 
 
 @pytest.mark.slow
-def test_the_worker_ends_with_its_server(up):
-    """Last of all. Otherwise the next one to take the port could tell it what to run."""
+def test_the_worker_and_the_flow_it_runs_end_with_its_server(up, project_tools):
+    """Last of all. Otherwise the next one to take the port could tell them what to run."""
+    engine = running_engine(up.project, project_tools, up)
     children = {child.cmdline()[3]: child for child in psutil.Process(up.process.pid).children()}
     children["server"].kill()
+    _, alive = psutil.wait_procs([children["worker"], engine], 5)
+    assert not alive, alive
     assert up.process.wait(60) != 0
-    assert not children["worker"].is_running()

@@ -20,6 +20,7 @@ from pipelines.side_by_side import (
     RUN,
     RWLOCK,
     Run,
+    _signal_group,
     describe_run,
     forget_broken_lock,
     log_of,
@@ -171,6 +172,14 @@ def test_a_failure_is_told_with_what_the_stage_said_and_outputs_that_were_there_
     (tmp_path / "code.txt").unlink()
     assert reproduce_side_by_side([], jobs=2).failed == {CODE: 255}
     assert "code.txt" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
+def test_a_stage_process_that_has_no_group_yet_or_has_ended_is_stopped_without_an_error(number):
+    just_started = subprocess.Popen(["sleep", "60"])
+    _signal_group(just_started.pid, number)
+    assert just_started.wait(10) == -signal.SIGKILL
+    _signal_group(just_started.pid, number)
 
 
 @pytest.mark.slow

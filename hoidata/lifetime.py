@@ -1,0 +1,153 @@
+"""When a process of ours ends: with the process that started it, and within seconds of Ctrl-C or SIGTERM.
+
+Ending at any moment is safe, because what we write appears whole or not at all.
+"""
+
+import _thread
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from multiprocessing import resource_tracker
+from types import FrameType
+from typing import NoReturn
+
+PR_SET_PDEATHSIG = 1  # of linux/prctl.h
+GRACE_S = 8.0
+LOOK_S = 0.2
+INTERRUPTED = "interrupted: nothing that was there is lost; run it again"
+_received: list[int] = []
+
+
+def end_with_parent(parent: int) -> None:
+    """Make the kernel kill this process when its parent ends, however it ends. For programs started with ``exec``.
+
+    parent: process id of the parent. If it has ended already, this process ends now. The kernel also counts the end of
+    the thread that started this process. Only Linux can do this.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def end_with_starter() -> None:
+    """Kill this process of ``multiprocessing`` when the process that started it ends, however it ends."""
+    starter = multiprocessing.parent_process()
+    assert starter is not None
+    _end_after(starter.join)
+
+
+def begin_worker() -> None:
+    """The beginning of a worker process: it ends with its starter, which alone decides what Ctrl-C ends."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    end_with_starter()
+
+
+@contextmanager
+def ctrl_c_blocked() -> Iterator[None]:
+    """Processes of ``multiprocessing`` that start meanwhile see no Ctrl-C until they unblock it.
+
+    In a terminal Ctrl-C reaches all processes of a command, and an interpreter that starts would print a traceback.
+    This process gets it after the block.
+    """
+    resource_tracker.ensure_running()  # which unblocks Ctrl-C in this thread when it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def end_with_process(pid: int) -> None:
+    """Kill this process when any other process ends, however it ends."""
+    import psutil
+
+    def wait() -> None:
+        with suppress(psutil.NoSuchProcess):
+            process = psutil.Process(pid)
+            while process.is_running() and process.status() != psutil.STATUS_ZOMBIE:
+                time.sleep(LOOK_S)
+
+    _end_after(wait)
+
+
+def _end_after(wait: Callable[[], object]) -> None:
+    """Kill this process when ``wait`` returns; the leader of a process group takes its group along."""
+
+    def end() -> None:
+        wait()
+        kill, target = (os.killpg, 0) if os.getpgrp() == os.getpid() else (os.kill, os.getpid())
+        kill(target, signal.SIGKILL)
+
+    threading.Thread(target=end, daemon=True).start()
+
+
+def run_interruptibly(main: Callable[[], int | None]) -> NoReturn:
+    """Run a command and exit with its code; after Ctrl-C with 130, after SIGTERM with 143, and never with a traceback.
+
+    A second signal ends the process at once. The processes it started must end with it. A signal that this process
+    was started to ignore, as ``command &`` in a script does with Ctrl-C, stays ignored.
+    """
+    end_on_signals()
+    try:
+        sys.exit(main())
+    except BaseException as ended:
+        if not _received or (isinstance(ended, SystemExit) and not ended.code):
+            raise
+        print(INTERRUPTED, file=sys.stderr)
+        sys.exit(128 + _received[0])
+    finally:
+        for number in (signal.SIGINT, signal.SIGTERM):  # an exception in the interpreter's own end prints a traceback
+            if signal.getsignal(number) == _interrupt:
+                signal.signal(number, signal.SIG_DFL)
+
+
+def end_on_signals() -> None:
+    """Let Ctrl-C and SIGTERM raise KeyboardInterrupt, and end this process after GRACE_S whatever it does then."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
+    sys.unraisablehook = _on_unraisable
+
+
+def _on_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
+    """Python prints and drops what is raised while it deletes an object: also the interrupt."""
+    if _received and isinstance(unraisable.exc_value, KeyboardInterrupt):
+        _end_now(_received[0])
+    sys.__unraisablehook__(unraisable)
+
+
+def _interrupt(number: int, frame: FrameType | None) -> None:
+    # Modules of other projects catch BaseException while they are imported, and then go on.
+    if _received or _is_importing(frame):
+        _end_now(number)
+    _received.append(number)
+    _thread.start_new_thread(_end_later, (number,))  # threading.Thread takes a lock that this thread may hold
+    signal.setitimer(signal.ITIMER_REAL, GRACE_S + 1)  # SIGALRM ends a process in which no Python code can run
+    raise KeyboardInterrupt
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == "<frozen importlib._bootstrap>":
+            return True
+        frame = frame.f_back
+    return False
+
+
+def _end_later(number: int) -> None:
+    time.sleep(GRACE_S)
+    _end_now(number)
+
+
+def _end_now(number: int) -> NoReturn:
+    with suppress(OSError):  # nobody reads it
+        os.write(2, f"{INTERRUPTED}\n".encode())
+    os._exit(128 + number)

@@ -1,0 +1,221 @@
+"""Processes end with the process that started them, and soon after Ctrl-C or SIGTERM, whatever code they run."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from hoidata.lifetime import GRACE_S
+
+WAIT_S = 20
+COMMAND = """
+import sys
+import hoidata.lifetime
+from hoidata.lifetime import run_interruptibly
+hoidata.lifetime.GRACE_S = {grace}
+{globals}
+def main():
+{body}
+if __name__ == "__main__":
+    run_interruptibly(main)
+"""
+
+
+def until(holds: Callable[[], bool], seconds: float = WAIT_S) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def is_at_work(pid: int) -> bool:
+    try:
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
+
+
+def started(code: str, **options) -> subprocess.Popen:
+    """A Python process that has printed its first line; the test reads the words of that line from ``words``."""
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, **options)
+    process.words = process.stdout.readline().split()  # pyright: ignore
+    return process
+
+
+GREEDY = """
+import time
+while True:
+    try:
+        print('ready', flush=True)
+        time.sleep(60)
+    except BaseException:
+        pass
+"""
+BY_THE_KERNEL = """
+import os, subprocess, sys
+from functools import partial
+from hoidata.lifetime import end_with_parent
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"],
+                         preexec_fn=partial(end_with_parent, os.getpid()))
+print(child.pid, flush=True)
+child.wait()
+"""
+BY_A_THREAD = """
+import multiprocessing, os, subprocess, sys, time
+from hoidata.lifetime import end_with_starter
+def work(pipe):
+    os.setpgrp()
+    end_with_starter()
+    other = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"])
+    pipe.send((os.getpid(), other.pid))
+    time.sleep(60)
+context = multiprocessing.get_context("fork")
+ours, theirs = context.Pipe()
+context.Process(target=work, args=(theirs,)).start()
+print(*ours.recv(), flush=True)
+time.sleep(60)
+"""
+BY_NUMBER = """
+import os, subprocess, sys, time
+watching = "import sys, time; from hoidata import lifetime; lifetime.end_with_process(int(sys.argv[1])); time.sleep(60)"
+shell = subprocess.Popen(["sh", "-c", f"{sys.executable} -c '{watching}' {os.getpid()} & echo $!; wait"],
+                         stdout=subprocess.PIPE, text=True)
+print(shell.stdout.readline().strip(), flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("how", [BY_THE_KERNEL, BY_A_THREAD, BY_NUMBER], ids=["kernel", "thread", "number"])
+def test_a_process_ends_when_the_one_that_started_it_is_killed(how: str) -> None:
+    parent = started(how)
+    children = [int(word) for word in parent.words]  # pyright: ignore
+    assert children
+    assert all(map(is_at_work, children))
+    parent.kill()
+    parent.wait()
+    parent.stdout.close()
+    until(lambda: not any(map(is_at_work, children)))
+
+
+def test_a_process_whose_parent_has_ended_before_it_could_say_so_does_not_begin() -> None:
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    code = f"from hoidata.lifetime import end_with_parent; end_with_parent({gone.pid}); print('began')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (-signal.SIGKILL, "")
+
+
+def command(folder: Path, body: str, before: str = "", grace: float = GRACE_S) -> list[str]:
+    lines = "".join(f"    {line}\n" for line in body.strip().splitlines())
+    path = folder / "command.py"
+    path.write_text(COMMAND.format(body=lines, globals=before, grace=grace))
+    return [sys.executable, str(path)]
+
+
+def interrupted(words: list[str], *numbers: int, **options) -> tuple[int, str, float]:
+    """Exit code, what stderr says, and the seconds from the first signal to the end."""
+    process = subprocess.Popen(
+        words,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": "."},
+        **options,
+    )
+    assert process.stdout.readline() == "ready\n"
+    start = time.monotonic()
+    for number in numbers:
+        process.send_signal(number)
+        time.sleep(0.3)
+    _, told = process.communicate(timeout=30)
+    return process.returncode, told, time.monotonic() - start
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_command_says_in_words_that_it_was_interrupted(tmp_path: Path, number: int, code: int) -> None:
+    words = command(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(60)")
+    ended, told, _ = interrupted(words, number)
+    assert (ended, told) == (code, "interrupted: nothing that was there is lost; run it again\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_module_that_catches_everything_while_it_is_imported_cannot_swallow_a_signal(tmp_path: Path, number) -> None:
+    (tmp_path / "greedy.py").write_text(GREEDY)
+    ended, told, seconds = interrupted(command(tmp_path, "import greedy"), number)
+    assert (ended, told.count("\n")) == (128 + number, 1)
+    assert seconds < GRACE_S
+
+
+def test_an_interrupt_while_an_object_is_deleted_is_not_dropped(tmp_path: Path) -> None:
+    before = """
+import time
+class Slow:
+    def __del__(self):
+        print('ready', flush=True)
+        time.sleep(60)
+"""
+    ended, told, seconds = interrupted(command(tmp_path, "Slow()\ntime.sleep(60)", before), signal.SIGINT)
+    assert (ended, told.count("\n"), seconds < GRACE_S) == (130, 1, True)
+
+
+CTRL_C_AT_ONCE = """
+import multiprocessing, os, signal, sys
+from hoidata.lifetime import begin_worker, ctrl_c_blocked
+if __name__ == "__main__":
+    signal.signal(signal.SIGINT, lambda *_: None)
+    process = multiprocessing.get_context("spawn").Process(target=begin_worker)
+    with ctrl_c_blocked():
+        process.start()
+    for _ in range(200):
+        os.kill(process.pid, signal.SIGINT)
+    process.join()
+    print(process.exitcode)
+"""
+
+
+@pytest.mark.slow
+def test_ctrl_c_while_a_worker_process_starts_is_left_to_the_one_that_started_it(tmp_path: Path) -> None:
+    (tmp_path / "starts.py").write_text(CTRL_C_AT_ONCE)
+    words = [sys.executable, str(tmp_path / "starts.py")]
+    done = subprocess.run(words, env={**os.environ, "PYTHONPATH": "."}, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("0\n", "")
+
+
+@pytest.mark.slow
+def test_code_that_catches_everything_ends_after_the_grace_of_less_than_ten_seconds(tmp_path: Path) -> None:
+    ended, told, seconds = interrupted(command(tmp_path, GREEDY, grace=1.0), signal.SIGTERM)
+    assert (ended, told.count("\n"), seconds >= 1) == (143, 1, True)
+    assert GRACE_S + 1 < 10
+
+
+def test_a_second_signal_ends_a_command_at_once(tmp_path: Path) -> None:
+    ended, _, seconds = interrupted(command(tmp_path, GREEDY), signal.SIGINT, signal.SIGINT)
+    assert (ended, seconds < GRACE_S) == (130, True)
+
+
+@pytest.mark.slow
+def test_code_that_lets_no_other_python_code_run_ends_as_soon(tmp_path: Path) -> None:
+    """A regular expression that takes for ever holds Python's lock: no handler and no thread can run."""
+    slow = "print('ready', flush=True)\ntry:\n    time.sleep(60)\nfinally:\n    re.match('(a+)+$', 'a' * 60 + 'b')"
+    ended, _, _ = interrupted(command(tmp_path, slow, "import re, time", grace=1.0), signal.SIGINT)
+    assert ended in (130, -signal.SIGALRM)
+
+
+def test_a_signal_that_the_starting_script_ignores_stays_ignored(tmp_path: Path) -> None:
+    words = command(tmp_path, "import time\nprint('ready', flush=True)\ntime.sleep(1)\nreturn 0")
+    ended, told, _ = interrupted(words, signal.SIGINT, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
+    assert (ended, told) == (0, "")
+
+
+def test_an_error_that_an_interrupt_became_is_no_traceback_and_one_without_a_signal_is(tmp_path: Path) -> None:
+    body = "import time\nprint('ready', flush=True)\ntry:\n    time.sleep({})\nfinally:\n    raise ValueError('odd')"
+    ended, told, _ = interrupted(command(tmp_path, body.format(60)), signal.SIGINT)
+    assert (ended, told.count("\n")) == (130, 1)
+    ended, told, _ = interrupted(command(tmp_path, body.format(0)))
+    assert (ended, "ValueError: odd" in told) == (1, True)

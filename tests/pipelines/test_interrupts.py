@@ -1,0 +1,186 @@
+"""Ctrl-C and SIGTERM at any moment: a command ends within ten seconds, with all it started, and says so in words."""
+
+import contextlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.pipelines.test_side_by_side import PROJECT, tiny_project
+
+MARK = "HOIDATA_TEST_RUN"  # a variable that all processes of a run inherit
+MOMENTS = range(2 * int(os.environ.get("HOIDATA_CHAOS", "1")))
+STUBBORN = """
+import signal, sys, time
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, signal.SIG_IGN)
+print("stubborn", flush=True)
+time.sleep(60)
+"""
+# `hoidata repro` without the look at raw files, which a project of other stages has none of.
+REPRO = """
+from hoidata.lifetime import run_interruptibly
+def main():
+    from pipelines.side_by_side import reproduce_side_by_side
+    return len(reproduce_side_by_side([], 2).failed)
+if __name__ == "__main__":
+    run_interruptibly(main)
+"""
+
+
+def processes_of(mark: str) -> list[psutil.Process]:
+    """All processes that inherited the mark, whoever their parent is by now."""
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error):
+            if process.environ().get(MARK) == mark:
+                found.append(process)
+    return [process for process in found if is_at_work(process)]
+
+
+def is_at_work(process: psutil.Process) -> bool:
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return process.status() != psutil.STATUS_ZOMBIE
+    return False
+
+
+def until(holds: Callable[[], object], seconds: float) -> None:
+    deadline = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+class Run:
+    """A command under a mark of its own; its output goes to a file."""
+
+    def __init__(self, words: list[str], folder: Path, environment: dict[str, str], **options) -> None:
+        self.mark = f"{folder}-{time.monotonic_ns()}"
+        self.log = folder / f"told-{time.monotonic_ns()}.log"
+        with self.log.open("w") as stream:
+            self.process = subprocess.Popen(
+                words, cwd=folder, env={**environment, MARK: self.mark}, stdout=stream, stderr=stream, **options
+            )
+
+    def until_it_handles_signals(self) -> None:
+        """SIGTERM is caught only after our code has begun: before, the interpreter itself is starting."""
+
+        def is_handled() -> bool:
+            [caught] = [line for line in self.status().splitlines() if line.startswith("SigCgt")]
+            return bool(int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1)
+
+        until(is_handled, 60)
+
+    def status(self) -> str:
+        return Path(f"/proc/{self.process.pid}/status").read_text()
+
+    def ends(self, seconds: float = 10) -> int:
+        """The exit code, when the command and all it started have ended in time."""
+        start = time.monotonic()
+        code = self.process.wait(seconds)
+        until(lambda: not processes_of(self.mark), max(1, start + seconds - time.monotonic()))
+        return code
+
+
+@pytest.fixture
+def stubborn_project(tmp_path: Path) -> Path:
+    """Its first stage ignores Ctrl-C and SIGTERM."""
+    tiny_project(tmp_path)
+    (tmp_path / "make.py").write_text(STUBBORN)
+    (tmp_path / "repro.py").write_text(REPRO)
+    return tmp_path
+
+
+def stubborn_run(folder: Path, **options) -> Run:
+    run = Run([sys.executable, "repro.py"], folder, {**os.environ, "PYTHONPATH": str(PROJECT)}, **options)
+    log = folder / ".hoidata/logs/a.log"
+    until(lambda: log.is_file() and "stubborn" in log.read_text(), 120)
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+def test_a_run_kills_a_stage_that_ignores_its_end(stubborn_project, sent):
+    run = stubborn_run(stubborn_project)
+    run.process.send_signal(sent)
+    assert run.ends() == 128 + sent
+    assert run.log.read_text().count("run it again") == 1
+    assert "Traceback" not in run.log.read_text()
+
+
+@pytest.mark.slow
+def test_a_second_ctrl_c_hastens_the_end_of_a_run(stubborn_project):
+    run = stubborn_run(stubborn_project)
+    start = time.monotonic()
+    run.process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    run.process.send_signal(signal.SIGINT)
+    assert run.ends() == 130
+    assert time.monotonic() - start < 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sent", [signal.SIGTERM, signal.SIGKILL])
+def test_a_run_in_the_background_of_a_script_takes_its_stages_along(stubborn_project, sent):
+    """There Ctrl-C is ignored by everything that the script starts with `&`."""
+    run = stubborn_run(stubborn_project, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN))
+    run.process.send_signal(sent)
+    assert run.ends() == (143 if sent == signal.SIGTERM else -sent)
+
+
+STAGE = """
+import os, time
+import pipelines.stages.__main__ as stages
+def wait(*_):
+    print(os.getpid(), flush=True)
+    time.sleep(60)
+stages.run_warm = wait
+stages.main()
+"""
+DVC = """
+import subprocess, sys
+subprocess.run(sys.argv[1:])
+"""
+
+
+@pytest.mark.parametrize("shell", ["dash", "bash"])
+@pytest.mark.parametrize("killed", ["DVC", "its shell"])
+def test_a_stage_ends_with_the_dvc_that_runs_it(tmp_path, shell, killed):
+    """Some shells put the command in their own place, and others stay between the two."""
+    (tmp_path / "stage.py").write_text(STAGE)
+    command = [sys.executable, "-c", DVC, shell, "-c", f"{sys.executable} {tmp_path / 'stage.py'} raw --dataset grab"]
+    environment = {**os.environ, "DVC_STAGE": "raw@embedded-grab", "PYTHONPATH": str(PROJECT)}
+    dvc = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
+    stage = psutil.Process(int(dvc.stdout.readline()))
+    (dvc if killed == "DVC" else psutil.Process(stage.ppid())).kill()
+    try:
+        until(lambda: not is_at_work(stage), 10)
+    finally:
+        dvc.kill()
+        dvc.wait()
+        dvc.stdout.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("turn", MOMENTS)
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("words", [("hoidata", "repro"), ("hoidata", "synth", "write", "grab")], ids=" ".join)
+def test_a_signal_at_any_moment_of_its_start_ends_a_command(project, project_tools, words, sent, turn):
+    """Ctrl-C reaches all processes of a command in a terminal, SIGTERM the one that it is sent to."""
+    run = Run(list(words), project, project_tools.environment(), start_new_session=True)
+    run.until_it_handles_signals()
+    time.sleep(random.Random(f"{words} {sent} {turn}").uniform(0, 12))
+    if sent == signal.SIGINT:
+        os.killpg(run.process.pid, sent)
+    else:
+        run.process.send_signal(sent)
+    code = run.ends()
+    told = run.log.read_text()
+    assert (code, told.count("run it again"), "Traceback" in told) == (128 + sent, 1, False), told
