@@ -271,7 +271,7 @@ def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Ha
     clip = open_store(paths.clips, hands).clip(wish.clip)
     tracks = [clip.hands[side] for side in SIDES]
     templates = [track.template_m for track in tracks if track.template_m is not None]
-    notes = [] if clip.gravity is not None else ["where down is is not known of this clip: z is taken for up"]
+    notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
     gravity = own.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
     own = replace(
         own,

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 import trimesh
+from scipy.spatial import QhullError
 
 from hoidata.errors import BadInput
 from hoidata.objects.ply import MOST_CORNERS, MOST_TRIANGLES, MOST_VERTICES, parse_ply
@@ -256,7 +257,10 @@ def mass_properties(vertices_m: np.ndarray, faces: np.ndarray) -> MassProperties
     mesh = trimesh.Trimesh(vertices_m, faces, process=True)
     with np.errstate(invalid="ignore", divide="ignore"):  # of what is flat, trimesh divides by no volume
         solid = mesh.is_watertight and encloses(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-        used = mesh if solid else mesh.convex_hull
+        try:
+            used = mesh if solid else mesh.convex_hull
+        except QhullError:  # fewer than four places
+            used = mesh
         if used.volume < 0:
             used.invert()
         volume = float(used.volume)

@@ -80,10 +80,10 @@ def found_up(vertices_m: np.ndarray) -> tuple[str, str]:
     """Which axis of a mesh points up, and why: "z", or "y" where the object then stands on clearly more ground."""
     on_z, on_y = footing(vertices_m, 2), footing(vertices_m, 1)
     if on_y > CLEARLY * on_z and (on_y > STANDS or on_y > FAR_MORE * on_z):
-        return "y", f"y is taken for up: so it stands on {on_y:.0%} of its outline, with z up on {on_z:.0%}"
+        return "y", f"up: y (it stands on {on_y:.0%} of its outline; with z up on {on_z:.0%})"
     if on_z < STANDS:
-        return "z", "z is taken for up: neither so nor with y up it clearly stands"
-    return "z", f"z is taken for up: so it stands on {on_z:.0%} of its outline"
+        return "z", "up: z, assumed: it stands firmly with neither y nor z up (--up chooses)"
+    return "z", f"up: z (it stands on {on_z:.0%} of its outline)"
 
 
 def footing(vertices_m: np.ndarray, axis: int) -> float:

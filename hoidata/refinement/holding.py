@@ -256,7 +256,7 @@ class _Start:
         hand = HandInTime(self.skin, self.field, self.pose, self.holds, valid, other, settings, draw, *held)
         pose = hand.corrected()
         track = self.track
-        made = pose.seen_from(self.part_from_world.inverse()).track(track.betas[0], track.valid, track.template_m)
+        made = pose.seen_from(self.part_from_world.inverse()).track(track.mean_betas, track.valid, track.template_m)
         kept = {name: getattr(track, name) for name in ("wrist_m", "global_orient", "hand_pose")}
         return replace(
             track, **{name: np.where(valid[:, None], getattr(made, name), own) for name, own in kept.items()}
@@ -356,7 +356,7 @@ class _Grip:
     def _everywhere(self, pose: HandPose) -> HandTrack:
         """The hand in one pose, one frame in the part's frame, all the time."""
         moved = pose.taken(np.zeros(len(self.track.valid), int)).seen_from(self.world_from_part)
-        return moved.track(self.track.betas[0], self.track.valid, self.track.template_m)
+        return moved.track(self.track.mean_betas, self.track.valid, self.track.template_m)
 
     def _held(self, hand: HandModel, load: _Load, other: Capsules | None, passed: bool) -> Held:
         """The hand in the middle one of frames in which it has to carry."""

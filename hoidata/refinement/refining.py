@@ -129,7 +129,7 @@ class _Motion:
             gain, seen, damping = 1 - moved.cost / seen.cost, moved, damping / 10
             if gain < self.settings.enough:
                 break
-        return seen.pose.track(self.track.betas[0], self.track.valid, self.track.template_m)
+        return seen.pose.track(self.track.mean_betas, self.track.valid, self.track.template_m)
 
     def _see(self, pose: HandPose) -> _Seen:
         near_pose = HandPose(*(array[self.near] for array in pose))

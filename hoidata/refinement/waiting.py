@@ -90,7 +90,7 @@ class _HandAtPart:
     def carried(self, thing: ObjectTrack) -> HandTrack:
         """The hand as it was, seen from its part, where that is now; frames without it stay as they were."""
         pose, track, valid = self.pose.seen_from(world_from_part(thing, self.part)), self.track, self.track.valid
-        made = pose.track(track.betas[0], valid, track.template_m)
+        made = pose.track(track.mean_betas, valid, track.template_m)
         wrist, turn = (
             np.where(valid[:, None], getattr(made, name), getattr(track, name)) for name in ("wrist_m", "global_orient")
         )

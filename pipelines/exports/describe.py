@@ -17,6 +17,7 @@ import yaml
 from hoidata.dataset_folders import dataset_facts
 from hoidata.files import sha256_file
 from hoidata.store.fields import STORE_FILES, StoreFile
+from hoidata.store.info import stand_in_note
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
 from pipelines.exports.motion import Column
@@ -150,6 +151,8 @@ def _conventions(info: dict[str, Any], form: Description) -> list[str]:
         "The wrist joint is joint 0; it is not MANO's transl.",
         f"- Frames in which a hand is not tracked are marked; {form.untracked}.",
     ]
+    if stand_in := stand_in_note(info):
+        lines.append(f"- Warning: {markdown_text(stand_in)}.")
     if form.columns:
         lines += ["", "| array | type | shape | meaning |", "|---|---|---|---|"]
         lines += [f"| {c.name} | {c.dtype} | {list(c.shape) or ''} | {c.meaning} |" for c in form.columns]

@@ -12,6 +12,8 @@ from hoidata.store.info import stand_in_note
 from hoidata.store.store import open_store
 from pipelines.commands.adapters import _hands
 from pipelines.commands.store_facts import fact_rows
+from pipelines.exports.describe import Description, dataset_card
+from pipelines.exports.motion import WORLD
 from pipelines.pages.report import _stand_ins
 from pipelines.showing import write_stored_clip
 from tests.builders import arctic, grab, h2o, hoi4d, hot3d, oakink2, taco
@@ -33,7 +35,10 @@ def test_mano_parameters_converted_with_the_embedded_hand_come_with_a_warning(
     assert summary.clips
     assert NUMBERS in summary.warning
     assert capsys.readouterr().out.startswith(f"warning: {name} has MANO parameters, and the embedded hand is no MANO")
-    assert NUMBERS in dict(fact_rows(open_store(tmp_path / "store")))["hand model"]
+    store = open_store(tmp_path / "store")
+    assert NUMBERS in dict(fact_rows(store))["hand model"]
+    card = dataset_card(store.folder, store, Description("the store", WORLD, "as they are", (), True))
+    assert f"- Warning: {name} has MANO parameters" in card
 
 
 def test_generated_files_fitted_hands_and_mano_itself_come_without_a_warning(tmp_path: Path) -> None:

@@ -201,3 +201,11 @@ def test_a_thin_solid_across_its_box_is_one():
     facts = mass_properties(rod.vertices, rod.faces)
     assert facts.source == "solid"
     assert facts.volume_m3 == pytest.approx(rod.volume)
+
+
+def test_a_single_triangle_has_no_volume_and_no_inertia():
+    corners = np.array([[0.0, 0, 0], [0.3, 0, 0], [0, 0.3, 0]])
+    found = mass_properties(corners, np.array([[0, 1, 2]]))
+    assert (found.volume_m3, found.source) == (0, "convex hull")
+    np.testing.assert_allclose(found.centre_m, (0.1, 0.1, 0))
+    assert not found.inertia_kg_m2.any()

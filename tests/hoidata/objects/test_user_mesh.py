@@ -24,21 +24,21 @@ def saved(mesh, path, scale=1.0, turn=None):
 def test_a_mesh_that_stands_on_z_is_taken_as_it_is(tmp_path, suffix):
     found = read_user_object(saved(MUG, tmp_path / f"mug{suffix}"))
     assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
-    assert "z is taken for up" in found.notes[0]
+    assert found.notes[0].startswith("up: z (it stands on ")
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".glb"])
 def test_a_mesh_that_stands_on_y_is_stood_upright(tmp_path, suffix):
     found = read_user_object(saved(MUG, tmp_path / f"mug{suffix}", turn=Y_UP))
     assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.1], abs=1e-6)
-    assert found.notes[0].startswith("y is")
+    assert found.notes[0].startswith("up: y (it stands on " if suffix == ".obj" else "y is up")
 
 
 def test_a_glass_with_a_narrow_foot_is_stood_upright(tmp_path):
     glass = trimesh.creation.revolve([[0, 0], [0.012, 0], [0.002, 0.01], [0.002, 0.08], [0.04, 0.12], [0, 0.12]])
     found = read_user_object(saved(glass, tmp_path / "glass.obj", turn=Y_UP))
     assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.08, 0.08, 0.12], abs=2e-3)
-    assert found.notes[0].startswith("y is taken for up: so it stands on 9% of its outline")
+    assert found.notes[0].startswith("up: y (it stands on 9% of its outline; with z up on ")
 
 
 def test_a_bowl_that_stands_on_little_is_not_laid_on_its_side(tmp_path):
@@ -47,7 +47,7 @@ def test_a_bowl_that_stands_on_little_is_not_laid_on_its_side(tmp_path):
     ball.remove_unreferenced_vertices()
     found = read_user_object(saved(ball, tmp_path / "bowl.obj"))
     assert np.ptp(found.model.vertices_m, axis=0) == pytest.approx([0.1, 0.1, 0.05], abs=2e-3)
-    assert found.notes[0].startswith("z is taken for up")
+    assert found.notes[0].startswith("up: z")
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
