@@ -38,7 +38,11 @@ def _counts(dataset: str, data: Path) -> str:
 def _splits(data: Path) -> dict[str, Any]:
     """What the stage split says of a dataset; nothing where it has not run."""
     path = data / "splits/info.json"
-    return read_json(path, {"chosen": {"clips": {}}}) if path.is_file() else {}
+    if not path.is_file():
+        return {}
+    found = read_json(path, {"chosen": {"clips": {}}})
+    found.check_given({"missing": dict})
+    return found
 
 
 def _measured(path: Path) -> bool:

@@ -3,6 +3,7 @@
 import os
 import pickle
 import shutil
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,9 @@ def pytest_configure(config: pytest.Config) -> None:
     """xdist would begin with the modules of many tests, and end with the few that take minutes."""
     config.option.loadscopereorder = False
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        # In the background of a script; processes that tests start and interrupt would ignore it by inheritance.
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -26,10 +30,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 @pytest.fixture(autouse=True)
-def _usual_arithmetic() -> Iterator[None]:
-    """Commands set threads, precision and algorithms of the process; no test, and no fixture that tests share, is to
-    notice which ran before it."""
+def _usual_process() -> Iterator[None]:
+    """Commands set threads, precision and algorithms of the process, and what files are checked against; no test, and
+    no fixture that tests share, is to notice which ran before it."""
     yield
+    if written := sys.modules.get("hoidata.files.written"):
+        written._known_by.clear()
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(1)
         torch.set_deterministic_debug_mode("default")

@@ -20,7 +20,7 @@ from models.text2hoi.verb_check import VerbCheck
 
 GAP_M = 0.01  # between skin and surface: a hand farther away is seen not to touch
 DEEP_M = 0.02  # as thick as a finger, which is then inside as a whole
-LIFTED_M = 0.02  # above where the object began: it is in the air
+FLOATING_M = 0.02  # above where the object began: it is in the air
 LEAST_FRAMES = 3  # a tenth of a second; what is shorter passes unseen
 STILL = {"path_m": 0.01, "tilt_deg": 5.0, "turn_deg": 5.0, "hinge_max_deg": 5.0}  # less of each is no motion
 MOVES = {"path_m": 0.05, "hinge_max_deg": 10.0}  # of the mean training clip of a verb that moves its object
@@ -61,7 +61,7 @@ def _contact_faults(clip: Clip, gap_m: Mapping[Side, np.ndarray]) -> list[str]:
     found = [f"the {side} hand never touches the object ({gap * 100:.1f} cm away)" for side, gap in away.items()]
     if len(away) < len(gap_m) and clip.gravity is not None:
         height = -(clip.object.translation_m.astype(np.float64) @ np.asarray(clip.gravity, np.float64))
-        lifted = height - height[0] > LIFTED_M
+        lifted = height - height[0] > FLOATING_M
         alone = int((lifted & (np.min([*gap_m.values()], axis=0) > GAP_M)).sum())
         found += [f"the object is in the air and no hand touches it in {alone} frames"] * (alone >= LEAST_FRAMES)
     return found

@@ -35,7 +35,7 @@ SHOWN_ON_PURPOSE = {"annotate.encoder", "tables.datasets"}  # dvc.yaml reads the
 # Constants that are as large as a contact threshold and mean something else.
 OTHER_LENGTHS = {
     "LONGEST_EDGE_M", "STAND_RADIUS_M", "LARGEST_DISTANCE_M", "REACH_M", "HANDS_BELOW", "TOUCH_M",
-    "GUIDED_WITHIN_M", "FADES_M",
+    "GUIDED_WITHIN_M", "FADES_M", "DEEP_M", "FLOATING_M",
 }  # fmt: skip
 
 
