@@ -255,6 +255,9 @@ class _Children:
 
     def __enter__(self) -> "_Children":
         self.context.set_forkserver_preload(PRELOADED)
+        in_main = threading.current_thread() is threading.main_thread()
+        if in_main and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:  # commands and Prefect have handlers
+            signal.signal(signal.SIGTERM, signal.default_int_handler)
         return self
 
     def __exit__(self, *_: object) -> None:
