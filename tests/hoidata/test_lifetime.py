@@ -128,13 +128,16 @@ def interrupted(words: list[str], *numbers: int, **options) -> tuple[int, str, f
         env={**os.environ, "PYTHONPATH": "."},
         **options,
     )
-    assert process.stdout.readline() == "ready\n"
-    start = time.monotonic()
-    for number in numbers:
-        process.send_signal(number)
-        time.sleep(0.3)
-    _, told = process.communicate(timeout=30)
-    return process.returncode, told, time.monotonic() - start
+    try:
+        assert process.stdout.readline() == "ready\n"
+        start = time.monotonic()
+        for number in numbers:
+            process.send_signal(number)
+            time.sleep(0.3)
+        _, told = process.communicate(timeout=30)
+        return process.returncode, told, time.monotonic() - start
+    finally:
+        process.kill()
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
