@@ -54,7 +54,7 @@ def read_user_object(path: Path, unit: str = "", up: str = "", hinge: str = "") 
     vertices = mesh.vertices * scale
     if not up:
         up, note = ("y", "y is up, as in every GLB file") if _is_gltf(path) else found_up(vertices)
-        notes.append(f"{note}; --up tells it otherwise")
+        notes.append(f"{note}; --up chooses another")
     if up not in UP_AXES:
         raise BadInput("--up", f"one of {', '.join(UP_AXES)}", up, "name the axis of the file that points up")
     turn = _upright_from_file(UP_AXES[up])
@@ -82,7 +82,7 @@ def found_up(vertices_m: np.ndarray) -> tuple[str, str]:
     if on_y > CLEARLY * on_z and (on_y > STANDS or on_y > FAR_MORE * on_z):
         return "y", f"up: y (it stands on {on_y:.0%} of its outline; with z up on {on_z:.0%})"
     if on_z < STANDS:
-        return "z", "up: z, assumed: it stands firmly with neither y nor z up (--up chooses)"
+        return "z", "up: z, assumed: it stands firmly with neither y nor z up"
     return "z", f"up: z (it stands on {on_z:.0%} of its outline)"
 
 
