@@ -58,9 +58,7 @@ def settings() -> str:
     lines.append(
         "Networks, presets and sizes stand in `params.yaml` itself, under `train`; what `sample.text2hoi` may say, in"
     )
-    lines.append(
-        "`SamplingConfig` of `models/text2hoi/sampler.py`. Reasons: [decisions](../decisions/text2hoi-ours.md).\n"
-    )
+    lines.append("`SamplingConfig` of `models/text2hoi/sampler.py`. Reasons: [decisions](../decisions.md).\n")
     return "\n".join(lines)
 
 

@@ -1,6 +1,6 @@
 """Pictures of the pages of `make demo`, taken in headless Chromium: python -m docs.make.screens PROJECT.
 
-A generated motion as an animated WebP, the page of one, the report on a wide and a narrow screen, and its intervals.
+A generated motion as an animated WebP, the page of a generated motion, and the report.
 """
 
 import asyncio
@@ -33,8 +33,6 @@ CANVAS = "JSON.stringify(document.querySelector('canvas').getBoundingClientRect(
 SHOW = """(async () => {{ const bar = document.querySelector('input[type=range]'); bar.value = {};
 bar.dispatchEvent(new Event('input')); await new Promise((done) => setTimeout(done, 120)); }})()"""
 
-
-INTERVALS = "const all = document.querySelector('details .charts').parentElement; all.open = true; all.scrollIntoView()"
 SENTENCE = "Drink from a mug with the right hand."
 
 
@@ -86,17 +84,11 @@ async def take(project: Path, folder: Path) -> None:
             frames.append(await page.picture(**area))
         options = {"save_all": True, "append_images": frames[1:], "duration": 100, "loop": 0, "quality": 70}
         frames[0].save(IMAGES / "motion.webp", **options)
-        for name, width, height in (("report", 1200, 1150), ("report-phone", 390, 1500)):
-            await page.open(project / "report/embedded/index.html", width, height, 3)
+        pages = {"report": project / "report/embedded/index.html", "generate": generated(project, folder)}
+        for name, path in pages.items():
+            await page.open(path, 1200, 1150, 3)
             await asyncio.sleep(3)
             (await page.picture()).save(IMAGES / f"{name}.png", optimize=True)
-        await page.open(project / "report/embedded/index.html", 1200, 900, 3)
-        await page.run(INTERVALS)
-        await asyncio.sleep(1)
-        (await page.picture()).save(IMAGES / "charts.png", optimize=True)
-        await page.open(generated(project, folder), 1200, 1150, 3)
-        await asyncio.sleep(3)
-        (await page.picture()).save(IMAGES / "generate.png", optimize=True)
 
 
 def generated(project: Path, folder: Path) -> Path:
