@@ -16,8 +16,8 @@ def test_every_question_of_a_newcomer_is_answered_by_files_that_exist():
     assert missing == []
 
 
-def test_the_table_of_rooms_names_every_room_and_no_other():
-    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").split("| room |")[1].split("\n\n")[0]
+def test_the_table_of_packages_names_every_package_and_no_other():
+    text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8").split("| package |")[1].split("\n\n")[0]
     named = {
         room for row in text.splitlines()[2:] for room in re.findall(r"`(\w+)`", row.replace("\\|", "/").split("|")[1])
     }
