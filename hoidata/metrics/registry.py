@@ -18,7 +18,7 @@ from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
 
 Direction = Literal["higher", "lower", "nearer the truth"]
-Topic = Literal["Action", "Contact", "Physics", "Motion", "BimArt", "CAMS"]
+Topic = Literal["Action", "Contact", "Physics", "Motion", "BimArt"]
 Reduction = Literal["best of a clip's samples", "mean over motions", "mean over frames"]
 
 

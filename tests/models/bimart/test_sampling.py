@@ -8,7 +8,6 @@ import torch
 
 from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
-from hoidata.objects.model import articulate
 from hoidata.sensors.part_bps import BasisSettings
 from hoidata.settings import build_config
 from models.bimart.guidance import Map, combined, discrepancy, metre_step, released_step
@@ -23,7 +22,6 @@ from models.bimart.sampler import (
     Path,
     SamplingConfig,
     WalkConfig,
-    held_joints,
     sampling_of,
 )
 from models.bimart.scene import FeatureConfig, Recorded, Scene
@@ -277,20 +275,3 @@ def test_a_preset_keeps_what_is_not_told_beside_it() -> None:
     assert told == replace(RELEASED, sampler=replace(RELEASED.sampler, steps=20), hold_m=0.03)
     with pytest.raises(BadInput, match="guidence"):
         sampling_of("ours", {"guidence": 1}, "sample.bimart.sampling")
-
-
-def test_joints_that_come_near_stay_at_their_place_of_the_part_and_others_go_on() -> None:
-    own = scene(6)
-    model = own.bps.model
-    lid = np.flatnonzero(model.part == 1)[0]
-    on_lid = articulate(model.vertices_m[[lid]], np.ones(1, int), model.hinge, own.hinge_rad)[:, 0]
-    joints = np.full((6, 42, 3), 5.0) + np.arange(6)[:, None, None]
-    joints[2, 0] = on_lid[2] + (0, 0, 0.01)
-    joints[3, 1] = model.vertices_m[np.flatnonzero(model.part == 0)[-1]] + (0, 0, 0.02)
-    held = held_joints(joints.reshape(6, -1).astype(np.float32), own, 0.03).reshape(6, 42, 3)
-    np.testing.assert_allclose(held[:2], joints[:2], rtol=1e-6)
-    np.testing.assert_allclose(held[:, 2:], joints[:, 2:], rtol=1e-6)
-    apart = np.linalg.norm(held[2:, 0] - on_lid[2:], axis=1)  # as far from its place of the lid at every angle
-    np.testing.assert_allclose(apart, 0.01, atol=1e-5)
-    assert np.abs(held[2:, 0] - held[2, 0]).max() > 1e-3
-    np.testing.assert_allclose(held[3:, 1], np.broadcast_to(joints[3, 1], (3, 3)), atol=1e-6)
