@@ -1,11 +1,10 @@
 """Adapters beside naive readers: frames per second to joints and object poses, H2O's text.
 
-``python -m bench.adapters``. Both sides read the same sequences and give world joints of both hands and object
+``python -m bench adapters``. Both sides read the same sequences and give world joints of both hands and object
 poses of every frame of the clips; the values are compared. The adapters also digest every file, and read the frames
 around the clips.
 """
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -137,11 +136,7 @@ def ratios(base: Times, time: Times) -> tuple[str, str]:
     return f"{base.median / time.median:.1f}x", f"{base.processor / time.processor:.1f}x"
 
 
-def main(corpora: Path | None = None) -> None:
-    root = corpora or embedded_root()
+def main() -> None:
+    root = embedded_root()
     compare_readers(root)
     compare_text(root)
-
-
-if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:2]))

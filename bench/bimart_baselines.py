@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -74,9 +74,8 @@ def placed(clip: ClipSample) -> Placed:
     scene = Scene.of(clip.object_model, clip.object, BASIS)
     joints_m = scene.model_from_canonical.inverse() @ clip.joints_m.astype(np.float64)
     hands = canonical_hands(clip.hands, scene.model_from_canonical)
-    return Placed(
-        scene, condition_of(scene, clip.active_hands), joints_m, hands, clip.valid & clip.active_hands[:, None]
-    )
+    acting = clip.valid & clip.active_hands[:, None]
+    return Placed(scene, condition_of(scene, clip.active_hands), joints_m, hands, acting)
 
 
 def condition_of(scene: Scene, hands: np.ndarray) -> np.ndarray:
@@ -253,7 +252,7 @@ class PoseSampler:
     @classmethod
     def load(cls, sources: Sources, *networks: Network) -> "PoseSampler":
         trained = [load_checkpoint(sources.checkpoints / own.name, own, sources.device) for own in networks]
-        return cls([_as(PoseNetwork, own.network) for own in trained], bool(trained[0].facts["synthetic"]))
+        return cls([cast(PoseNetwork, own.network) for own in trained], bool(trained[0].facts["synthetic"]))
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self._answer(request) for request in requests]
@@ -272,11 +271,6 @@ class PoseSampler:
         made = self.networks[-1].drawn(condition, request.seed).reshape(len(scene), 2, -1).swapaxes(0, 1)
         hands = moved_hands(proper_hands(torch.from_numpy(made)).numpy(), scene.model_from_canonical)
         return motion_clip(request, torch.from_numpy(hands), torch.from_numpy(motion), self.synthetic)
-
-
-def _as(kind: type[Any], module: nn.Module) -> Any:
-    assert isinstance(module, kind)
-    return module
 
 
 # --- CAMS-B
@@ -387,7 +381,7 @@ class CamsObjective:
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         rows = self._together(self.held_out)
-        return _as(CamsNetwork, network).losses(*rows, torch.Generator().manual_seed(0))["total"]
+        return cast(CamsNetwork, network).losses(*rows, torch.Generator().manual_seed(0))["total"]
 
     def _together(self, rows: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[Tensor]:
         return [torch.from_numpy(np.concatenate(own)).to(self.device) for own in zip(*rows, strict=True)]
@@ -410,7 +404,7 @@ class CamsSampler:
     @classmethod
     def load(cls, sources: Sources) -> "CamsSampler":
         trained = load_checkpoint(sources.checkpoints / CAMS.name, CAMS, sources.device)
-        return cls(_as(CamsNetwork, trained.network), sources, bool(trained.facts["synthetic"]))
+        return cls(cast(CamsNetwork, trained.network), sources, bool(trained.facts["synthetic"]))
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return [self._answer(request) for request in requests]

@@ -63,8 +63,8 @@ NETWORKS = {
     "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
     "refiner": "models.text2hoi.refiner_training:REFINER",
     "manipnet": "models.manipnet.training:MANIPNET",
-    "bimart-contact": "models.bimart.contact_training:CONTACT",
-    "bimart-motion": "models.bimart.motion_training:MOTION",
+    "bimart-contact": "models.bimart.learning:CONTACT",
+    "bimart-motion": "models.bimart.learning:MOTION",
 }
 # Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
 IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")

@@ -25,7 +25,7 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import AskedDistances, read_asked, read_asked_distances
 from hoidata.metrics.encoded import Encoder
-from hoidata.metrics.encoded_store import encoder_summary
+from hoidata.metrics.feature_metrics import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
 from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count, unmeasured
