@@ -60,10 +60,10 @@ imports: install-dev
 
 check: lint types imports docs test
 
-# Figures beside baselines of the same run; hours, most of them `ablation`. One part: python -m bench adapters
+# Speed next to named baselines of the same run; minutes. One part: python -m bench adapters
 bench: install-dev
 	OMP_NUM_THREADS=1 python -m bench
 
 # Removes what the graph made and the generated raw data; your own raw files are never touched.
 clean:
-	rm -rf code data checkpoints evaluators tables samples metrics report .hoidata dvc.lock pipelines/dvc.lock models/*/dvc.lock
+	rm -rf code data checkpoints evaluators samples metrics report .hoidata dvc.lock pipelines/dvc.lock models/*/dvc.lock

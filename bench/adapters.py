@@ -1,20 +1,16 @@
-"""Adapters beside naive readers: frames per second to joints and object poses, H2O's text, bytes per frame.
+"""Adapters beside naive readers: frames per second to joints and object poses, H2O's text.
 
-``python -m bench.adapters``. Both sides read the same sequences and give world joints of both hands and object
+``python -m bench adapters``. Both sides read the same sequences and give world joints of both hands and object
 poses of every frame of the clips; the values are compared. The adapters also digest every file, and read the frames
 around the clips.
 """
 
-import sys
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from bench.corpus import embedded_root
-from bench.harness import Times, medians, show
+from bench.harness import Times, embedded_root, medians, show
 from bench.naive import READERS, NaiveHands, Poses
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.hand_parameters import hands_for
@@ -22,14 +18,10 @@ from hoidata.datasets import Adapter, RawTree, SequenceKey, get_adapter
 from hoidata.datasets.h2o.files import parse_rows
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
-from hoidata.store.info import generated_info
-from hoidata.store.mapped import map_npz
-from hoidata.store.store import write_store
 
 SEQUENCES = {"h2o": 1, "grab": 3, "arctic": 2}
 TOLERANCE_M = 2e-6  # half of float32's step at some metres, over a chain of joints
 TEXT_COLUMNS = {"cam_pose": 16, "hand_pose_mano": 124, "obj_pose_rt": 17, "action_label": 1}
-NOT_PARAMETERS = ("source_contact", "camera", "body")
 
 
 @dataclass(frozen=True)
@@ -144,53 +136,7 @@ def ratios(base: Times, time: Times) -> tuple[str, str]:
     return f"{base.median / time.median:.1f}x", f"{base.processor / time.processor:.1f}x"
 
 
-def compare_bytes(corpora: Path) -> None:
-    """Bytes per frame of a store, beside the reference's layout: 6D features and joints of each clip in an NPZ."""
-    rows = []
-    for name in SEQUENCES:
-        chosen = sample(name, corpora / name)
-        clips = [clip for key in chosen.frames for clip in _clips(chosen.adapter, chosen.root, chosen.hands, key)]
-        with tempfile.TemporaryDirectory() as folder:
-            write_store(Path(folder) / "store", clips, generated_info(name))
-            shards = sorted((Path(folder) / "store" / "arrays").glob("frames-*.npz"))
-            arrays = {key: array.nbytes for path in shards for key, array in map_npz(path).items()}
-            for number, clip in enumerate(clips):
-                np.savez(Path(folder) / f"{number}.npz", **features(clip, chosen.hands))
-            reference = sum(path.stat().st_size for path in Path(folder).glob("*.npz"))
-        ours = sum(size for key, size in arrays.items() if not key.startswith(NOT_PARAMETERS))
-        figures = (reference / chosen.n_frames, ours / chosen.n_frames, sum(arrays.values()) / chosen.n_frames)
-        rows.append((name, *(f"{figure:.0f}" for figure in figures), f"{figures[0] / figures[1]:.1f}x"))
-    columns = (
-        "dataset",
-        "6D features and joints, NPZ",
-        "store: parameters",
-        "with what else the source gives",
-        "ratio",
-    )
-    show("Bytes per frame", columns, rows)
-
-
-def features(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
-    """What Text2HOI keeps of each frame: 99 numbers and 21 joints per hand, 10 numbers of the object, float32."""
-    found: dict[str, np.ndarray] = {}
-    for side in SIDES:
-        track = clip.hands[side]
-        rotvecs = np.concatenate([track.global_orient, track.hand_pose], axis=1).reshape(-1, 3)
-        six = Rotation.from_rotvec(rotvecs).as_matrix()[:, :, :2].reshape(clip.n_frames, 96)
-        found[f"{side}_hand"] = np.concatenate([track.wrist_m, six], axis=1).astype(np.float32)
-        found[f"{side}_joints"] = track_joints(track, hands[side])
-    six = Rotation.from_rotvec(clip.object.rotvec).as_matrix()[:, :, :2].reshape(clip.n_frames, 6)
-    hinge = np.zeros(clip.n_frames) if clip.object.hinge_rad is None else clip.object.hinge_rad
-    found["object"] = np.column_stack([clip.object.translation_m, six, hinge]).astype(np.float32)
-    return found
-
-
-def main(corpora: Path | None = None) -> None:
-    root = corpora or embedded_root()
+def main() -> None:
+    root = embedded_root()
     compare_readers(root)
     compare_text(root)
-    compare_bytes(root)
-
-
-if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:2]))

@@ -14,10 +14,8 @@ from scipy.spatial import KDTree
 from bench.harness import medians, show
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.sensors.part_bps import BasisSettings, PartBps, distance_map
-from hoidata.surface.bimart_maps import packed_map
 
 FRAMES, COUNT, HAND = 300, 512, 778
-NUMBERS_OF_A_FRAME = 109  # 51 of each hand and 7 of the object, float32: what a clip stores
 
 
 def thing() -> ObjectModel:
@@ -82,5 +80,3 @@ def main() -> None:
     columns = ["", "beside", "ms a frame", "its ms a frame", "faster"]
     show(f"{len(model.vertices_m):,} vertices, {COUNT} basis points per part", columns, rows)
     print(f"vertices that differ: {100 * wrong:.3f} %; distances differ by at most {1e6 * apart:.2f} um")
-    stored = 4 * NUMBERS_OF_A_FRAME + packed_map(maps).nbytes / FRAMES
-    print(f"on disk {stored:,.0f} bytes a frame ({NUMBERS_OF_A_FRAME} numbers and both maps); the release 277,000")

@@ -1,18 +1,20 @@
-"""What the benchmarks share: alternating runs with medians, the memory of a process tree, a table."""
+"""What the benchmarks share: the embedded corpora, alternating runs with medians, a table."""
 
+import os
 import statistics
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple
 
 from rich.console import Console
 from rich.table import Table
 
+from hoidata.synthetic.corpus import write_corpus
+
 RUNS = 5
 WIDTH = 140  # of tables written to a file
+CORPORA = ("h2o", "grab", "arctic")
 
 
 class Times(NamedTuple):
@@ -49,57 +51,14 @@ def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> N
     (console if console.is_terminal else Console(width=WIDTH)).print(table)
 
 
-class TreeMemory:
-    """Peak memory of a process and all below it, while the block runs, from /proc (Linux).
-
-    peak_at_once: the largest sum of resident memory seen at one moment (sampled 50 times a second); own_at_once: of
-    the memory that is no file's, which the system cannot take back. sum_of_peaks: every process's own highest mark
-    (VmHWM) added up, an upper bound. Pages processes share count for each.
-    """
-
-    def __init__(self, root: int) -> None:
-        self.root = root
-        self.peak_at_once = 0
-        self.own_at_once = 0
-        self.peaks: dict[int, int] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, daemon=True)
-
-    def __enter__(self) -> "TreeMemory":
-        self._thread.start()
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self._stop.set()
-        self._thread.join()
-
-    @property
-    def sum_of_peaks(self) -> int:
-        return sum(self.peaks.values())
-
-    def _watch(self) -> None:
-        while not self._stop.wait(0.02):
-            now = {pid: _memory(pid) for pid in _tree(self.root)}
-            self.peak_at_once = max(self.peak_at_once, sum(resident for resident, _, _ in now.values()))
-            self.own_at_once = max(self.own_at_once, sum(own for _, own, _ in now.values()))
-            for pid, (_, _, highest) in now.items():
-                self.peaks[pid] = max(self.peaks.get(pid, 0), highest)
-
-
-def _tree(pid: int) -> list[int]:
-    try:
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    except OSError:
-        return []
-    return [pid, *(below for child in children for below in _tree(int(child)))]
-
-
-def _memory(pid: int) -> tuple[int, int, int]:
-    """Bytes resident now, of those no file's, and at most so far; none for a process that has ended."""
-    try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
-    except OSError:
-        return 0, 0, 0
-    found = dict(line.split(":", 1) for line in lines)
-    resident, own, highest = (int(found.get(name, "0 kB").split()[0]) for name in ("VmRSS", "RssAnon", "VmHWM"))
-    return resident * 1024, own * 1024, highest * 1024
+def embedded_root() -> Path:
+    """The embedded corpora: of HOIDATA_BENCH_CORPORA, else those ``make demo`` wrote, else generated here once."""
+    given = os.environ.get("HOIDATA_BENCH_CORPORA")
+    made = Path(".hoidata", "raw", "embedded")
+    if given or all((made / name).is_dir() for name in CORPORA):
+        return Path(given or made).resolve()
+    folder = Path(".hoidata", "bench", "embedded").resolve()
+    for name in CORPORA:
+        if not (folder / name).is_dir():
+            write_corpus(name, folder / name)
+    return folder

@@ -1,22 +1,12 @@
 """Distance maps, joints and farthest points beside the plain way of each, in one run.
 
-``python -m bench.kernels``. One thread. A turn of a variant is a batch of clips, as a corpus comes; variants take
-turns, and figures are medians of the processor's time. Building an index is shown apart, and so is compiling: the first
-call of a process that finds nothing compiled, less its second. Errors are against float64 brute force.
+``python -m bench kernels``. One thread. A turn of a variant is a batch of clips, as a corpus comes; variants take
+turns, and results are medians of the processor's time. The first call is shown apart: it compiles, unless numba's cache
+has the code. Errors are against float64 brute force.
 """
 
-import contextlib
-import importlib.util
-import io
-import json
-import os
-import subprocess
-import sys
-import tempfile
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,12 +16,11 @@ from bench.harness import Times, medians, show
 from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_joints, track_rotmats
+from hoidata.hands import HandKinematics, load_embedded_hands, track_joints, track_rotmats
 from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints, sample_points
-from tests.builders.mano import write_mano_pickle
 
 RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21
 
@@ -92,7 +81,7 @@ def brute_force(points: SampledPoints, joints: np.ndarray, track: ObjectTrack) -
     return np.linalg.norm(world[:, :, None] - joints[:, None].astype(np.float64), axis=3)
 
 
-def distance_rows(articulated: bool, compiled_s: float) -> list[list[str]]:
+def distance_rows(articulated: bool) -> list[list[str]]:
     made = scene(articulated)
     index, valid = ProximityIndex(made.points), np.ones(FRAMES, bool)
     variants: dict[str, Callable[[], object]] = {
@@ -100,9 +89,6 @@ def distance_rows(articulated: bool, compiled_s: float) -> list[list[str]]:
         "cell grid, sparse": lambda: [index.entries(joints, valid, track) for joints, track in made.clips],
     }
     times = medians(variants, RUNS)
-    build = medians(
-        {"": lambda: ProximityIndex(made.points).entries(*made.clips[0][:1], ~valid, made.clips[0][1])}, RUNS
-    )
     joints, track = made.clips[0]
     truth, found = brute_force(made.points, joints, track), index.entries(joints, valid, track)
     plain = dense_in_world(made.points, joints, track)
@@ -111,8 +97,7 @@ def distance_rows(articulated: bool, compiled_s: float) -> list[list[str]]:
         entry_errors(truth, np.stack([found[name] for name in ("frame", "point", "joint")]), found["distance_m"]),
     ]
     name = "articulated" if articulated else "rigid"
-    notes = ["", f"index {build[''].processor * 1e3:.1f} ms, compiling {compiled_s:.1f} s"]
-    return rows_of(f"distance map, {name}: ", times, CLIPS, errors, notes)
+    return rows_of(f"distance map, {name}: ", times, CLIPS, errors)
 
 
 def entry_errors(truth: np.ndarray, places: np.ndarray, distances: np.ndarray) -> str:
@@ -126,21 +111,19 @@ def entry_errors(truth: np.ndarray, places: np.ndarray, distances: np.ndarray) -
     return f"{missing} / {extra} of {listed.sum():,}; {error_m * 1e6:.3f} um"
 
 
-def joints_rows(compiled_s: float) -> list[list[str]]:
+def joints_rows() -> list[list[str]]:
     model, tracks = load_embedded_hands().right, [random_track(seed) for seed in range(CLIPS)]
     layer, inputs = HandKinematics(model), [torch_inputs(track) for track in tracks]
-    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
-        forwards: dict[str, Callable[[], list[np.ndarray]]] = {}
-        if importlib.util.find_spec("smplx"):
-            forwards["smplx, all vertices, a batch per clip"] = smplx_forward(model, tracks, Path(folder))
-        forwards["own layer in torch, all vertices, float32"] = lambda: [layer(*own)[1].numpy() for own in inputs]
-        forwards["own layer in torch, joints and tips, float64"] = lambda: [track_joints(own, model) for own in tracks]
-        forwards["compiled, joints and tips, float64"] = lambda: [fast_track_joints(own, model) for own in tracks]
+    forwards: dict[str, Callable[[], list[np.ndarray]]] = {
+        "all vertices in torch, float32": lambda: [layer(*own)[1].numpy() for own in inputs],
+        "joints and tips in torch, float64": lambda: [track_joints(own, model) for own in tracks],
+        "joints and tips compiled, float64": lambda: [fast_track_joints(own, model) for own in tracks],
+    }
+    with torch.no_grad():
         times = medians(forwards, RUNS)
         truth = HandKinematics(model, torch.float64)(*torch_inputs(tracks[0], torch.float64))[1].numpy()
         errors = [f"{np.abs(run()[0] - truth[:, : run()[0].shape[1]]).max() * 1e6:.3f} um" for run in forwards.values()]
-    notes = [""] * (len(forwards) - 1) + [f"compiling {compiled_s:.1f} s"]
-    return rows_of("joints: ", times, CLIPS, errors, notes)
+    return rows_of("joints: ", times, CLIPS, errors)
 
 
 def random_track(seed: int) -> HandTrack:
@@ -157,34 +140,16 @@ def torch_inputs(track: HandTrack, dtype: torch.dtype = torch.float32) -> list[t
     return [torch.as_tensor(array).to(dtype) for array in (track.wrist_m, track_rotmats(track), track.betas)]
 
 
-def smplx_forward(model: HandModel, tracks: list[HandTrack], folder: Path) -> Callable[[], list[np.ndarray]]:
-    """smplx's MANO layer over a file of the same hand; its 16 joints (tips are a matter of indexing its vertices)."""
-    import smplx
-
-    write_mano_pickle(model, folder / "MANO_RIGHT.pkl")
-    with contextlib.redirect_stdout(io.StringIO()):
-        layer = smplx.MANO(str(folder), is_rhand=True, use_pca=False, flat_hand_mean=True, batch_size=FRAMES)
-    inputs = []
-    for track in tracks:
-        betas = np.repeat(track.betas, FRAMES, axis=0)
-        transl = (track.wrist_m - model.wrist_offset_m(betas)).astype(np.float32)
-        arrays = {"betas": betas, "global_orient": track.global_orient, "hand_pose": track.hand_pose, "transl": transl}
-        inputs.append({name: torch.as_tensor(array) for name, array in arrays.items()})
-    return lambda: [layer(**own).joints[:, :16].numpy() for own in inputs]
-
-
-def farthest_rows(n_points: int, loops: int, compiled_s: float) -> list[list[str]]:
+def farthest_rows(n_points: int) -> list[list[str]]:
     points = np.random.default_rng(0).normal(size=(n_points, 3))
     points = (0.05 * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(np.float32)
-    variants: dict[str, Callable[[], object]] = {
-        "torch loop": lambda: torch_farthest(torch.as_tensor(points), 1024),
-        "compiled": lambda: [farthest_points(points, 1024) for _ in range(loops)],
+    variants: dict[str, Callable[[], np.ndarray]] = {
+        "torch loop": lambda: torch_farthest(torch.as_tensor(points), 1024).numpy(),
+        "compiled": lambda: farthest_points(points, 1024),
     }
-    times = medians(variants, RUNS)
-    times["compiled"] = Times(*(value / loops for value in times["compiled"]))
-    same = (torch_farthest(torch.as_tensor(points), 1024).numpy() == farthest_points(points, 1024)).sum()
-    notes = ["", f"compiling {compiled_s:.1f} s"]
-    return rows_of(f"1,024 farthest of {n_points:,}: ", times, 1, ["", f"{same} of 1,024 indices equal"], notes)
+    plain, found = (work() for work in variants.values())
+    errors = ["", f"{(plain == found).sum()} of 1,024 indices equal"]
+    return rows_of(f"1,024 farthest of {n_points:,}: ", medians(variants, RUNS), 1, errors)
 
 
 def torch_farthest(points: torch.Tensor, count: int) -> torch.Tensor:
@@ -198,38 +163,8 @@ def torch_farthest(points: torch.Tensor, count: int) -> torch.Tensor:
     return chosen
 
 
-def compiling_s() -> dict[str, float]:
-    """Seconds of compiling by operation, in a process of its own with an empty cache."""
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "NUMBA_CACHE_DIR": folder}
-        command = [sys.executable, "-m", "bench.kernels", "--first-calls"]
-        done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, text=True, check=True)
-    return json.loads(done.stdout.splitlines()[-1])
-
-
-def first_calls_s() -> dict[str, float]:
-    """Of each operation, the first call less the second, in seconds of the processor."""
-    points = np.random.default_rng(0).normal(size=(4000, 3)).astype(np.float32)
-    farthest = first_less_second_s(lambda: farthest_points(points, 1024))  # first: sampling a scene needs it, too
-    made, model, track = scene(True), load_embedded_hands().right, random_track(0)
-    index, valid = ProximityIndex(made.points), np.ones(FRAMES, bool)
-    return {
-        "farthest": farthest,
-        "distance": first_less_second_s(lambda: index.entries(made.clips[0][0], valid, made.clips[0][1])),
-        "joints": first_less_second_s(lambda: fast_track_joints(track, model)),
-    }
-
-
-def first_less_second_s(work: Callable[[], object]) -> float:
-    times = []
-    for _ in range(2):
-        start = time.process_time()
-        work()
-        times.append(time.process_time() - start)
-    return times[0] - times[1]
-
-
-def rows_of(title: str, times: Mapping[str, Times], size: int, errors: list[str], notes: list[str]) -> list[list[str]]:
+def rows_of(title: str, times: Mapping[str, Times], size: int, errors: list[str]) -> list[list[str]]:
+    """The first variant is the baseline. size: clips of a turn."""
     base = next(iter(times.values()))
     return [
         [
@@ -237,26 +172,16 @@ def rows_of(title: str, times: Mapping[str, Times], size: int, errors: list[str]
             f"{own.processor / size * 1e3:.3f} / {own.median / size * 1e3:.3f}",
             f"{base.processor / own.processor:.1f}",
             error,
-            note,
+            f"{own.first:.2f} s",
         ]
-        for (name, own), error, note in zip(times.items(), errors, notes, strict=True)
+        for (name, own), error in zip(times.items(), errors, strict=True)
     ]
 
 
 def main() -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
-    first = compiling_s()
-    rows = [*distance_rows(False, first["distance"]), *distance_rows(True, first["distance"])]
-    rows += joints_rows(first["joints"])
-    rows += [*farthest_rows(4000, 10, first["farthest"]), *farthest_rows(30000, 3, first["farthest"])]
+    rows = [*distance_rows(False), *distance_rows(True), *joints_rows(), *farthest_rows(4000), *farthest_rows(30000)]
     torch.set_num_threads(threads)
-    columns = ["", "ms processor / clock", "x", "missing / extra; largest error", "apart"]
+    columns = ["", "ms processor / clock", "x", "missing / extra; largest error", "first call"]
     show(f"Kernels: {FRAMES} frames, one hand, medians of {RUNS} turns of {CLIPS} clips", columns, rows)
-
-
-if __name__ == "__main__":
-    if sys.argv[1:] == ["--first-calls"]:
-        print(json.dumps(first_calls_s()))
-    else:
-        main()

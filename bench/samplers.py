@@ -93,7 +93,3 @@ def motion_s(model: DiffusionModel, config: SamplerConfig) -> float:
     start = time.process_time()
     run(model, config)
     return time.process_time() - start
-
-
-if __name__ == "__main__":
-    main()

@@ -1,214 +1,154 @@
-"""A corpus of the papers' size: time, memory and bytes of conversion, annotation and contact, and how they grow.
+"""How conversion, annotation and contact grow: time, memory and bytes per clip, compared with a small corpus.
 
-``python -m bench.scale [SHARE ...]`` (0.01, 0.1 and 1 when none is given). The raw files are those of the
-embedded corpora, repeated (see ``corpus``); nothing is read from a manifest. Each stage runs in processes of its own,
-so that its memory can be told apart; conversion on HOIDATA_BENCH_JOBS workers (2 if not given), the others on one
-process, as the graph runs them. "checksums and files": digests of the raw files and reading them, done once more by
-themselves, which can be taken off conversion.
+``python -m bench scale``. The raw files are hard links to those of the embedded corpora under the names of further
+subjects; HOIDATA_BENCH_COPIES: how many copies of the corpora (1,4,16; 26 give as many clips as Text2HOI counts). Each
+stage runs in a process of its own, conversion on HOIDATA_BENCH_JOBS workers (2). Memory is the peak of the largest
+process. A cost that grows in a straight line has the same value per further clip at every size.
 """
 
-import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
-from bench.corpus import PAPER, embedded_root, replicate
-from bench.growth import show_growth
-from bench.harness import TreeMemory, show
+from bench.harness import CORPORA, embedded_root, show
 from hoidata.lifetime import end_with_parent
-from hoidata.store.mapped import map_npz
 from hoidata.store.store import open_store
 
 MEBI = 1 << 20
-MEMORY = ("peak_at_once", "own_at_once", "sum_of_peaks")
-DISK = "checksums and files"
-PARTS = ("clips", "annotation", "contact")
-# What a clip's motion is made of; all else in the arrays is what a source offers besides (contact labels, cameras).
-PARAMETERS = (
-    *(f"{side}_{name}" for side in ("left", "right") for name in ("wrist_m", "global_orient", "hand_pose", "valid")),
-    *("left_betas", "right_betas", "source_frames", "object_rotvec", "object_translation_m", "object_hinge_rad"),
-)
+SUBJECT = re.compile(r"(s|subject)(\d+)")
+SUBJECTS_APART = 20  # more than any of the corpora has
 
 
-@dataclass(frozen=True)
-class Measured:
-    """One stage over all datasets. processor_s counts all processes; the rest is that of ``TreeMemory``."""
-
-    wall_s: float
-    processor_s: float
-    peak_at_once: int
-    own_at_once: int
-    sum_of_peaks: int
-
-
-def convert(name: str, raw: Path, out: Path) -> None:
+def convert(raw: Path, out: Path) -> None:
     from hoidata.conversion.convert import convert_dataset
     from hoidata.datasets import get_adapter
     from hoidata.hands import load_embedded_hands
 
-    jobs, clips = int(os.environ.get("HOIDATA_BENCH_JOBS", "2")), out / name / "clips"
-    convert_dataset(get_adapter(name), raw / name, load_embedded_hands(), clips, jobs, synthetic=True)
+    jobs = int(os.environ.get("HOIDATA_BENCH_JOBS", "2"))
+    convert_dataset(get_adapter(raw.name), raw, load_embedded_hands(), out / "clips", jobs, synthetic=True)
 
 
-def read_and_digest(name: str, raw: Path, out: Path) -> None:
-    for path in sorted((raw / name).rglob("*")):
-        if path.is_file():
-            hashlib.sha256(path.read_bytes())
-
-
-def annotate(name: str, raw: Path, out: Path) -> None:
+def annotate(raw: Path, out: Path) -> None:
     from hoidata.annotation.stage import annotate_store
 
-    print(annotate_store(out / name / "clips", out / name / "annotation", encoder="hash"))
+    annotate_store(out / "clips", out / "annotation", encoder="hash")
 
 
-def contact(name: str, raw: Path, out: Path) -> None:
+def contact(raw: Path, out: Path) -> None:
     from hoidata.contact.stage import contact_store
 
-    print(contact_store(out / name / "clips", out / name / "contact"))
+    contact_store(out / "clips", out / "contact")
 
 
-STAGES: dict[str, Callable[[str, Path, Path], None]] = {
-    DISK: read_and_digest,
-    "convert": convert,
-    "annotate": annotate,
-    "contact": contact,
-}
+STAGES: dict[str, Callable[[Path, Path], None]] = {"convert": convert, "annotate": annotate, "contact": contact}
+OUTPUTS = {"convert": "clips", "annotate": "annotation", "contact": "contact"}
 
 
-def measured(stage: str, name: str, raw: Path, out: Path) -> Measured:
+class Cost(NamedTuple):
+    """Of one stage over all datasets. processor_s: of all its processes; peak_bytes: of the largest one."""
+
+    wall_s: float
+    processor_s: float
+    peak_bytes: int
+    output_bytes: int
+
+
+def replicate(source: Path, target: Path, copies: int) -> None:
+    """Link a raw folder. Files below the folder of a subject appear ``copies`` times, each under another subject."""
+    for path in sorted(source.rglob("*")):
+        if path.is_dir():
+            continue
+        parts = path.relative_to(source).parts
+        numbers = range(copies) if any(SUBJECT.fullmatch(part) for part in parts) else range(1)
+        for copy in numbers:
+            link = target.joinpath(*(SUBJECT.sub(partial(_renamed, copy), part) for part in parts))
+            link.parent.mkdir(parents=True, exist_ok=True)
+            if not link.exists():
+                os.link(path, link)
+
+
+def _renamed(copy: int, name: re.Match[str]) -> str:
+    """A folder ``s05`` is ``s25`` in the first further copy; other names that contain a number stay."""
+    if name.group() != name.string:
+        return name.group()
+    return f"{name[1]}{int(name[2]) + SUBJECTS_APART * copy:0{len(name[2])}d}"
+
+
+def measured(stage: str, raw: Path, out: Path) -> Cost:
     """Run one stage of one dataset in a process of its own."""
-    command = [sys.executable, "-m", "bench.scale", "--stage", stage, name, str(raw), str(out)]
-    before, start = os.times(), time.perf_counter()
+    command = [sys.executable, "-m", "bench.scale", stage, str(raw), str(out)]
     environment, end = {**os.environ, "OMP_NUM_THREADS": "1"}, partial(end_with_parent, os.getpid())
+    start = time.perf_counter()
     process = subprocess.Popen(command, env=environment, stdout=sys.stderr, preexec_fn=end)
-    with TreeMemory(process.pid) as memory:
-        code = process.wait()
-    if code:
-        raise RuntimeError(f"{stage} of {name} ended with exit code {code}")
-    wall, after = time.perf_counter() - start, os.times()
-    processor = after.children_user + after.children_system - before.children_user - before.children_system
-    found = Measured(wall, processor, memory.peak_at_once, memory.own_at_once, memory.sum_of_peaks)
-    print(f"{stage} of {name}: {found}", file=sys.stderr)
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise RuntimeError(f"{stage} of {raw.name} ended with exit code {process.returncode}")
+    size = sum(path.stat().st_size for path in (out / OUTPUTS[stage]).rglob("*") if path.is_file())
+    return Cost(time.perf_counter() - start, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024, size)
+
+
+def total(parts: list[Cost]) -> Cost:
+    """Datasets run one after another: times and bytes add up, peaks do not."""
+    wall_s, processor_s, peaks, sizes = zip(*parts, strict=True)
+    return Cost(sum(wall_s), sum(processor_s), max(peaks), sum(sizes))
+
+
+def run_size(source: Path, folder: Path, copies: int) -> tuple[int, int, dict[str, Cost]]:
+    """Clips, frames, and the cost of each stage, of so many copies of the corpora."""
+    found: dict[str, list[Cost]] = {stage: [] for stage in STAGES}
+    clips = frames = 0
+    for name in CORPORA:
+        raw, out = folder / "raw" / name, folder / "out" / name
+        replicate(source / name, raw, copies)
+        for stage, costs in found.items():
+            costs.append(measured(stage, raw, out))
+        store = open_store(out / "clips")
+        clips, frames = clips + len(store), frames + int(store.sequences["n_frames"].sum())
+    return clips, frames, {stage: total(costs) for stage, costs in found.items()}
+
+
+def rows(sizes: list[tuple[int, int, dict[str, Cost]]]) -> list[list[str]]:
+    """Of each stage and size: costs, and processor time and bytes per clip beyond the size before it."""
+    found = []
+    for stage in STAGES:
+        before, known = 0, Cost(0, 0, 0, 0)
+        for clips, frames, costs in sizes:
+            cost, more = costs[stage], max(clips - before, 1)
+            further = (cost.processor_s - known.processor_s) / more, (cost.output_bytes - known.output_bytes) / more
+            found.append(
+                [
+                    f"{stage}, {clips:,} clips",
+                    f"{cost.wall_s:.1f}",
+                    f"{cost.processor_s:.1f}",
+                    f"{frames / cost.wall_s:,.0f}",
+                    f"{cost.peak_bytes / MEBI:,.0f}",
+                    f"{1e3 * further[0]:.1f}",
+                    f"{further[1] / 1024:.1f}",
+                ]
+            )
+            before, known = clips, cost
     return found
 
 
-def total(parts: list[Measured]) -> Measured:
-    """Datasets run one after another: times add up, peaks do not."""
-    return Measured(
-        sum(part.wall_s for part in parts),
-        sum(part.processor_s for part in parts),
-        max(part.peak_at_once for part in parts),
-        max(part.own_at_once for part in parts),
-        max(part.sum_of_peaks for part in parts),
-    )
-
-
-def run_share(source: Path, folder: Path, share: float, stages: tuple[str, ...] = tuple(STAGES)) -> dict:
-    """Make, convert, annotate and measure one corpus below ``folder``; figures as JSON values."""
-    raw, out = folder / "raw", folder / "out"
-    start = time.perf_counter()
-    wanted = replicate(source, raw, share)
-    made_s = time.perf_counter() - start
-    found = {stage: total([measured(stage, name, raw, out) for name in PAPER]) for stage in stages}
-    stores = {name: open_store(out / name / "clips") for name in PAPER}
-    clips = {name: len(store) for name, store in stores.items()}
-    if clips != wanted:
-        raise AssertionError(f"{clips} clips, wanted {wanted}")
-    frames = sum(int(store.sequences["n_frames"].to_numpy().sum()) for store in stores.values())
-    return {
-        "share": share,
-        "made_s": made_s,
-        "clips": sum(clips.values()),
-        "sequences": sum(store.sequences["sequence"].nunique() for store in stores.values()),
-        "frames": frames,
-        "parameter_bytes": sum(parameter_bytes(store.folder) for store in stores.values()),
-        "bytes": {part: sum(folder_bytes(out / name / part) for name in PAPER) for part in PARTS},
-        "stages": {stage: asdict(value) for stage, value in found.items()},
-    }
-
-
-def parameter_bytes(store: Path) -> int:
-    """Bytes of the arrays a clip's motion is made of."""
-    shards = sorted((store / "arrays").glob("frames-*.npz"))
-    return sum(array.nbytes for path in shards for name, array in map_npz(path).items() if name in PARAMETERS)
-
-
-def folder_bytes(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
-
-
-def report(figures: list[dict]) -> None:
-    rows = [(name, *(line(figure) for figure in figures)) for name, line in LINES.items()]
-    show("Paper scale", ["", *(f"share {figure['share']:g}" for figure in figures)], rows)
-    lines = {name: [size(figure) for figure in figures] for name, size in GROWING.items()}
-    show_growth("Growth with the number of clips", [figure["clips"] for figure in figures], lines)
-
-
-def _stage(stage: str, key: str) -> Callable[[dict], float]:
-    return lambda figure: figure["stages"][stage][key]
-
-
-def _seconds(stage: str) -> Callable[[dict], str]:
-    return lambda figure: f"{_stage(stage, 'wall_s')(figure):.1f} / {_stage(stage, 'processor_s')(figure):.1f} s"
-
-
-def _peak(stage: str) -> Callable[[dict], str]:
-    return lambda figure: " / ".join(f"{_stage(stage, kind)(figure) / MEBI:.0f}" for kind in MEMORY) + " MiB"
-
-
-def _mebibytes(size: Callable[[dict], float]) -> Callable[[dict], str]:
-    return lambda figure: f"{size(figure) / MEBI:,.1f} MiB"
-
-
-BYTES: dict[str, Callable[[dict], float]] = {
-    "bytes of parameters": lambda figure: figure["parameter_bytes"],
-    **{f"bytes of {part}": lambda figure, part=part: figure["bytes"][part] for part in PARTS},
-    "bytes of all": lambda figure: sum(figure["bytes"].values()),
-}
-GROWING: dict[str, Callable[[dict], float]] = {
-    **{f"{name}, MiB": lambda figure, size=size: size(figure) / MEBI for name, size in BYTES.items()},
-    **{
-        f"{stage}, peak MiB": lambda figure, stage=stage: _stage(stage, "peak_at_once")(figure) / MEBI
-        for stage in STAGES
-    },
-    **{f"{stage}, processor s": _stage(stage, "processor_s") for stage in STAGES},
-    "all stages, processor s": lambda figure: sum(
-        _stage(stage, "processor_s")(figure) for stage in STAGES if stage != DISK
-    ),
-}
-LINES: dict[str, Callable[[dict], str]] = {
-    "clips / sequences": lambda figure: f"{figure['clips']:,} / {figure['sequences']:,}",
-    "frames": lambda figure: f"{figure['frames']:,}",
-    "making the raw folder (links)": lambda figure: f"{figure['made_s']:.1f} s",
-    **{f"{stage}: wall / processor": _seconds(stage) for stage in STAGES},
-    "convert: frames per second": lambda figure: f"{figure['frames'] / _stage('convert', 'wall_s')(figure):,.0f}",
-    **{f"{stage}: memory at once / no file's / sum of peaks": _peak(stage) for stage in STAGES},
-    "parameters per frame": lambda figure: f"{figure['parameter_bytes'] / figure['frames']:.1f} bytes",
-    **{name: _mebibytes(size) for name, size in BYTES.items()},
-    "all per frame": lambda figure: f"{sum(figure['bytes'].values()) / figure['frames']:.1f} bytes",
-}
-
-
-def main(shares: tuple[float, ...] = (0.01, 0.1, 1.0)) -> None:
-    """Measure each share, one after another, and show them side by side."""
+def main() -> None:
     corpora = embedded_root()
+    copies = [int(number) for number in os.environ.get("HOIDATA_BENCH_COPIES", "1,4,16").split(",")]
     # Beside the corpora: hard links do not leave a file system.
     with tempfile.TemporaryDirectory(prefix="bench-scale-", dir=corpora.parent) as folder:
-        figures = [run_share(corpora, Path(folder) / f"share-{share:g}", share) for share in shares]
-    report(figures)
-    print(json.dumps(figures))
+        sizes = [run_size(corpora, Path(folder) / f"{number}", number) for number in copies]
+    columns = ["", "s", "processor s", "frames/s", "peak MiB", "processor ms per further clip", "KiB per further clip"]
+    show("Growth with the number of clips", columns, rows(sizes))
+    print(json.dumps([[clips, frames, costs] for clips, frames, costs in sizes]))
 
 
 if __name__ == "__main__":
-    if sys.argv[1:2] == ["--stage"]:
-        STAGES[sys.argv[2]](sys.argv[3], Path(sys.argv[4]), Path(sys.argv[5]))
-    else:
-        main(*([tuple(map(float, sys.argv[1:]))] if sys.argv[1:] else []))
+    STAGES[sys.argv[1]](Path(sys.argv[2]), Path(sys.argv[3]))

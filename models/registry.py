@@ -30,7 +30,6 @@ FAMILIES = {
     "nearest-window-refined": "models.bimart.refined_lookup:NEAREST_REFINED",
     "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
     "random-window": "models.bimart.lookups:RANDOM_WINDOW",
-    "cams-b": "models.bimart_tables.cams:CAMS_B",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
@@ -64,16 +63,13 @@ NETWORKS = {
     "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
     "refiner": "models.text2hoi.refiner_training:REFINER",
     "manipnet": "models.manipnet.training:MANIPNET",
-    "bimart-contact": "models.bimart.contact_training:CONTACT",
-    "bimart-motion": "models.bimart.motion_training:MOTION",
-    "cams-b": "models.bimart_tables.cams:CAMS",
+    "bimart-contact": "models.bimart.learning:CONTACT",
+    "bimart-motion": "models.bimart.learning:MOTION",
 }
 # Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
 IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
 # Networks of such a family under other names.
 LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
-# Networks of the tables that BimArt is compared in.
-IN_TABLES = ("bimart-contact", "bimart-motion", "cams-b")
 
 
 def family_names() -> list[str]:

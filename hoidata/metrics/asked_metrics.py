@@ -7,12 +7,12 @@ from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
 
 from hoidata.errors import BadInput
-from hoidata.metrics import bimart, cams
+from hoidata.metrics import bimart
 from hoidata.metrics.pair import Pair
 from hoidata.metrics.registry import HANDS, METRICS, Direction, Metric
 from hoidata.metrics.unmeasured import Values
 
-BIMART, CAMS = "BimArt (Zhang et al. 2025)", "CAMS (Zheng et al. 2023)"
+BIMART = "BimArt (Zhang et al. 2025)"
 _PAPER, _CORRECTED = "as released", "this project: corrected"
 _HINGE = f"the hinge turns by more than {bimart.TURNED_RAD:g} rad"
 _MOVES = f"{HANDS} and an object vertex moves by more than {1000 * bimart.MOVED_M:g} mm, or {_HINGE}, to the next"
@@ -23,13 +23,10 @@ _MOVES_RELEASED = (
 )
 _TURNS_RELEASED = f"{HANDS} and the hinge turns by more than {bimart.TURNED_AS_RELEASED_RAD:g} rad to the next"
 _WHOLE = "inside where the winding number of the whole posed mesh is odd"
-_PART = "inside where the winding number of the part's triangles is odd"
 _SOLID = "inside the solid of a closed part"
 _CONTACT = "5 mm or nearer, none deeper than 1 cm"
-_FORCES = "residual below 0.01, friction 0.35, contact 2 mm"
 Measure = Callable[[Pair, int], Values]
 _THREE = f"{HANDS}, three recorded ones in a row"
-_INNER = f"{HANDS}, with a recorded one before and after; known gravity"
 
 
 def _shares(
@@ -98,33 +95,6 @@ BIMART_METRICS: tuple[Metric, ...] = (
         "BimArt", "bimart_cm_corrected", "CM, corrected", "cm", "lower", bimart.cm_corrected, "mean over motions",
         HANDS, f"{BIMART}, {_CORRECTED}: to the hand vertices the map was made of",
         thresholds="distances capped at 20 cm",
-    ),
-    Metric(
-        "CAMS", "cams_pen_paper", "CAMS Pen, paper", "", "lower", cams.pen_paper, "mean over motions", HANDS,
-        f"{CAMS}, {_PAPER}: share of hand vertices, added up over parts", samples=1, thresholds=f"5 mm, {_PART}",
-    ),
-    Metric(
-        "CAMS", "cams_pen_corrected", "CAMS Pen, corrected", "", "lower", cams.pen_corrected, "mean over motions",
-        HANDS, f"{CAMS}, {_CORRECTED}", thresholds=f"5 mm, {_SOLID}",
-    ),
-    Metric(
-        "CAMS", "cams_con_paper", "CAMS Con, paper", "", "higher", cams.con_paper, "mean over frames", _INNER,
-        f"{CAMS}, {_PAPER}: 1 kg on every vertex, gravity 1 m per frame2", samples=1, thresholds=_FORCES,
-    ),
-    Metric(
-        "CAMS", "cams_con_corrected", "CAMS Con, corrected", "", "higher", cams.con_corrected, "mean over motions",
-        _INNER, f"{CAMS}, {_CORRECTED}: SI, 1 kg of even density", samples=1,
-        thresholds=f"{_FORCES}, no deeper than 1 cm",
-    ),
-    Metric(
-        "CAMS", "cams_art_paper", "CAMS Art, paper", "", "higher", cams.art_paper, "mean over frames",
-        f"{HANDS} and the hinge turns by more than 1e-6 rad to the next", f"{CAMS}, {_PAPER}", samples=1,
-        thresholds="arm above 0.3 of the mean, contact 2 mm",
-    ),
-    Metric(
-        "CAMS", "cams_art_corrected", "CAMS Art, corrected", "", "higher", cams.art_corrected, "mean over motions",
-        _TURNS, f"{CAMS}, {_CORRECTED}",
-        thresholds="arm above 0.3 of the mean, contact 2 mm, no deeper than 1 cm",
     ),
 )  # fmt: skip
 

@@ -65,20 +65,6 @@ def mul_cm(pairs: Sequence[Pair], every: int) -> Values:
     return 100 * np.array(apart)
 
 
-def border_ratios(values: np.ndarray, borders: Sequence[int], reach: int = 1) -> float:
-    """95th percentile of ``values`` at the borders of windows over that elsewhere; NaN where either has none.
-
-    values: (frame, ...) any measure per frame, such as lengths of second differences or changes of contact, row i of
-    frame i. borders: first frame of every window but the first. reach: frames this near to one are of the border.
-    """
-    frames = np.arange(len(values))
-    at = np.any([np.abs(frames - border) <= reach for border in borders], axis=0) if len(borders) else frames < 0
-    if not at.any() or at.all():
-        return np.nan
-    there, elsewhere = (np.percentile(values[rows], 95) for rows in (at, ~at))
-    return float(there / elsewhere) if elsewhere else np.nan
-
-
 def _second_differences_m(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
     """(hand and frame,) lengths over three recorded frames, metres, and how many frames these are apart."""
     lengths, steps = [np.zeros(0)], [np.zeros(0)]

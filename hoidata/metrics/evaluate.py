@@ -9,7 +9,7 @@ the clips may lie the contact maps that were asked for (``hoidata.metrics.asked`
 are left out, counted and listed with the reason.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,7 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import AskedDistances, read_asked, read_asked_distances
 from hoidata.metrics.encoded import Encoder
-from hoidata.metrics.encoded_store import encoder_summary
+from hoidata.metrics.feature_metrics import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
 from hoidata.metrics.registry import METRICS, Metric, reduced, sum_and_count, unmeasured
@@ -79,7 +79,6 @@ def evaluate_store(
     encoders: Sequence[Encoder] = (),
     jobs: int = 1,
     progress: bool = False,
-    by_clip: bool = False,
 ) -> dict[str, Any]:
     """Figures of the store ``predicted`` against the annotated dataset ``reference``.
 
@@ -90,9 +89,8 @@ def evaluate_store(
     value), intervals (95 %, over repetitions and over clips drawn by source sequence, where there are two or more),
     counts (how many clips, motions and values went into each), unmeasured (of each metric without a value of some clip
     that could be compared, how many such clips there are by reason), actions (where the limits of verbs come from) and
-    left_out (clip id and reason); with encoders also notes and evaluators (``encoder_summary``); by_clip: also by_clip,
-    for each clip its group (the source sequence) and for each metric with a value there its sum and count, so that
-    two stores can be compared clip by clip. Raises BadInput where no clip of the two stores can be compared.
+    left_out (clip id and reason); with encoders also notes and evaluators (``encoder_summary``). Raises BadInput where
+    no clip of the two stores can be compared.
     """
     annotated, store = load_annotated(reference, hands), open_store(predicted, hands)
     asked = annotated.ids(split)
@@ -127,21 +125,6 @@ def evaluate_store(
         **summary,
         "actions": bench.actions.facts,
         "left_out": [item._asdict() for item in left_out],
-        **({"by_clip": _parts_by_clip(metrics, found)} if by_clip else {}),
-    }
-
-
-def _parts_by_clip(metrics: Sequence[Metric], found: Mapping[str, Measured]) -> dict[str, dict[str, Any]]:
-    """Group and sums and counts of every clip that could be compared."""
-    return {
-        clip_id: {
-            "group": own.group,
-            "parts": {
-                metric.name: list(parts) for metric in metrics if (parts := sum_and_count(metric, own.of(metric)))[1]
-            },
-        }
-        for clip_id, own in found.items()
-        if own.samples
     }
 
 

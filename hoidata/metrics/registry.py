@@ -12,13 +12,13 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from hoidata.clips.slip import MOVING_CM_S
-from hoidata.metrics import forces, motion, touch, two_hands
+from hoidata.metrics import forces, motion, touch
 from hoidata.metrics.unmeasured import Unmeasured, Values, counted
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
 
 Direction = Literal["higher", "lower", "nearer the truth"]
-Topic = Literal["Action", "Contact", "Physics", "Motion", "BimArt", "CAMS"]
+Topic = Literal["Action", "Contact", "Physics", "Motion", "BimArt"]
 Reduction = Literal["best of a clip's samples", "mean over motions", "mean over frames"]
 
 
@@ -128,7 +128,7 @@ METRICS: tuple[Metric, ...] = (
         every=3, samples=2, thresholds=f"lines {1000 * touch.CELL_M:g} mm apart",
     ),
     Metric(
-        "Physics", "hand_hand_mm", "penetration of one hand by the other", "mm", "lower", two_hands.hand_hand_mm,
+        "Physics", "hand_hand_mm", "penetration of one hand by the other", "mm", "lower", touch.hand_hand_mm,
         "mean over motions", f"{HANDS}, both hands", "this project: depth of the deepest of 19 x 19 capsules",
         every=3, samples=2,
     ),

@@ -1,4 +1,4 @@
-"""Hands against the object: contact, slip, penetration. Each function gives the values of one motion.
+"""Hands against the object and each other: contact, slip, penetration. Each function gives the values of one motion.
 
 Penetration has one meaning everywhere: the depth of a hand's deepest vertex inside the solid the object's mesh
 encloses, by the exact surface (``hoidata.objects.surface_index``); penetrating volume is what both fill.
@@ -9,13 +9,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from hoidata.clips.clip import Side
+from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
 from hoidata.contact.agreement import f1_score
 from hoidata.errors import BadInput
 from hoidata.metrics.pair import Motion, Pair
 from hoidata.metrics.unmeasured import NO_INSIDE, Unmeasured, Values
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.physics.capsules import Capsules
+from hoidata.physics.mano_capsules import hand_capsules
 from hoidata.surface.contact import PlacedHand, deepest_m, placed_hand
 from hoidata.surface.solid_overlap import SolidOverlap
 
@@ -164,3 +166,42 @@ def _surface_distances_m(motion: Motion, side: Side, frames: np.ndarray) -> np.n
     """(frame, 21) distance of joints from the surface, metres, never negative."""
     index = surface_index(motion.clip.object.model)
     return index.distance_m(motion.joints_in_object(side, frames), motion.hinge_rad(frames))
+
+
+# --- one hand against the other
+
+
+def hand_hand_mm(pair: Pair, every: int) -> Values:
+    """(frame,) depth of the deepest capsule of one hand in one of the other, millimetres, 0 where they are apart.
+
+    None where one hand acts alone.
+    """
+    frames = np.flatnonzero(pair.valid("left") & pair.valid("right"))[::every]
+    if pair.sides != SIDES:
+        return Unmeasured("one hand acts alone")
+    if not len(frames):
+        return np.zeros(0)
+    clip, hands = pair.predicted.clip.take(frames), pair.predicted.hands
+    left, right = (hand_capsules(clip.hands[side], hands[side]) for side in SIDES)
+    return 1000 * depth_m(left, right)
+
+
+def depth_m(one: Capsules, other: Capsules) -> np.ndarray:
+    """(frame,) how deep two sets of capsules overlap at most: the sum of two radii less the distance of their axes."""
+    apart = _axis_distances_m(*(ends[:, :, None] for ends in one[:2]), *(ends[:, None] for ends in other[:2]))
+    depth = one.radius_m[:, None] + other.radius_m - apart
+    return np.maximum(depth.max(axis=(1, 2)), 0.0)
+
+
+def _axis_distances_m(
+    start: np.ndarray, stop: np.ndarray, other_start: np.ndarray, other_stop: np.ndarray
+) -> np.ndarray:
+    """Least distance of segments by their ends (..., 3), as in Ericson 2005, Real-Time Collision Detection, 5.1.9."""
+    way, other_way, between = stop - start, other_stop - other_start, start - other_start
+    a, e, b = (way * way).sum(-1), (other_way * other_way).sum(-1), (way * other_way).sum(-1)
+    c, f = (way * between).sum(-1), (other_way * between).sum(-1)
+    cross = a * e - b * b
+    along = np.clip(np.where(cross > 0, (b * f - c * e) / np.where(cross > 0, cross, 1), 0), 0, 1)
+    beside = np.clip((b * along + f) / np.where(e > 0, e, 1), 0, 1)
+    along = np.clip((b * beside - c) / np.where(a > 0, a, 1), 0, 1)
+    return np.linalg.norm(between + along[..., None] * way - beside[..., None] * other_way, axis=-1)

@@ -6,7 +6,7 @@ import numpy as np
 
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
-from hoidata.hands import JOINT_NAMES, PARENTS, TIP_VERTICES, HandModel, HandPair, HandTrackLike, track_rotmats
+from hoidata.hands import JOINT_NAMES, PARENTS, TIP_VERTICES, HandModel, HandPair
 from hoidata.hands.embedded import vertex_normals
 from hoidata.hands.model import N_ROTATIONS, Side
 from hoidata.hands.tracked_hand import JointCapsules, Skin, TrackedHand
@@ -56,12 +56,6 @@ def mano_hand(
         hinge_axis=np.zeros((N_ROTATIONS, 3)),
         limit_rad=np.zeros((N_ROTATIONS, 2)),
     )
-
-
-def mano_state_inputs(track: HandTrackLike) -> tuple[RigidTransform, np.ndarray]:
-    """world_from_wrist (frame,) and finger rotations (frame, 15, 3, 3) of a recorded track."""
-    rotmats = track_rotmats(track)
-    return RigidTransform(rotmats[:, 0], np.asarray(track.wrist_m, dtype=np.float64)), rotmats[:, 1:]
 
 
 def canonical_axes(model: HandModel) -> np.ndarray:

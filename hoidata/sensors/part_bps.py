@@ -22,11 +22,9 @@ from hoidata.objects.distance_grid import nearest_triangles
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.surface_index import PartSurface, surface_index
 
-Variant = Literal["part", "whole", "unscaled"]
 Nearest = Literal["vertex", "surface"]
 CanonicalFrame = Literal["axis", "base"]
 MARGIN = 0.15  # d_margin of eq. 1
-UNSCALED_RADIUS_M = 0.5
 ARC_RAD = np.deg2rad(3.0)
 ROUNDING_M = 1e-6  # more than float32 loses in a distance of a metre
 LANES, FAR_M = 16, 1e6
@@ -35,32 +33,29 @@ ON_AXIS_M = 1e-3  # a base whose middle is nearer to the axis than this has no d
 
 @dataclass(frozen=True)
 class BasisSettings:
-    """count: points per part; drawn uniformly in the ball from ``seed``.
+    """count: points per part; drawn uniformly in the unit ball from ``seed``.
 
-    variant: "part": every part by itself, scaled to the unit ball; "whole": twice as many points, whichever part is
-    nearest; "unscaled": the same in a ball of 0.5 m. nearest: mesh vertices (released) or the surface itself, with
-    which meshes of other density mean the same. frame: of objects whose hinge is not yet along -z through the origin:
-    "axis" turns it there the shortest way; "base" turns every object further, the middle of its base to +x.
+    nearest: mesh vertices (released) or the surface itself, with which meshes of other density mean the same.
+    frame: of objects whose hinge is not yet along -z through the origin: "axis" turns it there the shortest way;
+    "base" turns every object further, the middle of its base to +x.
     """
 
     count: int = 512
     seed: int = 0
-    variant: Variant = "part"
     nearest: Nearest = "vertex"
     frame: CanonicalFrame = "axis"
 
     @property
     def places(self) -> int:
-        """How many places of an object are looked at: top part first, then the base (of variant "part")."""
+        """How many places of an object are looked at: top part first, then the base."""
         return 2 * self.count
 
     def points(self) -> np.ndarray:
-        """(count or 2 count, 3) float64 basis points, in the unit ball, or within 0.5 m (unscaled)."""
+        """(count, 3) float64 basis points in the unit ball."""
         draws = np.random.default_rng(self.seed)
-        number = self.count if self.variant == "part" else self.places
-        ways = draws.normal(size=(number, 3))
-        ways *= draws.uniform(size=(number, 1)) ** (1 / 3) / np.linalg.norm(ways, axis=1, keepdims=True)
-        return ways * (UNSCALED_RADIUS_M if self.variant == "unscaled" else 1.0)
+        ways = draws.normal(size=(self.count, 3))
+        ways *= draws.uniform(size=(self.count, 1)) ** (1 / 3) / np.linalg.norm(ways, axis=1, keepdims=True)
+        return ways
 
 
 class Seen(NamedTuple):
@@ -134,7 +129,7 @@ class PartBps:
 
     def __init__(self, model: ObjectModel, settings: BasisSettings) -> None:
         self.model, self.settings = model, settings
-        self.scale = 1.0 if settings.variant == "unscaled" else object_scale(model)
+        self.scale = object_scale(model)
         self.points_m = settings.points() / self.scale
         self.vertices = {part: _PartVertices(model, part, self.points_m) for part in model.parts}
         surfaces = surface_index(model).filled if settings.nearest == "surface" else {}
@@ -144,15 +139,12 @@ class PartBps:
         """The nearest places at hinge angles (frame,), zeros for a rigid object."""
         angles = np.asarray(hinge_rad, np.float64)
         found = {part: self._of_part(part, angles) for part in self.model.parts}
-        points, there = self.points_m, np.ones(self.settings.places, bool)
-        if self.settings.variant == "part":
-            nothing = np.zeros((len(angles), *points.shape)), np.full((len(angles), len(points)), -1, np.int32)
-            both = [found.get(part, nothing) for part in (1, 0)]
-            place, vertex = (np.concatenate(kind, axis=1) for kind in zip(*both, strict=True))
-            points, there = np.tile(points, (2, 1)), np.repeat([part in found for part in (1, 0)], len(points))
-        else:
-            place, vertex = _nearer(points, list(found.values()))
-        offset = np.where(there[:, None], (place - points) * self.scale, 0.0)
+        shape = len(angles), len(self.points_m)
+        nothing = np.zeros((*shape, 3)), np.full(shape, -1, np.int32)
+        both = [found.get(part, nothing) for part in (1, 0)]
+        place, vertex = (np.concatenate(kind, axis=1) for kind in zip(*both, strict=True))
+        there = np.repeat([part in found for part in (1, 0)], shape[1])
+        offset = np.where(there[:, None], (place - np.tile(self.points_m, (2, 1))) * self.scale, 0.0)
         return Seen(place.astype(np.float32), offset.astype(np.float32), vertex, there)
 
     def nearest_m(self, positions_m: np.ndarray, hinge_rad: np.ndarray) -> np.ndarray:
@@ -166,8 +158,9 @@ class PartBps:
                 place = _on_surface(self.surfaces[part], asked)
             else:
                 place = own.vertices_m[own.tree.query(asked)[1]]
-            found.append((object_from_part @ place, np.zeros(positions.shape[:2], np.int32)))
-        return _nearer(positions, found)[0]
+            found.append(object_from_part @ place)
+        nearest = np.argmin([((place - positions) ** 2).sum(-1) for place in found], axis=0)
+        return np.take_along_axis(np.stack(found), nearest[None, ..., None], axis=0)[0]
 
     def _of_part(self, part: int, hinge_rad: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Nearest places (frame, point, 3) of one part, and which vertices (frame, point) they are."""
@@ -182,15 +175,6 @@ class PartBps:
             vertex = np.full(asked.shape[:2], -1, np.int32)
         shape = len(hinge_rad), len(self.points_m)
         return np.broadcast_to(object_from_part @ place, (*shape, 3)), np.broadcast_to(vertex, shape)
-
-
-def _nearer(points_m: np.ndarray, found: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """Of what each part offers, places and vertices, the nearer to each point."""
-    place, vertex = found[0]
-    for other, other_vertex in found[1:]:
-        closer = ((other - points_m) ** 2).sum(-1) < ((place - points_m) ** 2).sum(-1)
-        place, vertex = np.where(closer[..., None], other, place), np.where(closer, other_vertex, vertex)
-    return place, vertex
 
 
 def _on_surface(surface: PartSurface, positions_m: np.ndarray) -> np.ndarray:

@@ -34,7 +34,5 @@ class SensorSettings:
     touching_m: float = 0.001
 
 
-RELEASED = SensorSettings()
-OURS = RELEASED
-PAPER = replace(RELEASED, ambient_turn="wrist", depth_m=0.1, inside="backward", behind_m=0.1, touching_m=0.0)
-PRESETS = {"ours": OURS, "paper": PAPER, "released": RELEASED}
+OURS = SensorSettings()  # as the release defines them
+PAPER = replace(OURS, ambient_turn="wrist", depth_m=0.1, inside="backward", behind_m=0.1, touching_m=0.0)

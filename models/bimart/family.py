@@ -19,16 +19,14 @@ from hoidata.metrics.asked import AskedDistances
 from hoidata.refinement import GeneratedHand, RefinementSettings, fit_hands, refine_hands
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
-from models.bimart.contact_training import CONTACT
 from models.bimart.diagnostics import diagnose
-from models.bimart.lookups import moved_hands, training_clips
-from models.bimart.motion_training import MOTION
+from models.bimart.learning import CONTACT, MOTION
+from models.bimart.lookups import training_clips
 from models.bimart.network import MotionModel
 from models.bimart.sampler import BimArt, Made, Path, preset_of, sampling_of
 from models.bimart.scene import Scene
-from models.common.checkpoints import FILE_NAME, load_checkpoint
+from models.common.checkpoints import load_checkpoint
 from models.common.family import Family, Figures, LeftOut, Sources, motion_clip, refuse_not_finite
-from models.common.features import proper_hands
 
 NO_OBJECT_MOTION = "it makes hands for the motion of an object, and none was given"
 NO_OTHER = {"other path": "no training clip of its object", "other object": "all training clips are of its object"}
@@ -43,7 +41,7 @@ class FamilyConfig:
     refined: hands are refined against the object after they are fitted.
     """
 
-    preset: Literal["ours", "paper", "released"] | None = None
+    preset: Literal["ours", "paper"] | None = None
     sampling: Mapping[str, Any] = field(default_factory=dict)
     refined: bool = True
     refinement: RefinementSettings = field(default_factory=RefinementSettings)
@@ -62,16 +60,13 @@ class HandsForPaths:
 
     @classmethod
     def load(cls, sources: Sources, refined: bool = True, change: Change = "none") -> "HandsForPaths":
-        """Without contact maps (MDM) there need be no contact model."""
         config = build_config(FamilyConfig, sources.settings.get("bimart"), "params.yaml: sample.bimart")
         motion = load_checkpoint(sources.checkpoints / MOTION.name, MOTION, sources.device)
         assert isinstance(motion.network, MotionModel)
         preset = config.preset or preset_of(motion.network.config)
         sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
         sampling = replace(sampling, with_map=sampling.with_map and change != "no map")
-        folder = sources.checkpoints / CONTACT.name
-        has_contact = sampling.with_map or (folder / FILE_NAME).is_file()
-        contact = load_checkpoint(folder, CONTACT, sources.device) if has_contact else None
+        contact = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
         model = BimArt.of(contact, motion, sampling, sources.device)
         synthetic = bool(motion.facts["synthetic"])
         config = replace(config, refined=config.refined and refined)
@@ -97,8 +92,7 @@ class HandsForPaths:
             self.clip(request, found[row]) if row in found else LeftOut(request.motion_id, self._why_not(request))
             for row, request in enumerate(requests)
         ]
-        told = self.model.config.with_map and self.model.motion.config.features.between == "map"
-        told = told and self.change in ("none", "zero map")  # other places are not of this object
+        told = self.model.config.with_map and self.change in ("none", "zero map")  # other places are not of this object
         maps = [
             self.asked(request, found[row]) if told and row in found else None for row, request in enumerate(requests)
         ]
@@ -169,11 +163,7 @@ class HandsForPaths:
         }
 
     def clip(self, request: Request, made: Made) -> Clip:
-        """The hands fitted to what was made, and refined against the object; of rotations, as they were made."""
-        if self.model.motion.config.features.hands == "mano":
-            own = proper_hands(torch.from_numpy(np.concatenate((made.keypoints_m[:, :, 0], made.rest), axis=-1)))
-            moved = moved_hands(own.numpy(), self._true_scene(request).model_from_canonical)
-            return _motion_clip(request, torch.from_numpy(moved), self.synthetic)
+        """The hands fitted to what was made, and refined against the object."""
         hands, clip = self.generated(request, made), clip_without_hands(request, self.synthetic)
         ids = self.model.motion.keypoint_ids.cpu().numpy()
         tracks = fit_hands(self.pair, request.betas, ids, hands, request.template_m)
@@ -201,11 +191,7 @@ def clip_without_hands(request: Request, synthetic: bool) -> Clip:
     """The object as it is asked for, and hands that nobody has placed yet."""
     nothing = torch.zeros(2, request.n_frames, HAND_FEATURES)
     nothing[..., GLOBAL_ORIENT_6D.start :: 6] = nothing[..., GLOBAL_ORIENT_6D.start + 3 :: 6] = 1
-    return _motion_clip(request, nothing, synthetic)
-
-
-def _motion_clip(request: Request, hands: torch.Tensor, synthetic: bool) -> Clip:
-    return motion_clip(request, hands, torch.from_numpy(_path(request)), synthetic)
+    return motion_clip(request, nothing, torch.from_numpy(_path(request)), synthetic)
 
 
 def _figures(sources: Sources) -> Figures:

@@ -22,7 +22,7 @@ class Map:
     known: Tensor
 
 
-Guide = Literal["off", "released", "metres"]
+Guide = Literal["off", "paper", "metres"]
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def discrepancy(keypoints_m: Tensor, wanted: Map) -> Discrepancy:
     return Discrepancy(error * wanted.known.unflatten(-1, (2, -1)), nearest.reshape(shape), away.reshape(*shape, 3))
 
 
-def released_step(keypoints_m: Tensor, wanted: Map, scale: Tensor, window: int) -> Tensor:
+def paper_step(keypoints_m: Tensor, wanted: Map, scale: Tensor, window: int) -> Tensor:
     """(B, F, 2, J, 3) the step of eq. 6 in normalised numbers: the gradient of the mean square, made of length 1.
 
     scale: (2, J, 3) metres of a normalised number. A path longer than a window takes the step every window would.

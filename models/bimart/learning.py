@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,10 +13,10 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair
 from hoidata.sensors.keypoints import hand_keypoints
-from models.bimart.network import ContactModel, Denoiser, MotionModel, Windows
+from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Windows, contact_channels
 from models.bimart.scene import Recorded, recorded_clip
 from models.bimart.windows import Asked, windows_of
-from models.common.family import Losses, Setup
+from models.common.family import Losses, Network, Setup
 from models.common.losses import masked_mean
 from models.common.sampling import TRAIN_STEPS, add_noise
 
@@ -30,19 +29,14 @@ JUMP_M, JUMP_RAD, HINGE_JUMP_RAD, HAND_JUMP_M = 0.04, 0.3, 0.2, 0.05
 
 @dataclass(frozen=True)
 class LossConfig:
-    """windows: drawn of every clip of a batch. skip_first, skip_last: frames at the ends of a clip in which no window
-    starts (the release: 100, and 100 after the end of the last window). contact_dropout: how often a contact map is not
-    told; per "window", or the whole "batch" alike (released). velocity_weight: of the same error of differences between
-    frames. error: "square", or "absolute" (OMOMO).
+    """windows: drawn of every clip of a batch. contact_dropout: share of windows that are given no contact map.
+
+    velocity_weight: of the same error of differences between frames.
     """
 
     windows: int = 1
-    skip_first: int = 0
-    skip_last: int = 0
     contact_dropout: float = 0.5
-    dropout_of: Literal["window", "batch"] = "window"
     velocity_weight: float = 0.0
-    error: Literal["square", "absolute"] = "square"
 
 
 @dataclass(frozen=True)
@@ -61,10 +55,9 @@ class Targets:
         return Targets(told.to(device), *(send(own, device) for own in others))
 
 
-def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:
+def window_starts(clip: Recorded, length: int) -> np.ndarray:
     """First frames of a clip's windows, none across a jump; a clip that is too short has one, or none."""
-    last = max(len(clip.scene) - length, 0)
-    starts = np.arange(min(loss.skip_first, last), max(last - loss.skip_last, min(loss.skip_first, last)) + 1)
+    starts = np.arange(max(len(clip.scene) - length, 0) + 1)
     jumps = np.append(0, np.cumsum(_is_jump(clip)))
     stops = np.minimum(starts + length, len(clip.scene)) - 1
     return starts[jumps[stops] == jumps[starts]]
@@ -72,7 +65,7 @@ def window_starts(clip: Recorded, length: int, loss: LossConfig) -> np.ndarray:
 
 def middle_start(clip: Recorded, length: int) -> list[int]:
     """First frame of the window nearest to the middle of a clip; none where every one crosses a jump."""
-    starts, middle = window_starts(clip, length, LossConfig()), max(len(clip.scene) - length, 0) // 2
+    starts, middle = window_starts(clip, length), max(len(clip.scene) - length, 0) // 2
     return starts[np.argsort(np.abs(starts - middle), kind="stable")[:1]].tolist()
 
 
@@ -108,7 +101,7 @@ class Objective:
         train = setup.corpus.train
         features = network.config.features
         self.clips = {own: recorded_clip(train.whole(own), pair, features) for own in train.ids}
-        self.starts = {own: window_starts(clip, self.length, self.loss) for own, clip in self.clips.items()}
+        self.starts = {own: window_starts(clip, self.length) for own, clip in self.clips.items()}
         network.keypoint_ids.copy_(torch.from_numpy(hand_keypoints(pair.right, features.keypoints)))
         learn_statistics(network, self._every_window())
         self.network = network.to(setup.device)
@@ -157,13 +150,11 @@ def window_losses(network: Denoiser, target: Targets, loss: LossConfig, generato
     batch, count = len(clean), network.config.diffusion_steps
     number = torch.randint(count, (batch,), generator=generator)
     steps = send((number + 1) * (TRAIN_STEPS // count) - 1, device)
-    drop = torch.rand(batch, generator=generator) < loss.contact_dropout
-    drop = send(drop if loss.dropout_of == "window" else drop[:1].expand(batch), device)
+    drop = send(torch.rand(batch, generator=generator) < loss.contact_dropout, device)
     noise = send(torch.randn(clean.shape, generator=generator), device)
     made = network(add_noise(clean, noise, steps, network.signal), steps, target.windows, drop)
     wrong = (made - clean) / network.config.signal_scale
-    size = wrong.square() if loss.error == "square" else wrong.abs()
-    found = {"simple": masked_mean(size, target.known)}
+    found = {"simple": masked_mean(wrong.square(), target.known)}
     total = found["simple"]
     if loss.velocity_weight:
         found["velocity"] = masked_mean(wrong.diff(dim=1).square(), target.known[:, 1:] & target.known[:, :-1])
@@ -189,7 +180,7 @@ def targets_of(network: Denoiser, drawn: Sequence[tuple[Recorded, int]]) -> Targ
     motion = [clip.motion[own] for (clip, _), own in zip(drawn, rows, strict=True)]
     clean = contact_m if isinstance(network, ContactModel) else _padded(motion, length)
     present = _padded([clip.present[:, own].T for (clip, _), own in zip(drawn, rows, strict=True)], length).bool()
-    mapped = present.repeat_interleave(config.features.told_size, 2) & network.told_channels(windows)
+    mapped = present.repeat_interleave(config.features.places, 2) & contact_channels(windows)
     known = mapped
     if isinstance(network, MotionModel):
         known = config.features.of_hands(present) & network.channel_mask(windows)
@@ -228,7 +219,7 @@ def learn_statistics(network: Denoiser, every: Sequence[tuple[Recorded, int]], a
         "contact": [slice(None)],
     }
     if isinstance(network, MotionModel):
-        groups[""] = [slice(0, 6 * features.points), slice(6 * features.points, None)]
+        groups[""] = [slice(0, 6 * features.keypoints), slice(6 * features.keypoints, None)]
     for name, moments in sums.items():
         mean, spread = moments.found()
         for own in groups[name]:
@@ -261,3 +252,12 @@ class Moments:
         mean = self.total / self.count.clamp_min(1)
         spread = (self.squares / self.count.clamp_min(1) - mean.square()).clamp_min(0).sqrt()
         return mean, torch.where(self.count > 0, spread, 1.0)
+
+
+def _network(name: str, build: type[Denoiser]) -> Network:
+    return Network(
+        name, DenoiserConfig, build, lambda setup: (Objective(setup, build(setup.network)), None), LossConfig
+    )
+
+
+CONTACT, MOTION = _network("bimart-contact", ContactModel), _network("bimart-motion", MotionModel)

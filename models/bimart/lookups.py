@@ -50,7 +50,7 @@ def moved_hands(hands: np.ndarray, frame: RigidTransform) -> np.ndarray:
 def told(scene: Scene) -> np.ndarray:
     """(frame, number) what a network is told of each frame: O, local G, scale."""
     scale = np.full((len(scene), 1), scene.scale)
-    own = scene.offset.reshape(len(scene), -1), scene.state("local", "first", 0, len(scene)), scale
+    own = scene.offset.reshape(len(scene), -1), scene.state("local", 0, len(scene)), scale
     return np.concatenate(own, axis=1)
 
 

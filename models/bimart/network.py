@@ -20,11 +20,10 @@ from models.common.transformer import Encoder, TransformerConfig, attention_mask
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """The defaults are the release's sizes. encoder: widths of the hidden layers of both encoders, of object and map.
+    """The defaults are the paper's. encoder: widths of the hidden layers of both encoders, of object and map.
 
-    latents: of object and contact are added to a token ("sum", released), or half its width each ("concatenate",
-    paper), or one encoder sees both ("joint"), which can tell where on the object a value of the map belongs.
-    untold: what stands for a map that is not told, learnt for every frame of a window (released), or one for all.
+    latents: of object and contact have half a token's width each ("concatenate", paper), or one encoder sees both
+    ("joint"), which can tell where on the object a value of the map belongs.
     told: which hands take part is told, and the others neither enter nor are made. diffusion_steps: of the 1,000 those
     that are trained; 50 are walked one by one, 1,000 by any sampler. position_dropout: of tokens with their positions.
     floor: no number counts as varying less than this share of the mean spread of its kind. knot_frames: what is made
@@ -35,8 +34,7 @@ class DenoiserConfig:
     features: FeatureConfig = field(default_factory=FeatureConfig)
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     encoder: tuple[int, ...] = (1024, 1024)
-    latents: Literal["sum", "concatenate", "joint"] = "sum"
-    untold: Literal["window", "frame"] = "window"
+    latents: Literal["concatenate", "joint"] = "concatenate"
     told: bool = False
     diffusion_steps: int = 50
     position_dropout: float = 0.1
@@ -117,7 +115,7 @@ class Denoiser(nn.Module):
         if with_contact:
             told = features.contact_size if self.is_joint else latent
             self.contact_in = nn.Identity() if self.is_joint else _layers(features.contact_size, config.encoder, latent)
-            self.null = nn.Parameter(0.02 * torch.randn(features.window if config.untold == "window" else 1, told))
+            self.null = nn.Parameter(0.02 * torch.randn(1, told))
         self.encoder, self.drop = Encoder(config.transformer), nn.Dropout(config.position_dropout)
         for name, count in (("input", features.scene_size), ("", size), ("contact", features.contact_size)):
             self.register_buffer(f"{name}_mean".strip("_"), torch.zeros(count))
@@ -129,13 +127,6 @@ class Denoiser(nn.Module):
     def channel_mask(self, windows: Windows) -> Tensor:
         """(B, F, D) bool: numbers of hands and parts that are there, in frames that are."""
         raise NotImplementedError
-
-    def told_channels(self, windows: Windows) -> Tensor:
-        """(B, F, contact_size) bool: values of a contact map that are there, or joints of hands that take part."""
-        if self.config.features.between == "map":
-            return contact_channels(windows)
-        hands = windows.hands.bool().repeat_interleave(self.config.features.told_size, 1)
-        return hands[:, None] & windows.frames[..., None]
 
     def forward(self, x: Tensor, steps: Tensor, windows: Windows, drop: Tensor | None = None) -> Tensor:
         """Clean numbers (B, F, D) of noised ones at timesteps (B,); drop: (B,) bool, told no contact map."""
@@ -171,15 +162,14 @@ class Denoiser(nn.Module):
         """(B, F, width) what a frame's token is told of its object, and of its contact map where that is known."""
         if not self.with_contact:
             return self.object_in(seen)
-        contact = self.null[: seen.shape[1]].expand(*seen.shape[:2], -1)
+        contact = self.null.expand(*seen.shape[:2], -1)
         if known:
             assert windows.contact_m is not None
             normalised = (windows.contact_m - self.contact_mean) / self.contact_scale
-            contact = self.contact_in(normalised * self.told_channels(windows))
+            contact = self.contact_in(normalised * contact_channels(windows))
         if self.is_joint:
             return self.object_in(torch.cat((seen, contact), -1))
-        latent = self.object_in(seen)
-        return latent + contact if self.config.latents == "sum" else torch.cat((latent, contact), -1)
+        return torch.cat((self.object_in(seen), contact), -1)
 
     def denoise(self, x: Tensor, steps: Tensor, known: Prepared, tokens: Tensor) -> Tensor:
         """``forward`` with what is prepared; tokens: its conditional or unconditional ones."""
@@ -209,17 +199,17 @@ class Denoiser(nn.Module):
 
 
 class ContactModel(Denoiser):
-    """Makes contact maps (B, F, 2N), or joints: of the left hand, then of the right (Sec. 3.2)."""
+    """Makes contact maps (B, F, 2N): of the left hand, then of the right (Sec. 3.2)."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__(config, config.features.contact_size, with_contact=False)
 
     def channel_mask(self, windows: Windows) -> Tensor:
-        return self.told_channels(windows)
+        return contact_channels(windows)
 
 
 class MotionModel(Denoiser):
-    """Makes positions and what goes with them (B, F, motion_size) for contact maps, or joints (Sec. 3.3)."""
+    """Makes keypoints and vectors to the object (B, F, motion_size) for contact maps (Sec. 3.3)."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__(config, config.features.motion_size, with_contact=True)

@@ -55,7 +55,7 @@ class RefinedWindow:
         scene = Scene.of(request.object, request.trajectories.object[: request.n_frames], BASIS)
         windows = [(self._recorded(request, number), frames) for number, frames in self.nearest.windows(request, scene)]
         keypoints = np.concatenate([clip.keypoints_m[:, frames] for clip, frames in windows], axis=1)
-        ways = np.concatenate([clip.rest[:, frames] for clip, frames in windows], axis=1).reshape(keypoints.shape)
+        ways = np.concatenate([clip.to_object_m[:, frames] for clip, frames in windows], axis=1)
         near = np.linalg.norm(ways, axis=-1).min(axis=-1) < IDLE_M
         world = world_from_canonical(request, scene)
         return {

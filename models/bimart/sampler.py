@@ -13,12 +13,10 @@ from torch import Tensor
 
 from hoidata.devices import send
 from hoidata.errors import BadInput
-from hoidata.objects.model import articulate
-from hoidata.sensors.part_bps import distance_map
 from hoidata.settings import build_config
-from models.bimart.guidance import Guide, Map, combined, metre_step, released_step
+from models.bimart.guidance import Guide, Map, combined, metre_step, paper_step
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Prepared, Windows
-from models.bimart.scene import Anchor, FeatureConfig, Scene, split_motion
+from models.bimart.scene import FeatureConfig, Scene, split_motion
 from models.bimart.windows import Asked, Layout, layout_of, windows_of
 from models.common.checkpoints import Checkpoint
 from models.common.sampling import SamplerConfig, sample
@@ -40,8 +38,7 @@ class SamplingConfig:
 
     rule: of that guidance. with_map: motions are told contact maps. guide: contact-map guidance, in the last
     ``guide_share`` of the steps. overlapping: windows of a path share their frames at every step; else they are made
-    apart and put side by side. contact_anchor: of G for the contact model, otherwise than it learnt (released:
-    "before"). hold_m: joints of the first network that come so near to the object stay there, on its part (OMOMO).
+    apart and put side by side.
     """
 
     sampler: WalkConfig = field(default_factory=WalkConfig)
@@ -50,14 +47,11 @@ class SamplingConfig:
     guide: Guide = "metres"
     guide_share: float = 1 / 3
     overlapping: bool = True
-    contact_anchor: Anchor | None = None
-    hold_m: float = 0.0
 
 
 OURS = SamplingConfig()
-PAPER = SamplingConfig(WalkConfig("ddpm", 50, 0.5), rule="paper", guide="released", guide_share=1.0, overlapping=False)
-RELEASED = replace(PAPER, rule="usual", contact_anchor="before")
-PRESETS = {"ours": OURS, "paper": PAPER, "released": RELEASED}
+PAPER = SamplingConfig(WalkConfig("ddpm", 50, 0.5), rule="paper", guide="paper", guide_share=1.0, overlapping=False)
+PRESETS = {"ours": OURS, "paper": PAPER}
 
 
 def sampling_of(preset: str, told: Mapping[str, Any], where: str) -> SamplingConfig:
@@ -70,8 +64,8 @@ def sampling_of(preset: str, told: Mapping[str, Any], where: str) -> SamplingCon
 
 
 def preset_of(config: DenoiserConfig) -> str:
-    """The preset that a network's settings are of: what sets the three apart."""
-    return "ours" if config.told else "paper" if config.untold == "frame" else "released"
+    """The preset that a network's settings are of."""
+    return "ours" if config.told else "paper"
 
 
 @dataclass(frozen=True)
@@ -85,40 +79,32 @@ class Path:
 
 @dataclass(frozen=True)
 class Made:
-    """Canonical frame, metres. contact_m: (frame, 2 x places) wanted distances, or joints. keypoints_m: (side, frame,
-    point, 3), or joints; rest: (side, frame, number) ways from them to the object, or rotations. active: (side, frame)
-    near the object.
+    """Canonical frame, metres. contact_m: (frame, 2 x places) wanted distances. keypoints_m and to_object_m, vectors
+    from them to the object: (side, frame, keypoint, 3). active: (side, frame) near the object.
     """
 
     contact_m: np.ndarray
     keypoints_m: np.ndarray
-    rest: np.ndarray
+    to_object_m: np.ndarray
     active: np.ndarray
-
-    @property
-    def to_object_m(self) -> np.ndarray:
-        """(side, frame, keypoint, 3) ways from keypoints to the object."""
-        return self.rest.reshape(self.keypoints_m.shape)
 
 
 @dataclass(frozen=True)
 class BimArt:
-    """Both trained networks, ready to answer. contact: None where motions are told no map."""
+    """Both trained networks, ready to answer."""
 
-    contact: ContactModel | None
+    contact: ContactModel
     motion: MotionModel
     config: SamplingConfig
     device: torch.device
 
     @classmethod
-    def of(
-        cls, contact: Checkpoint | None, motion: Checkpoint, config: SamplingConfig, device: torch.device
-    ) -> "BimArt":
+    def of(cls, contact: Checkpoint, motion: Checkpoint, config: SamplingConfig, device: torch.device) -> "BimArt":
         """Raises BadInput where the two networks do not see alike."""
-        first, second = None if contact is None else contact.network, motion.network
-        assert isinstance(first, ContactModel | None)
+        first, second = contact.network, motion.network
+        assert isinstance(first, ContactModel)
         assert isinstance(second, MotionModel)
-        own, wanted = (_seen(one.config.features) for one in (second, first or second))
+        own, wanted = (_seen(one.config.features) for one in (second, first))
         if own != wanted:
             raise BadInput("bimart-motion", f"features of its contact model, {wanted}", f"{own}", "train both alike")
         return cls(first, second, config, device)
@@ -139,24 +125,13 @@ class BimArt:
         return self._maps(paths, [torch.Generator().manual_seed(path.seed) for path in paths]).cpu().numpy()
 
     def _maps(self, paths: Sequence[Path], generators: list[torch.Generator]) -> Tensor:
-        features = self.motion.config.features
-        if self.contact is None:
-            return torch.zeros(len(paths), len(paths[0].scene), features.contact_size, device=self.device)
         drawn = self.contact.decode(self._walk(self.contact, paths, generators, None))
-        if features.between == "map":
-            return drawn.clamp(0, features.most_m or None) * self._known(paths)
-        rows = zip(paths, drawn.cpu().numpy(), strict=True)
-        held = [held_joints(joints, path.scene, self.config.hold_m) for path, joints in rows]
-        return torch.from_numpy(np.stack(held)).to(drawn) * self._known(paths)
+        return drawn.clamp(0, self.motion.config.features.most_m or None) * self._known(paths)
 
     def _known(self, paths: Sequence[Path]) -> Tensor:
-        """(B, frame, contact_size) bool: values of maps that are there, or joints of hands that take part."""
-        frames, features = len(paths[0].scene), self.motion.config.features
-        nothing = np.ones(features.told_size, bool)
-        there = [path.scene.there if features.between == "map" else nothing for path in paths]
-        rows = zip(paths, there, strict=True)
-        own = np.stack([np.concatenate([here & bool(hand) for hand in self._hands(path)]) for path, here in rows])
-        return torch.from_numpy(own).to(self.device)[:, None].expand(-1, frames, -1)
+        """(B, frame, 2N) bool: values of maps that are there, of hands that take part."""
+        own = np.stack([(self._hands(path)[:, None] & path.scene.there).ravel() for path in paths])
+        return torch.from_numpy(own).to(self.device)[:, None].expand(-1, len(paths[0].scene), -1)
 
     def _hands(self, path: Path) -> np.ndarray:
         return path.hands if self.motion.config.told else np.ones(2, bool)
@@ -184,8 +159,7 @@ class BimArt:
         asked = [
             Asked(path.scene, start, start + layout.length, path.hands) for path in paths for start in layout.starts
         ]
-        anchor = self.config.contact_anchor if contact_m is None else None
-        windows = windows_of(asked, layout.length, network.config, anchor).to(self.device)
+        windows = windows_of(asked, layout.length, network.config).to(self.device)
         return windows if contact_m is None else replace(windows, contact_m=layout.cut(contact_m))
 
     def _map(self, paths: Sequence[Path], contact_m: Tensor) -> Map:
@@ -218,48 +192,24 @@ class BimArt:
 
     def _pulled(self, clean: Tensor, wanted: Map) -> Tensor:
         """(B, frame, D) with its positions moved by a step of contact-map guidance; the ways to the object stay."""
-        network, half = self.motion, 6 * self.motion.config.features.points
+        network, half = self.motion, 6 * self.motion.config.features.keypoints
         scale = (network.scale[:half] / network.config.signal_scale).reshape(2, -1, 3)
         keypoints = network.decode(clean)[..., :half].unflatten(-1, (2, -1, 3))
-        if self.config.guide == "released":
-            step = released_step(keypoints, wanted, scale, network.config.features.window)
+        if self.config.guide == "paper":
+            step = paper_step(keypoints, wanted, scale, network.config.features.window)
         else:
             step = metre_step(keypoints, wanted) / scale
         return torch.cat((clean[..., :half] + step.flatten(2), clean[..., half:]), -1)
 
     def _made(self, path: Path, contact_m: np.ndarray, motion: np.ndarray) -> Made:
-        features = self.motion.config.features
-        keypoints, rest = split_motion(motion, features)
-        if features.hands == "keypoints":
-            near = np.linalg.norm(rest.reshape(keypoints.shape), axis=-1).min(axis=-1) < IDLE_M
-        else:
-            near = np.stack([distance_map(path.scene.place_m, own).min(axis=1) < IDLE_M for own in keypoints])
-        return Made(contact_m, keypoints, rest, near & self._hands(path)[:, None])
+        keypoints, to_object = split_motion(motion)
+        near = np.linalg.norm(to_object, axis=-1).min(axis=-1) < IDLE_M
+        return Made(contact_m, keypoints, to_object, near & self._hands(path)[:, None])
 
 
 def _seen(features: FeatureConfig) -> FeatureConfig:
     """What both networks of a pair must agree in."""
-    return replace(features, state="none", anchor="first", window=0, hands="keypoints")
-
-
-def held_joints(joints_m: np.ndarray, scene: Scene, within_m: float) -> np.ndarray:
-    """(frame, 2 x 21 x 3) joints that, once within so many metres of the object, stay at that place of its part.
-
-    OMOMO's contact constraint (Li et al. 2023, Sec. 3.3): frozen where a joint first comes near a vertex, to the end.
-    """
-    if not within_m:
-        return joints_m
-    model, joints = scene.bps.model, joints_m.reshape(len(joints_m), -1, 3).astype(np.float64)
-    rest, apart = [], []
-    for part, own in scene.bps.vertices.items():
-        rest.append(np.broadcast_to(model.object_from_part(part, scene.hinge_rad).inverse() @ joints, joints.shape))
-        apart.append(own.tree.query(rest[-1])[0])
-    near = np.min(apart, axis=0) < within_m
-    first, every = near.argmax(axis=0), np.arange(joints.shape[1])
-    part = np.array([own[first, every] for own in apart]).argmin(axis=0)
-    held = articulate(np.stack(rest)[part, first, every], part, model.hinge, scene.hinge_rad)
-    stays = near.any(axis=0) & (np.arange(len(joints))[:, None] >= first)
-    return np.where(stays[..., None], held, joints).reshape(joints_m.shape).astype(joints_m.dtype)
+    return replace(features, state="local", window=0)
 
 
 def _plain(network: Denoiser, known: Prepared, layout: Layout) -> Callable[[Tensor, Tensor], Tensor]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from models.bimart.network import DenoiserConfig, Windows
-from models.bimart.scene import Anchor, Scene
+from models.bimart.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -63,18 +63,14 @@ class Asked:
     hands: np.ndarray
 
 
-def windows_of(asked: Sequence[Asked], length: int, config: DenoiserConfig, anchor: Anchor | None = None) -> Windows:
-    """What a network is told of windows, padded to ``length``. anchor: of G, otherwise than the network learnt it."""
-    features = config.features
+def windows_of(asked: Sequence[Asked], length: int, config: DenoiserConfig) -> Windows:
+    """What a network is told of windows, padded to ``length``."""
 
     def padded(rows: np.ndarray) -> np.ndarray:
         return np.concatenate((rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)))
 
     stops = [min(one.stop, len(one.scene)) for one in asked]
-    states = [
-        one.scene.state(features.state, anchor or features.anchor, one.start, stop)
-        for one, stop in zip(asked, stops, strict=True)
-    ]
+    states = [one.scene.state(config.features.state, one.start, stop) for one, stop in zip(asked, stops, strict=True)]
     offsets = [
         one.scene.offset[one.start : stop].reshape(stop - one.start, -1) for one, stop in zip(asked, stops, strict=True)
     ]

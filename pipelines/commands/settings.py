@@ -18,7 +18,6 @@ SECTIONS = {
     "evaluator": "models.evaluator.settings:EvaluatorSettings",
     "evaluate": "pipelines.stages.evaluate:EvaluateSettings",
     "controls": "pipelines.stages.controls:ControlSettings",
-    "tables": "pipelines.stages.table_rows:TableSettings",
 }
 
 

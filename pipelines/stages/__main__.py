@@ -28,9 +28,6 @@ STAGES = (
     "sample",
     "evaluate",
     "controls",
-    "table_networks",
-    "table_rows",
-    "tables",
     "report",
 )
 

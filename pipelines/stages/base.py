@@ -62,11 +62,6 @@ class StagePaths:
     samples = _At("samples/{profile}/{dataset}/{family}")
     metrics = _At("metrics/{profile}/{dataset}/{family}.json")
     report = _At("report/{profile}")
-    table_networks = _At("tables/{profile}/{dataset}/networks/{family}")
-    table_network = _At("tables/{profile}/{dataset}/networks/{family}/{model}")
-    table_training = _At(".hoidata/training/{profile}/{dataset}/{family}/{model}")
-    table_rows = _At("tables/{profile}/{dataset}/rows/{family}")
-    tables = _At("tables/{profile}/{dataset}/tables.md")
 
     @property
     def is_generated(self) -> bool:

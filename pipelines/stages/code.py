@@ -13,7 +13,7 @@ from typing import Any
 from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from models.registry import IF_LISTED, IN_TABLES, LISTED_AS, NETWORKS, family_module, family_names, network_modules
+from models.registry import IF_LISTED, LISTED_AS, NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.params import chosen_params, read_file, read_params
 from pipelines.stages.base import StagePaths, write_json
@@ -31,10 +31,6 @@ READERS = {
 
 # Sections of params.yaml that hold a key per dataset. It may be absent, which DVC does not allow of a parameter.
 SECTIONS_OF_DATASETS = {"convert": ("convert", "adapters"), "split": ("split",)}
-
-
-# Rows of BimArt's tables; those of its controls are in the modules of these.
-TABLE_FAMILIES = ("bimart", "nearest-window", "nearest-window-refined", "cams-b", "ground-truth", "hands-still")
 
 
 @dataclass(frozen=True)
@@ -101,10 +97,6 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
     rows = (params.get("controls") or {}).get("families") or []
     found["controls"] = _start("controls", every | _families([family_module(family) for family in rows]))
-    tables = [*map(family_module, TABLE_FAMILIES), *(module for one in IN_TABLES for module in network_modules(one))]
-    found |= {stage: _start(stage, every | _families(tables)) for stage in ("table_rows", "tables")}
-    for network in IN_TABLES:
-        found[f"table_networks/{network}"] = _start("table_networks", every | _families(network_modules(network)))
     every |= _families([family_module(family) for family in params["families"]])
     return found | {stage: _start(stage, every) for stage in ("evaluator", "evaluate", "report")}
 
@@ -152,11 +144,6 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
     section = params.get(stage) or {}
     if stage == "train":
         return section.get("seed"), *_trained(section, of)
-    if stage == "table_networks":
-        return _trained(params["train"], of)
-    tables = params.get("tables") or {}
-    if stage in ("table_rows", "tables"):  # the latter reads what the former wrote
-        return (params.get("sample"), tables.get("samples"), tables.get("clips")) if stage == "table_rows" else None
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
     return (section, params.get("sample"), params.get("evaluate")) if stage == "controls" else section

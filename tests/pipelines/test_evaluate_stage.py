@@ -48,7 +48,7 @@ def test_lists_of_figures_are_computed_where_params_name_them(clips):
     Path("params.yaml").write_text("{profile: embedded, evaluate: {metrics: [bimart]}}")
     evaluate.run(PATHS)
     figures = json.loads(PATHS.metrics.read_text())["figures"]
-    assert (figures["contact_f1"], figures["bimart_con_paper"], figures["cams_pen_corrected"]) == (1, 100, 0)
+    assert (figures["contact_f1"], figures["bimart_con_paper"], figures["bimart_pen_1cm_corrected"]) == (1, 100, 0)
     Path("params.yaml").write_text("{profile: embedded, evaluate: {metrics: [omomo]}}")
     with pytest.raises(BadInput, match=r"evaluate.metrics: expected names of bimart, got omomo"):
         evaluate.run(PATHS)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipelines.stages import evaluator, table_networks, train
+from pipelines.stages import evaluator, train
 from pipelines.stages.base import StagePaths
 
 PROJECT = Path(__file__).parents[2]
@@ -45,9 +45,8 @@ def killed(run: Callable[[StagePaths], None], paths: StagePaths) -> None:
     [
         (train.run, StagePaths("embedded", "grab", "length"), "checkpoints"),
         (evaluator.run, StagePaths("embedded", "grab"), "evaluators"),
-        (table_networks.run, StagePaths("embedded", "arctic", "cams-b", "cams-0"), "tables"),
     ],
-    ids=["train", "evaluator", "table_networks"],
+    ids=["train", "evaluator"],
 )
 def test_a_killed_training_leaves_nothing_beside_its_output(
     project: Path, monkeypatch: pytest.MonkeyPatch, run: Callable[[StagePaths], None], paths: StagePaths, out: str

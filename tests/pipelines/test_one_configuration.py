@@ -31,7 +31,7 @@ THRESHOLD_M = {"wide": 0.02, "narrow": 0.01}
 SHIFT_M = np.float32([0.006, 0.004, 0.004])
 RULE = {"by": "subject", "train": "rest", "validation": ["s9"], "test": ["s10"]}
 # Named for the user although the library's default is the same: readers look for it here.
-SHOWN_ON_PURPOSE = {"annotate.encoder", "tables.datasets"}  # dvc.yaml reads the latter
+SHOWN_ON_PURPOSE = {"annotate.encoder"}
 # Constants that are as large as a contact threshold and mean something else.
 OTHER_LENGTHS = {
     "LONGEST_EDGE_M", "STAND_RADIUS_M", "LARGEST_DISTANCE_M", "REACH_M", "HANDS_BELOW", "TOUCH_M",

@@ -382,11 +382,3 @@ def test_the_list_costs_nothing_until_it_is_asked_for(write_annotated, moved, tm
 def test_names_and_titles_of_all_lists_are_different():
     rows = [*METRICS, *(row for rows in ASKED_LISTS.values() for row in rows)]
     assert len({row.name for row in rows}) == len({row.title for row in rows}) == len(rows)
-
-
-def test_figures_at_borders_stand_over_those_elsewhere():
-    values = np.ones((20, 5))
-    assert bimart.border_ratios(values, [10]) == 1
-    values[9:12] = 4
-    assert bimart.border_ratios(values, [10]) == 4
-    assert np.isnan(bimart.border_ratios(values, []))

@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear
 
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
-from hoidata.metrics import motion, touch, two_hands
+from hoidata.metrics import motion, touch
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.objects.distance import volume_m3
 from hoidata.objects.solid import patched_holes
@@ -176,15 +176,15 @@ def capsules(start, end, radius) -> Capsules:
 )
 def test_depth_of_two_capsules_is_the_sum_of_their_radii_less_the_distance_of_their_axes(start, end, depth):
     one, other = capsules([(0, 0, -1)], [(0, 0, 1)], [0.2]), capsules([start], [end], [0.3])
-    assert two_hands.depth_m(one, other) == pytest.approx([depth])
-    assert two_hands.depth_m(other, one) == pytest.approx([depth])
+    assert touch.depth_m(one, other) == pytest.approx([depth])
+    assert touch.depth_m(other, one) == pytest.approx([depth])
 
 
 def test_axes_of_any_direction_are_as_far_apart_as_a_search_finds():
     draw = np.random.default_rng(3)
     for _ in range(20):
         a, b, c, d = draw.normal(size=(4, 3))
-        found = 9 - two_hands.depth_m(capsules([a], [b], [4]), capsules([c], [d], [5]))
+        found = 9 - touch.depth_m(capsules([a], [b], [4]), capsules([c], [d], [5]))
         along = lsq_linear(np.stack([b - a, c - d], axis=1), c - a, bounds=(0, 1)).x
         far = np.linalg.norm(a + along[0] * (b - a) - c - along[1] * (d - c))
         assert found == pytest.approx([far], abs=1e-6)
@@ -196,9 +196,9 @@ def test_hands_are_measured_against_each_other_where_both_act(make_clip, moved, 
     between = clip.hands["right"].wrist_m - clip.hands["left"].wrist_m
     hands = clip.hands | {"left": replace(clip.hands["left"], wrist_m=clip.hands["left"].wrist_m + between)}
     crossed = replace(clip, hands=hands)
-    assert two_hands.hand_hand_mm(pair_of(apart, clip, "both"), 3).tolist() == [0.0] * 3
-    assert two_hands.hand_hand_mm(pair_of(crossed, clip, "both"), 3).min() > 5
-    assert len(two_hands.hand_hand_mm(pair_of(crossed, clip, "right"), 3)) == 0
+    assert touch.hand_hand_mm(pair_of(apart, clip, "both"), 3).tolist() == [0.0] * 3
+    assert touch.hand_hand_mm(pair_of(crossed, clip, "both"), 3).min() > 5
+    assert len(touch.hand_hand_mm(pair_of(crossed, clip, "right"), 3)) == 0
 
 
 # --- jitter and controls

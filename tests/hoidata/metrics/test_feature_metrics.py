@@ -9,7 +9,8 @@ import pytest
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
 from hoidata.metrics.feature_distances import TOO_SMALL, fid_frechet, fid_paired, frechet_distance, kid
 from hoidata.metrics.feature_measures import ranks
-from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_figures, feature_findings
+from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_findings
+from hoidata.metrics.feature_sets import FeatureFigure
 from hoidata.metrics.majority import majority_rows
 from hoidata.metrics.unmeasured import Unmeasured
 
@@ -35,6 +36,11 @@ def encoded(features, samples=1, encoder="corrected", seed=0, **changes) -> Enco
         np.array([f"sequence {number // 2}" for number in clip]),
     )
     return replace(made, **changes)
+
+
+def feature_figures(*sets) -> dict[str, FeatureFigure]:
+    """What ``feature_findings`` gives, without figures that could not be measured."""
+    return {name: own for name, own in feature_findings(*sets).items() if isinstance(own, FeatureFigure)}
 
 
 def normal(rows, size=4, seed=0, shift=0.0) -> np.ndarray:

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from hoidata.clips.clip import SIDES
-from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints, track_vertices
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands import TIP_VERTICES, load_embedded_hands, track_joints, track_rotmats, track_vertices
 from hoidata.physics.mano_capsules import hand_capsules
-from hoidata.sensors.mano_hand import N_SENSORS, canonical_axes, mano_hand, mano_state_inputs, sensor_vertices
+from hoidata.sensors.mano_hand import N_SENSORS, canonical_axes, mano_hand, sensor_vertices
 
 HANDS = load_embedded_hands()
 
@@ -29,8 +30,9 @@ def track(frames: int = 7, template_m: np.ndarray | None = None) -> SimpleNamesp
 def test_joints_tips_sensors_and_capsules_are_those_of_the_model(side, personal):
     moved = track(template_m=HANDS[side].template_m * 1.1 if personal else None)
     hand = mano_hand(HANDS, side, moved.betas[0], moved.template_m)
-    world_from_wrist, fingers = mano_state_inputs(moved)
-    found = hand.state(fingers).placed(world_from_wrist)
+    rotmats = track_rotmats(moved)
+    fingers = rotmats[:, 1:]
+    found = hand.state(fingers).placed(RigidTransform(rotmats[:, 0], moved.wrist_m))
     vertices = track_vertices(moved, HANDS[side])
     np.testing.assert_allclose(found.joint_m, track_joints(moved, HANDS[side])[:, :16], atol=1e-6)
     np.testing.assert_allclose(found.tip_m, vertices[:, list(TIP_VERTICES)], atol=1e-6)
@@ -42,7 +44,7 @@ def test_joints_tips_sensors_and_capsules_are_those_of_the_model(side, personal)
 
 def test_the_left_hand_of_the_embedded_pair_is_the_right_one_in_a_mirror():
     left, mirrored = mano_hand(HANDS, "left"), mano_hand(HANDS, "right").mirrored()
-    poses = mano_state_inputs(track())[1]
+    poses = track_rotmats(track())[:, 1:]
     for one, other in zip(left.state(poses), mirrored.state(poses), strict=True):
         np.testing.assert_allclose(one, other, atol=1e-9)
     np.testing.assert_array_equal(left.wrist_from_canonical, mirrored.wrist_from_canonical)

@@ -15,7 +15,6 @@ from hoidata.sensors.part_bps import (
     BasisSettings,
     Nearest,
     PartBps,
-    Variant,
     canonical_object,
     distance_map,
     object_scale,
@@ -51,25 +50,12 @@ def test_vertices_are_those_of_a_tree_of_every_frame_and_part_the_moving_part_fi
             np.testing.assert_allclose(seen.offset[frame, columns], scale * vertices[nearest] - points, atol=1e-5)
 
 
-@pytest.mark.parametrize("variant", ["whole", "unscaled"])
-def test_variants_without_parts_find_the_nearest_vertex_of_the_whole_object(variant: Variant) -> None:
-    settings = BasisSettings(COUNT, variant=variant)
-    seen, points = PartBps(BOTTLE, settings).look(ANGLES), settings.points()
-    assert len(points) == 2 * COUNT
-    scale = 1.0 if variant == "unscaled" else object_scale(BOTTLE)
-    for vertices, found in zip(
-        articulate(BOTTLE.vertices_m, BOTTLE.part, BOTTLE.hinge, ANGLES), seen.vertex, strict=True
-    ):
-        np.testing.assert_array_equal(found, KDTree(scale * vertices).query(points)[1])
-
-
 def test_basis_points_fill_their_ball_evenly_and_come_from_the_seed() -> None:
     points = BasisSettings(4000).points()
     radius = np.linalg.norm(points, axis=1)
     assert radius.max() <= 1
     assert abs((radius < 0.5).mean() - 0.125) < 0.02
     assert np.abs(points.mean(axis=0)).max() < 0.03
-    assert np.linalg.norm(BasisSettings(4000, variant="unscaled").points(), axis=1).max() <= 0.5
     assert not np.array_equal(points, BasisSettings(4000, seed=1).points())
 
 

@@ -3,13 +3,17 @@
 import os
 from collections import Counter
 from pathlib import Path
+from typing import NamedTuple
 
 import igl
 import numpy as np
 import pytest
 
-from bench.sensors import RECORDINGS, Asked, read
 from hoidata.clips.clip import SIDES
+from hoidata.datasets.base import RawTree, SequenceKey
+from hoidata.datasets.manipnet.adapter import read_hand_recording
+from hoidata.geometry.transform import RigidTransform
+from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.triangle_tree import TriangleTree
 from hoidata.sensors import Sensed, sense
@@ -19,9 +23,18 @@ from tests.hoidata.sensors import slow
 from tests.hoidata.sensors.test_sensors import cells_in_object
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
+RECORDINGS = ("cube_med2", "cyl_med3", "cup1", "mug1", "teapot2")
 FRAMES = 200  # of each recording and hand; 132 distances, 104 rays and 66 numbers of normals each
 _MM = 1e3  # libigl leaves out triangles of less than 1e-6 square units, seen along the ray
 EVERY = 20  # of those, for the 1,000 cells
+
+
+class Asked(NamedTuple):
+    """Hand-frames at one object. wrist: object_from_wrist (frame, time)."""
+
+    hand: TrackedHand
+    state: HandState
+    wrist: RigidTransform
 
 
 @pytest.mark.long
@@ -29,13 +42,13 @@ EVERY = 20  # of those, for the 1,000 cells
 def test_all_sensors_agree_with_libigl_on_real_hands_and_meshes_within_a_micrometre():
     counts = Counter()
     for name in RECORDINGS:
-        recording = read(Path(ROOT), name)
+        recording = read_hand_recording(RawTree(Path(ROOT)), SequenceKey("manipnet", "manipnet", name))
         control, surface = recording_control(recording), surface_index(recording.object.model)
         frames = np.flatnonzero(recording.usable)
         frames = frames[np.linspace(0, len(frames) - 1, FRAMES).astype(int)]
         for side in SIDES:
             wrist, _ = object_from_wrist(control, side, recording.time_s[frames], FeatureSettings())
-            asked = Asked(surface.model, recording.tracked_hand(side), recording.state(side, frames), wrist)
+            asked = Asked(recording.tracked_hand(side), recording.state(side, frames), wrist)
             found = sense(asked.hand, asked.state, asked.wrist, None, surface)
             tree = next(iter(surface.filled.values())).tree
             counts.update(_check_distances(asked, found, tree))

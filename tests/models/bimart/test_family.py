@@ -15,11 +15,9 @@ from hoidata.hands import load_embedded_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.store.annotated import AnnotatedStore
-from models.bimart.contact_training import CONTACT
 from models.bimart.family import BIMART, NO_MAP, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, HandsForPaths
-from models.bimart.learning import LossConfig, learn_statistics, targets_of, window_losses
+from models.bimart.learning import CONTACT, MOTION, LossConfig, learn_statistics, targets_of, window_losses
 from models.bimart.lookups import NEAREST_WINDOW, OBJECT_MEAN_POSE
-from models.bimart.motion_training import MOTION
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
 from models.bimart.refined_lookup import NEAREST_REFINED
 from models.bimart.sampler import BimArt
@@ -40,7 +38,6 @@ PARAMS: dict[str, Any] = {
         "features": {"basis": {"count": 8}, "keypoints": 20, "window": 16, "state": "local", "most_m": 0.2},
         "transformer": {"width": 16, "layers": 1, "heads": 2, "feed_forward": 16, "norm_first": True},
         "encoder": [16],
-        "untold": "frame",
         "told": True,
         "diffusion_steps": 1000,
     },
@@ -126,7 +123,7 @@ def test_targets_are_the_clips_hands_in_the_objects_frame(samples: list[ClipSamp
         scene = clip.scene
         np.testing.assert_allclose(clip.motion[:, :60], clip.keypoints_m[0].reshape(-1, 60))
         near = scene.bps.nearest_m(clip.keypoints_m[1].astype(np.float64), scene.hinge_rad)
-        np.testing.assert_allclose(clip.rest[1].reshape(near.shape), near - clip.keypoints_m[1], atol=1e-6)
+        np.testing.assert_allclose(clip.to_object_m[1], near - clip.keypoints_m[1], atol=1e-6)
         places = target.clean[0].reshape(16, 2, -1).numpy()
         skin = distance_map(scene.place_m[3:19], clip.keypoints_m[0, 3:19])
         assert (places[:, 0] <= np.minimum(skin, 0.2) + 1e-3).all()  # the skin has more points than the keypoints
@@ -225,7 +222,7 @@ def test_two_windows_are_learnt_by_heart_to_5_mm(samples: list[ClipSample]) -> N
     torch.manual_seed(0)
     features = FeatureConfig(BasisSettings(32, nearest="surface"), 20, 24, "local", most_m=0.2, map_of="keypoints")
     transformer = TransformerConfig(96, 2, 4, 192, 0.0, norm_first=True)
-    config = DenoiserConfig(features, transformer, (128,), "joint", "frame", True, 1000, 0.0, 0.05, 4, 0.2)
+    config = DenoiserConfig(features, transformer, (128,), "joint", True, 1000, 0.0, 0.05, 4, 0.2)
     clips, network, loss = [recorded_clip(own, HANDS, features) for own in samples], MotionModel(config), LossConfig()
     learn_statistics(network, [(clip, 0) for clip in clips])
     target = targets_of(network, [(clip, 0) for clip in clips] * 8)

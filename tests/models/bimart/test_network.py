@@ -1,7 +1,7 @@
 """Promises of BimArt's denoisers: sizes layer by layer, what is not there changes nothing, statistics, switches."""
 
 from dataclasses import fields, replace
-from typing import Literal, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -22,10 +22,11 @@ def linear(inputs: int, outputs: int) -> int:
 
 
 @pytest.mark.parametrize(
-    ("kind", "numbers", "total"), [(ContactModel, 2048, 24_175_616), (MotionModel, 1200, 27_011_760)]
+    ("kind", "numbers", "total"), [(ContactModel, 2048, 24_175_616), (MotionModel, 1200, 26_454_448)]
 )
-def test_parameters_at_paper_size_are_those_of_the_release_layer_by_layer(kind, numbers: int, total: int) -> None:
+def test_parameters_at_paper_size_are_counted_layer_by_layer(kind, numbers: int, total: int) -> None:
     network = kind(DenoiserConfig())
+    latent = 256 if kind is MotionModel else 512  # half a token each of object and contact
     width, forward, scene = 512, 1024, 2 * 512 * 3 + 6 + 1
     block = (
         linear(width, 3 * width) + linear(width, width) + linear(width, forward) + linear(forward, width) + 4 * width
@@ -34,12 +35,12 @@ def test_parameters_at_paper_size_are_those_of_the_release_layer_by_layer(kind, 
         "x_in": linear(numbers, width),
         "x_out": linear(width, numbers),
         "step_in": 2 * linear(width, width),
-        "object_in": linear(scene, 1024) + linear(1024, 1024) + linear(1024, width),
+        "object_in": linear(scene, 1024) + linear(1024, 1024) + linear(1024, latent),
         "encoder": 8 * block,
     }
     if kind is MotionModel:
-        wanted["contact_in"] = linear(2048, 1024) + linear(1024, 1024) + linear(1024, width)
-        wanted["null"] = 64 * width
+        wanted["contact_in"] = linear(2048, 1024) + linear(1024, 1024) + linear(1024, latent)
+        wanted["null"] = latent
     found: dict[str, int] = {}
     for name, parameter in network.named_parameters():
         own = name.split(".")[0]
@@ -111,9 +112,7 @@ def test_the_map_is_not_seen_where_it_is_dropped_and_the_contact_model_never_see
     assert torch.equal(both[0][1], both[1][1]) == isinstance(network, ContactModel)
 
 
-@pytest.mark.parametrize(
-    "change", [{"latents": "concatenate"}, {"latents": "joint"}, {"untold": "frame"}, {"knot_frames": 4}]
-)
+@pytest.mark.parametrize("change", [{"latents": "concatenate"}, {"latents": "joint"}, {"knot_frames": 4}])
 def test_every_kind_of_encoding_keeps_these_promises(change: dict) -> None:
     network = MotionModel(replace(TINY, **change)).eval()
     test_padding_and_what_stands_in_it_change_nothing(network)
@@ -144,15 +143,14 @@ def test_moments_are_of_what_is_known_alone() -> None:
     assert (mean[2], spread[2]) == (0, 1)
 
 
-@pytest.mark.parametrize("hands", ["keypoints", "mano"])
-def test_a_motion_is_positions_left_and_right_then_the_rest_left_and_right(hands: Literal["keypoints", "mano"]) -> None:
-    draws, features = np.random.default_rng(0), FeatureConfig(keypoints=4, hands=hands)
-    points, rest = draws.normal(size=(2, 3, features.points, 3)), draws.normal(size=(2, 3, features.rest_size))
-    rows = Recorded(cast(Scene, None), rest, points, rest, rest, rest).motion
-    wanted = [points[0, 1].ravel(), points[1, 1].ravel(), rest[0, 1], rest[1, 1]]
+def test_a_motion_is_keypoints_left_and_right_then_vectors_to_the_object_left_and_right() -> None:
+    draws, features = np.random.default_rng(0), FeatureConfig(keypoints=4)
+    points, vectors = draws.normal(size=(2, 2, 3, 4, 3))
+    rows = Recorded(cast(Scene, None), vectors, points, vectors, vectors, vectors).motion
+    wanted = [points[0, 1].ravel(), points[1, 1].ravel(), vectors[0, 1].ravel(), vectors[1, 1].ravel()]
     np.testing.assert_array_equal(rows[1], np.concatenate(wanted))
     assert rows.shape == (3, features.motion_size)
-    for own, back in zip((points, rest), split_motion(rows, features), strict=True):
+    for own, back in zip((points, vectors), split_motion(rows), strict=True):
         np.testing.assert_array_equal(back, own)
     left = features.of_hands(torch.tensor([True, False])).numpy()
     np.testing.assert_array_equal(rows[1][left], np.concatenate((wanted[0], wanted[2])))

@@ -1,4 +1,4 @@
-"""Promises of BimArt's presets in params.yaml: sizes of the release, and which differences each of them has."""
+"""Promises of BimArt's presets in params.yaml: networks of a pair see alike and say which preset they are of."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -28,29 +28,14 @@ def differences(first: Any, second: Any, name: str = "") -> set[str]:
     return {found for key in first for found in differences(first[key], second[key], f"{name}.{key}".strip("."))}
 
 
-@pytest.mark.parametrize(("name", "size"), [(NETWORKS[0], 24_175_616), (NETWORKS[1], 27_011_760)])
-def test_the_released_preset_at_full_size_has_the_parameters_of_the_release(name: str, size: int) -> None:
-    network = load_network(name).build(plan("released", "full", name).network)
-    assert sum(parameter.numel() for parameter in network.parameters()) == size
-
-
-def test_paper_and_release_differ_in_the_switches_of_the_list() -> None:
-    common = {"network.untold", "loss.skip_first", "loss.skip_last", "training.weight_decay", "training.warmup"}
-    plans = [[asdict(plan(own, "full", name)) for own in ("paper", "released")] for name in NETWORKS]
-    found = [differences(paper, released) for paper, released in plans]
-    assert found[0] == common | {"training.learning_rate", "training.ema_decay"}
-    motion = {"network.latents", "network.features.anchor", "loss.dropout_of", "training.schedule"}
-    assert found[1] == common | motion
-
-
-@pytest.mark.parametrize("preset", ["paper", "released", "ours"])
+@pytest.mark.parametrize("preset", ["paper", "ours"])
 @pytest.mark.parametrize("size", ["small", "full"])
 def test_networks_say_which_preset_they_are_of(preset: str, size: str) -> None:
     assert preset_of(plan(preset, size, "bimart-motion").network) == preset
 
 
-@pytest.mark.parametrize("preset", ["paper", "released", "ours"])
+@pytest.mark.parametrize("preset", ["paper", "ours"])
 @pytest.mark.parametrize("size", ["small", "full"])
 def test_both_networks_of_a_preset_see_alike_but_for_the_state(preset: str, size: str) -> None:
     contact, motion = (asdict(plan(preset, size, name).network.features) for name in NETWORKS)
-    assert differences(contact, motion) <= {"state", "anchor"}
+    assert differences(contact, motion) <= {"state"}

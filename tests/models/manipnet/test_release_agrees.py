@@ -16,7 +16,7 @@ from hoidata.datasets.base import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import read_hand_recording
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.scene import LIFTED_M
-from hoidata.sensors import RELEASED
+from hoidata.sensors import OURS
 from models.manipnet.control import recording_control
 from models.manipnet.features import (
     FeatureSettings,
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.skipif(
     not ROOT, reason="HOIDATA_MANIPNET is not set: the data are not part of this repository"
 )
 
-SETTINGS = FeatureSettings(step_s=1 / 30, velocity_axes="object", sensors=RELEASED)
+SETTINGS = FeatureSettings(step_s=1 / 30, velocity_axes="object", sensors=OURS)
 FRAMES, MARGIN = 80, 80  # per recording and hand; source frames left out at the ends, so that no window is clamped
 BLOCKS = {
     "trajectory": (192, 528),
