@@ -60,7 +60,7 @@ imports: install-dev
 
 check: lint types imports docs test
 
-# Figures beside baselines of the same run; hours, most of them `ablation`. One part: python -m bench adapters
+# Figures beside baselines of the same run; hours. One part: python -m bench adapters
 bench: install-dev
 	OMP_NUM_THREADS=1 python -m bench
 

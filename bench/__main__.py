@@ -7,7 +7,6 @@ shown. Nothing here passes or fails by time. HOIDATA_BENCH_CORPORA: a folder wit
 import sys
 
 from bench import (
-    ablation,
     adapters,
     batches,
     bimart,
@@ -47,7 +46,6 @@ BENCHMARKS = {
     "batches": batches.main,
     "samplers": samplers.main,
     "gpu": gpu.main,
-    "ablation": ablation.main,
     "evaluate": evaluate.main,
     "evaluator": evaluator.main,
     "fingers": manipnet_speed.main,

@@ -144,7 +144,7 @@ def fill(tables: dict[str, Rows], jobs: Sequence[Job], size: str, budget_s: floa
         if job.trial.name not in tables:
             tables[job.trial.name] = control_rows(job.trial)
         for rule, sums in kept(job.key(size), lambda job=job: trained_row(job, size)).items():
-            words = {"off": "", "ours": ", post-processed", "released": ", the demo's post-processing"}[rule]
+            words = {"off": "", "ours": ", post-processed", "paper": ", the paper's post-processing"}[rule]
             tables[job.trial.name].setdefault(job.name + words, []).append(sums)
         longest = max(longest, time.monotonic() - start)
     return left_out
@@ -197,9 +197,9 @@ def control_rows(trial: Trial) -> Rows:
 
 
 def trained_row(job: Job, size: str) -> dict[str, dict[str, float]]:
-    """Train one network and roll it out, without and with post-processing; of ours also with the demo's."""
+    """Train one network and roll it out, without and with post-processing; of ours also with the paper's."""
     model = trained_network(job, size)
-    rules: tuple[Rule, ...] = ("off", "ours", "released")[: 3 if job.name == "ours" else 2]
+    rules: tuple[Rule, ...] = ("off", "ours", "paper")[: 3 if job.name == "ours" else 2]
     return {rule: measured(job.trial, rolled(job.trial, model, rule)) for rule in rules}
 
 

@@ -73,8 +73,6 @@ def times_read_s(kept: np.ndarray, hand: TrackedHand, settings: FeatureSettings)
     count = sizes(hand, settings)
     parts = dict(zip(count, np.split(kept, np.cumsum(list(count.values()))[:-1]), strict=True))
     samples = np.any(parts["trajectory"].reshape(-1, SAMPLE_NUMBERS), axis=1)
-    if settings.smooth and samples.any():  # every sample has something of the others
-        samples = np.ones_like(samples)
     times = np.array(settings.sensors.times_s)
     sensed = [np.any(parts[name].reshape(len(times), -1), axis=1) for name in ("proximity", "distance")]
     read = np.concatenate([[0.0], settings.samples_s[samples], *(times[seen] for seen in sensed)])

@@ -8,14 +8,11 @@ Numbers go in and come out as they are: normalisation is part of the network, so
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from models.manipnet.features import FeatureSettings
-
-Kind = Literal["manipnet", "resnet", "mlp"]
 
 
 @dataclass(frozen=True)
@@ -24,9 +21,8 @@ class NetworkConfig:
 
     features: how they are measured, and the time from one pose to the next. without: sensors that are switched off.
 
-    encoder: width of each of the three encoders, the paper's 512. kind: "resnet" has no way from a block's input to
-    its output, "mlp" no way past any layer (Sec. 8). keep: share of the numbers that dropout keeps at the input of
-    every linear layer.
+    encoder: width of each of the three encoders, the paper's 512. keep: share of the numbers that dropout keeps at the
+    input of every linear layer.
     """
 
     pose: int = 192
@@ -38,7 +34,6 @@ class NetworkConfig:
     without: tuple[str, ...] = ()
     encoder: int = 512
     blocks: int = 2
-    kind: Kind = "manipnet"
     keep: float = 0.7
 
     @property
@@ -49,21 +44,14 @@ class NetworkConfig:
 class DenseBlock(nn.Module):
     """One residual dense block on activations (..., width): Sec. 6.2, the two equations."""
 
-    def __init__(self, width: int, kind: Kind, keep: float) -> None:
+    def __init__(self, width: int, keep: float) -> None:
         super().__init__()
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
         self.dropout = nn.Dropout(1 - keep)
-        self.kind = kind
 
     def forward(self, a: Tensor) -> Tensor:
-        hidden = self.first(self.dropout(a))
-        if self.kind != "mlp":
-            hidden = hidden + a
-        r = torch.relu(hidden)
-        out = self.second(self.dropout(r))
-        if self.kind != "mlp":
-            out = out + r
-        return out + a if self.kind == "manipnet" else out
+        r = torch.relu(self.first(self.dropout(a)) + a)
+        return self.second(self.dropout(r)) + r + a
 
 
 class ManipNet(nn.Module):
@@ -87,7 +75,7 @@ class ManipNet(nn.Module):
         self.config = config
         width = 3 * config.encoder
         self.encoders = nn.ModuleList([nn.Linear(size, config.encoder) for size in config.inputs])
-        self.blocks = nn.ModuleList([DenseBlock(width, config.kind, config.keep) for _ in range(config.blocks)])
+        self.blocks = nn.ModuleList([DenseBlock(width, config.keep) for _ in range(config.blocks)])
         self.decoder = nn.Linear(width, config.output)
         self.dropout = nn.Dropout(1 - config.keep)
         for layer in self.modules():

@@ -7,7 +7,6 @@ joints placed by forward kinematics: bones keep their length, which the release'
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,28 +27,15 @@ from models.manipnet.features import (
 )
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.network import ManipNet
-from models.manipnet.targets import Nearest, Rule, Targets, our_targets, paper_targets, released_targets
+from models.manipnet.targets import Nearest, Rule, Targets, our_targets, paper_targets
 
-
-class Out(NamedTuple):
-    """Passes that move joints by a share of what their capsule is deeper than allowed, and the weight of that.
-
-    joints: those that are too deep themselves come out too.
-    """
-
-    passes: int
-    allowed_m: float = 0.0
-    share: float = 0.3
-    weight: float = 0.3
-    joints: bool = False
-
-
-# Ours: a capsule is held by its joint, so that the one after it goes twice as far as its middle is to go.
-OUT = {"paper": Out(0), "released": Out(1), "ours": Out(4, 0.006, 2.0, 1.0, True)}
+# Of our rule: so many passes move joints out that they, or their capsule, are deeper in the object than allowed.
+PASSES, ALLOWED_M = 4, 0.006
+# A capsule is held by its joint, so that the one after it goes twice as far as its middle is to go.
+OUT_SHARE = 2.0
 AT_OBJECT_M = 0.01  # a point of the network's this far from the finger's skin is kept out of the object
 ROUNDS = 2  # of ours: what a hand sees changes with its pose
 LEAD = 0.2  # of the way from the answer before to the network's pose, whose twist points do not tell
-_RULES = {"paper": paper_targets, "released": released_targets}
 
 
 @dataclass(frozen=True)
@@ -146,20 +132,17 @@ class Follower:
     def _corrected(self, output: np.ndarray, then: Situation, before: np.ndarray) -> HandState:
         """The hand that an output means, post-processed; before: the answer of the frame before."""
         hand, settings, points = self.hand, self.predictor.settings, self.state.point_m[0]
-        radius = hand.point_radius_m if settings.less_radius else np.zeros(hand.n_points)
         predicted = np.clip(output[-hand.n_points :], 0, 1)
-        found, given = self._nearest(points, then), (points, predicted, radius, settings.range_m)
-        if self.predictor.rule == "ours":
-            near = found.distance_m < self.cover_m + AT_OBJECT_M
-            state = self.hand.state(between(before, self.finger_rotmats, np.full(1, LEAD)))
-            for _ in range(ROUNDS):
-                seen = self._nearest(state.point_m[0], then)
-                state = self._reached(state, our_targets(*given, near, self.cover_m, seen))
-        else:
-            state = self._reached(self.state, _RULES[self.predictor.rule](*given, found))
-        out = OUT[self.predictor.rule]
-        for _ in range(out.passes):
-            targets = self._out_of_object(state, then, out)
+        found, given = self._nearest(points, then), (points, predicted, hand.point_radius_m, settings.range_m)
+        if self.predictor.rule == "paper":
+            return self._reached(self.state, paper_targets(*given, found))
+        near = found.distance_m < self.cover_m + AT_OBJECT_M
+        state = self.hand.state(between(before, self.finger_rotmats, np.full(1, LEAD)))
+        for _ in range(ROUNDS):
+            seen = self._nearest(state.point_m[0], then)
+            state = self._reached(state, our_targets(*given, near, self.cover_m, seen))
+        for _ in range(PASSES):
+            targets = self._out_of_object(state, then)
             if not targets.weight.any():
                 break
             state = self._reached(state, targets)
@@ -174,25 +157,24 @@ class Follower:
             return state
         return self.hand.state(reach(self.hand, self.limits, state, targets.point_m, weight))
 
-    def _out_of_object(self, state: HandState, then: Situation, out: Out) -> Targets:
+    def _out_of_object(self, state: HandState, then: Situation) -> Targets:
         """A further pass: what of the hand is too deep in the object moves out by a share of what is too much."""
         hand = self.hand
         target, weight, n_points = state.point_m[0].copy(), np.zeros(hand.n_points), hand.n_points
         middle = (state.capsule_start_m[0] + state.capsule_end_m[0]) / 2
         found = self._nearest(np.concatenate([target, middle]), then)
-        if out.joints:
-            depth = np.maximum(self.cover_m - found.distance_m[:n_points] - out.allowed_m, 0)
-            target += depth[:, None] * found.normal[:n_points]
-            weight[depth > 0] = out.weight
-        depth = np.maximum(hand.capsules.radius_m - found.distance_m[n_points:] - out.allowed_m, 0)
+        depth = np.maximum(self.cover_m - found.distance_m[:n_points] - ALLOWED_M, 0)
+        target += depth[:, None] * found.normal[:n_points]
+        weight[depth > 0] = 1
+        depth = np.maximum(hand.capsules.radius_m - found.distance_m[n_points:] - ALLOWED_M, 0)
         depth *= hand.capsules.joint > 0
         for capsule in np.flatnonzero(depth):
             # A capsule hangs between its joint and the one after it: the latter moves it.
             after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
             tip = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
             moved = np.concatenate([after, tip])
-            target[moved] += out.share * depth[capsule] * found.normal[n_points + capsule]
-            weight[moved] = out.weight
+            target[moved] += OUT_SHARE * depth[capsule] * found.normal[n_points + capsule]
+            weight[moved] = 1
         return Targets(target, weight)
 
     def _nearest(self, points_m: np.ndarray, then: Situation) -> Nearest:

@@ -1,4 +1,4 @@
-"""Where post-processing wants the joints: the paper's Algorithm 1, the rule of the released demo, and ours.
+"""Where post-processing wants the joints: the paper's Algorithm 1, and ours.
 
 Points are in the wrist's frame, metres. Distances here are of points themselves: a predicted distance that stops at
 the skin has the radius added before it comes here.
@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-Rule = Literal["off", "paper", "released", "ours"]
+Rule = Literal["off", "paper", "ours"]
 ACTIVE_SHARE = 0.8  # of the range of predicted distances: the paper's 2.8 of 3.5 cm, the demo's 2.4 of 3 cm
 NEAR_M = 0.06  # the demo looks at no point farther away; nor do we, or a wrong distance pulls at a hand in the air
 # Ours, chosen on the validation tenths of the real recordings, whose touching points are 4 to 8 mm deep in 5 %.
@@ -48,23 +48,6 @@ def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndar
     mixed = np.where(inside, 0.8 * distance_m + 0.2 * found.distance_m, 0.2 * distance_m + 0.8 * found.distance_m)
     wanted = found.closest_m + mixed[..., None] * found.normal
     return Targets(np.where(_active(predicted, found)[..., None], wanted, points_m), np.ones(predicted.shape))
-
-
-def released_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
-                     found: Nearest) -> Targets:  # fmt: skip
-    """The demo's rule: out of the object by the radius, or a third of the way to the predicted distance.
-
-    Arguments as in ``paper_targets``.
-    """
-    distance_m = predicted * range_m + radius_m
-    inside = found.distance_m < radius_m
-    away = points_m - found.closest_m
-    length = np.linalg.norm(away, axis=-1, keepdims=True)
-    away = np.where(length > 1e-6, away / np.maximum(length, 1e-6), found.normal)
-    mixed = 0.35 * distance_m + 0.65 * found.distance_m
-    out = found.closest_m + radius_m[:, None] * found.normal
-    wanted = np.where(inside[..., None], out, found.closest_m + mixed[..., None] * away)
-    return Targets(wanted, np.where(inside, 0.8, 0.5) * _active(predicted, found))
 
 
 def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,

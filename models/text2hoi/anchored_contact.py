@@ -14,11 +14,12 @@ from torch.nn import functional
 
 from hoidata.batches.requests import RequestBatch
 from hoidata.devices import send
-from models.common.features import scaled_text
+from models.common.features import TEXT_FEATURES, scaled_text
 from models.common.point_net import PointNet, normalised_points
 from models.text2hoi.contact_config import HAND_FLAGS, ContactConfig, ContactLossConfig
 
 N_SIDES = 2
+ANCHORS = 4  # touches that a map is drawn by, of each hand
 ANCHOR_FEATURES = 8
 WAVES = (1.0, 2.0, 4.0)
 REACHES = (0.1, 0.2, 0.4)
@@ -38,11 +39,10 @@ class AnchoredContact(nn.Module):
         first, second, third = config.decoder_widths
         self.from_point = nn.Linear(local + 3 + 6 * len(WAVES) + N_SIDES * ANCHOR_FEATURES, first)
         self.from_clip = nn.Sequential(
-            nn.Linear(overall + 1 + config.text + HAND_FLAGS, first), nn.GELU(), nn.Linear(first, first)
+            nn.Linear(overall + 1 + TEXT_FEATURES + HAND_FLAGS, first), nn.GELU(), nn.Linear(first, first)
         )
         self.rest = nn.Sequential(
             nn.GELU(),
-            nn.Dropout(config.dropout),
             nn.Linear(first, second),
             nn.GELU(),
             nn.Linear(second, third),
@@ -80,7 +80,7 @@ class AnchoredContact(nn.Module):
         The left hand's next touch is told some of its own, the right's also all of the left's. contact (B, 2, N) float:
         the true maps. A hand without any touched point has no anchor.
         """
-        cloud, count, device = self.see(points_m, text, batch.active_hands), self.config.anchors, contact.device
+        cloud, count, device = self.see(points_m, text, batch.active_hands), ANCHORS, contact.device
         there = contact.any(-1) & batch.active_hands
         rows = picked(contact, send(torch.rand(len(contact), N_SIDES, count, generator=generator), device))
         anchors = cloud[0][:, None].expand(-1, N_SIDES, -1, -1).gather(2, rows[..., None].expand(-1, -1, -1, 3))
@@ -111,7 +111,7 @@ class AnchoredContact(nn.Module):
         first = self.logits(some, nowhere, nothing)[0]  # the same for every draw
         for draw in latents:
             anchors, known = nowhere.clone(), nothing.clone()
-            for turn, (side, number) in enumerate(product(sides, range(self.config.anchors))):
+            for turn, (side, number) in enumerate(product(sides, range(ANCHORS))):
                 touches = self.logits(some, anchors, known)[0] if turn else first
                 touch = touches[:, side].softmax(-1)
                 anchors[:, side, number] = some[0][clips, picked(touch, draw[:, side, number, None])[:, 0]]
@@ -121,7 +121,7 @@ class AnchoredContact(nn.Module):
 
     def draw_latents(self, count: int, n_clips: int, generator: torch.Generator) -> Tensor:
         """(count, clip, 2, A) draws that choose the touches."""
-        return torch.rand(count, n_clips, N_SIDES, self.config.anchors, generator=generator)
+        return torch.rand(count, n_clips, N_SIDES, ANCHORS, generator=generator)
 
 
 def picked(weights: Tensor, draws: Tensor) -> Tensor:

@@ -8,10 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from hoidata.batches.dataset import ClipBatch
 from hoidata.batches.requests import RequestBatch
-from hoidata.devices import send
-from hoidata.geometry.rotations import rotvec_to_rotmat
+from models.common.features import TEXT_FEATURES
 from models.common.point_net import PointLayer, PointNet, normalised_points
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 
@@ -29,16 +27,14 @@ class ContactModel(nn.Module):
         self.to_latent = nn.Sequential(
             PointLayer(overall, heads[0]),
             PointLayer(heads[0], heads[1]),
-            nn.Dropout(config.encoder_dropout),
             nn.Linear(heads[1], 2 * config.latent),
         )
         first, second, third = config.decoder_widths
         # Table S6's first layer, which sees the same numbers of a clip at each point, in two pieces.
         self.from_point = nn.Linear(local, first)
-        self.from_clip = nn.Linear(overall + 1 + config.text + config.latent, first, bias=False)
+        self.from_clip = nn.Linear(overall + 1 + TEXT_FEATURES + config.latent, first, bias=False)
         self.rest = nn.Sequential(
             nn.LeakyReLU(0.2),
-            nn.Dropout(config.dropout),
             nn.Linear(first, second),
             nn.LeakyReLU(0.2),
             nn.Linear(second, third),
@@ -88,14 +84,3 @@ def contact_loss(
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
     total = cross + weights.dice_weight * dice.mean() + weights.kl_weight * divergence
     return {"total": total, "cross_entropy": cross, "dice": dice.mean(), "kl": divergence}
-
-
-def turned_and_scaled(batch: ClipBatch, generator: torch.Generator) -> Tensor:
-    """The batch's object points (B, N, 3), each clip's scaled by 0.8-1.2 and turned by up to 15 degrees per axis.
-
-    Augmentation of Text2HOI's released training.
-    """
-    device = batch.points_m.device
-    drawn = send(torch.rand(len(batch), 4, generator=generator), device)
-    turn = rotvec_to_rotmat((drawn[:, :3] * 2 - 1) * torch.pi / 12)
-    return batch.points_m @ turn.transpose(1, 2) * (0.8 + 0.4 * drawn[:, 3])[:, None, None]

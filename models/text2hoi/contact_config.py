@@ -12,30 +12,24 @@ HAND_FLAGS = 2
 class ContactConfig:
     """Sizes; the defaults are the paper's.
 
-    encoder_dropout: before the last layer of z's encoder. drawn_by: what a sample is drawn by: the paper's Gaussian
-    latent, which gives one map for both hands, or anchors, touched points of each hand drawn one after the other
-    (``anchored_contact``), which gives a map for each.
+    drawn_by: what a sample is drawn by: the paper's Gaussian latent, which gives one map for both hands, or anchors,
+    touched points of each hand drawn one after the other (``anchored_contact``), which gives a map for each.
     """
 
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
     decoder_widths: tuple[int, int, int] = (512, 256, 128)
     latent: int = 64
-    text: int = 512
-    dropout: float = 0.0
-    encoder_dropout: float = 0.0
     drawn_by: Literal["latent", "anchor"] = "latent"
-    anchors: int = 4
 
 
 @dataclass(frozen=True)
 class ContactLossConfig:
     """Weights of KL divergence, Dice term, and the cross-entropy of anchors, beside a map's cross-entropy.
 
-    augment: turn and scale objects. points: how many points of every object a step sees, drawn anew each time.
+    points: how many points of every object a step sees, drawn anew each time.
     """
 
     kl_weight: float = 1.0
     dice_weight: float = 1.0
     touch_weight: float = 0.1
-    augment: bool = False
     points: int = 1024

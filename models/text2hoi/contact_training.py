@@ -13,7 +13,7 @@ from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss
-from models.text2hoi.contact import ContactModel, contact_loss, turned_and_scaled
+from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
 from models.text2hoi.thresholds import (
     UNCHOSEN_THRESHOLD,
@@ -38,9 +38,8 @@ class ContactObjective:
         return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
-        some = send(torch.randperm(points.shape[1], generator=generator)[: self.weights.points], self.device)
-        points, text, network = points[:, some], any_form(batch, generator), self.network
+        some = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.weights.points], self.device)
+        points, text, network = batch.points_m[:, some], any_form(batch, generator), self.network
         if isinstance(network, AnchoredContact):
             contact = batch.contact[..., some].float()
             touch, logits = network.losses(points, text, batch, contact, generator)

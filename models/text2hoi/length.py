@@ -13,25 +13,25 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.devices import send
+from models.common.features import TEXT_FEATURES
 from models.text2hoi.verb_reading import VerbReading
 
 SHORTEST_FRAMES = 8
+NOISE = 64  # numbers that the paper's network reads beside the sentence
 EXPECTED_OF = 32  # draws
 WIDEST_DRAW = 2.0  # standard deviations; lengths of one verb have limits, a Gaussian has none
 
 
 @dataclass(frozen=True)
 class LengthConfig:
-    """Sizes; ``width`` is the paper's 512, and so is ``noise``, 64.
+    """Sizes; ``width`` is the paper's 512.
 
     drawn_by: "noise" among the inputs, or "spread". text_input: the sentence's features, or "verbs": which of ``verbs``
     verbs it means (``verb_reading``). told: hand flags.
     """
 
-    text: int = 512
     width: int = 512
     dropout: float = 0.0
-    noise: int = 64
     drawn_by: Literal["noise", "spread"] = "noise"
     text_input: Literal["features", "verbs"] = "features"
     verbs: int = 1
@@ -52,10 +52,10 @@ class LengthModel(nn.Module):
         super().__init__()
         self.config = config
         spread, read = config.drawn_by == "spread", config.text_input == "verbs"
-        self.reading = VerbReading(config.text, config.verbs) if read else None
-        said = config.verbs if read else config.text
+        self.reading = VerbReading(TEXT_FEATURES, config.verbs) if read else None
+        said = config.verbs if read else TEXT_FEATURES
         self.layers = nn.Sequential(
-            nn.Linear(said + 2 * config.told + (0 if spread else config.noise), config.width),
+            nn.Linear(said + 2 * config.told + (0 if spread else NOISE), config.width),
             nn.ReLU() if spread else nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
             nn.Linear(config.width, 2 if spread else 1),
@@ -63,7 +63,7 @@ class LengthModel(nn.Module):
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, D) draws from N(0, I)."""
-        return torch.randn(count, 1 if self.config.drawn_by == "spread" else self.config.noise, generator=generator)
+        return torch.randn(count, 1 if self.config.drawn_by == "spread" else NOISE, generator=generator)
 
     def moments(self, text: Tensor, active_hands: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """(B,) mean and log-spread; of a length that is drawn by noise (B, D) itself, the spread stands for nothing."""

@@ -15,16 +15,13 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
-from hoidata.clips.features import HAND_POSE_6D, OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
+from hoidata.clips.features import OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
 from hoidata.devices import send
-from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from models.common.features import (
     OBJECT_START_6D,
     base_middle_m,
-    hand_rotmats,
     hands_in_object_frame,
     hands_in_world,
-    object_rotmat,
     placed_at,
     recentred,
 )
@@ -56,9 +53,6 @@ class MotionCodeConfig:
     object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
     lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many
     frames (0: the course itself).
-
-    convention: what rotations mean; "own", or that of a dataset in the authors' code, for networks they trained:
-    GRAB's objects are transposed, ARCTIC's fingers are offsets from ``finger_mean_rad``, 45 numbers for each hand.
     """
 
     knot_frames: int = 0
@@ -68,8 +62,6 @@ class MotionCodeConfig:
     object_turn: Literal["absolute", "since start"] = "absolute"
     whitening_frames: float = 0.0
     rest_m: float = 0.0
-    convention: Literal["own", "h2o", "grab", "arctic"] = "own"
-    finger_mean_rad: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -113,7 +105,6 @@ class MotionCode:
     def encode(self, sample: ClipSample) -> CodedClip:
         """A recorded clip's rows."""
         hands, thing = recentred(torch.from_numpy(sample.hands), self.placed(sample))
-        hands, thing = self.converted(hands, thing, -1)
         present = torch.from_numpy(sample.valid & sample.active_hands[:, None])
         if self.config.hand_frame == "object":
             hands = hands_in_object_frame(hands[None], thing[None])[0]
@@ -147,7 +138,7 @@ class MotionCode:
         objects, there = self._course(objects), self.rows(counts, objects.device)[1]
         start = mean_start(objects, there) if self.config.object_turn == "since start" else None
         if not self.config.knot_frames:
-            return self.converted(hands, objects if start is None else turned_from(objects, start), 1)
+            return hands, objects if start is None else turned_from(objects, start)
         n_frames = max(counts)
         knots = [intervals_of(n, self.config.knot_frames) for n in counts]
         hands = spline_values(hands, stacked_bases(list(counts), knots, n_frames, hands.device))
@@ -182,18 +173,6 @@ class MotionCode:
         """Rows of an object in ``whitening_frames``."""
         frames = self.config.knot_frames / self.config.object_knots if self.config.knot_frames else 1
         return self.config.whitening_frames / frames
-
-    def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
-        """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
-        if self.config.convention == "grab":
-            turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
-            objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
-        if self.config.convention == "arctic":
-            mean = torch.tensor(self.config.finger_mean_rad).to(hands.device).reshape(2, 1, 15, 3)
-            fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
-            fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
-            hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
-        return hands, objects
 
     def at_origin(self, objects: Tensor, points_m: Tensor, part: Tensor) -> Tensor:
         """Objects (B, F, 10) of ``curves`` with the position of their mesh's origin; points as in ``place_m``."""

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor
 
 from hoidata.annotation.encoders import TextEncoder
-from hoidata.batches.dataset import MAX_FRAMES
 from hoidata.batches.requests import Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
@@ -255,8 +254,7 @@ class Text2Hoi:
             network = self.trained["refiner"].network
             assert isinstance(network, RefinerModel)
             seen = surface.coarse(batch, coarse, objects, contact_maps, batch.hand_frames)
-            rows = (MAX_FRAMES, 0), (coarse.shape[2], 0)
-            refined = refine(network, seen, draw_each(*rows, generators)[0] if network.config.noise_steps else None)
+            refined = refine(network, seen)
         parts = zip(coarse, refined, objects, contact_maps, strict=True)
         return [
             Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())
