@@ -32,8 +32,7 @@ from models.common.repeatable import make_repeatable
 from models.common.sampling import SamplerConfig
 from models.common.training import TrainingConfig, train_network
 from models.registry import load_network
-from models.text2hoi.networks import NETWORKS
-from models.text2hoi.sampler import SamplingConfig, Text2Hoi
+from models.text2hoi.sampler import NETWORKS, SamplingConfig, Text2Hoi
 from pipelines.params import laid_over
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams

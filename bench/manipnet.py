@@ -42,9 +42,9 @@ KEPT = Path(".hoidata/manipnet")
 ROOT = Path(__file__).parents[1]
 # What training examples and networks come from, and what else figures come from.
 LEARNT_FROM = ("models/manipnet/control.py", "models/manipnet/examples.py", "models/manipnet/features.py",
-               "models/manipnet/layout.py", "models/manipnet/network.py", "models/common/training.py",
+               "models/manipnet/features.py", "models/manipnet/network.py", "models/common/training.py",
                "hoidata/hands/tracked_hand.py", "hoidata/sensors", "bench/manipnet_recordings.py")  # fmt: skip
-MEASURED_BY = (*LEARNT_FROM, "models/manipnet/rollout.py", "models/manipnet/targets.py", "models/manipnet/lookups.py",
+MEASURED_BY = (*LEARNT_FROM, "models/manipnet/rollout.py", "models/manipnet/rollout.py", "models/manipnet/lookups.py",
                "models/manipnet/inverse_kinematics.py", "hoidata/physics", "bench/manipnet.py")  # fmt: skip
 SETTINGS = FeatureSettings(step_s=1 / RATE_HZ)
 SIZES = {

@@ -17,8 +17,7 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.hands import HandPair
 from hoidata.store.annotated import load_annotated
 from models.common.checkpoints import FILE_NAME, load_checkpoint
-from models.manipnet.diagnostics import recorded_hands
-from models.manipnet.family import Fingers
+from models.manipnet.family import Fingers, recorded_hands
 from models.manipnet.lookups import joint_errors_m
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor

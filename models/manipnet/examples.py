@@ -15,9 +15,8 @@ from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import sensor_size
 from models.common.training import TrainingConfig, learning_rate_factor
 from models.manipnet.control import Control
-from models.manipnet.features import FeatureSettings, hand_inputs, outputs
+from models.manipnet.features import FeatureSettings, floors, hand_inputs, kept_columns, outputs, sizes
 from models.manipnet.inverse_kinematics import turns_from_rest
-from models.manipnet.layout import floors, kept_columns, sizes
 from models.manipnet.network import ManipNet, NetworkConfig
 
 LEARNT = ("inputs", "outputs")

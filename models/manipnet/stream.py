@@ -14,7 +14,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, Motion
-from models.manipnet.layout import times_read_s
+from models.manipnet.features import times_read_s
 from models.manipnet.rollout import Follower, Predictor, Situation, situation
 
 SPARE_S = 0.25  # kept beyond the oldest sample: the one before it tells a velocity

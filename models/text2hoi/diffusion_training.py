@@ -30,10 +30,9 @@ from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import OBJECT_START_6D, Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
-from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawer
+from models.text2hoi.contact_training import CONTACT, ContactNetwork, DrawContact, contact_drawer
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
-from models.text2hoi.thresholds import ContactNetwork
 from models.text2hoi.verb_check import action_results
 from models.text2hoi.verb_reading import Sentences, learn_verbs
 

@@ -3,11 +3,17 @@
 Text2HOI denoises the features of every frame, hands in the world. Two switches change that: hands may be given in the
 frame the object has at the same moment, where a hand that holds still on a moving object is constant; and curves may
 stand for frames, as control points of B-splines (``models.common.spline``).
+
+Two more make verbs alike in the rows of an object. A turn of the object in the world, ``R(t) R(0)^T``, is the same
+whatever its mesh calls front or up; ``R(0)`` stands beside it. And rows of a path are nearly the same as those before:
+a shake of 3 cm hardly counts beside a lift of 20. Whitened rows, each what the smooth course of those before does not
+say, give slow and quick movement the same weight, and what a network gets wrong in them comes out smooth.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -17,17 +23,74 @@ from torch import Tensor
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
 from hoidata.clips.features import OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
 from hoidata.devices import send
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from models.common.features import (
     OBJECT_START_6D,
     base_middle_m,
     hands_in_object_frame,
     hands_in_world,
+    object_rotmat,
     placed_at,
     recentred,
 )
 from models.common.sampling import Motion
 from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
-from models.text2hoi.object_rows import mean_start, turned_from, turned_since_start, unwhiten, whiten
+
+# An object that has not moved: position, 6D of no turn, hinge.
+UNMOVED = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+# Share of a row's variance that no neighbour tells; and the deviation of a row, which keeps those of a path of some
+# centimetres above the smallest spread a normaliser knows.
+ROUGH, DEVIATION = 0.3, 0.5
+
+
+def turned_since_start(thing: Tensor) -> Tensor:
+    """Object features (F, 10) as rows (F, 16): turned since the first frame, and how it lay in that."""
+    rotation = object_rotmat(thing)
+    turn, start = (rotmat_to_rot6d(own) for own in (rotation @ rotation[0].T, rotation[:1].expand_as(rotation)))
+    return torch.cat((thing[:, OBJECT_POSITION], turn, thing[:, OBJECT_HINGE:], start), -1)
+
+
+def mean_start(rows: Tensor, there: Tensor) -> Tensor:
+    """(B, 1, 3, 3) rotations of the first frame: the mean of what the rows (B, L, 16) of ``there`` (B, L) say."""
+    said = (rows[..., OBJECT_START_6D] * there[..., None]).sum(1, keepdim=True)
+    return rot6d_to_rotmat(said / there.sum(1)[:, None, None])
+
+
+def turned_from(rows: Tensor, start: Tensor) -> Tensor:
+    """Object features (B, F, 10) of rows (B, F, 16) and first rotations (B, 1, 3, 3)."""
+    rotation = rotmat_to_rot6d(object_rotmat(rows) @ start)
+    return torch.cat((rows[..., OBJECT_POSITION], rotation, rows[..., OBJECT_HINGE:OBJECT_FEATURES]), -1)
+
+
+def whiten(rows: Tensor, reach: float) -> Tensor:
+    """Rows (..., L, 10 or 16) as what is new in each. reach: rows over which a path is alike."""
+    moved = rows[..., :OBJECT_FEATURES] - _as(UNMOVED, rows)
+    new = torch.linalg.solve_triangular(_as(smooth_root(rows.shape[-2], reach), rows), moved, upper=False)
+    return torch.cat((new, rows[..., OBJECT_FEATURES:]), -1)
+
+
+def unwhiten(rows: Tensor, reach: float) -> Tensor:
+    """The inverse of :func:`whiten`."""
+    moved = _as(smooth_root(rows.shape[-2], reach), rows) @ rows[..., :OBJECT_FEATURES]
+    return torch.cat((moved + _as(UNMOVED, rows), rows[..., OBJECT_FEATURES:]), -1)
+
+
+def _as(known: Tensor, rows: Tensor) -> Tensor:
+    """What is known beforehand, of the device and kind of ``rows``."""
+    return send(known, rows.device).to(rows.dtype)
+
+
+@lru_cache(maxsize=256)
+def smooth_root(rows: int, reach: float) -> Tensor:
+    """(rows, rows) lower triangular, the Cholesky factor of the covariance of smooth rows.
+
+    Of fewer rows it is the upper left part: a motion's rows do not depend on how long others of its batch are.
+    """
+    place = torch.arange(rows, dtype=torch.float64)
+    alike = torch.exp(-0.5 * ((place[:, None] - place) / reach).square())
+    covariance = (1 - ROUGH) * alike + ROUGH * torch.eye(rows, dtype=torch.float64)
+    return DEVIATION * torch.linalg.cholesky(covariance).float()
+
 
 # What is like a metre of movement: 0.1 of a rotation's numbers per centimetre, a hinge's angle at 20 cm from it, and
 # fingers, of which there are many, more. Place, turn and hinge of an object come to rest each for itself.

@@ -17,8 +17,7 @@ from models.common.family import Network, Objective, Setup
 from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
-from models.text2hoi.surface import Surface
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
 
 GENERATED_AT_ONCE = 32
 PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")

@@ -10,10 +10,9 @@ from torch import Tensor
 from hoidata.batches.dataset import ClipBatch
 from hoidata.contact.agreement import f1_score
 from models.common.point_net import PointNetConfig
-from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss, picked
-from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens, spread_out
+from models.text2hoi.contact import AnchoredContact, ContactConfig, ContactLossConfig, by_hand_loss, picked
 from models.text2hoi.contact_training import most_typical
+from models.text2hoi.diffusion import TOKEN_FEATURES, contact_tokens, spread_out
 
 POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16), align=False)
 

@@ -19,14 +19,12 @@ from models.common.sampling import add_noise, alphas_cumprod
 from models.common.training import Plan
 from models.common.transformer import TransformerConfig
 from models.registry import load_network
-from models.text2hoi.contact import ContactModel, contact_loss
-from models.text2hoi.contact_config import ContactLossConfig
+from models.text2hoi.contact import ContactLossConfig, ContactModel, contact_loss
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective, feature_shares
 from models.text2hoi.length import LengthModel, length_error
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, attention_map
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface, attention_map
 from models.text2hoi.refiner_training import RefinerObjective
-from models.text2hoi.surface import Surface
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
 

@@ -22,12 +22,11 @@ from models.common.features import Hands
 from models.common.sampling import Motion, SamplerConfig, draw_motion
 from models.common.training import Plan, TrainingConfig, fit
 from models.registry import load_network
+from models.text2hoi.contact_training import best_threshold, contact_probabilities, true_maps
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import Targets
-from models.text2hoi.refiner import RefinerModel
+from models.text2hoi.refiner import RefinerModel, Surface
 from models.text2hoi.refiner_training import RefinerObjective, _Coarse, _Comparison
-from models.text2hoi.surface import Surface
-from models.text2hoi.thresholds import best_threshold, contact_probabilities, true_maps
 from pipelines.stages.base import load_settings
 from pipelines.stages.train import TrainParams
 from tests.builders.stores import write_annotated

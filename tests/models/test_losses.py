@@ -15,7 +15,7 @@ from models.common.features import Hands, place_points, scaled_text, to_object_f
 from models.common.sampling import add_noise
 from models.text2hoi.contact import ContactLossConfig, contact_loss
 from models.text2hoi.length import length_loss
-from models.text2hoi.surface import Surface
+from models.text2hoi.refiner import Surface
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,7 @@ from models.evaluator.settings import EvaluatorSettings
 from models.evaluator.stage import train_evaluators
 from models.registry import load_family, load_network
 from models.text2hoi.contact_training import contact_threshold, draw_threshold
-from models.text2hoi.diagnostics import contact_figures
-from models.text2hoi.family import other_prompts
+from models.text2hoi.family import contact_figures, other_prompts
 from tests.builders.stores import write_annotated
 from tests.models.conftest import PLANS, make_clip
 from tests.models.test_progress import SETTINGS
@@ -86,7 +85,7 @@ def test_thresholds_that_no_validation_clip_chooses_are_one_half(
     def refuse(*_: object) -> float:
         raise AssertionError("a threshold was chosen")
 
-    monkeypatch.setattr("models.text2hoi.diagnostics.best_threshold", refuse)
+    monkeypatch.setattr("models.text2hoi.family.best_threshold", refuse)
     sources = Sources(annotated, tmp_path, HANDS, torch.device("cpu"))
     assert contact_figures(sources, train_clips, [], test)["threshold"] == 0.5
 

@@ -29,8 +29,7 @@ from models.text2hoi.diffusion import SAME_OBJECT, Condition, DiffusionConfig, D
 from models.text2hoi.diffusion_training import DiffusionObjective
 from models.text2hoi.length import LengthConfig, LengthModel, length_loss
 from models.text2hoi.motion_code import MotionCodeConfig
-from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel
-from models.text2hoi.surface import Surface
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
 
 SMALL = TransformerConfig(
     width=32, layers=2, heads=2, feed_forward=64, dropout=0.0, norm_first=True, frames_per_token=2

@@ -16,11 +16,11 @@ from models.manipnet.features import (
     FeatureSettings,
     hand_inputs,
     joint_rotmats_of,
+    kept_columns,
     output_distances,
     pose_features,
     trajectory_features,
 )
-from models.manipnet.layout import kept_columns
 from tests.builders.objects import box_model
 from tests.builders.sensing import small_hand, turns
 

@@ -30,9 +30,8 @@ from models.manipnet.features import FeatureSettings, outputs, pose_features
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.lookups import as_right
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.rollout import Follower, Predictor, Situation, Task, roll_out
+from models.manipnet.rollout import Follower, Nearest, Predictor, Situation, Task, our_targets, paper_targets, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
-from models.manipnet.targets import Nearest, our_targets, paper_targets
 from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.training import MANIPNET
 

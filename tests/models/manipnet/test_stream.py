@@ -15,8 +15,7 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 from models.manipnet.examples import hand_examples, prepared
-from models.manipnet.features import FeatureSettings
-from models.manipnet.layout import kept_columns, times_read_s
+from models.manipnet.features import FeatureSettings, kept_columns, times_read_s
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, Task, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
