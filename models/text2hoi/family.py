@@ -4,16 +4,14 @@
 How motions compare with recorded ones is no matter of a network: see ``hoidata.metrics``.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from hoidata.annotation.encoders import TextEncoder, load_encoder
 from hoidata.batches.dataset import ClipSample, HoiDataset, collate
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
@@ -131,20 +129,13 @@ def mean_map_by_position(points: np.ndarray, train_clouds: list[np.ndarray], tra
 
 
 NAMES = tuple(network.name for network in NETWORKS)
-WITHOUT_FILES = ("use", "hash")
 NO_OTHER_SENTENCE = "all test clips have its sentence"
 
 
 def load_text2hoi(sources: Sources) -> Text2Hoi:
     """The four networks with the settings of ``sample.text2hoi``."""
     config = build_config(SamplingConfig, sources.settings.get("text2hoi"), "params.yaml: sample.text2hoi")
-    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device, encoder_of(sources))
-
-
-def encoder_of(sources: Sources) -> Callable[[], TextEncoder] | None:
-    """What makes the encoder of the dataset's sentences; None where it needs a file that nobody has named."""
-    name = sources.encoder or sources.annotated.encoder_identity["name"]
-    return partial(load_encoder, name) if sources.encoder or name in WITHOUT_FILES else None
+    return Text2Hoi.load(sources.checkpoints, sources.hands, config, sources.device)
 
 
 @dataclass(frozen=True)

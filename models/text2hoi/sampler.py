@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hoidata.annotation.encoders import TextEncoder
 from hoidata.batches.requests import ObjectPoints, Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
@@ -34,7 +33,6 @@ from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
 from models.text2hoi.length import LENGTH, LengthModel
 from models.text2hoi.refiner import RefinerModel, Surface, refine
 from models.text2hoi.refiner_training import REFINER
-from models.text2hoi.understanding import Teller
 from models.text2hoi.verb_check import VerbCheck, asked_verb
 
 NETWORKS = (CONTACT, LENGTH, DIFFUSION, REFINER)
@@ -163,7 +161,6 @@ class Text2Hoi:
     config: SamplingConfig
     device: torch.device
     pair: HandPair
-    teller: Teller | None = None
 
     @classmethod
     def load(
@@ -172,20 +169,15 @@ class Text2Hoi:
         hands: HandPair,
         config: SamplingConfig | None = None,
         device: torch.device | str = "cpu",
-        encoder: Callable[[], TextEncoder] | None = None,
     ) -> "Text2Hoi":
-        """From ``checkpoints/<network>``. Raises BadInput for one that is not there.
-
-        encoder: makes that of sentences which have to be told in other words; None: all are told as they are.
-        """
+        """From ``checkpoints/<network>``. Raises BadInput for one that is not there."""
         device = torch.device(device)
         trained = {
             network.name: load_checkpoint(Path(checkpoints) / network.name, network, device) for network in NETWORKS
         }
         config = config or SamplingConfig()
         compute_in(trained["diffusion"].network, config.precision)
-        teller = None if encoder is None else Teller.of(trained, encoder)
-        return cls(trained, Hands(hands).to(device), config, device, hands, teller)
+        return cls(trained, Hands(hands).to(device), config, device, hands)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -213,12 +205,8 @@ class Text2Hoi:
         self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
     ) -> tuple[list[Clip], list[np.ndarray]]:
         """Motions, and the contact map (N,) bool each of them was drawn for; arguments as in ``motions``."""
-        answers = self.answers(self.told(requests), refined, contact_maps)
+        answers = self.answers(requests, refined, contact_maps)
         return [own.clip for own in answers], [own.motion.contact_map.numpy() > 0 for own in answers]
-
-    def told(self, requests: Sequence[Request]) -> Sequence[Request]:
-        """The requests as ``teller`` tells them, with the features that the networks read the sentence's verb from."""
-        return requests if self.teller is None else [self.teller.told(request) for request in requests]
 
     def answers(
         self,
@@ -291,7 +279,7 @@ class Text2Hoi:
     @torch.no_grad()
     def contact_maps(self, requests: Sequence[Request]) -> list[Tensor]:
         """(2, N) by hand the contact map, 0 or 1, that the first motion drawn for each request would be made for."""
-        batch = collate_requests(self.told(requests)).to(self.device)
+        batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
         return list(self._contact(batch, generators).cpu())
 
