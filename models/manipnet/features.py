@@ -1,17 +1,15 @@
 """What the network reads and writes: pose, trajectory and sensors of one hand, all in canonical axes of its wrist.
 
 Sizes for ManipNet's 17-joint hand: pose 192, trajectory 336, sensors 1,822 (2,350 in all); output 192 + 22 = 214.
-Metres and right-handed axes. Groups of columns have names, to switch sensors off and to scale by unit.
+Metres and right-handed axes. Groups of columns have names, to scale by unit.
 """
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Side
-from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import N_TIPS, HandState, TrackedHand
@@ -157,7 +155,6 @@ def outputs(hand: TrackedHand, state: HandState, distance_m: np.ndarray, setting
     return np.concatenate([pose_features(hand, state), output_distances(hand, distance_m, settings)], axis=1)
 
 
-SHORT_FUTURE_S = 0.1
 METRES, AXES, CELL, RAD_S, SHARE = 0.001, 0.01, 0.05, 0.05, 0.02  # the least spread a number is scaled by
 
 
@@ -172,59 +169,6 @@ def sizes(hand: TrackedHand, settings: FeatureSettings) -> dict[str, int]:
         "distance": times * hand.n_points,
         "normal": 3 * hand.n_points,
     }
-
-
-def kept_columns(hand: TrackedHand, settings: FeatureSettings, without: Iterable[str]) -> np.ndarray:
-    """(input,) float32: 0 for the numbers that are switched off, else 1.
-
-    without: of ambient, proximity, signed-distance; distance for the last two together (the paper's "no distance"),
-    sensors for all; future for what sensors say of later times; long-future for all that is later than 0.1 s.
-    """
-    kept = {name: np.ones(size, np.float32) for name, size in sizes(hand, settings).items()}
-    switches = _switches(hand, settings, kept)
-    for name in without:
-        if name not in switches:
-            raise BadInput("sensors to switch off", f"some of {', '.join(switches)}", name, "correct the name")
-        for columns in switches[name]:
-            columns[:] = 0
-    return np.concatenate(list(kept.values()))
-
-
-def _switches(hand: TrackedHand, settings: FeatureSettings, kept: dict[str, np.ndarray]) -> dict[str, list[np.ndarray]]:
-    """By name the columns it switches off, as views of ``kept``."""
-    later = np.array(settings.sensors.times_s) > 1e-9
-    far = np.array(settings.sensors.times_s) > SHORT_FUTURE_S + 1e-9
-    rows = {name: kept[name].reshape(len(later), -1) for name in ("proximity", "distance")}
-
-    def at(times: np.ndarray) -> list[np.ndarray]:
-        return [rows[name][number] for name in rows for number in np.flatnonzero(times)]
-
-    samples = kept["trajectory"].reshape(-1, SAMPLE_NUMBERS)
-    long = np.flatnonzero(settings.samples_s > SHORT_FUTURE_S + 1e-9)
-    signed = [kept["distance"], kept["normal"]]
-    return {
-        "ambient": [kept["ambient"]],
-        "proximity": [kept["proximity"]],
-        "signed-distance": signed,
-        "distance": [kept["proximity"], *signed],
-        "sensors": [kept["ambient"], kept["proximity"], *signed],
-        "future": at(later),
-        "long-future": [*at(far), *(samples[number] for number in long)],
-    }
-
-
-def times_read_s(kept: np.ndarray, hand: TrackedHand, settings: FeatureSettings) -> tuple[float, float]:
-    """The earliest and the latest time, seconds from now, of which a network with these kept columns reads anything.
-
-    kept: (input,) as ``kept_columns`` gives. (A velocity also asks for one step before its sample.)
-    """
-    count = sizes(hand, settings)
-    parts = dict(zip(count, np.split(kept, np.cumsum(list(count.values()))[:-1]), strict=True))
-    samples = np.any(parts["trajectory"].reshape(-1, SAMPLE_NUMBERS), axis=1)
-    times = np.array(settings.sensors.times_s)
-    sensed = [np.any(parts[name].reshape(len(times), -1), axis=1) for name in ("proximity", "distance")]
-    read = np.concatenate([[0.0], settings.samples_s[samples], *(times[seen] for seen in sensed)])
-    return float(read.min()), float(read.max())
 
 
 def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:

@@ -19,7 +19,7 @@ from models.manipnet.features import FeatureSettings
 class NetworkConfig:
     """pose, trajectory, sensors, output: how many numbers there are of each; joints of the hand.
 
-    features: how they are measured, and the time from one pose to the next. without: sensors that are switched off.
+    features: how they are measured, and the time from one pose to the next.
 
     encoder: width of each of the three encoders, the paper's 512. keep: share of the numbers that dropout keeps at the
     input of every linear layer.
@@ -31,7 +31,6 @@ class NetworkConfig:
     output: int = 214
     joints: int = 17
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    without: tuple[str, ...] = ()
     encoder: int = 512
     blocks: int = 2
     keep: float = 0.7
@@ -57,8 +56,7 @@ class DenseBlock(nn.Module):
 class ManipNet(nn.Module):
     """Inputs (..., pose + trajectory + sensors) to outputs (..., output), both as measured.
 
-    Buffers of the normalisation: input_mean, input_scale, output_mean, output_scale; kept: 0 for inputs it does not
-    see, which is how sensors are switched off: every variant has the same layers. low_rad, high_rad: (joint - 1, 3)
+    Buffers of the normalisation: input_mean, input_scale, output_mean, output_scale. low_rad, high_rad: (joint - 1, 3)
     how far finger joints turned in training (``inverse_kinematics.Limits``).
     """
 
@@ -66,7 +64,6 @@ class ManipNet(nn.Module):
     input_scale: Tensor
     output_mean: Tensor
     output_scale: Tensor
-    kept: Tensor
     low_rad: Tensor
     high_rad: Tensor
 
@@ -85,7 +82,6 @@ class ManipNet(nn.Module):
         for name, size in (("input", sum(config.inputs)), ("output", config.output)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
-        self.register_buffer("kept", torch.ones(sum(config.inputs)))
         for name, value in (("low_rad", -torch.pi), ("high_rad", torch.pi)):
             self.register_buffer(name, torch.full((config.joints - 1, 3), value))
 
@@ -94,7 +90,7 @@ class ManipNet(nn.Module):
 
     def normalised(self, inputs: Tensor) -> Tensor:
         """The outputs in units of their spread, on which the loss is."""
-        z = self.dropout((inputs - self.input_mean) / self.input_scale * self.kept)
+        z = self.dropout((inputs - self.input_mean) / self.input_scale)
         parts = z.split(self.config.inputs, -1)
         a = torch.cat([encoder(part) for encoder, part in zip(self.encoders, parts, strict=True)], -1)
         for block in self.blocks:

@@ -16,7 +16,6 @@ from models.manipnet.features import (
     FeatureSettings,
     hand_inputs,
     joint_rotmats_of,
-    kept_columns,
     output_distances,
     pose_features,
     trajectory_features,
@@ -138,18 +137,3 @@ def test_output_distances_are_shares_of_3_cm_beyond_the_capsule():
     np.testing.assert_allclose(found, [0, 0, 0.5, 1, 1, 1, 0, 0.5, 1, 1, 1])
     wide = output_distances(hand, distance_m, replace(SETTINGS, range_m=0.06))[0]
     np.testing.assert_allclose(wide[:4], [0, 0, 0.25, 0.5])
-
-
-def test_what_is_switched_off_is_all_that_its_name_says():
-    hand, n_points, n_sensors = HANDS["mano"], HANDS["mano"].n_points, HANDS["mano"].n_sensors
-    off = {
-        "ambient": 1000,
-        "proximity": 6 * n_sensors,
-        "signed-distance": 9 * n_points,
-        "distance": 6 * n_sensors + 9 * n_points,
-        "sensors": 1000 + 6 * n_sensors + 9 * n_points,
-        "future": 5 * (n_sensors + n_points),
-        "long-future": 4 * (n_sensors + n_points) + 8 * 16,  # 0.15 to 0.5 s of the trajectory
-    }
-    for name, count in off.items():
-        assert (kept_columns(hand, SETTINGS, [name]) == 0).sum() == count, name
