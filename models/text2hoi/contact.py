@@ -24,6 +24,7 @@ from models.common.features import TEXT_FEATURES, scaled_text
 from models.common.point_net import PointLayer, PointNet, PointNetConfig, normalised_points
 
 HAND_FLAGS = 2
+TOUCH_WEIGHT = 0.1  # of the cross-entropy of touches beside that of the maps they give
 N_SIDES = 2
 ANCHORS = 4  # touches that a map is drawn by, of each hand
 ANCHOR_FEATURES = 8
@@ -50,14 +51,8 @@ class ContactConfig:
 
 @dataclass(frozen=True)
 class ContactLossConfig:
-    """Weights of KL divergence, Dice term, and the cross-entropy of anchors, beside a map's cross-entropy.
+    """points: how many points of every object a step sees, drawn anew each time."""
 
-    points: how many points of every object a step sees, drawn anew each time.
-    """
-
-    kl_weight: float = 1.0
-    dice_weight: float = 1.0
-    touch_weight: float = 0.1
     points: int = 1024
 
 
@@ -121,15 +116,13 @@ class ContactModel(nn.Module):
         return torch.randn(count, n_clips, self.config.latent, generator=generator)
 
 
-def contact_loss(
-    logits: Tensor, contact_map: Tensor, mean: Tensor, log_variance: Tensor, weights: ContactLossConfig
-) -> dict[str, Tensor]:
+def contact_loss(logits: Tensor, contact_map: Tensor, mean: Tensor, log_variance: Tensor) -> dict[str, Tensor]:
     """Summed cross-entropy, Dice (per clip) and KL divergence to N(0, I) per latent, by name, and their "total"."""
     cross = functional.binary_cross_entropy_with_logits(logits, contact_map) * logits.shape[1]
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact_map).sum(1) + 1) / (probability.sum(1) + contact_map.sum(1) + 1)
     divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(1).mean()
-    total = cross + weights.dice_weight * dice.mean() + weights.kl_weight * divergence
+    total = cross + dice.mean() + divergence
     return {"total": total, "cross_entropy": cross, "dice": dice.mean(), "kl": divergence}
 
 
@@ -237,9 +230,7 @@ def picked(weights: Tensor, draws: Tensor) -> Tensor:
     return found.clamp_max(weights.shape[-1] - 1)
 
 
-def by_hand_loss(
-    touch: Tensor, logits: Tensor, contact: Tensor, active_hands: Tensor, weights: ContactLossConfig
-) -> dict[str, Tensor]:
+def by_hand_loss(touch: Tensor, logits: Tensor, contact: Tensor, active_hands: Tensor) -> dict[str, Tensor]:
     """Cross-entropy and Dice of the maps (B, 2, N) of hands that act, and that of touches, as parts and "total"."""
     there = active_hands.to(logits.dtype)
     total = there.sum().clamp_min(1)
@@ -247,5 +238,5 @@ def by_hand_loss(
     probability = logits.sigmoid()
     dice = 1 - (2 * (probability * contact).sum(-1) + 1) / (probability.sum(-1) + contact.sum(-1) + 1)
     parts = {"cross_entropy": (cross * there).sum() / total, "dice": (dice * there).sum() / total, "touch": touch}
-    whole = parts["cross_entropy"] + weights.dice_weight * parts["dice"] + weights.touch_weight * touch
+    whole = parts["cross_entropy"] + parts["dice"] + TOUCH_WEIGHT * touch
     return {"total": whole, **parts}

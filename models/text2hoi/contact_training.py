@@ -83,25 +83,25 @@ class ContactObjective:
 
     frames = entries = 0
 
-    def __init__(self, network: nn.Module, weights: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.weights, self.corpus, self.device = network, weights, corpus, device
+    def __init__(self, network: nn.Module, loss: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
+        self.network, self.loss, self.corpus, self.device = network, loss, corpus, device
 
     @cached_property
     def held_out(self) -> ClipBatch:
         return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        some = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.weights.points], self.device)
+        some = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points], self.device)
         points, text, network = batch.points_m[:, some], any_form(batch, generator), self.network
         if isinstance(network, AnchoredContact):
             contact = batch.contact[..., some].float()
             touch, logits = network.losses(points, text, batch, contact, generator)
-            return by_hand_loss(touch, logits, contact, batch.active_hands, self.weights)
+            return by_hand_loss(touch, logits, contact, batch.active_hands)
         assert isinstance(network, ContactModel)
         contact_map = batch.contact_map[:, some]
         noise = send(torch.randn(len(batch), network.config.latent, generator=generator), self.device)
         logits, mean, log_variance = network(points, text, contact_map, noise)
-        return contact_loss(logits, contact_map, mean, log_variance, self.weights)
+        return contact_loss(logits, contact_map, mean, log_variance)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:

@@ -19,7 +19,7 @@ from models.common.sampling import add_noise, alphas_cumprod
 from models.common.training import Plan
 from models.common.transformer import TransformerConfig
 from models.registry import load_network
-from models.text2hoi.contact import ContactLossConfig, ContactModel, contact_loss
+from models.text2hoi.contact import ContactModel, contact_loss
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.diffusion_training import DiffusionLossConfig, DiffusionObjective, feature_shares
 from models.text2hoi.length import LengthModel, length_error
@@ -315,7 +315,7 @@ def test_contact_and_length_losses_are_sums_of_their_parts() -> None:
     cross = -(touched * np.log(p) + (1 - touched) * np.log(1 - p)).sum(1).mean()
     dice = (1 - (2 * (p * touched).sum(1) + 1) / (p.sum(1) + touched.sum(1) + 1)).mean()
     divergence = (0.5 * (mean**2 + np.exp(spread) - 1 - spread)).sum(1).mean()
-    found = contact_loss(*map(torch.from_numpy, (logits, touched, mean, spread)), ContactLossConfig())
+    found = contact_loss(*map(torch.from_numpy, (logits, touched, mean, spread)))
     assert float(found["total"]) == pytest.approx(cross + dice + divergence, rel=1e-5)
     assert float(length_error(torch.tensor([0.5, 0.2]), torch.tensor([90, 30]))["total"]) == pytest.approx(0.005)
 
