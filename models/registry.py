@@ -59,7 +59,7 @@ FAMILIES = {
 # Each in a module of its own, so that a change of one trains no other again.
 NETWORKS = {
     "contact": "models.text2hoi.contact_training:CONTACT",
-    "length": "models.text2hoi.length_training:LENGTH",
+    "length": "models.text2hoi.length:LENGTH",
     "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
     "refiner": "models.text2hoi.refiner_training:REFINER",
     "manipnet": "models.manipnet.training:MANIPNET",

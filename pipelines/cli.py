@@ -17,7 +17,6 @@ from pipelines.commands import (
     export,
     generate,
     graph,
-    import_checkpoint,
     init,
     inspect,
     lineage,
@@ -59,7 +58,6 @@ app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)
-app.command("import-checkpoint")(import_checkpoint.import_checkpoint)
 app.command("generate")(generate.generate)
 app.command("animate")(animate.animate)
 app.command("hands")(object_hands.hands)

@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from hoidata.errors import BadInput
-from hoidata.files.torch_zip import load_torch_zip
 
 Tensors = dict[str, Tensor]
 ZIP_BYTES = b"PK\x03\x04"
@@ -111,9 +110,10 @@ def _state_dict(path: Path) -> Tensors:
     if any(name.endswith("/constants.pkl") for name in members):
         raise BadInput(path, expected, "a TorchScript archive, which holds code", CONVERT)
     try:
-        stored: Any = load_torch_zip(path)
-    except BadInput as error:
-        raise BadInput(path, expected, error.got, CONVERT) from error
+        stored: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a malformed file can raise anything
+        text = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"[:300]
+        raise BadInput(path, expected, text, CONVERT) from error
     if isinstance(stored, Mapping) and isinstance(stored.get("state_dict"), Mapping):
         stored = stored["state_dict"]
     named = stored.items() if isinstance(stored, Mapping) else ()

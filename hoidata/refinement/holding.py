@@ -30,7 +30,6 @@ from hoidata.refinement.object_field import ObjectField, world_from_part
 from hoidata.refinement.regrasping import Held, RegraspSettings, bends_rad, grasps_that_carry
 from hoidata.refinement.resting import RestSettings, rest_object
 from hoidata.refinement.skin import HandPose, Skin
-from hoidata.refinement.waiting import WaitSettings, wait_for_hands
 from hoidata.workers import one_thread
 
 _OPPOSITE: Mapping[Side, Side] = {"left": "right", "right": "left"}
@@ -50,8 +49,8 @@ class HoldSettings:
     the part moves in no hand. reach_m, keypoint_m: from where skin is drawn to the surface, and the standard deviation
     of a vertex from where it was: the first of each, then the next, on top of what came out, where those hands cannot
     carry the object in some of air_frames frames in which it is in the air. solver: the other wishes. regrasp: of hands
-    that cannot carry it then. rest: of the object, before all that. wait: of the object for hands that come and go,
-    after it. Raises BadInput where there is no reach, or not one deviation for each.
+    that cannot carry it then. rest: of the object, before all that. Raises BadInput where there is no reach, or
+    not one deviation for each.
     """
 
     near_m: float = 0.006
@@ -69,7 +68,6 @@ class HoldSettings:
     solver: SolverSettings = field(default_factory=SolverSettings)
     regrasp: RegraspSettings = field(default_factory=RegraspSettings)
     rest: RestSettings = field(default_factory=RestSettings)
-    wait: WaitSettings = field(default_factory=WaitSettings)
 
     def __post_init__(self) -> None:
         if len(self.reach_m) != len(self.keypoint_m) or not self.reach_m:
@@ -81,12 +79,9 @@ class HoldSettings:
 
 @one_thread()
 def hold_clip(pair: HandPair, clip: Clip, settings: HoldSettings = HoldSettings()) -> Clip:
-    """The clip with its object at rest where it lay (``resting``), hands that hold it (``hold_hands``), and an object
-    that waits for them (``waiting``).
-    """
+    """The clip with its object at rest where it lay (``resting``), and hands that hold it (``hold_hands``)."""
     clip = rest_object(clip, settings.rest)
-    held = replace(clip, hands=hold_hands(pair, clip, settings))
-    return wait_for_hands(pair, held, settings.wait)
+    return replace(clip, hands=hold_hands(pair, clip, settings))
 
 
 @one_thread()

@@ -1,19 +1,17 @@
 """Clips for a training: the two splits that may be read, batches in a repeatable order, and facts to record."""
 
 import itertools
-from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from itertools import pairwise
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, Crop, HoiDataset, collate
-from hoidata.batches.mirror import Mirror
 from hoidata.batches.sight import Sight
 from hoidata.devices import send
 from hoidata.files import canonical_json, sha256_bytes
@@ -23,7 +21,6 @@ from models.common.augmentation import Augmentation
 from models.common.vocabulary import Vocabulary
 
 BUCKET_BATCHES = 4
-Balance = Literal["none", "verb"]
 Item = TypeVar("Item")
 HAND_TYPES = ("left", "right", "both")
 
@@ -32,17 +29,14 @@ HAND_TYPES = ("left", "right", "both")
 class Wanted:
     """What of every batch is asked for. frames, entries: of each clip and in all, for losses of geometry (``Sight``).
 
-    parts: those of ``of`` equal parts of a batch that this process computes. balance: clips drawn evenly, or verbs.
-    mirror: every other clip in a mirror, where that can be (``Mirror``). augmented_copies: of every clip,
-    beside it (``Augmentation``).
+    parts: those of ``of`` equal parts of a batch that this process computes. augmented_copies: of every clip, beside it
+    (``Augmentation``).
     """
 
     frames: int = 0
     entries: int = 0
     parts: Sequence[int] = (0,)
     of: int = 1
-    balance: Balance = "none"
-    mirror: bool = False
     augmented_copies: int = 0
 
 
@@ -109,15 +103,13 @@ def batches(
     part), so that a training that goes on finds what it would have found.
     """
     lengths = [min(dataset.whole(clip_id).length, dataset.max_frames) for clip_id in dataset.ids]
-    weights = _verb_weights(dataset) if wanted.balance == "verb" else None
-    mirror = Mirror.of(map(dataset.whole, dataset.ids)) if wanted.mirror else None
     augmentation = Augmentation(dataset, wanted.augmented_copies)
-    for step, (epoch, rows) in enumerate(_plan(lengths, size, seed, weights), 1):
+    for step, (epoch, rows) in enumerate(_plan(lengths, size, seed), 1):
         if step > start:
             dataset.set_epoch(epoch)
             parts = {part: rows[part :: wanted.of] or rows[:1] for part in wanted.parts}
             yield [
-                (part, _collated([dataset[row] for row in own], wanted, (seed, step, part), mirror, augmentation))
+                (part, _collated([dataset[row] for row in own], wanted, (seed, step, part), augmentation))
                 for part, own in parts.items()
             ]
 
@@ -126,39 +118,26 @@ def _collated(
     samples: list[ClipSample],
     wanted: Wanted,
     drawn_from: tuple[int, int, int],
-    mirror: Mirror | None,
     augmentation: Augmentation,
 ) -> ClipBatch:
     if augmentation.count:
         numbers = np.random.default_rng([*drawn_from, 2]).integers(0, augmentation.count + 1, len(samples)).tolist()
         samples = [augmentation.copy_of(one.clip_id, n) if n else one for one, n in zip(samples, numbers, strict=True)]
-    if mirror is not None:
-        turned = np.random.default_rng([*drawn_from, 1]).random(len(samples)) < 0.5
-        samples = [(turn and mirror.mirrored(one)) or one for one, turn in zip(samples, turned, strict=True)]
     random = np.random.default_rng(drawn_from)
     lengths = [sample.length for sample in samples]
     sight = Sight.drawn(lengths, wanted.frames, wanted.entries, random) if wanted.frames else None
     return collate(samples, sight)
 
 
-def _plan(lengths: list[int], size: int, seed: int, weights: np.ndarray | None) -> Iterator[tuple[int, list[int]]]:
+def _plan(lengths: list[int], size: int, seed: int) -> Iterator[tuple[int, list[int]]]:
     """Epoch and clips of every step. Clips of like length share a batch, which saves padding: within each interval of a
-    few batches they are sorted. weights: how often each clip is drawn; then an epoch may leave some out."""
+    few batches they are sorted."""
     for epoch in itertools.count():
-        random, count = np.random.default_rng([seed, epoch]), len(lengths)
-        order = random.permutation(count) if weights is None else random.choice(count, count, p=weights)
-        for window in _split(order.tolist(), size * BUCKET_BATCHES):
+        random = np.random.default_rng([seed, epoch])
+        for window in _split(random.permutation(len(lengths)).tolist(), size * BUCKET_BATCHES):
             groups = _split(sorted(window, key=lambda row: (lengths[row], row)), size)
             for number in random.permutation(len(groups)):
                 yield epoch, groups[number]
-
-
-def _verb_weights(dataset: HoiDataset) -> np.ndarray:
-    """(clip,) probabilities with which every verb is drawn alike."""
-    verbs = [dataset.whole(clip_id).verb for clip_id in dataset.ids]
-    counts = Counter(verbs)
-    weights = np.array([1 / counts[verb] for verb in verbs])
-    return weights / weights.sum()
 
 
 def _split(items: list[Item], size: int) -> list[list[Item]]:

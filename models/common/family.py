@@ -96,8 +96,7 @@ class Network(StoredNetwork):
 class Sources:
     """What a family may use to answer. annotated: the dataset; checkpoints: folder with one folder per network.
 
-    hands: the hand model of the dataset's clips. settings: sections of families, by name. encoder: the name of the one
-    that wrote the dataset's text features, as in ``annotate.encoder``; None: the one the dataset names.
+    hands: the hand model of the dataset's clips. settings: sections of families, by name.
     """
 
     annotated: AnnotatedStore
@@ -105,7 +104,6 @@ class Sources:
     hands: HandPair
     device: torch.device
     settings: Mapping[str, Any] = field(default_factory=dict)
-    encoder: str | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from hoidata.clips.features import (
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandPair
 
+TEXT_FEATURES = 512  # of a sentence, whatever the encoder
 # Of rows that say how an object has turned since its first frame, after its features: how it lay there.
 OBJECT_START_6D = slice(OBJECT_FEATURES, OBJECT_FEATURES + 6)
 # A feature that hardly varies in training is scaled as if it varied this much, so that noise in it stays harmless.

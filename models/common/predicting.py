@@ -66,14 +66,13 @@ def sample_family(
     *,
     settings: Mapping[str, Any] | None = None,
     device: str = "cpu",
-    encoder: str | None = None,
 ) -> dict[str, int]:
     """Write ``out/clips`` and ``out/diagnostics.json``, or ``out/empty.json`` with the reason; the counts.
 
     Requests the family has no answer to stand in ``out/left_out.json``, where there are any. A family that is
     :class:`AsksContact` also gets ``out/asked.npz`` or ``out/asked-distances.npz`` (``hoidata.metrics.asked``).
     annotated_root: clips, annotation, contact and splits of a dataset. checkpoints: folder with one per network.
-    params: a :class:`PredictionConfig`; settings: sections of families, by name. encoder: as in ``Sources``. The k-th
+    params: a :class:`PredictionConfig`; settings: sections of families, by name. The k-th
     motion for a clip is named ``<clip id>~<k>``; lengths and acting hands are the clip's own, of clips longer than a
     model takes the first frames.
     """
@@ -87,7 +86,7 @@ def sample_family(
         with atomic_folder(out) as partial:
             write_empty(partial, reason or "no test clips")
         return {"clips": 0}
-    sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {}, encoder)
+    sources = Sources(annotated, checkpoints, hands, torch.device(device), settings or {})
     with atomic_folder(out) as partial:
         info = annotated.info | {"family": family.name, "sampling_device": sources.device.type}
         left_out, asked = list[LeftOut](), dict[str, np.ndarray | AskedDistances]()

@@ -41,8 +41,8 @@ class Diverged(Exception):
 class State:
     """Where a training stands after ``step``; with (seed, step) it is all that the next step depends on.
 
-    kept: running average of the network's weights. best: weights at the lowest validation loss, which was ``best_loss``
-    ``since`` validations ago. log: a row per validation. running: losses added up since the last row, over the team.
+    kept: running average of the network's weights. best: weights at the lowest validation loss, ``best_loss``.
+    log: a row per validation. running: losses added up since the last row, over the team.
     """
 
     network: nn.Module
@@ -51,7 +51,6 @@ class State:
     step: int = 0
     best: dict[str, Tensor] = field(default_factory=dict)
     best_loss: float = math.inf
-    since: int = 0
     log: list[Row] = field(default_factory=list)
     running: dict[str, Tensor] = field(default_factory=dict)
 
@@ -72,7 +71,7 @@ class State:
                 yield row, name, value
 
     def restore(self, tensors: Mapping[str, Tensor], numbers: Mapping[str, Any]) -> None:
-        """The inverse of ``tensors``; numbers: step, best_loss, since and log."""
+        """The inverse of ``tensors``; numbers: step, best_loss and log."""
         groups: dict[str, dict[str, Tensor]] = {}
         for name, value in tensors.items():
             group, _, own = name.partition("/")
@@ -87,7 +86,7 @@ class State:
         device = next(iter(self.network.state_dict().values())).device
         self.best = {name: value.to(device) for name, value in groups.get("best", {}).items()}
         self.running = {name: groups["running"][name].to(device) for name in numbers["losses"]}
-        self.step, self.since, self.log = numbers["step"], numbers["since"], numbers["log"]
+        self.step, self.log = numbers["step"], numbers["log"]
         self.best_loss = math.inf if numbers["best_loss"] is None else numbers["best_loss"]
 
 
@@ -143,7 +142,7 @@ class Progress:
     def save(self, state: State) -> None:
         """Everything, whole or not at all. Raises Diverged where a weight is no finite number: none such is kept."""
         best_loss = None if math.isinf(state.best_loss) else state.best_loss
-        numbers = {"digest": self.digest, "step": state.step, "since": state.since, "best_loss": best_loss}
+        numbers = {"digest": self.digest, "step": state.step, "best_loss": best_loss}
         numbers["losses"] = list(state.running)  # in the order of the log's columns
         tensors = {name: value.detach().cpu().contiguous() for name, value in sorted(state.tensors().items())}
         if not all_finite(tensors):

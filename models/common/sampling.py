@@ -58,9 +58,9 @@ def alphas_cumprod(device: torch.device | str = "cpu") -> Tensor:
     return torch.tensor(signal_shares()).to(device)
 
 
-def timesteps(steps: int, first: int = TRAIN_STEPS) -> list[int]:
-    """The steps that are walked: from the last of the ``first`` down, evenly ("trailing", Lin et al. 2024)."""
-    return [round(first * (1 - number / steps)) - 1 for number in range(steps)]
+def timesteps(steps: int) -> list[int]:
+    """The steps that are walked: from the last of the 1,000 down, evenly ("trailing", Lin et al. 2024)."""
+    return [round(TRAIN_STEPS * (1 - number / steps)) - 1 for number in range(steps)]
 
 
 def add_noise(clean: Tensor, noise: Tensor, steps: Tensor, signal: Tensor) -> Tensor:
@@ -116,14 +116,12 @@ def sample(
     noise: Tensor,
     config: SamplerConfig,
     generator: torch.Generator | list[torch.Generator],
-    first: int = TRAIN_STEPS,
 ) -> Tensor:
     """Samples from noise (B, ...), on its device; ``denoise(x, t)`` gives what is clean in x at timesteps (B,).
 
-    generator: of the noise that DDPM adds, one for all rows or one for each. first: what is given is no noise, but
-    something noised by so many of the 1,000 steps.
+    generator: of the noise that DDPM adds, one for all rows or one for each.
     """
-    x, walked, shares = noise, timesteps(config.steps, first), signal_shares()
+    x, walked, shares = noise, timesteps(config.steps), signal_shares()
     before: Tensor | None = None
     for number, step in enumerate(walked):
         now, then = shares[step], shares[walked[number + 1]] if number + 1 < len(walked) else 1.0

@@ -32,7 +32,7 @@ from models.common.checkpoints import (
     save_checkpoint,
     write_empty,
 )  # fmt: skip
-from models.common.corpus import Balance, Corpus, Wanted, batches
+from models.common.corpus import Corpus, Wanted, batches
 from models.common.family import Network, Objective, Setup
 from models.common.features import Hands, Normaliser
 from models.common.precision import Precision, compute_in
@@ -48,14 +48,11 @@ CHECK_EVERY_ON_CPU, CHECK_EVERY = 1, 50
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """Budget and optimiser (AdamW). The defaults are Text2HOI's released ones, but for ``steps``.
+    """Budget and optimiser (AdamW). The defaults are Text2HOI's, but for ``steps``.
 
     schedule: "constant", or "cosine" to zero after ``warmup`` steps. ema_decay: of the running average of the weights
-    that is kept (0: the weights themselves). adam_beta2: of AdamW's running mean of squared gradients; at .999 the
-    large gradients of the first steps slow a thousand more, which a short training does not have. keep_best: keep the
-    step with the lowest validation loss, not the last. Without validation clips the last step is kept.
-    patience: stop after so many validations without a lower loss (0: never). balance: draw clips evenly, or verbs.
-    mirror: every other clip is seen in a mirror, where the other hand is known to do the same (``batches.mirror``).
+    that is kept (0: the weights themselves). keep_best: keep the step with the lowest validation loss, not
+    the last. Without validation clips the last step is kept.
     augmented_copies: how many copies of every clip are seen beside it, with other paths, turns and moments
     (``common.augmentation``); they are kept in memory, each as large as its clip.
     precision: of Transformers and point networks, where the time is; all else stays float32. parts: of a batch, whose
@@ -71,13 +68,9 @@ class TrainingConfig:
     schedule: Literal["constant", "cosine"] = "constant"
     warmup: int = 0
     ema_decay: float = 0.0
-    adam_beta2: float = 0.999
     clip_norm: float = 0.0
     keep_best: bool = False
-    patience: int = 0
     validate_every: int = 500
-    balance: Balance = "none"
-    mirror: bool = False
     augmented_copies: int = 0
     precision: Precision = "float32"
     parts: int = 1
@@ -259,22 +252,17 @@ def fit(
     """Run the steps; the network to keep, in evaluation mode, and one log row per validation."""
     team, network = Team.joined(), objective.network.train()
     learnt = [parameter for parameter in network.parameters() if parameter.requires_grad]
-    betas, decay = (0.9, config.adam_beta2), config.weight_decay
-    optimiser = torch.optim.AdamW(learnt, lr=config.learning_rate, betas=betas, weight_decay=decay, fused=True)
+    optimiser = torch.optim.AdamW(learnt, lr=config.learning_rate, weight_decay=config.weight_decay, fused=True)
     state = State(network, copy.deepcopy(network).eval().requires_grad_(False), optimiser)
     compute_in(network, config.precision)
     if progress:
         progress.load(state)
     shared = team.own_parts(config.parts), config.parts
-    wanted = Wanted(
-        objective.frames, objective.entries, *shared, config.balance, config.mirror, config.augmented_copies
-    )
+    wanted = Wanted(objective.frames, objective.entries, *shared, config.augmented_copies)
     stream = batches(corpus.train, config.batch, seed, wanted, state.step)
     remaining, losses = range(state.step + 1, config.steps + 1), dict[int, Tensor]()
     check_every = CHECK_EVERY_ON_CPU if device.type == "cpu" else CHECK_EVERY
     for step in track(remaining, description=type(network).__name__, transient=True, disable=not team.writes):
-        if config.patience and state.since >= config.patience:
-            break
         optimiser.zero_grad(set_to_none=True)
         losses[step] = _add_gradients(state, objective, next(stream), (seed, step, config.parts), device, team)
         is_validated = step % config.validate_every == 0 or step == config.steps
@@ -360,13 +348,10 @@ def _validate(state: State, objective: Objective | None, config: TrainingConfig)
         raise Diverged(state.step, f"a validation loss of {loss:g}", state)
     state.log.append({"step": state.step, "validation": loss, **row})
     state.running = {}
-    if loss is None:
-        return
-    better = loss < state.best_loss
-    state.since = 0 if better else state.since + 1
-    state.best_loss = loss if better else state.best_loss
-    if better and config.keep_best:
-        state.best = copy.deepcopy(state.kept.state_dict())
+    if loss is not None and loss < state.best_loss:
+        state.best_loss = loss
+        if config.keep_best:
+            state.best = copy.deepcopy(state.kept.state_dict())
 
 
 def learning_rate_factor(step: int, config: TrainingConfig) -> float:

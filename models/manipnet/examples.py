@@ -15,9 +15,8 @@ from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import sensor_size
 from models.common.training import TrainingConfig, learning_rate_factor
 from models.manipnet.control import Control
-from models.manipnet.features import FeatureSettings, hand_inputs, outputs
+from models.manipnet.features import FeatureSettings, floors, hand_inputs, outputs, sizes
 from models.manipnet.inverse_kinematics import turns_from_rest
-from models.manipnet.layout import floors, kept_columns, sizes
 from models.manipnet.network import ManipNet, NetworkConfig
 
 LEARNT = ("inputs", "outputs")
@@ -90,12 +89,11 @@ def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
 
 
 def prepared(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
-    """A network that knows its normalisation, its sensors and the limits of the joints from training examples."""
+    """A network that knows its normalisation and the limits of the joints from training examples."""
     network = ManipNet(sized(config, hand))
     inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in LEARNT)
     least = [torch.from_numpy(values).float() for values in floors(hand, config.features)]
     network.learn_normalisation(inputs, made, (least[0], least[1]))
-    network.kept.copy_(torch.from_numpy(kept_columns(hand, config.features, config.without)))
     turns = torch.from_numpy(np.concatenate([one.turns_rad for one in examples]))
     network.low_rad.copy_(turns.amin(0) - MARGIN_RAD)
     network.high_rad.copy_(turns.amax(0) + MARGIN_RAD)

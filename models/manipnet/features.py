@@ -1,11 +1,11 @@
 """What the network reads and writes: pose, trajectory and sensors of one hand, all in canonical axes of its wrist.
 
 Sizes for ManipNet's 17-joint hand: pose 192, trajectory 336, sensors 1,822 (2,350 in all); output 192 + 22 = 214.
-Metres and right-handed axes; ``released_inputs`` and ``released_outputs`` turn to the release's layout.
+Metres and right-handed axes. Groups of columns have names, to scale by unit.
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,36 +13,27 @@ from hoidata.clips.clip import SIDES, Side
 from hoidata.geometry.rotations import rotmat_to_rotvec
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import N_TIPS, HandState, TrackedHand
-from hoidata.objects.mesh import mass_properties
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import OURS, SensorSettings, sense
 from hoidata.sensors.settings import CELLS
 from models.manipnet.control import Control, Motion
 
-_RELEASED_UNIT = 10.0  # decimetres
 SAMPLE_NUMBERS = 16
-_SMOOTHED_SAMPLES, _SMOOTHING = 5, 2.5
 
 
 @dataclass(frozen=True)
 class FeatureSettings:
     """step_s: from one pose to the next. past_s, future_s, spacing_s: samples of the trajectory around now.
 
-    velocity_axes: of the object's angular velocity relative to the wrist: the wrist's now, or the object's.
-    object_place: what stands for the object's position. smooth: the release's smoothing of trajectories in training.
-    range_m: distances of the output are clamped to 0 and this and divided by it; less_radius: less that of the
-    capsule that begins at the joint.
+    range_m: distances of the output, less the radius of the capsule that begins at the joint, are clamped to 0 and this
+    and divided by it.
     """
 
     step_s: float = 1 / 60
     past_s: float = 0.5
     future_s: float = 0.5
     spacing_s: float = 0.05
-    velocity_axes: Literal["wrist", "object"] = "wrist"
-    object_place: Literal["box", "mass"] = "box"
-    smooth: bool = False
     range_m: float = 0.03
-    less_radius: bool = True
     sensors: SensorSettings = OURS
 
     @property
@@ -106,22 +97,12 @@ def trajectory_features(
     wrist_from_world = now.inverse()
     away = np.linalg.norm(other.at(samples).translation - now.translation[:, None], axis=-1, keepdims=True)
     axes = canonical.T @ (now.rotation[:, None].swapaxes(-1, -2) @ wrist.rotation) @ canonical
-    middle = (thing @ object_place(control, settings)[None])[:, :, 0]
+    middle = (thing @ control.box_middle_m[None])[:, :, 0]
     turning = _angular_velocity(control.thing, own, samples, now, settings)
-    if settings.velocity_axes == "wrist":
-        turning = np.linalg.det(canonical) * turning @ canonical  # a mirror turns axial vectors round
-    else:
-        turning = turning * ([1.0, 1.0, 1.0] if hand.side == "right" else [1.0, -1.0, -1.0])
+    turning = np.linalg.det(canonical) * turning @ canonical  # a mirror turns axial vectors round
     places = [(wrist_from_world @ points) @ canonical for points in (wrist.translation, middle)]
     rows = np.concatenate([away, places[0], axes[..., 2], axes[..., 1], places[1], turning], axis=-1)
-    return (_smoothed(rows) if settings.smooth else rows).reshape(len(time_s), -1)
-
-
-def object_place(control: Control, settings: FeatureSettings) -> np.ndarray:
-    """(3,) what stands for the object's position, object frame, hinge at 0: its box's centre, or its mass's."""
-    if settings.object_place == "mass":
-        return mass_properties(control.model.vertices_m, control.model.faces).centre_m
-    return control.box_middle_m
+    return rows.reshape(len(time_s), -1)
 
 
 def _angular_velocity(
@@ -132,21 +113,9 @@ def _angular_velocity(
     here, before = (
         own.at(times).rotation.swapaxes(-1, -2) @ thing.at(times).rotation for times in (samples_s, before_s)
     )
-    if settings.velocity_axes == "object":
-        return rotmat_to_rotvec(before.swapaxes(-1, -2) @ here) / settings.step_s
     turn = rotmat_to_rotvec(here @ before.swapaxes(-1, -2)) / settings.step_s
     now_from_then = now.rotation[:, None].swapaxes(-1, -2) @ own.at(samples_s).rotation
     return (now_from_then @ turn[..., None])[..., 0]
-
-
-def _smoothed(rows: np.ndarray) -> np.ndarray:
-    """The release's filter over samples (frame, sample, number): in place, so it smooths what is smooth already."""
-    rows = rows.copy()
-    for sample in range(rows.shape[1]):
-        around = np.arange(max(sample - _SMOOTHED_SAMPLES, 0), min(sample + _SMOOTHED_SAMPLES + 1, rows.shape[1]))
-        weight = np.exp(-(((around - sample) / _SMOOTHING) ** 2))
-        rows[:, sample] = np.einsum("s,fsn->fn", weight / weight.sum(), rows[:, around])
-    return rows
 
 
 def object_from_wrist(
@@ -178,8 +147,7 @@ def hand_inputs(
 
 def output_distances(hand: TrackedHand, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
     """(frame, 22) in 0 to 1, of signed distances (frame, 22) of joints and tips (``Sensed.distance_m[:, 0]``)."""
-    radius = hand.point_radius_m if settings.less_radius else 0.0
-    return np.clip((distance_m - radius) / settings.range_m, 0.0, 1.0)
+    return np.clip((distance_m - hand.point_radius_m) / settings.range_m, 0.0, 1.0)
 
 
 def outputs(hand: TrackedHand, state: HandState, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
@@ -187,43 +155,37 @@ def outputs(hand: TrackedHand, state: HandState, distance_m: np.ndarray, setting
     return np.concatenate([pose_features(hand, state), output_distances(hand, distance_m, settings)], axis=1)
 
 
-class Relabelled(NamedTuple):
-    """Numbers of one layout in another: ``values[:, order] * scale``; folded into mean, deviation and matrices."""
-
-    order: np.ndarray
-    scale: np.ndarray
-
-    def __call__(self, values: np.ndarray) -> np.ndarray:
-        return values[..., self.order] * self.scale
-
-    def back(self, values: np.ndarray) -> np.ndarray:
-        """From the other layout to this one."""
-        return (values / self.scale)[..., np.argsort(self.order)]
+METRES, AXES, CELL, RAD_S, SHARE = 0.001, 0.01, 0.05, 0.05, 0.02  # the least spread a number is scaled by
 
 
-_MIRROR = np.array([-1.0, 1.0, 1.0])
+def sizes(hand: TrackedHand, settings: FeatureSettings) -> dict[str, int]:
+    """Numbers of each group in their order: pose, trajectory, ambient, proximity, distance, normal."""
+    times = len(settings.sensors.times_s)
+    return {
+        "pose": 3 * _positions(hand) + 6 * hand.n_joints,
+        "trajectory": SAMPLE_NUMBERS * len(settings.samples_s),
+        "ambient": CELLS**3,
+        "proximity": times * hand.n_sensors,
+        "distance": times * hand.n_points,
+        "normal": 3 * hand.n_points,
+    }
 
 
-def released_inputs(hand: TrackedHand, settings: FeatureSettings) -> Relabelled:
-    """Inputs in the release's layout: decimetres, axes left-handed by a mirror in x."""
-    times, place = len(settings.sensors.times_s), _RELEASED_UNIT * _MIRROR
-    sample = np.concatenate([[_RELEASED_UNIT], place, _MIRROR, _MIRROR, place, -_MIRROR])
-    trajectory = np.tile(sample, len(settings.samples_s))
-    ways = np.full(times * (hand.n_sensors + hand.n_points), _RELEASED_UNIT)
-    cells = np.arange(CELLS**3).reshape(CELLS, CELLS, CELLS)[::-1].ravel()
-    parts = [_pose_scale(hand), trajectory, np.ones(CELLS**3), ways, np.tile(_MIRROR, hand.n_points)]
-    scale = np.concatenate(parts)
-    first, order = len(parts[0]) + len(parts[1]), np.arange(len(scale))
-    order[first : first + CELLS**3] = first + cells
-    return Relabelled(order, scale)
+def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:
+    """(input,) and (output,): the least spread a number is scaled by, by what it is."""
+    count = sizes(hand, settings)
+    pose = np.repeat([METRES, AXES], [3 * _positions(hand), 6 * hand.n_joints])
+    sample = np.repeat([METRES, AXES, METRES, RAD_S], [4, 6, 3, 3])
+    inputs = [
+        pose,
+        np.tile(sample, count["trajectory"] // SAMPLE_NUMBERS),
+        np.full(count["ambient"], CELL),
+        np.full(count["proximity"] + count["distance"], METRES),
+        np.full(count["normal"], CELL),
+    ]
+    return np.concatenate(inputs), np.concatenate([pose, np.full(hand.n_points, SHARE)])
 
 
-def released_outputs(hand: TrackedHand) -> Relabelled:
-    """Outputs in the release's layout; its distances are shares already."""
-    scale = np.concatenate([_pose_scale(hand), np.ones(hand.n_points)])
-    return Relabelled(np.arange(len(scale)), scale)
-
-
-def _pose_scale(hand: TrackedHand) -> np.ndarray:
-    places = hand.n_joints + N_TIPS + 2 * len(hand.palm_capsules)
-    return np.concatenate([np.tile(_RELEASED_UNIT * _MIRROR, places), np.tile(_MIRROR, 2 * hand.n_joints)])
+def _positions(hand: TrackedHand) -> int:
+    """How many positions a pose has: joints, tips, both ends of the palm's capsules."""
+    return hand.n_joints + N_TIPS + 2 * len(hand.palm_capsules)

@@ -11,8 +11,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.sensors import sense
 from models.manipnet.control import Control
-from models.manipnet.features import FeatureSettings, object_from_wrist, trajectory_features
-from models.manipnet.layout import floors, sizes
+from models.manipnet.features import FeatureSettings, floors, object_from_wrist, sizes, trajectory_features
 
 ROWS_AT_ONCE = 256
 

@@ -8,25 +8,21 @@ Numbers go in and come out as they are: normalisation is part of the network, so
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
 from models.manipnet.features import FeatureSettings
 
-Kind = Literal["manipnet", "resnet", "mlp"]
-
 
 @dataclass(frozen=True)
 class NetworkConfig:
     """pose, trajectory, sensors, output: how many numbers there are of each; joints of the hand.
 
-    features: how they are measured, and the time from one pose to the next. without: sensors that are switched off.
+    features: how they are measured, and the time from one pose to the next.
 
-    encoder: width of each of the three encoders, the paper's 512. kind: "resnet" has no way from a block's input to
-    its output, "mlp" no way past any layer (Sec. 8). keep: share of the numbers that dropout keeps at the input of
-    every linear layer.
+    encoder: width of each of the three encoders, the paper's 512. keep: share of the numbers that dropout keeps at the
+    input of every linear layer.
     """
 
     pose: int = 192
@@ -35,10 +31,8 @@ class NetworkConfig:
     output: int = 214
     joints: int = 17
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    without: tuple[str, ...] = ()
     encoder: int = 512
     blocks: int = 2
-    kind: Kind = "manipnet"
     keep: float = 0.7
 
     @property
@@ -49,28 +43,20 @@ class NetworkConfig:
 class DenseBlock(nn.Module):
     """One residual dense block on activations (..., width): Sec. 6.2, the two equations."""
 
-    def __init__(self, width: int, kind: Kind, keep: float) -> None:
+    def __init__(self, width: int, keep: float) -> None:
         super().__init__()
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
         self.dropout = nn.Dropout(1 - keep)
-        self.kind = kind
 
     def forward(self, a: Tensor) -> Tensor:
-        hidden = self.first(self.dropout(a))
-        if self.kind != "mlp":
-            hidden = hidden + a
-        r = torch.relu(hidden)
-        out = self.second(self.dropout(r))
-        if self.kind != "mlp":
-            out = out + r
-        return out + a if self.kind == "manipnet" else out
+        r = torch.relu(self.first(self.dropout(a)) + a)
+        return self.second(self.dropout(r)) + r + a
 
 
 class ManipNet(nn.Module):
     """Inputs (..., pose + trajectory + sensors) to outputs (..., output), both as measured.
 
-    Buffers of the normalisation: input_mean, input_scale, output_mean, output_scale; kept: 0 for inputs it does not
-    see, which is how sensors are switched off: every variant has the same layers. low_rad, high_rad: (joint - 1, 3)
+    Buffers of the normalisation: input_mean, input_scale, output_mean, output_scale. low_rad, high_rad: (joint - 1, 3)
     how far finger joints turned in training (``inverse_kinematics.Limits``).
     """
 
@@ -78,7 +64,6 @@ class ManipNet(nn.Module):
     input_scale: Tensor
     output_mean: Tensor
     output_scale: Tensor
-    kept: Tensor
     low_rad: Tensor
     high_rad: Tensor
 
@@ -87,7 +72,7 @@ class ManipNet(nn.Module):
         self.config = config
         width = 3 * config.encoder
         self.encoders = nn.ModuleList([nn.Linear(size, config.encoder) for size in config.inputs])
-        self.blocks = nn.ModuleList([DenseBlock(width, config.kind, config.keep) for _ in range(config.blocks)])
+        self.blocks = nn.ModuleList([DenseBlock(width, config.keep) for _ in range(config.blocks)])
         self.decoder = nn.Linear(width, config.output)
         self.dropout = nn.Dropout(1 - config.keep)
         for layer in self.modules():
@@ -97,7 +82,6 @@ class ManipNet(nn.Module):
         for name, size in (("input", sum(config.inputs)), ("output", config.output)):
             self.register_buffer(f"{name}_mean", torch.zeros(size))
             self.register_buffer(f"{name}_scale", torch.ones(size))
-        self.register_buffer("kept", torch.ones(sum(config.inputs)))
         for name, value in (("low_rad", -torch.pi), ("high_rad", torch.pi)):
             self.register_buffer(name, torch.full((config.joints - 1, 3), value))
 
@@ -106,7 +90,7 @@ class ManipNet(nn.Module):
 
     def normalised(self, inputs: Tensor) -> Tensor:
         """The outputs in units of their spread, on which the loss is."""
-        z = self.dropout((inputs - self.input_mean) / self.input_scale * self.kept)
+        z = self.dropout((inputs - self.input_mean) / self.input_scale)
         parts = z.split(self.config.inputs, -1)
         a = torch.cat([encoder(part) for encoder, part in zip(self.encoders, parts, strict=True)], -1)
         for block in self.blocks:

@@ -1,6 +1,6 @@
 """Fingers for trajectories that come frame by frame: the same numbers as for the whole clip, a look-ahead later.
 
-The look-ahead is what the network reads: half a second, 0.1 s for a short trajectory (``without=("long-future",)``).
+The look-ahead is what the network reads: half a second.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,6 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from models.manipnet.control import Control, Motion
-from models.manipnet.layout import times_read_s
 from models.manipnet.rollout import Follower, Predictor, Situation, situation
 
 SPARE_S = 0.25  # kept beyond the oldest sample: the one before it tells a velocity
@@ -56,10 +55,9 @@ class Stream:
         self.frames: list[TrackedFrame] = []
         self.made = 0
         self.first_s = 0.0
-        # What else is measured of other times meets zeros in the network: that it is not there yet changes no bit.
-        read = [times_read_s(predictor.network.kept.numpy(), hand, predictor.settings) for hand in hands.values()]
-        self._behind_s = -min(earliest for earliest, _ in read)
-        self._ahead_s = max(predictor.settings.step_s, *(latest for _, latest in read))
+        settings = predictor.settings
+        read_s = [*settings.samples_s, *settings.sensors.times_s]  # from now
+        self._behind_s, self._ahead_s = -min(read_s), max(settings.step_s, *read_s)
 
     def push(self, frame: TrackedFrame) -> list[dict[Side, np.ndarray]]:
         """Poses that can be told now: by side (joint - 1, 3, 3). Often none, sometimes several."""

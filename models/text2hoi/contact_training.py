@@ -1,26 +1,79 @@
-"""Training of the contact network: what one step and one validation are, and what is found on validation clips."""
+"""Training of the contact network: what one step and one validation are, and what is found on validation clips:
+the probability from which a point counts as touched."""
 
 from collections.abc import Callable
 from functools import cached_property
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import ClipBatch, collate
+from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.batches.requests import RequestBatch
+from hoidata.contact.agreement import f1_score
 from hoidata.devices import send
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
-from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss
-from models.text2hoi.contact import ContactModel, contact_loss, turned_and_scaled
-from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.thresholds import (
-    UNCHOSEN_THRESHOLD,
-    ContactNetwork,
-    choose_contact_threshold,
-    choose_draw_threshold,
-)  # fmt: skip
+from models.text2hoi.contact import (
+    AnchoredContact,
+    ContactConfig,
+    ContactLossConfig,
+    ContactModel,
+    by_hand_loss,
+    contact_loss,
+)
+
+ContactNetwork = ContactModel | AnchoredContact
+
+UNCHOSEN_THRESHOLD = 0.5  # without validation clips: touched where that is likelier than not
+THRESHOLDS = tuple(round(0.05 * step, 2) for step in range(1, 20))
+
+
+def mean_f1(probabilities: np.ndarray, true: np.ndarray, threshold: float) -> float:
+    """Mean over clips of the F1 of maps (clip, point) of probabilities at a threshold."""
+    pairs = zip(probabilities, true, strict=True)
+    return float(np.mean([f1_score(probability >= threshold, truth) for probability, truth in pairs]))
+
+
+def best_threshold(probabilities: np.ndarray, true: np.ndarray) -> float:
+    """The threshold among 0.05, 0.10, ... 0.95 with the best mean F1; the lowest of equals."""
+    scores = [mean_f1(probabilities, true, threshold) for threshold in THRESHOLDS]
+    return THRESHOLDS[int(np.argmax(scores))]
+
+
+def true_maps(samples: list[ClipSample]) -> np.ndarray:
+    """(clip, point) bool contact maps."""
+    return np.stack([sample.contact_map for sample in samples])
+
+
+@torch.no_grad()
+def contact_probabilities(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> np.ndarray:
+    """(clip, point) mean of ``count`` sampled maps, for the first sentence of every clip."""
+    batch, latents = _asked(network, samples, count, seed)
+    return network.sample(batch, batch.text[:, 0], latents).amax(2).mean(1).cpu().numpy()
+
+
+def choose_contact_threshold(network: ContactNetwork, held_out: list[ClipSample]) -> float:
+    """The threshold with the best mean F1 of the mean of 32 samples on held-out clips."""
+    return best_threshold(contact_probabilities(network, held_out, 32, seed=0), true_maps(held_out))
+
+
+@torch.no_grad()
+def choose_draw_threshold(network: ContactNetwork, held_out: list[ClipSample], count: int = 8) -> float:
+    """The threshold at which single samples touch as large a share of an object as held-out clips do."""
+    batch, latents = _asked(network, held_out, count, seed=0)
+    found = network.sample(batch, batch.text[:, 0], latents).amax(2)
+    share = float(batch.contact.any(1).float().mean())
+    return min(THRESHOLDS, key=lambda threshold: abs(float((found >= threshold).float().mean()) - share))
+
+
+def _asked(network: ContactNetwork, samples: list[ClipSample], count: int, seed: int) -> tuple[ClipBatch, Tensor]:
+    """The clips, and so many draws for each, where the network is."""
+    device = next(network.parameters()).device
+    latents = network.draw_latents(count, len(samples), torch.Generator().manual_seed(seed))
+    return collate(samples).to(device), send(latents, device)
+
 
 DrawContact = Callable[[RequestBatch, Tensor, torch.Generator], Tensor]
 
@@ -30,26 +83,25 @@ class ContactObjective:
 
     frames = entries = 0
 
-    def __init__(self, network: nn.Module, weights: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
-        self.network, self.weights, self.corpus, self.device = network, weights, corpus, device
+    def __init__(self, network: nn.Module, loss: ContactLossConfig, corpus: Corpus, device: torch.device) -> None:
+        self.network, self.loss, self.corpus, self.device = network, loss, corpus, device
 
     @cached_property
     def held_out(self) -> ClipBatch:
         return collate(self.corpus.held_out).to(self.device)
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        points = turned_and_scaled(batch, generator) if self.weights.augment else batch.points_m
-        some = send(torch.randperm(points.shape[1], generator=generator)[: self.weights.points], self.device)
-        points, text, network = points[:, some], any_form(batch, generator), self.network
+        some = send(torch.randperm(batch.points_m.shape[1], generator=generator)[: self.loss.points], self.device)
+        points, text, network = batch.points_m[:, some], any_form(batch, generator), self.network
         if isinstance(network, AnchoredContact):
             contact = batch.contact[..., some].float()
             touch, logits = network.losses(points, text, batch, contact, generator)
-            return by_hand_loss(touch, logits, contact, batch.active_hands, self.weights)
+            return by_hand_loss(touch, logits, contact, batch.active_hands)
         assert isinstance(network, ContactModel)
         contact_map = batch.contact_map[:, some]
         noise = send(torch.randn(len(batch), network.config.latent, generator=generator), self.device)
         logits, mean, log_variance = network(points, text, contact_map, noise)
-        return contact_loss(logits, contact_map, mean, log_variance, self.weights)
+        return contact_loss(logits, contact_map, mean, log_variance)
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:

@@ -5,6 +5,10 @@ agent-wise position codes, x0-prediction, masks by hand type and length. Each de
 by default: what stands for a motion (``motion_code``), contact as points to attend to, sentences read for their verb
 (``verb_reading``), the condition in every token, codes that count to the end. Hand flags are explicit inputs beside
 the masks.
+
+Text2HOI hands the denoiser the contact map as 1,024 numbers in the order of the points, which means something else on
+every object. ``contact_tokens`` are points that it can attend to: some of the touched and of the untouched surface,
+spread out over it; neither their order nor the order of the sampled points enters.
 """
 
 from collections.abc import Sequence
@@ -19,7 +23,8 @@ from hoidata.batches.requests import RequestBatch
 from hoidata.clips.features import HAND_FEATURES
 from hoidata.devices import send
 from hoidata.errors import BadInput
-from models.common.features import Normaliser, proper_hands, proper_object, recentred
+from hoidata.objects.sampling import POINT_COUNT
+from models.common.features import TEXT_FEATURES, Normaliser, proper_hands, proper_object, recentred
 from models.common.point_net import PointNet, PointNetConfig, normalised_points
 from models.common.sampling import Denoise, Motion, SamplerConfig, add_noise, alphas_cumprod, sample_motion
 from models.common.transformer import (
@@ -31,12 +36,50 @@ from models.common.transformer import (
     to_frames,
     to_tokens,
 )
-from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.verb_reading import VerbReading
 
+TOKEN_FEATURES = 13
+
+
+def contact_tokens(
+    points_m: Tensor, normals: Tensor, part: Tensor, contact: Tensor, count: int
+) -> tuple[Tensor, Tensor]:
+    """(B, 3 count, 13) features of points touched by the left hand, by the right, and by none; (B, 3 count) which are.
+
+    points_m, normals (B, N, 3), part (B, N), contact (B, 2, N) bool. A kind with fewer points than ``count`` has all.
+    """
+    about, _ = normalised_points(points_m)
+    kinds = torch.cat((contact, ~contact.any(1, keepdim=True)), 1)
+    chosen, there = spread_out(points_m, kinds, count)
+    own = torch.cat((about, points_m * 10, normals, part[..., None].to(points_m.dtype)), -1)
+    rows = torch.arange(len(own), device=own.device)[:, None, None]
+    kind = torch.eye(3, device=own.device)[:, None].expand(len(own), 3, count, 3)
+    return torch.cat((own[rows, chosen], kind), -1).flatten(1, 2), there.flatten(1, 2)
+
+
+def spread_out(points_m: Tensor, kinds: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """(B, S, count) rows of points far from each other among those of each kind (B, S, N) bool, and which are any.
+
+    Farthest-point sampling (Eldar et al. 1997), from the point farthest from the middle of its kind.
+    """
+    weight = kinds.to(points_m.dtype)
+    middle = weight @ points_m / weight.sum(-1, keepdim=True).clamp_min(1)
+    apart = torch.cdist(middle, points_m).masked_fill(~kinds, -1.0)
+    farthest = apart.argmax(-1)
+    nearest, chosen, there = apart.clone().masked_fill(kinds, torch.inf), [], []
+    for _ in range(count):
+        there.append(nearest.gather(-1, farthest[..., None])[..., 0] > 0)
+        chosen.append(farthest)
+        picked = points_m.gather(1, farthest[..., None].expand(-1, -1, 3))
+        nearest = torch.minimum(nearest, torch.cdist(picked, points_m)).masked_fill(~kinds, -1)
+        farthest = nearest.argmax(-1)
+    return torch.stack(chosen, -1), torch.stack(there, -1)
+
+
 # An object counts as known if its F_obj is nearer to that of a training object than this share of their mean length.
 SAME_OBJECT = 0.01
+CONTACT_TOKENS = 12  # of each kind: touched by the left hand, by the right, by none
 
 
 @dataclass(frozen=True)
@@ -44,12 +87,11 @@ class DiffusionConfig:
     """transformer: its sizes. point_net: as in the contact model it comes from. The defaults are the paper's.
 
     motion: what a token stands for. normalised: rows by mean and spread of the training clips, not metres and numbers
-    as they are. codes: of frames and agents, or (for an ablation) less. first_code: number of the first frame's code.
-    contact_input: "map", the paper's raw numbers, "tokens", ``contact_tokens`` of each kind, or "none". scale_input,
-    centroid: the object's size, and where its points lie, are told. told: hand flags and length are. hand_head: a hand
-    is read from its own token, or from the object's as well (released). object_feature: whether F_obj, the point
-    network's summary of the object, is told; of few objects it is a name. object_dropout: share of the steps in which
-    it is not; if any, it is told of the objects in training alone (their number, ``objects``, is set by training).
+    as they are.
+    contact_input: "map", the paper's raw numbers, or "tokens" of each kind (``contact_tokens``). scale_input: the
+    object's size is told. told: hand flags and length are. object_dropout: share of the steps in which F_obj, the point
+    network's summary of the object, is not told; of few objects it is a name. If any, it is told of the objects in
+    training alone (their number, ``objects``, is set by training).
     text_input: a linear layer, or "verbs", a hidden layer that is told which of ``verbs`` verbs (set by training too)
     the sentence means. condition_everywhere: the condition is added to every token instead of being one. frames_to_go:
     tokens know how far it is to the end.
@@ -60,18 +102,10 @@ class DiffusionConfig:
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
     point_net: PointNetConfig = field(default_factory=PointNetConfig)
     motion: MotionCodeConfig = field(default_factory=MotionCodeConfig)
-    points: int = 1024
-    text: int = 512
     normalised: bool = False
-    codes: Literal["frames and agents", "frames", "none"] = "frames and agents"
-    first_code: int = 0
-    contact_input: Literal["map", "tokens", "none"] = "map"
-    contact_tokens: int = 12
-    object_feature: bool = True
+    contact_input: Literal["map", "tokens"] = "map"
     scale_input: bool = True
-    centroid: bool = False
     told: bool = False
-    hand_head: Literal["hand", "hand and object"] = "hand"
     text_input: Literal["linear", "verbs"] = "linear"
     verbs: int = 1
     condition_everywhere: bool = False
@@ -141,8 +175,8 @@ class DiffusionModel(nn.Module):
 
     def __init__(self, config: DiffusionConfig) -> None:
         super().__init__()
-        if config.object_dropout and (config.contact_input == "map" or config.scale_input or config.centroid):
-            wanted = "neither contact_input: map nor scale_input nor centroid beside object_dropout"
+        if config.object_dropout and (config.contact_input == "map" or config.scale_input):
+            wanted = "neither contact_input: map nor scale_input beside object_dropout"
             raise BadInput("diffusion", wanted, "one of them", "set object_dropout: 0: it would hide them as well")
         self.config, self.code = config, MotionCode(config.motion)
         self.register_buffer("signal", alphas_cumprod(), persistent=False)
@@ -150,16 +184,15 @@ class DiffusionModel(nn.Module):
         self.hand_rows = config.transformer.frames_per_token
         self.object_rows = self.hand_rows * config.motion.object_knots
         # Trained with the contact model and frozen here; kept so that a checkpoint of this model is enough to sample.
-        self.object_net = PointNet(3, config.point_net).requires_grad_(False) if config.object_feature else None
+        self.object_net = PointNet(3, config.point_net).requires_grad_(False)
         self.hands_in = nn.ModuleList([nn.Linear(HAND_FEATURES * self.hand_rows, width) for _ in range(2)])
         self.object_in = nn.Linear(self.code.object_features * self.object_rows, width)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         self.gate_in = nn.Linear(width, width) if config.input_gate else None
         self.text_in = _text_layers(config)
-        as_map = config.contact_input == "map"
-        summary = config.point_net.widths[-1] if config.object_feature else 0
-        body = summary + config.points * as_map + config.scale_input + 3 * config.centroid
-        self.object_condition_in = nn.Linear(body, width) if body else None
+        summary = config.point_net.widths[-1]
+        body = summary + POINT_COUNT * (config.contact_input == "map") + config.scale_input
+        self.object_condition_in = nn.Linear(body, width)
         # A parameter, though no gradient changes it: buffers are averaged over the parts of a batch.
         known = torch.zeros(config.objects, summary)
         self.known_objects = nn.Parameter(known, requires_grad=False) if config.objects else None
@@ -167,15 +200,12 @@ class DiffusionModel(nn.Module):
         self.extent_in = nn.Linear(3, width) if config.told else None
         self.to_go_in = nn.Linear(2 * width, width) if config.frames_to_go else None
         self.encoder = Encoder(config.transformer, has_condition=True)
-        head = width * (2 if config.hand_head == "hand and object" else 1)
-        self.hands_out = nn.ModuleList([nn.Linear(head, HAND_FEATURES * self.hand_rows) for _ in range(2)])
+        self.hands_out = nn.ModuleList([nn.Linear(width, HAND_FEATURES * self.hand_rows) for _ in range(2)])
         self.object_out = nn.Linear(width, self.code.object_features * self.object_rows)
 
     @torch.no_grad()
     def object_feature(self, points_m: Tensor) -> Tensor:
-        """F_obj (B, G) of object points (B, N, 3), metres; (B, 0) where it is not told."""
-        if self.object_net is None:
-            return points_m.new_zeros(len(points_m), 0)
+        """F_obj (B, G) of object points (B, N, 3), metres."""
         self.object_net.eval()
         return self.object_net(normalised_points(points_m)[0])[0]
 
@@ -197,8 +227,8 @@ class DiffusionModel(nn.Module):
         points = condition.points_m.new_zeros(len(lengths), 0, self.config.transformer.width)
         points_mask = points.new_zeros(points.shape[:2], dtype=torch.bool)
         if self.points_in is not None:
-            shape = self._placed_points(condition), condition.normals, condition.part
-            points, points_mask = contact_tokens(*shape, contact, self.config.contact_tokens)
+            placed = condition.points_m - self.code.place_m(condition.points_m, condition.part)[:, None]
+            points, points_mask = contact_tokens(placed, condition.normals, condition.part, contact, CONTACT_TOKENS)
             points = self.points_in(points)
         extent = torch.cat((condition.active_hands.float(), lengths[:, None] / MAX_FRAMES), -1)
         hand_rows = condition.active_hands[:, :, None] & hand_rows[:, None]
@@ -218,21 +248,13 @@ class DiffusionModel(nn.Module):
             torch.cat(masks, 1),
         )
 
-    def _placed_points(self, condition: Condition) -> Tensor:
-        """(B, N, 3) points of the objects from where hands and objects are measured (``MotionCode.place_m``)."""
-        return condition.points_m - self.code.place_m(condition.points_m, condition.part)[:, None]
-
     def _body(self, condition: Condition, contact: Tensor) -> Tensor:
         """(B, width) what is told of the object: F_obj, the contact map and the scale (Table S7)."""
         config, body = self.config, [condition.object]
-        if self.object_condition_in is None:
-            return condition.object.new_zeros(len(condition.object), config.transformer.width)
         if config.contact_input == "map":
             body.append(contact.any(1).float())
         if config.scale_input:
             body.append(normalised_points(condition.points_m)[1])
-        if config.centroid:
-            body.append(self._placed_points(condition).mean(1))
         return self.object_condition_in(torch.cat(body, -1)) * self._known(condition.object)
 
     def _known(self, summary: Tensor) -> Tensor:
@@ -282,8 +304,7 @@ class DiffusionModel(nn.Module):
         *own, body = self.encoder(x, mask, first)[:, : moving.shape[1]].split([x.shape[1] for x in agents], 1)
         found = [hands.new_zeros(hands[:, 0].shape)] * 2
         for side, token in zip(known.sides, own, strict=True):
-            seen = torch.cat((token, body), -1) if self.config.hand_head == "hand and object" else token
-            found[side] = to_frames(self.hands_out[side](seen), hands.shape[2], k)
+            found[side] = to_frames(self.hands_out[side](token), hands.shape[2], k)
         return torch.stack(found, 1), to_frames(self.object_out(body), objects.shape[1], wide)
 
     def _codes(self, lengths: Tensor, n_tokens: Sequence[int], sides: Sequence[int]) -> Tensor:
@@ -291,14 +312,12 @@ class DiffusionModel(nn.Module):
         config, width = self.config, self.config.transformer.width
         every = self.hand_rows * max(1, config.motion.knot_frames)
         place = torch.arange(max(n_tokens), device=lengths.device) * every
-        codes = lengths.new_zeros(len(lengths), len(place), width, dtype=torch.float32)
-        if config.codes != "none":
-            codes = codes + sinusoid(place + config.first_code, width)
+        codes = sinusoid(place, width).expand(len(lengths), -1, -1)
         if self.to_go_in is not None:
             to_go = (lengths[:, None] - place).clamp_min(0)
             done = place * MAX_FRAMES / lengths[:, None]
             codes = codes + self.to_go_in(torch.cat((sinusoid(to_go, width), sinusoid(done, width)), -1))
-        own = agent_codes(width, lengths.device) * (config.codes == "frames and agents")
+        own = agent_codes(width, lengths.device)
         return torch.cat([codes[:, :n] + own[agent] for agent, n in zip((*sides, 2), n_tokens, strict=True)], 1)
 
     def _time(self, timesteps: Tensor) -> Tensor:
@@ -315,8 +334,8 @@ class DiffusionModel(nn.Module):
 
 def _text_layers(config: DiffusionConfig) -> nn.Module:
     if config.text_input == "linear":
-        return nn.Linear(config.text, config.transformer.width)
-    read = VerbReading(config.text, config.verbs)
+        return nn.Linear(TEXT_FEATURES, config.transformer.width)
+    read = VerbReading(TEXT_FEATURES, config.verbs)
     return nn.Sequential(read, _hidden_layer(config.verbs, config.transformer.width))
 
 

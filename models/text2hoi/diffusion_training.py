@@ -30,13 +30,13 @@ from models.common.corpus import Corpus, any_form
 from models.common.family import Losses, Network, Objective, Setup
 from models.common.features import OBJECT_START_6D, Hands, Normaliser, object_rotmat, place_points, to_object_frame
 from models.common.sampling import TRAIN_STEPS, Motion, add_noise, alphas_cumprod
-from models.text2hoi.contact_training import CONTACT, DrawContact, contact_drawer
+from models.text2hoi.contact_training import CONTACT, ContactNetwork, DrawContact, contact_drawer
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel, MotionGenerator
 from models.text2hoi.motion_code import CodedClip, MotionCode
-from models.text2hoi.thresholds import ContactNetwork
 from models.text2hoi.verb_check import action_results
 from models.text2hoi.verb_reading import Sentences, learn_verbs
 
+TOUCH_WEIGHT = 4.0
 MOST_CLIPS = 16_384  # whose rows are kept: at most some 150 kB each
 VALIDATION_STEPS = (100, 300, 500, 700, 900)
 HAND_GROUPS = (WRIST, GLOBAL_ORIENT_6D, HAND_POSE_6D)
@@ -47,12 +47,11 @@ OBJECT_GROUPS = (OBJECT_POSITION, OBJECT_ROTATION_6D, slice(OBJECT_HINGE, OBJECT
 class DiffusionLossConfig:
     """Weights beside the simple loss (1): eq. 6 and eq. 7. frames: how many of a clip they see; entries: of eq. 6.
 
-    contact: the map a motion is shown: drawn from the contact network, as in use, or the clip's own (released).
-    weighting: eq. 5 is the sum of a frame's squared errors; "even" counts their
-    mean, "grouped" wrist, palm and fingers alike, and the object's position, rotation and hinge. velocity_weight: of
-    the same error of differences of rows. joint_weight: of joints in the object's frame, those that touch counting
-    ``touch_weight`` more. thin_contact: each clip is shown a share of its touched points, as a drawn contact map may be
-    as sparse, and no two steps the same.
+    contact: the map a motion is shown: drawn from the contact network, as in use, or the clip's own. weighting: eq. 5
+    is the sum of a frame's squared errors; "grouped" counts wrist, palm and fingers alike, and the object's position,
+    rotation and hinge. velocity_weight: of the same error of differences of rows. joint_weight: of joints in the
+    object's frame, those that touch counting ``TOUCH_WEIGHT`` more. thin_contact: each clip is shown a share of its
+    touched points, as a drawn contact map may be as sparse, and no two steps the same.
     """
 
     distance_weight: float = 1.0
@@ -60,10 +59,9 @@ class DiffusionLossConfig:
     frames: int = 8
     entries: int = 8192
     contact: Literal["estimated", "recorded"] = "estimated"
-    weighting: Literal["sum", "even", "grouped"] = "sum"
+    weighting: Literal["sum", "grouped"] = "sum"
     velocity_weight: float = 0.0
     joint_weight: float = 0.0
-    touch_weight: float = 4.0
     thin_contact: bool = False
 
 
@@ -233,7 +231,7 @@ class DiffusionObjective:
         if weights.joint_weight:
             joints = self.hands.joints(code.in_object_frame(own, moved), batch.betas, batch.template_m)
             true, touching = (losses.take_frames(part, chosen, 2) for part in (target.joints_m, target.touching))
-            found["joints"] = losses.joint_loss(joints, true, present, 1 + weights.touch_weight * touching)
+            found["joints"] = losses.joint_loss(joints, true, present, 1 + TOUCH_WEIGHT * touching)
         hands = code.in_world(own, moved)
         if weights.distance_weight:
             joints = self.hands.joints(hands, batch.betas, batch.template_m)
@@ -262,7 +260,7 @@ def feature_shares(
     """Shares of a hand's 99 and an object's 10 or 16 numbers in the loss; each sums to one, but for "sum"."""
     shares, object_groups = [], [group for group in OBJECT_GROUPS if group.stop <= object_features]
     for size, groups in ((HAND_FEATURES, HAND_GROUPS), (object_features, object_groups)):
-        share = torch.full((size,), 1.0 if weighting == "sum" else 1 / size, device=device)
+        share = torch.ones(size, device=device)
         for group in groups if weighting == "grouped" else ():
             share[group] = 1 / (len(groups) * (group.stop - group.start))
         shares.append(share)
@@ -281,15 +279,13 @@ def _diffusion_objective(setup: Setup) -> tuple[Objective, Normaliser]:
     assert isinstance(contact, ContactNetwork)
     train, told = setup.corpus.train, setup.network
     sentences = Sentences.of(train if told.text_input == "verbs" else ())
-    named = told.object_feature and told.object_dropout > 0
-    points = {sample.object_key: sample.points.points_m for sample in (train if named else ())}
+    points = {sample.object_key: sample.points.points_m for sample in (train if told.object_dropout else ())}
     counted = {"verbs": sentences.n_verbs, "objects": len(points)}
     network = DiffusionModel(replace(told, point_net=contact.config.point_net, **counted))
     learn_verbs(network, sentences)
-    if network.object_net is not None:
-        network.object_net.load_state_dict(contact.object_net.state_dict())
-        if points:
-            network.learn_objects(network.object_feature(torch.from_numpy(np.stack(list(points.values())))))
+    network.object_net.load_state_dict(contact.object_net.state_dict())
+    if points:
+        network.learn_objects(network.object_feature(torch.from_numpy(np.stack(list(points.values())))))
     network = network.to(setup.device)
     coded = [network.code.encode(sample) for sample in setup.corpus.train]
     normaliser = Normaliser.nothing(network.code.object_features)

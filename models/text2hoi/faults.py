@@ -1,7 +1,7 @@
 """What a person who watches a generated motion would see to be wrong with it, and that alone, in words.
 
 A number outside the bounds of a verb's training clips counts where the difference is large enough to be seen
-(``hoidata.actions.words``). Hands that never reach the object, lie deep inside of it or leave it in the air, and an
+(``hoidata.actions.action``). Hands that never reach the object, lie deep inside of it or leave it in the air, and an
 object that stays where it is, are faults whatever the verb.
 """
 

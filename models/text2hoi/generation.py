@@ -28,8 +28,7 @@ from models.text2hoi.faults import visible_faults
 from models.text2hoi.length import SHORTEST_FRAMES
 from models.text2hoi.sampler import Answer, SamplingConfig, Text2Hoi
 from models.text2hoi.sentences import unseen_words
-from models.text2hoi.understanding import Reading, reading_of, understand
-from models.text2hoi.verb_check import VerbCheck
+from models.text2hoi.verb_check import VerbCheck, read_verb
 from models.text2hoi.wording import understood_words
 
 
@@ -42,9 +41,8 @@ class GeneratedMotion:
     of training the diffusion network takes the sentence for, with its probability, or None where it is told the
     sentence's features; "moved_as": the verb whose training clips move the object most alike, or None; "unusual": what
     of it lies outside the bounds of the verb's training clips, in words; "faults": what a person would see to be wrong
-    with it, in words; "told": the sentence the networks were told, not the user's where they would take that for
-    another verb ("plainly_read_as"); "unseen": what of the sentence was never in training, in words; "checkpoints":
-    SHA-256 of each network that had a part in it.
+    with it, in words; "unseen": what of the sentence was never in training, in words; "checkpoints": SHA-256 of each
+    network that had a part in it.
     """
 
     clip: Clip
@@ -117,15 +115,12 @@ class Generator:
         verb, thing = wording.verb, wording.thing
         choice = self._hand(text, wish)
         assert choice.hand is not None  # a prior decides last
-        points, read = sample_points(object, self.points), reading_of(self.model.trained["diffusion"])
-        encode = self.encoder.encode
-        own = encode([wording.text])[0]
-        told = understand(wording.text, own, verb, thing, choice.hand, self.vocabulary, encode, read)
+        points, features = sample_points(object, self.points), self.encoder.encode([wording.text])[0]
         first = Request(
             motion_id=f"generated/{object.name}",
             object=object,
             points=ObjectPoints(points.points_m, points.normals, points.part),
-            text=told.text,
+            text=features,
             active_hands=np.array([choice.hand in (side, "both") for side in SIDES]),
             n_frames=0,
             clip_id=text,
@@ -134,9 +129,7 @@ class Generator:
         requests = [self._request(first, text, wish, number) for number in range(wish.samples)]
         evidence = {
             "text": text,
-            "told": told.sentence,
-            "read_as": told.read_as,
-            "plainly_read_as": told.plainly,
+            "read_as": read_verb(self.model.trained["diffusion"], torch.from_numpy(features)),
             "seed": wish.seed,
             "hand": asdict(choice),
             "unseen": unseen_words(self.vocabulary, text, verb, object_words or thing, choice.hand, self.encoder),
@@ -198,7 +191,7 @@ class Generator:
         coarse = self.model.clips([request], [motion], refined=False)[0]
         return GeneratedMotion(answer.clip, coarse, motion.contact_map.numpy() > 0, points, evidence | own)
 
-    def _faults(self, request: Request, clip: Clip, read_as: Reading | None) -> tuple[str, ...]:
+    def _faults(self, request: Request, clip: Clip, read_as: tuple[str, float] | None) -> tuple[str, ...]:
         check = VerbCheck.of(self.model.trained["diffusion"], self.hands)
         return visible_faults(clip, request.points, self.hands, check, read_as[0] if read_as else None)
 

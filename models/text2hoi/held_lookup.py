@@ -16,8 +16,7 @@ from hoidata.refinement import carried_share, hold_clip
 from hoidata.settings import build_config
 from models.baselines.lookups import PROMPT_LOOKUP, VERB_LOOKUP
 from models.common.family import Family, LeftOut, Sampler, Sources
-from models.text2hoi.drawing import Drawn, best_drawn, checked
-from models.text2hoi.sampler import SamplingConfig
+from models.text2hoi.sampler import Drawn, SamplingConfig, best_drawn, checked
 from models.text2hoi.verb_check import VerbCheck, usual_motion
 
 

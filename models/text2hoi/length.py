@@ -5,33 +5,36 @@ noise. The other way here: the network gives a mean and a spread and the noise s
 likelihood: the noise keeps its meaning and nothing can collapse.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from hoidata.batches.dataset import MAX_FRAMES
+from hoidata.batches.dataset import MAX_FRAMES, ClipBatch, collate
 from hoidata.devices import send
-from models.text2hoi.verb_reading import VerbReading
+from models.common.corpus import Corpus, any_form
+from models.common.family import Losses, Network, Objective, Setup
+from models.common.features import TEXT_FEATURES
+from models.text2hoi.verb_reading import Sentences, VerbReading, learn_verbs
 
 SHORTEST_FRAMES = 8
+NOISE = 64  # numbers that the paper's network reads beside the sentence
 EXPECTED_OF = 32  # draws
 WIDEST_DRAW = 2.0  # standard deviations; lengths of one verb have limits, a Gaussian has none
 
 
 @dataclass(frozen=True)
 class LengthConfig:
-    """Sizes; ``width`` is the paper's 512, and so is ``noise``, 64.
+    """Sizes; ``width`` is the paper's 512.
 
     drawn_by: "noise" among the inputs, or "spread". text_input: the sentence's features, or "verbs": which of ``verbs``
     verbs it means (``verb_reading``). told: hand flags.
     """
 
-    text: int = 512
     width: int = 512
     dropout: float = 0.0
-    noise: int = 64
     drawn_by: Literal["noise", "spread"] = "noise"
     text_input: Literal["features", "verbs"] = "features"
     verbs: int = 1
@@ -52,10 +55,10 @@ class LengthModel(nn.Module):
         super().__init__()
         self.config = config
         spread, read = config.drawn_by == "spread", config.text_input == "verbs"
-        self.reading = VerbReading(config.text, config.verbs) if read else None
-        said = config.verbs if read else config.text
+        self.reading = VerbReading(TEXT_FEATURES, config.verbs) if read else None
+        said = config.verbs if read else TEXT_FEATURES
         self.layers = nn.Sequential(
-            nn.Linear(said + 2 * config.told + (0 if spread else config.noise), config.width),
+            nn.Linear(said + 2 * config.told + (0 if spread else NOISE), config.width),
             nn.ReLU() if spread else nn.LeakyReLU(0.2),
             nn.Dropout(config.dropout),
             nn.Linear(config.width, 2 if spread else 1),
@@ -63,7 +66,7 @@ class LengthModel(nn.Module):
 
     def draw(self, count: int, generator: torch.Generator) -> Tensor:
         """(count, D) draws from N(0, I)."""
-        return torch.randn(count, 1 if self.config.drawn_by == "spread" else self.config.noise, generator=generator)
+        return torch.randn(count, 1 if self.config.drawn_by == "spread" else NOISE, generator=generator)
 
     def moments(self, text: Tensor, active_hands: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """(B,) mean and log-spread; of a length that is drawn by noise (B, D) itself, the spread stands for nothing."""
@@ -114,3 +117,43 @@ def jittered_frames(lengths: Tensor, share: float, generator: torch.Generator) -
     """Lengths times a factor drawn from 1 - ``share`` to 1 + ``share``."""
     factor = 1 + share * (2 * torch.rand(len(lengths), generator=generator) - 1)
     return lengths * send(factor, lengths.device)
+
+
+class LengthObjective:
+    """Text2HOI Sec. 4.1: the squared error; of a length with a spread, a likelihood."""
+
+    frames = entries = 0
+
+    def __init__(self, network: LengthModel, loss: LengthLossConfig, corpus: Corpus, device: torch.device) -> None:
+        self.network, self.loss, self.corpus, self.device = network, loss, corpus, device
+
+    @cached_property
+    def held_out(self) -> ClipBatch:
+        return collate(self.corpus.held_out).to(self.device)
+
+    def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
+        frames = jittered_frames(batch.lengths, self.loss.jitter, generator)
+        noise = send(self.network.draw(len(batch), generator), self.device)
+        mean, log_spread = self.network.moments(any_form(batch, generator), batch.active_hands, noise)
+        spread = self.network.config.drawn_by == "spread"
+        return length_loss(mean, log_spread, frames) if spread else length_error(mean, frames)
+
+    @torch.no_grad()
+    def validation(self, network: nn.Module) -> Tensor:
+        assert isinstance(network, LengthModel)
+        held = self.held_out
+        errors = [
+            (network.expected_frames(held.text[:, form], held.active_hands) - held.lengths).abs()
+            for form in range(held.text.shape[1])
+        ]
+        return torch.stack(errors).mean()
+
+
+def _objective(setup: Setup) -> tuple[Objective, None]:
+    sentences = Sentences.of(setup.corpus.train if setup.network.text_input == "verbs" else ())
+    network = LengthModel(replace(setup.network, verbs=sentences.n_verbs))
+    learn_verbs(network, sentences)
+    return LengthObjective(network.to(setup.device), setup.loss, setup.corpus, setup.device), None
+
+
+LENGTH = Network("length", LengthConfig, LengthModel, _objective, LengthLossConfig)

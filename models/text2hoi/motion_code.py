@@ -3,11 +3,17 @@
 Text2HOI denoises the features of every frame, hands in the world. Two switches change that: hands may be given in the
 frame the object has at the same moment, where a hand that holds still on a moving object is constant; and curves may
 stand for frames, as control points of B-splines (``models.common.spline``).
+
+Two more make verbs alike in the rows of an object. A turn of the object in the world, ``R(t) R(0)^T``, is the same
+whatever its mesh calls front or up; ``R(0)`` stands beside it. And rows of a path are nearly the same as those before:
+a shake of 3 cm hardly counts beside a lift of 20. Whitened rows, each what the smooth course of those before does not
+say, give slow and quick movement the same weight, and what a network gets wrong in them comes out smooth.
 """
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -15,13 +21,12 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import MAX_FRAMES, ClipSample
-from hoidata.clips.features import HAND_POSE_6D, OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
+from hoidata.clips.features import OBJECT_FEATURES, OBJECT_HINGE, OBJECT_POSITION, OBJECT_ROTATION_6D
 from hoidata.devices import send
-from hoidata.geometry.rotations import rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d
 from models.common.features import (
     OBJECT_START_6D,
     base_middle_m,
-    hand_rotmats,
     hands_in_object_frame,
     hands_in_world,
     object_rotmat,
@@ -30,7 +35,62 @@ from models.common.features import (
 )
 from models.common.sampling import Motion
 from models.common.spline import fit_spline, intervals_of, settled, spline_values, stacked_bases
-from models.text2hoi.object_rows import mean_start, turned_from, turned_since_start, unwhiten, whiten
+
+# An object that has not moved: position, 6D of no turn, hinge.
+UNMOVED = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+# Share of a row's variance that no neighbour tells; and the deviation of a row, which keeps those of a path of some
+# centimetres above the smallest spread a normaliser knows.
+ROUGH, DEVIATION = 0.3, 0.5
+
+
+def turned_since_start(thing: Tensor) -> Tensor:
+    """Object features (F, 10) as rows (F, 16): turned since the first frame, and how it lay in that."""
+    rotation = object_rotmat(thing)
+    turn, start = (rotmat_to_rot6d(own) for own in (rotation @ rotation[0].T, rotation[:1].expand_as(rotation)))
+    return torch.cat((thing[:, OBJECT_POSITION], turn, thing[:, OBJECT_HINGE:], start), -1)
+
+
+def mean_start(rows: Tensor, there: Tensor) -> Tensor:
+    """(B, 1, 3, 3) rotations of the first frame: the mean of what the rows (B, L, 16) of ``there`` (B, L) say."""
+    said = (rows[..., OBJECT_START_6D] * there[..., None]).sum(1, keepdim=True)
+    return rot6d_to_rotmat(said / there.sum(1)[:, None, None])
+
+
+def turned_from(rows: Tensor, start: Tensor) -> Tensor:
+    """Object features (B, F, 10) of rows (B, F, 16) and first rotations (B, 1, 3, 3)."""
+    rotation = rotmat_to_rot6d(object_rotmat(rows) @ start)
+    return torch.cat((rows[..., OBJECT_POSITION], rotation, rows[..., OBJECT_HINGE:OBJECT_FEATURES]), -1)
+
+
+def whiten(rows: Tensor, reach: float) -> Tensor:
+    """Rows (..., L, 10 or 16) as what is new in each. reach: rows over which a path is alike."""
+    moved = rows[..., :OBJECT_FEATURES] - _as(UNMOVED, rows)
+    new = torch.linalg.solve_triangular(_as(smooth_root(rows.shape[-2], reach), rows), moved, upper=False)
+    return torch.cat((new, rows[..., OBJECT_FEATURES:]), -1)
+
+
+def unwhiten(rows: Tensor, reach: float) -> Tensor:
+    """The inverse of :func:`whiten`."""
+    moved = _as(smooth_root(rows.shape[-2], reach), rows) @ rows[..., :OBJECT_FEATURES]
+    return torch.cat((moved + _as(UNMOVED, rows), rows[..., OBJECT_FEATURES:]), -1)
+
+
+def _as(known: Tensor, rows: Tensor) -> Tensor:
+    """What is known beforehand, of the device and kind of ``rows``."""
+    return send(known, rows.device).to(rows.dtype)
+
+
+@lru_cache(maxsize=256)
+def smooth_root(rows: int, reach: float) -> Tensor:
+    """(rows, rows) lower triangular, the Cholesky factor of the covariance of smooth rows.
+
+    Of fewer rows it is the upper left part: a motion's rows do not depend on how long others of its batch are.
+    """
+    place = torch.arange(rows, dtype=torch.float64)
+    alike = torch.exp(-0.5 * ((place[:, None] - place) / reach).square())
+    covariance = (1 - ROUGH) * alike + ROUGH * torch.eye(rows, dtype=torch.float64)
+    return DEVIATION * torch.linalg.cholesky(covariance).float()
+
 
 # What is like a metre of movement: 0.1 of a rotation's numbers per centimetre, a hinge's angle at 20 cm from it, and
 # fingers, of which there are many, more. Place, turn and hinge of an object come to rest each for itself.
@@ -56,9 +116,6 @@ class MotionCodeConfig:
     object_turn: an object's rotation, or how it has turned in the world since the first frame and, beside that, how it
     lay there. whitening_frames: an object's rows are what is new in each beside a course that changes in about so many
     frames (0: the course itself).
-
-    convention: what rotations mean; "own", or that of a dataset in the authors' code, for networks they trained:
-    GRAB's objects are transposed, ARCTIC's fingers are offsets from ``finger_mean_rad``, 45 numbers for each hand.
     """
 
     knot_frames: int = 0
@@ -68,8 +125,6 @@ class MotionCodeConfig:
     object_turn: Literal["absolute", "since start"] = "absolute"
     whitening_frames: float = 0.0
     rest_m: float = 0.0
-    convention: Literal["own", "h2o", "grab", "arctic"] = "own"
-    finger_mean_rad: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -113,7 +168,6 @@ class MotionCode:
     def encode(self, sample: ClipSample) -> CodedClip:
         """A recorded clip's rows."""
         hands, thing = recentred(torch.from_numpy(sample.hands), self.placed(sample))
-        hands, thing = self.converted(hands, thing, -1)
         present = torch.from_numpy(sample.valid & sample.active_hands[:, None])
         if self.config.hand_frame == "object":
             hands = hands_in_object_frame(hands[None], thing[None])[0]
@@ -147,7 +201,7 @@ class MotionCode:
         objects, there = self._course(objects), self.rows(counts, objects.device)[1]
         start = mean_start(objects, there) if self.config.object_turn == "since start" else None
         if not self.config.knot_frames:
-            return self.converted(hands, objects if start is None else turned_from(objects, start), 1)
+            return hands, objects if start is None else turned_from(objects, start)
         n_frames = max(counts)
         knots = [intervals_of(n, self.config.knot_frames) for n in counts]
         hands = spline_values(hands, stacked_bases(list(counts), knots, n_frames, hands.device))
@@ -182,18 +236,6 @@ class MotionCode:
         """Rows of an object in ``whitening_frames``."""
         frames = self.config.knot_frames / self.config.object_knots if self.config.knot_frames else 1
         return self.config.whitening_frames / frames
-
-    def converted(self, hands: Tensor, objects: Tensor, sign: int) -> Motion:
-        """Hands (..., 2, F, 99) and objects (..., F, 10) from the config's convention to ours; with sign -1 back."""
-        if self.config.convention == "grab":
-            turned = rotmat_to_rot6d(object_rotmat(objects).transpose(-1, -2))
-            objects = torch.cat((objects[..., OBJECT_POSITION], turned, objects[..., OBJECT_HINGE:]), -1)
-        if self.config.convention == "arctic":
-            mean = torch.tensor(self.config.finger_mean_rad).to(hands.device).reshape(2, 1, 15, 3)
-            fingers = rotmat_to_rotvec(hand_rotmats(hands)[..., 1:, :, :]) + sign * mean
-            fingers = rotmat_to_rot6d(rotvec_to_rotmat(fingers)).flatten(-2)
-            hands = torch.cat((hands[..., : HAND_POSE_6D.start], fingers), -1)
-        return hands, objects
 
     def at_origin(self, objects: Tensor, points_m: Tensor, part: Tensor) -> Tensor:
         """Objects (B, F, 10) of ``curves`` with the position of their mesh's origin; points as in ``place_m``."""

@@ -14,11 +14,10 @@ from hoidata.devices import send
 from models.common import losses
 from models.common.corpus import Corpus, any_form
 from models.common.family import Network, Objective, Setup
-from models.common.sampling import TRAIN_STEPS, SamplerConfig, add_noise, alphas_cumprod, draw_motion
+from models.common.sampling import TRAIN_STEPS, SamplerConfig, draw_motion
 from models.text2hoi.diffusion import Condition, MotionGenerator
 from models.text2hoi.diffusion_training import DIFFUSION, Targets, motion_generator
-from models.text2hoi.refiner import CoarseMotion, NoisedHands, RefinerConfig, RefinerModel
-from models.text2hoi.surface import Surface
+from models.text2hoi.refiner import CoarseMotion, RefinerConfig, RefinerModel, Surface
 
 GENERATED_AT_ONCE = 32
 PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")
@@ -26,7 +25,7 @@ PER_HAND = ("hands", "joints_m", "distance_m", "offset_m")
 
 @dataclass(frozen=True)
 class RefinerLossConfig:
-    """Weights of eq. 9, 10 and 11, with lengths in ``unit_m``.
+    """Weights of eq. 10 and 11 beside eq. 9 (1), with lengths in ``unit_m``.
 
     weighting: eq. 9 is the sum of a frame's squared errors; "even" counts their mean. touch: joints near the surface
     are drawn onto it, as in the paper, or those that truly touch to where they truly are. generated: coarse motions are
@@ -36,7 +35,6 @@ class RefinerLossConfig:
     coarse motions made per training clip, sampled ones in ``sampler_steps``. field_resolution: of the grids.
     """
 
-    simple_weight: float = 1.0
     penetration_weight: float = 1.0
     contact_weight: float = 5.0
     unit_m: float = 1.0
@@ -75,9 +73,9 @@ class _Comparison:
 
 
 class RefinerObjective:
-    """Half of the coarse motions are clips noised and denoised once, as in Text2HOI's released training: they are to go
-    back to the clip's own hands relative to the object. The others are sampled from noise, as in use, where no true
-    hands exist: they are to stay near themselves. All are to touch as the clip does, and not to penetrate."""
+    """Half of the coarse motions are clips noised and denoised once: they are to go back to the clip's own hands
+    relative to the object. The others are sampled from noise, as in use, where no true hands exist: they are to stay
+    near themselves. All are to touch as the clip does, and not to penetrate."""
 
     entries = 0
 
@@ -115,28 +113,20 @@ class RefinerObjective:
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, Tensor]:
         numbers = np.random.default_rng(generator.initial_seed()).integers(self.weights.samples, size=len(batch))
         motions = [self.pool[sample.clip_id][n] for sample, n in zip(batch.samples, numbers, strict=True)]
-        return self._losses(self.network, self._batch(batch, motions), generator)
+        return self._losses(self.network, self._batch(batch, motions))
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, RefinerModel)
         assert self.held_out is not None
-        return self._losses(network, self.held_out, torch.Generator().manual_seed(0))["total"]
+        return self._losses(network, self.held_out)["total"]
 
     def _sight(self, samples: list[ClipSample]) -> Sight:
         return Sight.drawn([sample.length for sample in samples], self.frames, 0, np.random.default_rng(0))
 
-    def _noised(self, network: RefinerModel, target: Tensor, generator: torch.Generator) -> NoisedHands | None:
-        """What a refiner that is a diffusion model learns to bring back to ``target`` (eq. 1)."""
-        if not network.config.noise_steps:
-            return None
-        steps = send(torch.randint(network.config.noise_steps, (len(target),), generator=generator), self.device)
-        noise = send(torch.randn(target.shape, generator=generator), self.device)
-        return NoisedHands(add_noise(target, noise, steps, alphas_cumprod(self.device)), steps)
-
-    def _losses(self, network: RefinerModel, seen: _Comparison, generator: torch.Generator) -> dict[str, Tensor]:
+    def _losses(self, network: RefinerModel, seen: _Comparison) -> dict[str, Tensor]:
         batch, coarse, weights = seen.batch, seen.coarse, self.weights
-        refined = network(coarse, self._noised(network, seen.target, generator))
+        refined = network(coarse)
         change = (network.seen(refined, coarse.object) - seen.target) / network.reach
         simple = losses.masked_mean(change.square(), coarse.present[..., None])
         simple = simple * change.shape[-1] if weights.weighting == "sum" else simple
@@ -148,7 +138,7 @@ class RefinerObjective:
             contact = losses.surface_loss(inner, present, batch.contact_threshold_m, weights.unit_m)
         else:
             contact = losses.contact_loss(inner, true, present, batch.contact_threshold_m, weights.unit_m)
-        total = weights.simple_weight * simple + weights.penetration_weight * penetration
+        total = simple + weights.penetration_weight * penetration
         total = total + weights.contact_weight * contact
         return {"total": total, "simple": simple, "penetration": penetration, "contact": contact}
 

@@ -1,6 +1,8 @@
 """Text2HOI's answer to requests: a contact map, a motion of hands and object, and its refinement (Sec. 3).
 
 Everything a motion is drawn from comes from its request's seed, so it is the same in any company.
+Of several motions drawn for one request the best is the answer: whose hands carry, that does as its verb says, and as
+is usual.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -8,15 +10,13 @@ from dataclasses import dataclass, field, replace
 from hashlib import sha256
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hoidata.annotation.encoders import TextEncoder
-from hoidata.batches.dataset import MAX_FRAMES
-from hoidata.batches.requests import Request, RequestBatch, collate_requests
+from hoidata.batches.requests import ObjectPoints, Request, RequestBatch, collate_requests
 from hoidata.clips.clip import Clip
 from hoidata.hands import HandPair
 from hoidata.refinement import HoldSettings, carried_share, hold_clip
@@ -26,18 +26,82 @@ from models.common.family import motion_clip
 from models.common.features import Hands
 from models.common.precision import SamplingPrecision, compute_in
 from models.common.sampling import SamplerConfig, draw_each
-from models.text2hoi.anchored_contact import AnchoredContact
-from models.text2hoi.contact_training import most_typical, touched_maps
+from models.text2hoi.contact import AnchoredContact
+from models.text2hoi.contact_training import CONTACT, ContactNetwork, most_typical, touched_maps
 from models.text2hoi.diffusion import Condition
-from models.text2hoi.diffusion_training import motion_generator
-from models.text2hoi.drawing import Drawn, best_drawn, checked
-from models.text2hoi.length import LengthModel
-from models.text2hoi.networks import NETWORKS
-from models.text2hoi.refiner import RefinerModel, refine
-from models.text2hoi.surface import Surface
-from models.text2hoi.thresholds import ContactNetwork
-from models.text2hoi.understanding import Teller
+from models.text2hoi.diffusion_training import DIFFUSION, motion_generator
+from models.text2hoi.length import LENGTH, LengthModel
+from models.text2hoi.refiner import RefinerModel, Surface, refine
+from models.text2hoi.refiner_training import REFINER
 from models.text2hoi.verb_check import VerbCheck, asked_verb
+
+NETWORKS = (CONTACT, LENGTH, DIFFUSION, REFINER)
+
+
+ENOUGH = 0.5  # of the frames looked at: holds carry in all of them or in none
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A motion's clip. carried: share of some frames in the air in which its hands can carry the object, 1 where no
+    hold asked for it. moved_as: the verb whose training clips move the object most alike, None where that is not known
+    (``VerbCheck``); other_verb: whether it is not what was asked. unusual: numbers of object and hands, in words, that
+    lie outside the bounds of the verb's training clips; beyond: by how much the worst of them does, in widths of its
+    bounds, 0 where none does. draws: how many motions were drawn for it.
+    """
+
+    clip: Clip
+    carried: float = 1.0
+    moved_as: str | None = None
+    other_verb: bool = False
+    unusual: tuple[str, ...] = ()
+    beyond: float = 0.0
+    draws: int = 1
+
+    @property
+    def goodness(self) -> tuple[int, float, float]:
+        """How many of two things are so, that hands carry and that the verb is the one asked for; then how little is
+        unusual, at most 0 (a motion of another verb nearly always is, and is not counted twice); then the share.
+        """
+        count = int(self.carried >= ENOUGH) + (not self.other_verb)
+        return count, 0.0 if self.other_verb else -self.beyond, self.carried
+
+    @property
+    def needs_another(self) -> bool:
+        """Whether it is to be drawn again."""
+        return self.goodness[:2] != (2, 0.0)
+
+
+AnyDrawn = TypeVar("AnyDrawn", bound=Drawn)
+
+
+def checked(check: VerbCheck, clip: Clip, points: ObjectPoints, asked: str | None) -> dict[str, Any]:
+    """What ``Drawn`` says of a motion and the verb asked for; points: of the object."""
+    numbers = check.numbers(clip, points)
+    moved_as = check.moved_as(numbers)
+    return {
+        "moved_as": moved_as,
+        "other_verb": check.fails(asked, moved_as),
+        "unusual": check.unusual(asked, numbers),
+        "beyond": check.beyond(asked, numbers),
+    }
+
+
+def best_drawn(count: int, draws: int, draw: Callable[[Sequence[int], int], Sequence[AnyDrawn]]) -> list[AnyDrawn]:
+    """The best of at most ``draws`` motions for each of ``count`` requests; the first of equals.
+
+    draw: from the numbers of requests and which draw it is, from 1, to one motion for each of them.
+    """
+    best = list(draw(range(count), 1))
+    for which in range(2, draws + 1):
+        weak = [number for number, own in enumerate(best) if own.needs_another]
+        if not weak:
+            break
+        for number, own in zip(weak, draw(weak, which), strict=True):
+            kept = own if own.goodness > best[number].goodness else best[number]
+            best[number] = replace(kept, draws=which)
+    return best
+
 
 AT_ONCE = 64  # requests of the same hands and of like length: what is cut off for all is not computed
 
@@ -97,7 +161,6 @@ class Text2Hoi:
     config: SamplingConfig
     device: torch.device
     pair: HandPair
-    teller: Teller | None = None
 
     @classmethod
     def load(
@@ -106,20 +169,15 @@ class Text2Hoi:
         hands: HandPair,
         config: SamplingConfig | None = None,
         device: torch.device | str = "cpu",
-        encoder: Callable[[], TextEncoder] | None = None,
     ) -> "Text2Hoi":
-        """From ``checkpoints/<network>``. Raises BadInput for one that is not there.
-
-        encoder: makes that of sentences which have to be told in other words; None: all are told as they are.
-        """
+        """From ``checkpoints/<network>``. Raises BadInput for one that is not there."""
         device = torch.device(device)
         trained = {
             network.name: load_checkpoint(Path(checkpoints) / network.name, network, device) for network in NETWORKS
         }
         config = config or SamplingConfig()
         compute_in(trained["diffusion"].network, config.precision)
-        teller = None if encoder is None else Teller.of(trained, encoder)
-        return cls(trained, Hands(hands).to(device), config, device, hands, teller)
+        return cls(trained, Hands(hands).to(device), config, device, hands)
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -147,12 +205,8 @@ class Text2Hoi:
         self, requests: Sequence[Request], refined: bool = True, contact_maps: Sequence[Tensor] | None = None
     ) -> tuple[list[Clip], list[np.ndarray]]:
         """Motions, and the contact map (N,) bool each of them was drawn for; arguments as in ``motions``."""
-        answers = self.answers(self.told(requests), refined, contact_maps)
+        answers = self.answers(requests, refined, contact_maps)
         return [own.clip for own in answers], [own.motion.contact_map.numpy() > 0 for own in answers]
-
-    def told(self, requests: Sequence[Request]) -> Sequence[Request]:
-        """The requests as ``teller`` tells them, with the features that the networks read the sentence's verb from."""
-        return requests if self.teller is None else [self.teller.told(request) for request in requests]
 
     def answers(
         self,
@@ -225,7 +279,7 @@ class Text2Hoi:
     @torch.no_grad()
     def contact_maps(self, requests: Sequence[Request]) -> list[Tensor]:
         """(2, N) by hand the contact map, 0 or 1, that the first motion drawn for each request would be made for."""
-        batch = collate_requests(self.told(requests)).to(self.device)
+        batch = collate_requests(requests).to(self.device)
         generators = [torch.Generator().manual_seed(request.seed) for request in requests]
         return list(self._contact(batch, generators).cpu())
 
@@ -255,8 +309,7 @@ class Text2Hoi:
             network = self.trained["refiner"].network
             assert isinstance(network, RefinerModel)
             seen = surface.coarse(batch, coarse, objects, contact_maps, batch.hand_frames)
-            rows = (MAX_FRAMES, 0), (coarse.shape[2], 0)
-            refined = refine(network, seen, draw_each(*rows, generators)[0] if network.config.noise_steps else None)
+            refined = refine(network, seen)
         parts = zip(coarse, refined, objects, contact_maps, strict=True)
         return [
             Text2HoiMotion(before[:, :n].cpu(), after[:, :n].cpu(), thing[:n].cpu(), contact_map.cpu())

@@ -15,8 +15,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hoidata.actions.action import Actions, action_numbers, training_actions, usual_limits, verb_of
-from hoidata.actions.words import beside_usual, is_seen
+from hoidata.actions.action import (
+    Actions,
+    action_numbers,
+    beside_usual,
+    is_seen,
+    training_actions,
+    usual_limits,
+    verb_of,
+)
 from hoidata.batches.requests import ObjectPoints, Request
 from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts

@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 import torch
@@ -111,11 +110,6 @@ class VerbReading(nn.Module):
         read = self.read(torch.from_numpy(sentences.text).to(self.mean))
         own = read.gather(1, torch.from_numpy(sentences.verb)[:, None].to(read.device))
         self.sure.data.copy_(own.quantile(LESS_SURE))
-
-    def _load_from_state_dict(self, state_dict: dict[str, Tensor], prefix: str, *rest: Any) -> None:
-        """As any module; a checkpoint from before ``sure`` was kept tells sentences as they are read."""
-        state_dict.setdefault(f"{prefix}sure", torch.zeros(()))
-        super()._load_from_state_dict(state_dict, prefix, *rest)
 
 
 def learn_verbs(network: nn.Module, sentences: Sentences) -> None:

@@ -147,7 +147,6 @@ def generation_facts(motions: Sequence[GeneratedMotion], checkpoints: str) -> li
         ("length", "; ".join(lengths)),
         ("object", clip.object_words),
         *([("read as", f"{read_as[0]} ({read_as[1]:.0%})")] if read_as else []),
-        *([("rephrased for the networks", evidence["told"])] if evidence["told"] != evidence["text"] else []),
         ("seed", str(evidence["seed"])),
         *[
             ("compared with training", f"sample {shown.evidence['number'] + 1}: {words}")

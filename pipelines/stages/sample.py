@@ -34,6 +34,5 @@ def sample(paths: StagePaths, params: dict, family: str) -> None:
         load_hands(paths.profile),
         settings=settings,
         device=chosen_device(params.get("device", "auto")),
-        encoder=(params.get("annotate") or {}).get("encoder"),
     )
     print(f"{paths}: {counts['clips']} motions")

@@ -25,11 +25,10 @@ class TrainParams:
     processes: how many train one network together; ``training.parts`` says what each step computes.
     """
 
-    preset: Literal["paper", "released", "ours"]
+    preset: Literal["paper", "ours"]
     size: Literal["small", "full"]
     seed: int
     paper: Mapping[str, Any]
-    released: Mapping[str, Any]
     ours: Mapping[str, Any]
     small: Mapping[str, Any]
     full: Mapping[str, Any]

@@ -32,8 +32,7 @@ from models.common.features import Hands, Normaliser, recentred
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.sampling import SamplerConfig
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
-from models.text2hoi.networks import NETWORKS
-from models.text2hoi.sampler import SamplingConfig, Text2Hoi
+from models.text2hoi.sampler import NETWORKS, SamplingConfig, Text2Hoi
 from pipelines.params import laid_over, read_params
 from tests.models.toy import PARAMS, POINT_NET, TRANSFORMER
 

@@ -10,10 +10,9 @@ from torch import Tensor
 from hoidata.batches.dataset import ClipBatch
 from hoidata.contact.agreement import f1_score
 from models.common.point_net import PointNetConfig
-from models.text2hoi.anchored_contact import AnchoredContact, by_hand_loss, picked
-from models.text2hoi.contact_config import ContactConfig, ContactLossConfig
-from models.text2hoi.contact_tokens import TOKEN_FEATURES, contact_tokens, spread_out
+from models.text2hoi.contact import AnchoredContact, ContactConfig, by_hand_loss, picked
 from models.text2hoi.contact_training import most_typical
+from models.text2hoi.diffusion import TOKEN_FEATURES, contact_tokens, spread_out
 
 POINT_NET = PointNetConfig(widths=(16, 32, 64), heads=(32, 16), align=False)
 
@@ -133,9 +132,8 @@ def test_an_anchored_network_learns_two_regions_as_two_answers(batch: ClipBatch)
         some = torch.randperm(points.shape[1], generator=generator)[:256]
         touch, logits = model.losses(points[:, some], text, given, contact[..., some], generator)
         optimiser.zero_grad()
-        by_hand_loss(touch, logits, contact[..., some], active_hands, ContactLossConfig(touch_weight=1.0))[
-            "total"
-        ].backward()
+        found = by_hand_loss(touch, logits, contact[..., some], active_hands)
+        (found["cross_entropy"] + found["dice"] + found["touch"]).backward()
         optimiser.step()
     latents = model.eval().draw_latents(16, 1, torch.Generator().manual_seed(1))
     one = replace(batch, points_m=points[:1], active_hands=active_hands[:1])

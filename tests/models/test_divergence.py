@@ -148,7 +148,7 @@ def test_a_learning_rate_that_is_far_too_high_is_found_without_help(annotated_ro
 def test_the_key_that_is_named_is_the_one_that_decides(tmp_path: Path) -> None:
     path = tmp_path / "params.yaml"
     train_section = (
-        "{preset: ours, size: small, seed: 0, paper: {}, released: {}, "
+        "{preset: ours, size: small, seed: 0, paper: {}, "
         "ours: {length: {training: {clip_norm: 1.0}}}, small: {length: {training: {learning_rate: 0.1}}}, full: {}}"
     )
     path.write_text(f"profile: study\nprofiles: {{study: {{}}}}\ntrain: {train_section}\n")

@@ -24,11 +24,10 @@ from models.baselines.lookups import Lookup
 from models.common.family import Sources, motion_clip
 from models.common.predicting import AsksContact, PredictionConfig, requests_for, sample_family, spread
 from models.registry import family_names, load_family, load_network
-from models.text2hoi.diagnostics import mean_map_by_position
-from models.text2hoi.family import OtherPrompt, other_prompts
+from models.text2hoi.contact_training import best_threshold, mean_f1
+from models.text2hoi.family import OtherPrompt, mean_map_by_position, other_prompts
 from models.text2hoi.motion_code import MotionCode, MotionCodeConfig
 from models.text2hoi.sampler import AT_ONCE, Text2Hoi, Text2HoiMotion, alike
-from models.text2hoi.thresholds import best_threshold, mean_f1
 from models.text2hoi.verb_check import VerbCheck
 from tests.models.toy import FAST
 

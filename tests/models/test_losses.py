@@ -13,9 +13,9 @@ from hoidata.objects.signed_distance_grid import DistanceFields
 from models.common import losses
 from models.common.features import Hands, place_points, scaled_text, to_object_frame
 from models.common.sampling import add_noise
-from models.text2hoi.contact import ContactLossConfig, contact_loss
+from models.text2hoi.contact import contact_loss
 from models.text2hoi.length import length_loss
-from models.text2hoi.surface import Surface
+from models.text2hoi.refiner import Surface
 
 
 @pytest.fixture(scope="module")
@@ -144,9 +144,9 @@ def test_length_and_contact_losses_by_hand() -> None:
     wider = length_loss(torch.tensor([0.5]), torch.tensor([1.0]), torch.tensor([150]))
     assert float(wider["likelihood"]) == pytest.approx(1 + 0.125 * np.exp(-2))
     logits, touched, latent = torch.full((1, 4), 20.0), torch.tensor([[1.0, 1, 0, 0]]), torch.ones(1, 2)
-    found = contact_loss(logits, touched, latent, 0 * latent, ContactLossConfig())
+    found = contact_loss(logits, touched, latent, 0 * latent)
     # Everything is called touched: 1 - (2 x 2 + 1) / (4 + 2 + 1); two points wrong by 20; two latents of mean 1.
     expected = [1 - 5 / 7, 40.0, 1.0]
     assert [float(found[name]) for name in ("dice", "cross_entropy", "kl")] == pytest.approx(expected, rel=1e-4)
-    narrow = contact_loss(logits, touched, 0 * latent, -latent, ContactLossConfig())
+    narrow = contact_loss(logits, touched, 0 * latent, -latent)
     assert float(narrow["kl"]) == pytest.approx(np.exp(-1))

@@ -22,8 +22,7 @@ from models.evaluator.settings import EvaluatorSettings
 from models.evaluator.stage import train_evaluators
 from models.registry import load_family, load_network
 from models.text2hoi.contact_training import contact_threshold, draw_threshold
-from models.text2hoi.diagnostics import contact_figures
-from models.text2hoi.family import other_prompts
+from models.text2hoi.family import contact_figures, other_prompts
 from tests.builders.stores import write_annotated
 from tests.models.conftest import PLANS, make_clip
 from tests.models.test_progress import SETTINGS
@@ -51,9 +50,9 @@ def train(name: str, root: Path, out: Path, **training) -> Path:
 def test_without_validation_clips_the_last_weights_are_kept_whatever_the_losses_were(
     root: Path, tmp_path: Path, name: str, capsys: pytest.CaptureFixture
 ) -> None:
-    """Patience of one validation, and the best of them: neither stops or chooses anything. The log has no loss."""
+    """The best of the validations chooses nothing. The log has no loss."""
     settings = {"steps": 4, "validate_every": 1, "learning_rate": 0.25}
-    chosen = load_file(train(name, root, tmp_path / "chosen" / name, **settings, keep_best=True, patience=1))
+    chosen = load_file(train(name, root, tmp_path / "chosen" / name, **settings, keep_best=True))
     assert "no validation clips; nothing is chosen, the last weights are kept" in capsys.readouterr().err
     last = load_file(train(name, root, tmp_path / "last" / name, **settings))
     assert all(torch.equal(value, last[key]) for key, value in chosen.items())
@@ -86,7 +85,7 @@ def test_thresholds_that_no_validation_clip_chooses_are_one_half(
     def refuse(*_: object) -> float:
         raise AssertionError("a threshold was chosen")
 
-    monkeypatch.setattr("models.text2hoi.diagnostics.best_threshold", refuse)
+    monkeypatch.setattr("models.text2hoi.family.best_threshold", refuse)
     sources = Sources(annotated, tmp_path, HANDS, torch.device("cpu"))
     assert contact_figures(sources, train_clips, [], test)["threshold"] == 0.5
 

@@ -122,7 +122,7 @@ def test_a_motion_made_is_the_same_wherever_the_mesh_has_its_origin(batch: ClipB
     """Noise, words, touched points and network the same: hands lie where they lay, and so do points of the object."""
     torch.manual_seed(0)
     size = TransformerConfig(width=32, layers=1, heads=2, feed_forward=32)
-    told = {"contact_input": "tokens", "scale_input": False, "object_feature": False}
+    told = {"contact_input": "tokens", "scale_input": False}
     network = DiffusionModel(DiffusionConfig(size, PointNetConfig((8, 8, 16), (8, 8), False), MIDDLE, **told)).eval()
     generator = MotionGenerator(network, Normaliser.nothing(network.code.object_features).spread_to(4.0))
     n, rows = len(batch), network.code.sizes(batch.frames.shape[1])
@@ -130,7 +130,7 @@ def test_a_motion_made_is_the_same_wherever_the_mesh_has_its_origin(batch: ClipB
     made = []
     for shift in (torch.zeros(3), ELSEWHERE_M):
         here = replace(batch, points_m=batch.points_m + shift)
-        condition = Condition.of(here, batch.text.new_zeros(n, 0), batch.text[:, 0], batch.contact)
+        condition = Condition.of(here, batch.text.new_zeros(n, 16), batch.text[:, 0], batch.contact)
         hands, objects = generator.sample(condition, SamplerConfig(steps=2), noise, torch.Generator())
         at_old_origin = placed_at(objects, shift)
         start = at_old_origin[:, :1, OBJECT_POSITION]

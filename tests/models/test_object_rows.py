@@ -11,8 +11,10 @@ from torch import Tensor
 from hoidata.batches.dataset import ClipBatch
 from models.common.features import OBJECT_START_6D, Normaliser
 from models.common.spline import fit_spline, intervals_of
-from models.text2hoi.motion_code import MotionCode, MotionCodeConfig, _still_hinge
-from models.text2hoi.object_rows import (
+from models.text2hoi.motion_code import (
+    MotionCode,
+    MotionCodeConfig,
+    _still_hinge,
     mean_start,
     smooth_root,
     turned_from,

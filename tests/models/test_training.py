@@ -407,30 +407,6 @@ def test_kept_weights_are_a_running_average_from_the_end_of_the_warm_up_on(
     assert float(next(kept.parameters())) == pytest.approx(expected[1])
 
 
-class Flattening(Downhill):
-    """A slope of 1 at the first step, of a hundredth from then on."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.slopes = iter([1.0] + [0.01] * 9)
-
-    def losses(self, batch: ClipBatch, generator: torch.Generator) -> dict[str, torch.Tensor]:
-        return {"total": next(self.slopes) * self.validation(self.network)}
-
-
-@pytest.mark.parametrize("beta2", [0.999, 0.8])
-def test_first_gradients_are_forgotten_as_beta2_says(annotated: AnnotatedStore, beta2: float) -> None:
-    """A step goes 0.1 x the mean of gradients / the root of their mean square, recent ones counting more."""
-    config = TrainingConfig(10, 2, 0.1, weight_decay=0.0, adam_beta2=beta2, validate_every=10)
-    kept, _ = fit(Flattening(), Corpus.of(annotated, 0), config, 0, torch.device("cpu"))
-    slopes, expected = np.array([1.0] + [0.01] * 9), 2.0
-    for step in range(1, 11):
-        age = np.arange(step)[::-1]
-        mean, square = (np.average(slopes[:step] ** power, weights=beta**age) for power, beta in ((1, 0.9), (2, beta2)))
-        expected -= 0.1 * mean / np.sqrt(square)
-    assert float(next(kept.parameters())) == pytest.approx(expected, abs=1e-5)
-
-
 def test_the_learning_rate_warms_up_and_falls_to_zero() -> None:
     config = TrainingConfig(steps=110, warmup=10, schedule="cosine")
     found = [learning_rate_factor(step, config) for step in (1, 10, 60, 110)]

@@ -221,7 +221,7 @@ def test_unknown_keys_of_a_section_fail_and_list_the_known_ones(project):
     values = yaml.safe_load(path.read_text())
     values["train"]["sizes"] = 3
     path.write_text(yaml.safe_dump(values))
-    with pytest.raises(BadInput, match="preset, size, seed, paper, released, ours, small, full"):
+    with pytest.raises(BadInput, match="preset, size, seed, paper, ours, small, full"):
         load_settings(TrainParams, "train", path)
 
 

@@ -44,7 +44,7 @@ def test_what_is_no_whole_number_is_refused_where_one_is_needed(value):
 
 
 def test_numbers_in_a_list_are_read_by_the_same_rule():
-    from models.text2hoi.contact_config import ContactConfig
+    from models.text2hoi.contact import ContactConfig
 
     config = build_config(ContactConfig, {"decoder_widths": [1e2, "64", 32]}, "network")
     assert config.decoder_widths == (100, 64, 32)

@@ -4,8 +4,17 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.actions.action import LEARNT, NUMBERS, Actions, action_numbers, learn_actions, written_limits
-from hoidata.actions.words import WORDS, beside_usual, is_seen
+from hoidata.actions.action import (
+    LEARNT,
+    NUMBERS,
+    WORDS,
+    Actions,
+    action_numbers,
+    beside_usual,
+    is_seen,
+    learn_actions,
+    written_limits,
+)
 from hoidata.clips.clip import FPS, ObjectTrack
 from hoidata.errors import BadInput
 from tests.builders.clips import in_another_world

@@ -1,7 +1,5 @@
 """A stream says what a whole clip does: at any rate of the tracker, and as soon as it has what its network reads."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -16,7 +14,6 @@ from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
 from models.manipnet.examples import hand_examples, prepared
 from models.manipnet.features import FeatureSettings
-from models.manipnet.layout import kept_columns, times_read_s
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, Task, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
@@ -45,7 +42,7 @@ def tracked(fps: int, length_s: float) -> Control:
     return Control(wrists, body, BOX)
 
 
-def predictor(step_s: float, without: tuple[str, ...] = ()) -> Predictor:
+def predictor(step_s: float) -> Predictor:
     """A network that has learnt nothing but what poses look like."""
     torch.manual_seed(0)
     settings, control, time_s = FeatureSettings(step_s=step_s), tracked(30, 1.0), np.arange(31) / 30
@@ -54,7 +51,7 @@ def predictor(step_s: float, without: tuple[str, ...] = ()) -> Predictor:
         fingers = hand.rest_rotmats @ rotvec_to_rotmat(0.2 * np.random.default_rng(number).normal(size=(31, 15, 3)))
         usable, surface = np.ones(31, bool), surface_index(BOX)
         examples.append(hand_examples(control, side, hand, fingers, time_s, usable, surface, settings))
-    config = NetworkConfig(encoder=8, features=settings, without=without)
+    config = NetworkConfig(encoder=8, features=settings)
     return Predictor(prepared(config, HANDS["right"], examples).eval())
 
 
@@ -110,32 +107,11 @@ def test_a_time_on_a_frame_is_that_frame_whatever_else_is_asked_for_beside_it():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("without", "ahead_s"), [((), 0.5), (("sensors",), 0.5), (("long-future",), 0.1)])
-def test_a_stream_answers_once_it_has_what_its_network_reads_with_the_bits_of_the_clip(without, ahead_s):
-    said_by, control = predictor(1 / 60, without), tracked(60, 1.5)
+def test_a_stream_answers_once_it_has_what_its_network_reads_with_the_bits_of_the_clip():
+    said_by, control, ahead_s = predictor(1 / 60), tracked(60, 1.5), 0.5
     told, when_s = streamed(said_by, control)
     assert_is_the_clip(told, said_by, control)
     # Pose k is told from what is known a step before it; one frame more makes sure that it is there.
     waited = [when - (number - 1) / 60 for number, when in enumerate(when_s) if number]
     assert max(waited) <= ahead_s + 1 / 60 + 1e-6
     assert min(waited) > ahead_s - 1e-6
-
-
-def test_what_is_read_of_other_times_is_told_by_the_columns_that_are_kept():
-    hand, settings = HANDS["right"], FeatureSettings()
-
-    def read_s(*without: str, before: float = -1.0) -> tuple[float, float]:
-        kept = kept_columns(hand, settings, without)
-        first = 9 * hand.n_joints + 15 + 6 * len(hand.palm_capsules)  # numbers of the pose
-        samples = kept[first : first + 16 * len(settings.samples_s)].reshape(-1, 16)
-        samples[settings.samples_s < before] = 0
-        return times_read_s(kept, hand, settings)
-
-    assert read_s() == read_s("future") == read_s("sensors") == (-0.5, 0.5)
-    assert read_s("long-future") == read_s("long-future", "future") == (-0.5, 0.1)
-    assert read_s(before=-0.22) == (pytest.approx(-0.2), 0.5)
-    short = kept_columns(hand, settings, ["long-future"])
-    assert times_read_s(short, hand, replace(settings, smooth=True)) == (-0.5, 0.5)
-    later = replace(settings, future_s=0.0)  # sensors alone look ahead
-    assert times_read_s(kept_columns(hand, later, []), hand, later) == (-0.5, 0.5)
-    assert times_read_s(kept_columns(hand, later, ["future"]), hand, later) == (-0.5, 0.0)

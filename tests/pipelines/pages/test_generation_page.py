@@ -32,7 +32,6 @@ def motion(page_clip):
         "number": 0,
         "hand": hand,
         "read_as": ("lift", 0.97),
-        "told": "Lift a <b>jar</b> with the left hand.",
         "draws": 3,
         "moved_as": "pour",
         "unusual": ["highest rise 15.8 cm (usual: <19.1> to 23.7)"],
@@ -105,7 +104,6 @@ def test_page_names_seed_hands_length_models_and_what_was_never_seen(motion, wri
         "the object &#39;vase&#39; was never in training",
         "z is &lt;taken&gt; for up",
         "Lift a box &amp; hold it",
-        "Lift a &lt;b&gt;jar&lt;/b&gt; with the left hand.",
         "sample 1: the best of 3 motions",
         "sample 1: moves most like &#39;pour&#39;, highest rise 15.8 cm (usual: &lt;19.1&gt; to 23.7)",
     ):
