@@ -20,7 +20,7 @@ import pandas as pd
 from bench.harness import show
 from hoidata.annotation.derived import derive_verb
 from hoidata.clips import SIDES, Clip, HandType, Side
-from hoidata.contact.hands import acting_hands
+from hoidata.contact.maps import acting_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.stage import sample_objects
 from hoidata.objects.surface_index import surface_index

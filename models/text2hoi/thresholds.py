@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.devices import send
 from models.text2hoi.anchored_contact import AnchoredContact
 from models.text2hoi.contact import ContactModel
