@@ -19,7 +19,7 @@ from hoidata.datasets.registry import get_adapter
 from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracks import track_vertices
 from hoidata.store.annotated import load_annotated
-from hoidata.surface.store import open_surface
+from hoidata.surface.measure import measure_hand
 from pipelines.lineage.graph import written_graph
 
 IMAGES = Path(__file__).parents[1] / "images"
@@ -124,14 +124,14 @@ def posed(pose: np.ndarray) -> np.ndarray:
 def draw_contact(figure: Figure, data: Path) -> None:
     """The contact map of a clip, and BimArt's distances of one frame, on the same 1,024 points."""
     annotated = load_annotated(data / "grab", HANDS)
-    clip, surface = annotated.clip(CLIP), open_surface(data / "grab/surface")
-    points = annotated.points(annotated.object_key(CLIP)).points_m
-    frame, side = clip.n_frames // 2, annotated.hand_type(CLIP)
+    clip, sampled = annotated.clip(CLIP), annotated.points(annotated.object_key(CLIP))
+    frame, side, points = clip.n_frames // 2, annotated.hand_type(CLIP), sampled.points_m
     side = "right" if side == "both" else side
+    surface = measure_hand(clip, side, HANDS, sampled)
     touched = annotated.touched_frames(CLIP, side)
     maps = {
         "touched within 2 cm of a joint": (touched / clip.n_frames, TOUCH, "share of the frames"),
-        f"metres to the {side} hand, frame {frame}": (surface.bimart_map(CLIP, side)[frame], "RdYlBu", "m"),
+        f"metres to the {side} hand, frame {frame}": (surface.map_m[frame], "RdYlBu", "m"),
     }
     for number, (title, (values, colours, unit)) in enumerate(maps.items()):
         axes = figure.add_subplot(1, 2, number + 1, projection="3d")

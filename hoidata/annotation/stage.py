@@ -21,7 +21,7 @@ from hoidata.annotation.reference_mode import reference_sentences
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips import SIDES, Clip, HandType, Side
-from hoidata.contact.hands import acting_hands
+from hoidata.contact.maps import acting_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.contact.stage import sample_objects

@@ -1,4 +1,4 @@
-"""Contact maps and distance maps on the sampled points of a clip's object, one per hand."""
+"""Which hands take part in a clip, contact maps and distance maps: one per hand, on the object's sampled points."""
 
 from collections.abc import Mapping
 
@@ -7,8 +7,28 @@ import numpy as np
 from hoidata.clips import SIDES, Clip, Side
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.errors import BadInput
+from hoidata.store.hand_evidence import HandEvidence
 
 LONGEST_CLIP = int(np.iinfo(np.int16).max)
+
+
+def acting_hands(
+    clip: Clip,
+    joints_m: Mapping[Side, np.ndarray],
+    index: ProximityIndex,
+    threshold_m: float = CONTACT_THRESHOLD_M,
+) -> HandEvidence:
+    """Hands of which any joint comes closer than ``threshold_m`` to any sampled point in any valid frame.
+
+    The proximity test of Text2HOI (supplement, section 6).
+
+    joints_m: per side (frame, 21, 3) in the clip's world, metres. index: over ``sample_points(clip.object.model)``.
+    """
+    distance: dict[Side, np.ndarray] = {}
+    for side in SIDES:
+        closest = index.closest_m(joints_m[side], clip.object)
+        distance[side] = np.where(clip.hands[side].valid, closest, np.inf)
+    return HandEvidence(None, distance, threshold_m).at_threshold(threshold_m)
 
 
 def distance_entries(
@@ -36,3 +56,9 @@ def touched_frames(entries: np.ndarray, point_count: int) -> np.ndarray:
 def contact_maps(entries: Mapping[Side, np.ndarray], point_count: int) -> dict[Side, np.ndarray]:
     """Per hand Text2HOI's map (point,) uint8. A hand with an entry acts, so the union needs no hand type."""
     return {side: (touched_frames(entries[side], point_count) > 0).astype(np.uint8) for side in SIDES}
+
+
+def f1_score(made: np.ndarray, true: np.ndarray) -> float:
+    """F1 of boolean maps (point,): 2 TP / (2 TP + FP + FN); 1 where both are empty."""
+    total = int(made.sum()) + int(true.sum())
+    return 2 * int((made & true).sum()) / total if total else 1.0

@@ -4,15 +4,12 @@ Moving 21 joints into the frame of a part (which a hinge may have turned) instea
 one index per part serve every frame of every clip, and makes every result independent of the world frame.
 """
 
-from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from hoidata.clips import ObjectTrack
-from hoidata.contact.near_points import ENTRY, CellGrids, cell_grids, near_entries
-from hoidata.contact.nearest_point import PointBoxes, closest_of_joints, point_boxes
-from hoidata.contact.part_frames import part_motion
+from hoidata.contact.near_points import ENTRY, closest_of_joints, near_entries, point_boxes
 from hoidata.errors import BadInput
 
 CONTACT_THRESHOLD_M = 0.02
@@ -33,16 +30,13 @@ class ProximityIndex:
     def __init__(self, points: PartPoints) -> None:
         self.count = len(points.points_m)
         self.parts = [int(part) for part in np.unique(points.part)]
-        self._points_m = points.points_m.astype(np.float32, copy=False)
-        self._members = [np.flatnonzero(points.part == part) for part in self.parts]
-        self._grids: dict[float, CellGrids] = {}
+        self._boxes = point_boxes(points.points_m, [np.flatnonzero(points.part == part) for part in self.parts])
 
     def closest_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
         """(frame,) distance from the nearest of the world joints ``(frame, joint, 3)`` to the nearest point, metres."""
         if not self.parts:
             return np.full(len(joints_m), np.inf)
-        motion, reach = part_motion(track, self.parts), CONTACT_THRESHOLD_M
-        return closest_of_joints(joints_m, motion, self._boxes, self._grid(reach), reach)
+        return closest_of_joints(self._places_m(joints_m, track), self._boxes)
 
     def entries(
         self, joints_m: np.ndarray, valid: np.ndarray, track: ObjectTrack, threshold_m: float = CONTACT_THRESHOLD_M
@@ -57,16 +51,13 @@ class ProximityIndex:
             most = int(np.iinfo(ENTRY[name]).max)
             if count > most:
                 raise BadInput("distance map", f"at most {most} {name}s", f"{count}", "cut the sequence, or take fewer")
-        if not len(self.parts):
+        if not self.parts:
             return np.zeros(0, ENTRY)
-        motion = part_motion(track, self.parts)
-        return near_entries(joints_m, valid, motion, self._grid(threshold_m), self.count, threshold_m)
+        places_m = self._places_m(joints_m, track)
+        return near_entries(places_m, np.array(valid, bool), self._boxes, self.count, threshold_m)
 
-    def _grid(self, reach_m: float) -> CellGrids:
-        if reach_m not in self._grids:
-            self._grids[reach_m] = cell_grids(self._points_m, self._members, reach_m)
-        return self._grids[reach_m]
-
-    @cached_property
-    def _boxes(self) -> PointBoxes:
-        return point_boxes(self._points_m.astype(np.float64), self._members)
+    def _places_m(self, joints_m: np.ndarray, track: ObjectTrack) -> np.ndarray:
+        """(frame, part, joint, 3) float64, world joints in the frame of each part."""
+        in_object = track.world_from_object.inverse() @ joints_m.astype(np.float64)
+        parts = [track.model.object_from_part(part, track.hinge_rad).inverse() for part in self.parts]
+        return np.stack([part_from_object @ in_object for part_from_object in parts], axis=1)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from hoidata.clips.clip import SIDES, Clip, Side
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.metrics.pair import acting_sides
 from hoidata.splits.rules import PARTS

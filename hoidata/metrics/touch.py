@@ -11,7 +11,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.slip import joint_slips_cm_s, touched_parts
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.errors import BadInput
 from hoidata.metrics.pair import Motion, Pair
 from hoidata.metrics.unmeasured import NO_INSIDE, Unmeasured, Values

@@ -1,22 +1,23 @@
 """All measures of one clip and of one object."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from hoidata.clips.clip import SIDES, Clip, HandTrack, ObjectTrack, Side
-from hoidata.hands import HandPair, track_joints, track_vertices
+from hoidata.hands import HandPair, track_joints
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.sampling import sample_points
 from hoidata.objects.solid import Solid
+from hoidata.objects.surface_index import surface_index
 from hoidata.quality import motion
 from hoidata.quality.meshes import SurfaceFacts, part_facts
-from hoidata.quality.penetration import depths_m
 from hoidata.quality.shape import largest_beta, meant_betas
 from hoidata.quality.thresholds import Thresholds
 from hoidata.quality.timing import ObjectMotion, time_offset
+from hoidata.surface.contact import deepest_m, placed_hand
 
 NAN = float("nan")
 STILL_M = 0.001
@@ -167,27 +168,15 @@ def _penetration(clip: Clip, facts: ObjectFacts, hands: HandPair, thresholds: Th
     if not facts.solid_parts:
         note = f"penetration not measured: the mesh of {facts.model.name} is not solid"
         return {"penetration_m": NAN, "penetration_share": NAN, "note": note}
-    frames = np.arange(0, clip.n_frames, thresholds.penetration_every)
-    depth = np.zeros(len(frames))
-    for side in SIDES:
-        seen = clip.hands[side].valid[frames]
-        if seen.any():
-            depth[seen] = np.maximum(depth[seen], _hand_depths(clip, side, frames[seen], facts, hands))
+    looked_at = clip.take(slice(None, None, thresholds.penetration_every))
+    index = surface_index(facts.model)
+    depth = np.nan_to_num([deepest_m(placed_hand(looked_at, side, hands), index) for side in SIDES]).max(axis=0)
     solid, parts = len(facts.solid_parts), len(facts.surfaces)
     return {
         "penetration_m": float(depth.max()),
         "penetration_share": float((depth > thresholds.too_deep_m).mean()),
         "note": "" if solid == parts else f"penetration measured in the {solid} solid of {parts} parts only",
     }
-
-
-def _hand_depths(clip: Clip, side: Side, frames: np.ndarray, facts: ObjectFacts, hands: HandPair) -> np.ndarray:
-    track, thing = clip.hands[side], clip.object
-    vertices = track_vertices(track.take(frames), hands[side])
-    # Stored bytes depend on it: the translation is taken away in float32, as it is stored.
-    pose = replace(thing.world_from_object, offset=thing.translation_m)[frames]
-    hinge = None if thing.hinge_rad is None else thing.hinge_rad[frames]
-    return depths_m(facts.model, hinge, pose.inverse() @ vertices, facts.solid_parts)
 
 
 def _offset(clip: Clip, joints: Joints, facts: ObjectFacts, thresholds: Thresholds) -> dict[str, float]:

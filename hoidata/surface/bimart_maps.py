@@ -5,9 +5,8 @@ minimum; its equation writes the vector to the nearest vertex, whose length this
 feature"). Left and right are kept apart, and which vertex is nearest is not kept, as there.
 
 Two choices are ours. The points are those all maps of this project lie on (``sample_points``), where BimArt takes the
-mesh vertices nearest to its basis points (equations 2 and 3). And maps are stored in steps of 0.8 mm up to 20 cm, the
-range in which the paper draws its maps (figure 9): at most 0.4 mm of error, where its basis points cost 3 to 5 mm on
-average (table 6).
+mesh vertices nearest to its basis points (equations 2 and 3). And pages pack maps in steps of 0.8 mm up to 20 cm, the
+range in which the paper draws its maps (figure 9): at most 0.4 mm of error.
 """
 
 import numpy as np
@@ -41,11 +40,6 @@ def packed_map(distances_m: np.ndarray) -> np.ndarray:
     """uint8 of the same shape: steps of 0.8 mm, rounded; 255 beyond 20 cm."""
     near = distances_m <= REACH_M
     return np.where(near, np.rint(np.where(near, distances_m, 0.0) / STEP_M), BEYOND).astype(np.uint8)
-
-
-def unpacked_map(packed: np.ndarray) -> np.ndarray:
-    """float32 metres of :func:`packed_map`, at most 0.4 mm off; infinite beyond 20 cm."""
-    return np.where(packed == BEYOND, np.inf, packed * STEP_M).astype(np.float32)
 
 
 def _nearest_m(positions_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:

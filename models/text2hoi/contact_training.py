@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, collate
 from hoidata.batches.requests import RequestBatch
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.devices import send
 from models.common.checkpoints import Checkpoint
 from models.common.corpus import Corpus, any_form

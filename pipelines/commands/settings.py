@@ -14,7 +14,6 @@ SECTIONS = {
     "quality": "hoidata.quality.thresholds:Thresholds",
     "contact": "hoidata.contact.settings:ContactSettings",
     "annotate": "hoidata.annotation.settings:AnnotationSettings",
-    "surface": "hoidata.surface.stage:SurfaceSettings",
     "evaluator": "models.evaluator.settings:EvaluatorSettings",
     "evaluate": "pipelines.stages.evaluate:EvaluateSettings",
     "controls": "pipelines.stages.controls:ControlSettings",

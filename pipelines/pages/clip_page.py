@@ -12,7 +12,7 @@ from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import AnnotatedStore
-from hoidata.surface.bimart_maps import REACH_M, STEP_M
+from hoidata.surface.bimart_maps import REACH_M, STEP_M, packed_map
 from pipelines.pages.clip_page_facts import (
     clip_facts,
     clip_quality,
@@ -59,7 +59,7 @@ def write_clip_page(path: str | Path, annotated: AnnotatedStore, clip_id: str, h
         synthetic=clip.synthetic,
         clip_id=clip_id,
         player=replace(motion_player(clip, hands, title, contact=true_contact(annotated, clip_id)), contact_label=""),
-        paint=paint_values(clip, points, series.touched, {side: series.surface[side].map for side in sides}),
+        paint=paint_values(clip, points, series.touched, {side: series.surface[side].map_m for side in sides}),
         paint_colours=PAINT_COLOURS,
         distance_colours=DISTANCE_COLOURS,
         reach_cm=REACH_M * 100,
@@ -87,7 +87,7 @@ def paint_values(
     parts: per part that has triangles, the name of its node in the GLB, points in its mesh's coordinates (the moving
     part is drawn from its hinge's origin) in 0.1 mm, and their numbers among all points. left, right: touched points
     per frame, packed bits (first point in the highest bit) in base64, ``stride`` bytes per frame. distances: of each
-    hand of ``maps``, BimArt's packed map (frame, point) in base64; ``farthest`` steps are its reach.
+    hand of ``maps``, BimArt's map (frame, point) in metres, packed, in base64; ``farthest`` steps are its reach.
     """
     model = clip.object.model
     parts = []
@@ -100,7 +100,7 @@ def paint_values(
     bits = {side: np.packbits(touched[side], axis=1) for side in SIDES}
     packed = {side: base64.b64encode(bits[side].tobytes()).decode("ascii") for side in SIDES}
     distances = {
-        side: base64.b64encode(packed_map.tobytes()).decode("ascii") for side, packed_map in (maps or {}).items()
+        side: base64.b64encode(packed_map(map_m).tobytes()).decode("ascii") for side, map_m in (maps or {}).items()
     }
     return {
         **{"parts": parts, "stride": int(bits["left"].shape[1]), "frames": clip.n_frames, "points": len(points)},

@@ -1,7 +1,6 @@
 """What one clip's page plots, frame by frame: touched points, nearest distance, penetration, and how the object moves.
 
-Numbers are read from the folders of the stages. What the stage surface would have found is measured here, with its own
-functions, where it did not run or quality control left the clip out.
+Contact with points and hand types are read from the folders of the stages; the exact surface is asked here.
 """
 
 from dataclasses import dataclass
@@ -10,15 +9,11 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Clip, Side
 from hoidata.contact.maps import LONGEST_CLIP
-from hoidata.hands import HandPair, track_joints
-from hoidata.objects.sampling import SampledPoints
+from hoidata.hands import HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.hand_evidence import HandEvidence
-from hoidata.surface.contact import TOUCH_M
-from hoidata.surface.measure import ObjectShape, measure_hand
-from hoidata.surface.store import SideSurface
-from pipelines.pages.surface_facts import surface_beside
+from hoidata.surface.measure import SideSurface, measure_hand
 
 
 @dataclass(frozen=True)
@@ -26,15 +21,14 @@ class ClipSeries:
     """Everything per frame (frame,), NaN where it means nothing.
 
     touched: per side (frame, point) bool, the contact map of each frame. evidence: what the hand type rests on.
-    surface: per side what the stage surface measures; touch_m: a vertex nearer than that touches. solid: whether
-    anything can be inside the object, so that depths mean something.
+    surface: per side the hand against the exact surface. solid: whether anything can be inside the object, so that
+    depths mean something.
     lift_m: height of the object above its first frame, or None without gravity. hinge_rad: None for a rigid object.
     """
 
     touched: dict[Side, np.ndarray]
     evidence: HandEvidence
     surface: dict[Side, SideSurface]
-    touch_m: float
     solid: bool
     speed_m_s: np.ndarray
     lift_m: np.ndarray | None
@@ -61,26 +55,15 @@ def measure_clip(annotated: AnnotatedStore, clip: Clip, hands: HandPair) -> Clip
     points = annotated.points(annotated.object_key(clip.clip_id))
     # The mean of the sampled points: the moving part counts as far as its surface goes.
     centre_m = clip.object.points_in_world(points.points_m, points.part).mean(axis=1)
-    stored = surface_beside(annotated)
-    surface, touch_m = {}, TOUCH_M
-    if stored is not None and clip.clip_id in stored.ids:
-        surface |= {side: stored.hand(clip.clip_id, side) for side in SIDES}
-        touch_m = float(stored.info["touch_m"])
     return ClipSeries(
         touched={side: _touched(annotated, clip, side, len(points)) for side in SIDES},
         evidence=annotated.hand_evidence(clip.clip_id),
-        surface=surface or _measured(clip, hands, points),
-        touch_m=touch_m,
+        surface={side: measure_hand(clip, side, hands, points) for side in SIDES},
         solid=surface_index(clip.object.model).is_solid,
         speed_m_s=_speed_m_s(centre_m),
         lift_m=None if clip.gravity is None else -(centre_m - centre_m[0]) @ np.asarray(clip.gravity, np.float64),
         hinge_rad=clip.object.hinge_rad,
     )
-
-
-def _measured(clip: Clip, hands: HandPair, points: SampledPoints) -> dict[Side, SideSurface]:
-    shape = ObjectShape(clip.object.model, points, surface_index(clip.object.model))
-    return {side: measure_hand(clip, side, track_joints(clip.hands[side], hands[side]), hands, shape) for side in SIDES}
 
 
 def _touched(annotated: AnnotatedStore, clip: Clip, side: Side, n_points: int) -> np.ndarray:

@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hoidata.clips.clip import Side
+from hoidata.surface.contact import TOUCH_M
 from pipelines.pages.clip_page_series import ClipSeries
 from pipelines.pages.curves import figure_svg
 
@@ -80,7 +81,7 @@ def clip_charts(series: ClipSeries, sides: Sequence[Side], point_count: int) -> 
     vertices = [
         Line(side, SIDE_COLOURS[side], series.surface[side].touched.sum(axis=1).astype(float)) for side in sides
     ]
-    title = f"hand within {series.touch_m * 1000:g} mm of the object's surface"
+    title = f"hand within {TOUCH_M * 1000:g} mm of the object's surface"
     charts.append(Chart(title, "vertices of 778", vertices, 10, decimals=0))
     if series.depth_m is not None:
         depths = [Line(side, SIDE_COLOURS[side], series.depth_m[side] * 1000) for side in sides]

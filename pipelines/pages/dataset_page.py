@@ -17,12 +17,12 @@ from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from pipelines.commands.store_facts import fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
+from pipelines.pages.contact_facts import contact_by_object
 from pipelines.pages.curves import COLOURS, figure_svg
 from pipelines.pages.dataset_facts import has_tables, read_dataset
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, motion_player, write_page
 from pipelines.pages.quality import read_quality
-from pipelines.pages.surface_facts import contact_by_object, surface_beside
 
 EXAMPLES = 6
 SHOWN_BARS = 24
@@ -71,7 +71,6 @@ def write_dataset_page(
     if facts.empty:
         raise MissingResource(f"{name} has no clips to show: {facts.empty}")
     annotated = load_annotated(root, hands)
-    surface = surface_beside(annotated)
     return write_page(
         Path(out) / f"{name}.html",
         "dataset_page.html",
@@ -84,8 +83,8 @@ def write_dataset_page(
         examples=_examples(out, annotated, hands, examples),
         splits=split_rows(annotated),
         quality=read_quality(root / "quality", name),
-        contact=[] if surface is None else contact_by_object(surface),
-        touch_mm=0.0 if surface is None else surface.info["touch_m"] * 1000,
+        contact=contact_by_object(annotated),
+        threshold_cm=annotated.contact_threshold_m * 100,
         without_words=without_words(annotated),
         provenance=fact_rows(annotated.store),
         has_players=True,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.arrays import write_npz
 from hoidata.files.digest import canonical_json

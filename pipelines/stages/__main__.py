@@ -20,7 +20,6 @@ STAGES = (
     "quality",
     "annotate",
     "contact",
-    "surface",
     "split",
     "evaluator",
     "train",

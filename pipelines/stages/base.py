@@ -53,7 +53,6 @@ class StagePaths:
     quality = _At("data/{profile}/{dataset}/quality")
     annotation = _At("data/{profile}/{dataset}/annotation")
     contact = _At("data/{profile}/{dataset}/contact")
-    surface = _At("data/{profile}/{dataset}/surface")
     splits = _At("data/{profile}/{dataset}/splits")
     checkpoints = _At("checkpoints/{profile}/{dataset}")
     checkpoint = _At("checkpoints/{profile}/{dataset}/{model}")

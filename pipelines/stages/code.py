@@ -19,7 +19,7 @@ from pipelines.params import chosen_params, read_file, read_params
 from pipelines.stages.base import StagePaths, write_json
 
 CODE = Path("code")
-STAGES_OF_DATASETS = ("raw", "convert", "quality", "annotate", "contact", "surface", "split")
+STAGES_OF_DATASETS = ("raw", "convert", "quality", "annotate", "contact", "split")
 DATASETS = "hoidata.datasets"
 # Modules that read files in the folder of a dataset they are given by name, and which.
 READERS = {

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from hoidata.batches.dataset import ClipBatch
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from models.common.point_net import PointNetConfig
 from models.text2hoi.contact import AnchoredContact, ContactConfig, by_hand_loss, picked
 from models.text2hoi.contact_training import most_typical

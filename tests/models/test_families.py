@@ -13,7 +13,7 @@ import torch
 from hoidata.batches.dataset import ClipSample, HoiDataset, load_sample
 from hoidata.batches.requests import Sentence
 from hoidata.clips.clip import SIDES, Clip
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.metrics.asked import read_asked

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
 from hoidata.clips.features import WRIST
-from hoidata.contact.agreement import f1_score
+from hoidata.contact.maps import f1_score
 from hoidata.store.annotated import load_annotated
 from models.common.corpus import Corpus
 from models.common.family import Network, Objective, Setup

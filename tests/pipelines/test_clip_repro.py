@@ -17,7 +17,7 @@ pytestmark = [
     pytest.mark.skipif(find_spec("open_clip") is None, reason="hoidata[clip] is not installed"),
 ]
 ENCODER = "clip:tiny.safetensors?quick_gelu=true"
-MOTION = ("raw", "convert", "quality", "contact", "surface")
+MOTION = ("raw", "convert", "quality", "contact")
 GENERATE = ("hoidata", "generate", "Lift it with the left hand.", "--object")
 
 

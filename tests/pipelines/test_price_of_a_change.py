@@ -125,8 +125,8 @@ CHANGES = (
     Change(
         "a dataset is added: `hoidata/datasets/toy/`, its word",
         add_dataset,
-        "report; annotate, contact, controls, convert, evaluate, evaluator, quality, raw, sample, split, surface, "
-        "train, train-diffusion, train-refiner of toy",
+        "report; annotate, contact, controls, convert, evaluate, evaluator, quality, raw, sample, split, train, "
+        "train-diffusion, train-refiner of toy",
     ),
     Change("the sentences: `hoidata/annotation/sentences.py`", touch("hoidata/annotation/sentences.py"), "annotate"),
     Change(

@@ -10,7 +10,7 @@ import pytest
 from hoidata.annotation.hand_distances import hand_types_at
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip, Side
-from hoidata.contact.hands import acting_hands
+from hoidata.contact.maps import acting_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz, write_npz

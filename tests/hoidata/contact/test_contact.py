@@ -7,8 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hoidata.clips import SIDES, Clip, ObjectTrack
-from hoidata.contact.hands import acting_hands
-from hoidata.contact.maps import contact_maps, distance_entries, touched_frames
+from hoidata.contact.maps import acting_hands, contact_maps, distance_entries, touched_frames
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.contact.stage import contact_store
 from hoidata.errors import BadInput

@@ -1,7 +1,5 @@
 """The compiled searches against SciPy's trees and brute force: the same rows, the same bits, in the same order."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from hoidata.clips import ObjectTrack
-from hoidata.contact.near_points import ENTRY, cell_grids, near_entries
-from hoidata.contact.part_frames import PartMotion, part_motion, places_of_frame
+from hoidata.contact.near_points import ENTRY, near_entries, point_boxes
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.objects.model import Hinge, ObjectModel
@@ -89,48 +86,26 @@ def test_the_nearest_point_is_that_of_trees_bit_for_bit(seed, n_points, articula
     np.testing.assert_array_equal(index.closest_m(joints, track), expected.min(axis=1))
 
 
-@given(st.integers(0, 2**32), st.booleans(), st.sampled_from([1e-9, 1e-3, 1.0, 40.0]))
-@settings(max_examples=60, deadline=None)
-def test_joints_in_the_frames_of_parts_are_those_of_numpy_and_scipy_bit_for_bit(seed, articulated, scale) -> None:
-    _, track, joints = scene(seed, 5, articulated, 0.3)
-    hinge_rad = None if track.hinge_rad is None else (scale * track.hinge_rad).astype(np.float32)
-    track = replace(track, rotvec=(scale * track.rotvec).astype(np.float32), hinge_rad=hinge_rad)
-    found, motion, turns = np.empty((2, *joints.shape)), part_motion(track, [0, 1]), np.empty((2, 3, 3))
-    for frame, own in enumerate(joints.astype(np.float64)):
-        places_of_frame(own, motion, frame, turns, found[:, frame])
-    in_object = track.world_from_object.inverse() @ joints.astype(np.float64)
-    for part in (0, 1):
-        expected = track.model.object_from_part(part, track.hinge_rad).inverse() @ in_object
-        np.testing.assert_array_equal(found[part], expected)
+def points_near(places: np.ndarray, points: np.ndarray, reach_m: float) -> np.ndarray:
+    """(entry, 2) frame and point: one joint per frame at ``places``, before an object of one part at rest."""
+    boxes = point_boxes(points, [np.arange(len(points))])
+    every_frame = np.ones(len(places), bool)
+    entries = near_entries(places[:, None, None].astype(np.float64), every_frame, boxes, len(points), reach_m)
+    return np.column_stack((entries["frame"], entries["point"]))
 
 
-def at_rest(n_frames: int) -> PartMotion:
-    """One part that stays in the world's frame."""
-    nothing = np.zeros(3)
-    return PartMotion(
-        np.zeros((n_frames, 3)), np.zeros((n_frames, 3)), np.zeros(0), nothing, nothing, np.zeros(1, bool)
-    )
-
-
-def test_every_cell_lists_every_point_within_reach_of_any_place_in_it() -> None:
+def test_boxes_lose_no_point_within_reach_of_any_place() -> None:
     random = np.random.default_rng(3)
     points, reach = random.uniform(-0.05, 0.05, (200, 3)).astype(np.float32), 0.02
-    grids = cell_grids(points, [np.arange(200)], reach)
-    places = random.uniform(-0.069, 0.069, (500, 1, 3))
-    near = np.linalg.norm(places - points[None], axis=2) < reach
-    entries = near_entries(places, np.ones(500, bool), at_rest(500), grids, 200, reach)
-    np.testing.assert_array_equal(np.column_stack((entries["frame"], entries["point"])), np.argwhere(near))
-    # And few more than that: otherwise the grid would be brute force in disguise.
-    assert grids.point.size / len(grids.first) < 40
+    places = random.uniform(-0.069, 0.069, (500, 3))
+    near = np.linalg.norm(places[:, None] - points, axis=2) < reach
+    np.testing.assert_array_equal(points_near(places, points, reach), np.argwhere(near))
 
 
-def test_places_exactly_between_cells_and_on_corners_lose_no_point() -> None:
+def test_places_exactly_on_points_and_corners_of_boxes_lose_no_point() -> None:
     points = np.stack(np.meshgrid(*[np.arange(5) * 0.01] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
-    places = points[:, None].astype(np.float64)
-    grids = cell_grids(points, [np.arange(125)], 0.0101)
-    entries = near_entries(places, np.ones(125, bool), at_rest(125), grids, 125, 0.0101)
-    near = np.linalg.norm(places - places[None, :, 0], axis=2) < 0.0101
-    np.testing.assert_array_equal(np.column_stack((entries["frame"], entries["point"])), np.argwhere(near))
+    near = np.linalg.norm(points[:, None].astype(np.float64) - points, axis=2) < 0.0101
+    np.testing.assert_array_equal(points_near(points, points, 0.0101), np.argwhere(near))
 
 
 def test_more_entries_than_room_was_made_for_are_all_there() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hoidata.contact.hands import acting_hands
+from hoidata.contact.maps import acting_hands
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.sampling import sample_points

@@ -6,11 +6,9 @@ import trimesh
 
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, solid_of
-from hoidata.objects.surface_index import surface_index
 from hoidata.quality.meshes import part_facts, surface_facts
-from hoidata.quality.penetration import depths_m
 from hoidata.quality.shape import distances_to_others, largest_beta
-from tests.builders.objects import box_model, model_of, two_parts
+from tests.builders.objects import box_model, two_parts
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))
 
@@ -116,27 +114,3 @@ def test_every_part_is_a_surface_of_its_own():
     assert [facts.volume_m3 for facts in part_facts(model).values()] == pytest.approx([0.004, 0.0008])
     whole = ObjectModel("rigid", model.vertices_m, model.faces, np.zeros(16, np.uint8))
     assert [facts.shells for facts in part_facts(whole).values()] == [2]
-
-
-def test_depth_is_the_way_out_of_the_box_for_the_deepest_point():
-    model = model_of(BOX)
-    points = np.array([[[0.0, 0.0, 0.0], [0.03, 0, 0]], [[0.2, 0, 0], [0, 0.09, 0]], [[1, 1, 1], [0.051, 0, 0]]])
-    assert depths_m(model, None, points, [0]) == pytest.approx([0.05, 0.01, 0])
-
-
-def test_moving_part_is_met_where_its_hinge_has_taken_it():
-    model, quarter = hinged(), np.array([0.0, -np.pi / 2])
-    # Lid upright after a quarter turn: it stands over the hinge, from z = 0.05 to 0.25, x from -0.12 to -0.1.
-    points = np.tile([[-0.11, 0.0, 0.15]], (2, 1, 1))
-    assert depths_m(model, quarter, points, [0, 1]) == pytest.approx([0, 0.01])
-    assert depths_m(model, quarter, points, [0]) == pytest.approx([0, 0])
-
-
-def test_quality_means_by_penetration_what_the_exact_surface_means(make_clip):
-    """Two engines, because the bytes of quality rest on one and speed on the other; one figure."""
-    model = make_clip(2, articulated=True).object.model
-    points = np.random.default_rng(0).uniform(-0.06, 0.06, (1500, 1, 3))
-    hinge = np.linspace(0, 1.2, 1500)
-    exact = surface_index(model).depth_m(points, hinge).max(axis=1)
-    assert (exact > 0.01).sum() > 100
-    np.testing.assert_allclose(depths_m(model, hinge, points, [0, 1]), exact, atol=1e-12)

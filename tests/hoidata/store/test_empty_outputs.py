@@ -13,7 +13,6 @@ from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store
 from hoidata.store.writing import write_store
-from hoidata.surface.store import open_surface
 
 REASON = "grab is not present in the profile own"
 
@@ -28,14 +27,13 @@ def empty(folder: Path) -> Path:
 def dataset(tmp_path: Path) -> Path:
     """The folders of a dataset that is not there: a store without clips, and notes in place of all else."""
     write_store(tmp_path / "clips", [], generated_info("grab"))
-    for name in ("clips", "annotation", "contact", "splits", "quality", "surface"):
+    for name in ("clips", "annotation", "contact", "splits", "quality"):
         empty(tmp_path / name)
     return tmp_path
 
 
 READERS: list[Callable[[Path], object]] = [
     load_annotated,
-    lambda root: open_surface(root / "surface"),
     lambda root: left_out_reasons(root / "quality"),
     lambda root: read_contact_settings(root / "contact"),
 ]

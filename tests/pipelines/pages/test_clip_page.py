@@ -16,18 +16,16 @@ from scipy.spatial.transform import Rotation
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips.clip import CameraTrack, SourceFile
 from hoidata.contact.settings import read_contact_settings
-from hoidata.errors import BadInput, MissingResource
+from hoidata.errors import MissingResource
 from hoidata.hands import track_joints, track_vertices
 from hoidata.store.annotated import load_annotated
-from hoidata.surface.stage import surface_store
 from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
 from pipelines.pages.clip_page_facts import clip_facts
 from pipelines.pages.clip_page_series import measure_clip
 from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import three_javascript
-from pipelines.pages.surface_facts import surface_beside
-from tests.builders.stores import write_annotated, write_clips
+from tests.builders.stores import write_annotated
 
 THRESHOLD_M = 0.09
 SPLIT = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
@@ -157,35 +155,10 @@ def test_hand_against_the_surface_is_that_of_the_box(dataset, hands):
     assert not series.surface["left"].touched.any()
 
 
-@pytest.mark.slow
-def test_page_shows_the_same_whether_the_stage_surface_ran_or_not(dataset, page, hands, tmp_path):
-    surface_store(dataset.root / "clips", dataset.root / "surface", progress=False)
-    after = write_clip_page(tmp_path / "with.html", dataset, "test/s1/lid", hands)
-    assert after.read_text() == page("test/s1/lid").read_text()
-
-
-def test_page_reads_what_the_stage_wrote_and_measures_what_quality_control_left_out(dataset, hands):
-    left_out = {"test/s2/box": "left out by quality control: so"}
-    surface_store(dataset.root / "clips", dataset.root / "surface", touch_m=0.05, left_out=left_out, progress=False)
-    clips = [dataset.clip(clip_id) for clip_id in ("test/s1/lid", "test/s2/box")]
-    assert [measure_clip(dataset, clip, hands).touch_m for clip in clips] == [0.05, 0.005]
-
-
-def test_surface_of_another_conversion_or_of_other_points_is_refused(dataset, hands, page_clip, tmp_path):
-    surface_store(dataset.root / "clips", dataset.root / "surface", points=32, progress=False)
-    with pytest.raises(BadInput, match="maps on 1024 points, got on 32"):
-        surface_beside(dataset)
-    shutil.rmtree(dataset.root / "surface")
-    write_clips(tmp_path / "others", [page_clip()], "grab")
-    surface_store(tmp_path / "others", dataset.root / "surface", progress=False)
-    with pytest.raises(BadInput, match="the 3 clips of the store beside it"):
-        surface_beside(dataset)
-
-
 def test_packed_distances_of_every_frame_are_bimarts_in_steps(dataset, hands):
     clip = dataset.clip("test/s1/lid")
     points, series = dataset.points("lidded box"), measure_clip(dataset, clip, hands)
-    maps = {side: found.map for side, found in series.surface.items()}
+    maps = {side: found.map_m for side, found in series.surface.items()}
     values = json.loads(json.dumps(paint_values(clip, points, series.touched, maps)))
     placed = world_points(dataset, clip)
     for side in ("left", "right"):

@@ -15,8 +15,6 @@ from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import BadInput, HoidataError
 from hoidata.files.written import Facts, read_json, read_json_rows
 from hoidata.store.annotated import load_annotated
-from hoidata.surface.stage import surface_store
-from hoidata.surface.store import open_surface
 from pipelines.figures import LEADING, write_figures
 from pipelines.lineage.made import compare_made
 from pipelines.lineage.manifests import read_manifest
@@ -53,7 +51,7 @@ FIGURES = {
 
 @pytest.fixture(scope="module")
 def written(page_clip, tmp_path_factory) -> Path:
-    """A project with one dataset, its surface, and metrics."""
+    """A project with one dataset and metrics."""
     folder = tmp_path_factory.mktemp("written")
     clips = [
         replace(page_clip(), clip_id=CLIP),
@@ -61,7 +59,6 @@ def written(page_clip, tmp_path_factory) -> Path:
     ]
     split = {"by": "subject", "train": "rest", "test": ["s2"], "promises": ["subject"]}
     write_annotated(folder / DATA, clips, "grab", split, 0.09, quality=True)
-    surface_store(folder / DATA / "clips", folder / DATA / "surface", points=32, progress=False)
     (folder / METRICS).mkdir(parents=True)
     for family in ("ground-truth", "text2hoi"):
         (folder / METRICS / f"{family}.json").write_text(json.dumps(FIGURES))
@@ -99,12 +96,6 @@ def read_annotated() -> None:
     assert annotated.contact_threshold_m + annotated.contact_info["points"] + annotated.annotation_info["points"] > 0
 
 
-def read_surface() -> None:
-    surface = open_surface(DATA / "surface")
-    surface.touched(CLIP, "right")
-    assert surface.info["touch_m"] * 1000 + surface.info["map_step_m"] > 0
-
-
 def read_all_metrics() -> None:
     families = ("text2hoi", "ground-truth", "mean-pose")
     metrics_tables(METRICS, families)
@@ -130,7 +121,6 @@ READERS: dict[str, list[Callable[[], object]]] = {
     f"{DATA}/annotation/info.json": [read_annotated],
     f"{DATA}/contact/info.json": [read_annotated, lambda: read_contact_settings(DATA / "contact")],
     f"{DATA}/splits/info.json": [read_annotated, lambda: describe_results(Path(), "embedded")],
-    f"{DATA}/surface/info.json": [read_surface],
     f"{DATA}/clips/meta/info.json": [lambda: describe_results(Path(), "embedded"), read_annotated],
     f"{METRICS}/text2hoi.json": [read_all_metrics, lambda: describe_results(Path(), "embedded")],
     f"{METRICS}/mean-pose.json": [read_all_metrics],

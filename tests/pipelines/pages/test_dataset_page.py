@@ -10,13 +10,12 @@ import yaml
 
 from hoidata.clips.quarantine import Quarantined
 from hoidata.errors import BadInput, MissingResource
+from hoidata.files.written import read_table
 from hoidata.store.annotated import load_annotated
-from hoidata.surface.stage import surface_store
-from hoidata.surface.store import open_surface
+from pipelines.pages.contact_facts import contact_by_object
 from pipelines.pages.dataset_facts import read_dataset
 from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
 from pipelines.pages.report import ReportFolders, write_report
-from pipelines.pages.surface_facts import contact_by_object
 from pipelines.pages.view import view_of
 from pipelines.showing import closest_ids, find_clip, write_shown
 from tests.builders.stores import write_annotated, write_clips
@@ -76,7 +75,7 @@ def test_page_counts_lists_and_links(project, hands, tmp_path):
     links = re.findall(r'href="(clips/[^"]+)"', text)
     assert sorted(links) == ["clips/grab_s1_box_1.html", "clips/grab_s1_box_2.html", "clips/grab_s2_lid_1.html"]
     assert all((tmp_path / "out" / link).is_file() for link in links)
-    assert "Contact and penetration" not in text
+    assert "Contact and penetration" in text
 
 
 def test_minutes_are_of_frames_at_30_per_second(page_clip, hands, tmp_path):
@@ -91,62 +90,40 @@ def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, ha
     clip = page_clip(left=True, frames=30)
     tracks = {}
     for side, first in (("left", 10), ("right", 15)):
-        wrist = clip.hands[side].wrist_m.copy()
+        wrist = clip.hands[side].wrist_m + np.float32(1)
         wrist[first : first + 10] = clip.object.translation_m[first : first + 10]
         tracks[side] = replace(clip.hands[side], wrist_m=wrist)
-    alone = replace(page_clip(hinged=True), clip_id="test/lid")
-    write_clips(tmp_path / "clips", [replace(clip, hands=tracks), alone], "grab")
-    surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
-    store = open_surface(tmp_path / "surface")
-    rows = {row.name: row for row in contact_by_object(store)}
+    alone = replace(page_clip(hinged=True), clip_id="test/lid", subject="s2")
+    far = {side: replace(track, wrist_m=track.wrist_m + np.float32(1)) for side, track in alone.hands.items()}
+    clips = [replace(clip, hands=tracks), replace(alone, hands=far)]
+    annotated = load_annotated(write_annotated(tmp_path / "grab", clips, "grab", SPLIT, 0.09, quality=True), hands)
+    rows = {row.name: row for row in contact_by_object(annotated)}
     assert list(rows) == ["all objects", "box", "lidded box"]
-    depth = np.nanmax([store.depth_m(clip.clip_id, side) for side in ("left", "right")], axis=0)
-    assert (rows["box"].touching, rows["box"].inside, rows["box"].deep) == ("50.0 %", "50.0 %", "50.0 %")
-    assert rows["box"].deepest == f"{depth.max() * 1000:.1f}"
-    volumes = [store.clips.at[clip.clip_id, f"{side}_deepest_volume_m3"] for side in ("left", "right")]
-    assert rows["box"].volume == f"{max(volumes) * 1e6:.2f}"
-    assert max(volumes) > 1e-6
-    assert rows["lidded box"].touching == rows["lidded box"].inside == "0.0 %"
+    assert (rows["box"].touching, rows["lidded box"].touching) == ("50.0 %", "0.0 %")
+    # Quality control looks at every fifth frame: 10, 15 and 20 of 0, 5, ..., 25.
+    assert (rows["box"].deep, rows["lidded box"].deep, rows["lidded box"].deepest) == ("50.0 %", "0.0 %", "0.0")
+    deepest = read_table(tmp_path / "grab/quality/clips.parquet").set_index("clip_id").at[clip.clip_id, "penetration_m"]
+    assert rows["box"].deepest == f"{deepest * 1000:.1f}"
     assert (rows["all objects"].frames, rows["all objects"].touching) == ("54", f"{15 / 54 * 100:.1f} %")
 
 
-def test_frames_count_as_deep_from_a_centimetre_on(page_clip, hands, tmp_path, monkeypatch):
-    """The left hand is 3 mm deep in frames 5 to 14 and 11 mm in 15 to 17 of 30; the right 9.9 mm in the last two."""
-    write_clips(tmp_path / "clips", [page_clip(frames=30)], "grab")
-    surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
-    store = open_surface(tmp_path / "surface")
-    depth = {side: np.zeros(30) for side in ("left", "right")}
-    depth["left"][5:15], depth["left"][15:18], depth["right"][28:] = 0.003, 0.011, 0.0099
-    monkeypatch.setattr(store, "depth_m", lambda clip_id, side: depth[side])
-    [row] = contact_by_object(store)
-    assert (row.inside, row.deep, row.deepest) == ("50.0 %", "10.0 %", "11.0")
-
-
 @pytest.mark.slow
-def test_page_shows_contact_and_penetration_where_the_stage_ran(project, hands, tmp_path):
-    surface_store(project / "clips", project / "surface", touch_m=0.02, progress=False)
+def test_page_shows_contact_and_penetration(project, hands, tmp_path):
     text = write_dataset_page(tmp_path / "out", project, "grab", hands, examples=0).read_text()
     assert "<h3>Contact and penetration</h3>" in text
-    assert "within 20 mm of the exact surface" in text
+    assert "within 9 cm of one of the object" in text
     assert '<td>all objects</td><td class="number">4</td><td class="number">102</td>' in text
 
 
 def test_object_without_an_inside_has_no_depths_in_the_table(page_clip, hands, tmp_path):
     clip = page_clip()
-    plate = replace(clip.object.model, faces=clip.object.model.faces[:2])
-    write_clips(tmp_path / "clips", [replace(clip, object=replace(clip.object, model=plate))], "grab")
-    surface_store(tmp_path / "clips", tmp_path / "surface", points=32, progress=False)
-    [row] = contact_by_object(open_surface(tmp_path / "surface"))
-    assert (row.inside, row.deep, row.deepest, row.volume) == ("not measured",) * 4
-    both = [
-        clip,
-        replace(clip, clip_id="test/s1/open", object=replace(clip.object, model=replace(plate, name="plate"))),
-    ]
-    write_clips(tmp_path / "both", both, "grab")
-    surface_store(tmp_path / "both", tmp_path / "both-surface", points=32, progress=False)
-    every = contact_by_object(open_surface(tmp_path / "both-surface"))[0]
-    assert every.note == "not measured in 1 of 2 clips: the object has no inside"
-    assert "open" in row.note
+    plate = replace(clip.object.model, faces=clip.object.model.faces[:2], name="plate")
+    other = replace(page_clip(frames=30), clip_id="test/s2/open", subject="s2")
+    clips = [clip, replace(other, object=replace(other.object, model=plate))]
+    annotated = load_annotated(write_annotated(tmp_path / "grab", clips, "grab", SPLIT, 0.09, quality=True), hands)
+    every, box, open_mesh = contact_by_object(annotated)
+    assert (open_mesh.name, open_mesh.deep, open_mesh.deepest) == ("plate", "not measured", "not measured")
+    assert (every.deep, every.deepest) == (box.deep, box.deepest)
 
 
 @pytest.mark.slow
