@@ -12,7 +12,6 @@ from pipelines.commands import (
     animate,
     controls,
     convert,
-    corpus,
     evaluate,
     export,
     generate,
@@ -54,7 +53,6 @@ app.command("pull")(store.pull)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
-app.command("corpus")(corpus.corpus)
 app.command("evaluate")(evaluate.evaluate)
 app.command("controls")(controls.controls)
 app.command("table")(evaluate.table)

@@ -4,6 +4,14 @@
 noun_phrase and number (singular, plural or mass) for objects. Rules: lemminflect on the head word of an unknown verb;
 the first spoken sound for the article; the head noun's number, mass where ``mass_nouns.csv`` lists it: substances and
 collections of everyday English, which no rule of spelling gives away.
+
+``phrases.csv`` holds what English says for a verb with an object, one kind per row; lists are divided by semicolons.
+noun: ``said`` for each of ``objects`` ("a pair of scissors"), {} being the object.
+contents: verbs of what a container holds; with them the object keeps its bare name ("pour milk").
+verb: ``said`` before each of ``objects`` (* is any), {} being the verb: "chop with", "look through". hand: "with" or
+"in" the hand. tool: "used" or "held", where the passive is "A knife is used by the right hand to chop". purpose: what
+follows that "to".
+synonym: another verb of the same meaning.
 """
 
 import csv
@@ -12,6 +20,7 @@ import re
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from itertools import product
 from typing import Literal, cast
 
 from hoidata.errors import BadInput
@@ -45,6 +54,10 @@ class VerbForms:
     past_participle: str
     third_singular: str
 
+    @property
+    def forms(self) -> tuple[str, str, str, str]:
+        return self.base, self.gerund, self.past_participle, self.third_singular
+
 
 @dataclass(frozen=True)
 class NounPhrase:
@@ -66,6 +79,8 @@ class Grammar:
         """Forms of ``base`` (``hand over``). Raises BadInput when it holds no word."""
         base = _words(base, "verb")
         known = self.verbs.get(base) or self.verbs.get(base.lower())
+        if known is None:
+            logger.warning("verb %r is not in the grammar table; its forms are made by rule", base)
         return known or inflect_verb(base)
 
     def noun(self, base: str) -> NounPhrase:
@@ -99,7 +114,6 @@ def inflect_verb(base: str) -> VerbForms:
     from lemminflect import getInflection
 
     head, _, rest = base.partition(" ")
-    logger.warning("verb %r is not in the grammar table; its forms are made by rule", base)
     listed = [getInflection(head, tag=tag, inflect_oov=False) for tag in ("VBG", "VBN", "VBZ")]
     forms = [found[0] if found else regular for found, regular in zip(listed, regular_forms(head), strict=True)]
     return VerbForms(base, *(f"{form} {rest}".rstrip() for form in forms))
@@ -128,11 +142,68 @@ def article(noun: str) -> Literal["a", "an"]:
     return "an" if noun[0].lower() in "aeiou" and not CONSONANT_SOUND.match(noun) else "a"
 
 
+@dataclass(frozen=True)
+class Phrase:
+    """What English says for a verb with one object; see the module's text. said: the verb up to the object."""
+
+    said: VerbForms
+    hand: str = "with"
+    tool: str = ""
+    purpose: str = ""
+
+
+@dataclass(frozen=True)
+class Phrases:
+    """``phrases.csv``. verbs: by verb and object, "*" for any object. nouns: pattern by object."""
+
+    verbs: dict[tuple[str, str], Phrase]
+    nouns: dict[str, str]
+    contents: frozenset[str]
+    synonyms: dict[str, str]
+
+    def verb(self, forms: VerbForms, base: str) -> Phrase:
+        """The phrase of a verb with an object; "cut with" and the like name the instrument they are done with."""
+        found = self.verbs.get((forms.base, base)) or self.verbs.get((forms.base, "*"))
+        if not found and forms.base.endswith(" with"):
+            return Phrase(forms, "in", "used", forms.base.removesuffix(" with"))
+        return found or Phrase(forms)
+
+    def noun(self, noun: NounPhrase, verb: str) -> NounPhrase:
+        """The object as it is called when a hand handles it: "a carton of milk", but "pour milk"."""
+        if noun.base not in self.nouns or verb in self.contents:
+            return noun
+        return NounPhrase(noun.base, self.nouns[noun.base].format(noun.base), "singular")
+
+
+@lru_cache(maxsize=1)
+def default_phrases() -> Phrases:
+    """The phrases shipped with the package."""
+    rows: dict[str, list[dict[str, str]]] = {"noun": [], "contents": [], "verb": [], "synonym": []}
+    for row in _rows("phrases.csv"):
+        rows[row["kind"]].append(row)
+    verbs = {
+        (verb, name): Phrase(_said(row["said"].format(verb)), row["hand"], row["tool"], row["purpose"].format(verb))
+        for row in rows["verb"]
+        for verb, name in product(row["verb"].split(";"), row["objects"].split(";"))
+    }
+    nouns = {name: row["said"] for row in rows["noun"] for name in row["objects"].split(";")}
+    contents = frozenset(verb for row in rows["contents"] for verb in row["verb"].split(";"))
+    return Phrases(verbs, nouns, contents, {row["verb"]: row["said"] for row in rows["synonym"]})
+
+
+def _said(words: str) -> VerbForms:
+    """Forms of a phrase by those of its first word: "looking through"."""
+    verbs, (head, _, rest) = default_grammar().verbs, words.partition(" ")
+    if words in verbs:
+        return verbs[words]
+    forms = verbs.get(head) or inflect_verb(head)
+    return VerbForms(*(f"{form} {rest}".rstrip() for form in forms.forms))
+
+
 @lru_cache(maxsize=1)
 def default_grammar() -> Grammar:
     """The table shipped with the package: every verb and object of H2O, GRAB and ARCTIC, and common others."""
-    table = files("hoidata.annotation").joinpath("grammar.csv").read_text(encoding="utf-8")
-    rows = list(csv.DictReader(table.splitlines()))
+    rows = _rows("grammar.csv")
     forms = ("base", "gerund", "past_participle", "third_singular")
     verbs = {row["base"]: VerbForms(*(row[name] for name in forms)) for row in rows if row["kind"] == "verb"}
     nouns = {
@@ -146,8 +217,13 @@ def default_grammar() -> Grammar:
 @lru_cache(maxsize=1)
 def mass_nouns() -> frozenset[str]:
     """Nouns that take no article and a singular verb: water, bread, luggage."""
-    table = files("hoidata.annotation").joinpath("mass_nouns.csv").read_text(encoding="utf-8")
-    return frozenset(row["noun"] for row in csv.DictReader(table.splitlines()))
+    return frozenset(row["noun"] for row in _rows("mass_nouns.csv"))
+
+
+def _rows(table: str) -> list[dict[str, str]]:
+    """The rows of one of this package's tables."""
+    text = files("hoidata.annotation").joinpath(table).read_text(encoding="utf-8")
+    return list(csv.DictReader(text.splitlines()))
 
 
 def _words(text: str, kind: str) -> str:

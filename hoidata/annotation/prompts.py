@@ -6,17 +6,19 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from hoidata.annotation.encoders import TextEncoder
-from hoidata.annotation.grammar import Grammar, default_grammar
+from hoidata.annotation.grammar import Grammar, default_grammar, default_phrases
 from hoidata.annotation.hand_choice import HandChoice, select_hand
-from hoidata.annotation.reference_mode import ACTIONS, JOINED
+from hoidata.annotation.sentences import ACTIONS, JOINED
 
 HAND_PHRASE = re.compile(
-    r"\b(?:(?:with|by|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
-    r"\b(?:(?:with|by|using)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
+    r"\b(?:(?:with|by|in|using)\s+)?(?:(?:the|your|my|his|her|their)\s+)?(?:left|right)\s+hand\b|"
+    r"\b(?:(?:with|by|in|using)\s+)?(?:both|two)\s+(?:of\s+)?(?:(?:the|your|my|his|her|their)\s+)?hands\b|"
     r"\b(?:with|by)\s+(?:(?:only|just)\s+)?(?:(?:the|your|my|his|her|their|a|one)\s+)?(?:single\s+)?hand\b|"
     r"\busing\s+(?:(?:only|just)\s+)?(?:the|your|my|his|her|their|a|one)\s+(?:single\s+)?hand\b"
 )
 _RUN = re.compile(r"[\w-]+")
+# What stands before the verb in "A knife is used by the right hand to chop".
+_PURPOSE = re.compile(r"\b(?:hold|holds|held|holding|use|uses|used|using)\b.*\bto $")
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,13 @@ class Lexicon:
     def read(self, text: str) -> tuple[str | None, str | None]:
         """Verb and object of a sentence, base forms.
 
-        Hand phrases are passed over. Of all pairs of a known verb form and a known noun that do not overlap, the pair
-        that covers most of the sentence wins; among equals the one whose verb stands first.
+        Hand phrases are passed over. A verb after "to" is the action: "A knife is used to chop". Of all pairs of a
+        known verb form and a known noun that do not overlap, the pair that covers most of the sentence wins; among
+        equals the one whose verb stands first.
         """
         rest = " ".join(HAND_PHRASE.sub(" ¤ ", text.lower()).split())
         verbs, nouns = self._verbs.matches(rest), self._nouns.matches(rest)
+        verbs = [verb for verb in verbs if _PURPOSE.search(rest, 0, verb.start)] or verbs
         pairs = [(verb, noun) for verb in verbs for noun in nouns if not verb.overlaps(noun)]
         if pairs:
             verb, noun = max(pairs, key=_score)
@@ -108,9 +112,17 @@ class _Forms:
 
 
 def grammar_lexicon(grammar: Grammar) -> Lexicon:
-    """Every form of the verbs of a grammar, and its objects without their articles; the reference's words for both."""
-    verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(_forms(verb)))]
-    verbs += [(form, base) for base, verb in ACTIONS.items() if base in grammar.verbs for form in _forms(verb)]
+    """Every form of the verbs of a grammar, and its objects without their articles.
+
+    Phrases ("look through" for see) and the reference's words stand for the same verbs and objects.
+    """
+    verbs = [(form, verb.base) for verb in grammar.verbs.values() for form in sorted(set(verb.forms))]
+    verbs += [(form, base) for base, verb in ACTIONS.items() if base in grammar.verbs for form in verb.forms]
+    for (base, _), phrase in default_phrases().verbs.items():
+        if base in grammar.verbs and phrase.said.base not in grammar.verbs:
+            verbs += [(form, base) for form in phrase.said.forms]
+        if base in grammar.verbs and phrase.purpose:
+            verbs.append((phrase.purpose, base))
     nouns = [(noun.base, noun.base) for noun in grammar.nouns.values()]
     joined = [(words, base) for base, words in JOINED.items() if base in grammar.nouns and words not in grammar.nouns]
     return Lexicon(verbs, nouns + joined)
@@ -125,11 +137,18 @@ def read_prompt(text: str, encoder: TextEncoder | None = None, grammar: Grammar 
     """Hand type, verb and object of an English prompt, by the words of a grammar (see ``Lexicon.read``)."""
     lexicon = _default_lexicon() if grammar is None else grammar_lexicon(grammar)
     verb, noun = lexicon.read(text)
-    return PromptReading(select_hand(text, encoder), verb, noun)
+    return PromptReading(select_hand(text, encoder), _labels().get((verb, noun), verb), noun)
 
 
-def _forms(verb) -> tuple[str, ...]:
-    return verb.base, verb.gerund, verb.past_participle, verb.third_singular
+@lru_cache(maxsize=1)
+def _labels() -> dict[tuple[str | None, str | None], str]:
+    """The verb of a dataset that is said with another verb of the table: "put on" eyeglasses is "wear"."""
+    verbs = default_phrases().verbs
+    return {
+        (phrase.said.base, noun): verb
+        for (verb, noun), phrase in verbs.items()
+        if phrase.said.base in default_grammar().verbs and phrase.said.base != verb
+    }
 
 
 def _length(match: _Match) -> int:

@@ -1,9 +1,8 @@
 """Settings of the stage annotate: the section ``annotate`` of params.yaml."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal, get_args
 
-from hoidata.annotation.clip_variations import VariationSettings
 from hoidata.contact.settings import check_threshold
 from hoidata.errors import BadInput
 
@@ -17,16 +16,14 @@ class AnnotationSettings:
 
     threshold_m: None takes the contact stage's. hand: which hands are active: those that come so near, or the one the
     source's annotator named, where one did (Text2HOI does so for ARCTIC), as long as some hand comes near. forms: the
-    paper's four sentences in our English, or as the reference implementation writes them. variations: further
-    sentences, guarded. derive_verbs: a clip whose source names no verb gets the one its motion shows; else its
-    sentences say "move".
+    paper's four sentences in our English, or as the reference implementation writes them. derive_verbs: a clip whose
+    source names no verb gets the one its motion shows; else its sentences say "move".
     """
 
     encoder: str = "use"
     threshold_m: float | None = None
     hand: HandRule = "proximity"
     forms: Forms = "paper"
-    variations: VariationSettings = field(default_factory=VariationSettings)
     derive_verbs: bool = True
 
     def __post_init__(self) -> None:

@@ -5,20 +5,17 @@ The folder it writes is described in ``hoidata.store.annotated``.
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import pyarrow as pa
 
-from hoidata.annotation.clip_variations import ClipVariations, Wording, clip_variations, hand_speed_m_s
 from hoidata.annotation.derived import derive_verb
 from hoidata.annotation.encoders import TextEncoder, load_encoder
-from hoidata.annotation.feature_cache import DiskCachedEncoder
 from hoidata.annotation.hand_distances import write_hand_distances
-from hoidata.annotation.reference_mode import reference_sentences
-from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences
+from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences, reference_sentences
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips import SIDES, Clip, HandType, Side
 from hoidata.contact.maps import acting_hands
@@ -30,7 +27,6 @@ from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
 from hoidata.hands import HandPair
-from hoidata.store.annotated import VARIATION
 from hoidata.store.hand_evidence import HandEvidence
 from hoidata.store.store import Store, open_store
 
@@ -81,7 +77,6 @@ class _Annotated:
     sentences: FourSentences | None
     reason: str | None
     verb: _Verb
-    wording: Wording | None = None
 
 
 def annotate_store(
@@ -93,7 +88,6 @@ def annotate_store(
     encoder: str | TextEncoder | None = None,
     hands: HandPair | None = None,
     left_out: Mapping[str, str] | None = None,
-    features: str | Path | None = None,
     **changes: Any,
 ) -> dict[str, int]:
     """Annotate every clip of the store; the folder appears whole or not at all.
@@ -104,18 +98,16 @@ def annotate_store(
     settings, changes: fields of ``changes`` replace those of ``settings``. contact: of the stage contact, whose points
     are looked at. encoder: a name for ``load_encoder`` or the encoder itself, in place of the settings'.
     hands: as in ``open_store``. left_out: reasons of further clips that get no sentence, by clip id.
-    features: a folder that keeps text features between runs (``DiskCachedEncoder``); it changes no output.
     Returns counts: clips, annotated, left_out; by hand type left, right, both; sentences (distinct), labelled,
     agreeing (with the hand that comes near), derived_verbs.
     """
     settings, contact = replace(settings or AnnotationSettings(), **changes), contact or ContactSettings()
     threshold_m = contact.threshold_m if settings.threshold_m is None else settings.threshold_m
-    encoder = _encoder(settings.encoder if encoder is None else encoder, features)
-    store, variations = open_store(clips_folder, hands), settings.variations
+    encoder = settings.encoder if encoder is None else encoder
+    encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
+    store = open_store(clips_folder, hands)
     found = _annotate_clips(store, threshold_m, contact.points, left_out or {}, _Writer(settings))
-    named = [item for item in found if item.wording]
-    varied = clip_variations([item.wording for item in named if item.wording], variations)
-    sentences = _distinct(named, varied)
+    sentences = list(dict.fromkeys(text for item in found for text in item.sentences or ()))
     counts = _counts(found, sentences)
     info = {
         "encoder": encoder.identity,
@@ -123,21 +115,15 @@ def annotate_store(
         "points": contact.points,
         **({} if settings.hand == "proximity" else {"hand": settings.hand}),
         "forms": settings.forms,
-        "variations": {**asdict(variations), **varied.facts()},
         "counts": counts,
     }
     with atomic_folder(out_folder) as partial:
         write_table(partial / "hand_type.parquet", [_hand_row(item) for item in found], HAND_TYPE_TABLE)
         write_hand_distances(partial / "hand_distance.npz", [item.evidence for item in found])
-        write_table(partial / "text.parquet", _text_rows(named, varied, sentences), TEXT_TABLE)
+        write_table(partial / "text.parquet", _text_rows(found, sentences), TEXT_TABLE)
         _write_embeddings(partial / "embeddings.npz", encoder, sentences)
         (partial / "info.json").write_text(canonical_json(info) + "\n", encoding="utf-8")
     return counts
-
-
-def _encoder(encoder: str | TextEncoder, features: str | Path | None) -> TextEncoder:
-    encoder = load_encoder(encoder) if isinstance(encoder, str) else encoder
-    return encoder if features is None else DiskCachedEncoder(encoder, features)
 
 
 @dataclass(frozen=True)
@@ -175,19 +161,6 @@ class _Writer:
         except BadInput as error:
             return None, str(error)
 
-    def wording(
-        self, clip: Clip, hand: HandType | None, taken: FourSentences | None, joints: Mapping[Side, np.ndarray]
-    ) -> Wording | None:
-        """What variations of the clip's sentences may say; None for a clip without sentences."""
-        if hand is None or taken is None:
-            return None
-        acting: list[Side] = [side for side in SIDES if hand in (side, "both")]
-        valid = {side: clip.hands[side].valid for side in acting}
-        variations = self.settings.variations
-        measured = variations.per_clip > 0 and variations.adverbs
-        speed = hand_speed_m_s({side: joints[side] for side in acting}, valid) if measured else None
-        return Wording(clip.clip_id, clip.verb, clip.object_words, hand, speed, taken)
-
 
 def _annotate_clips(
     store: Store, threshold_m: float, points: int, left_out: Mapping[str, str], writer: _Writer
@@ -201,8 +174,7 @@ def _annotate_clips(
         hand, verb = writer.hand(clip, evidence), writer.verb(clip, evidence)
         clip = replace(clip, verb=verb.base)
         words = (None, left_out[clip_id]) if clip_id in left_out else writer.sentences(clip, hand.active, evidence)
-        wording = writer.wording(clip, hand.active, words[0], joints)
-        found.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, *words, verb, wording))
+        found.append(_Annotated(clip_id, clip.labelled_hand, hand, evidence, *words, verb))
     return found
 
 
@@ -230,21 +202,13 @@ def _no_hand(evidence: HandEvidence) -> str:
     return f"no joint within {evidence.threshold_m * 100:g} cm of the object; nearest {nearest * 100:.1f} cm"
 
 
-def _distinct(named: Sequence[_Annotated], varied: ClipVariations) -> list[str]:
-    """Every sentence once; those of the four forms first, whatever variations there are."""
-    formal = (text for item in named for text in item.sentences or ())
-    return list(dict.fromkeys([*formal, *(text for texts in varied.sentences.values() for text in texts)]))
-
-
-def _text_rows(named: Sequence[_Annotated], varied: ClipVariations, sentences: Sequence[str]) -> list[dict]:
+def _text_rows(found: Sequence[_Annotated], sentences: Sequence[str]) -> list[dict]:
     row_of = {sentence: row for row, sentence in enumerate(sentences)}
     return [
         {"clip_id": item.clip_id, "form": form, "sentence": sentence, "text_row": row_of[sentence]}
-        for item in named
-        for form, sentence in [
-            *zip(FORMS, item.sentences or (), strict=True),
-            *((VARIATION, sentence) for sentence in varied.sentences.get(item.clip_id, ())),
-        ]
+        for item in found
+        if item.sentences
+        for form, sentence in zip(FORMS, item.sentences, strict=True)
     ]
 
 

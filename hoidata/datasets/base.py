@@ -18,6 +18,7 @@ from hoidata.clips.hand_parameters import HandConvention
 from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording
 from hoidata.dataset_folders import DatasetFacts
+from hoidata.datasets import checks
 from hoidata.errors import BadInput, ChangedMeanwhile
 from hoidata.files import sha256_bytes, sha256_file
 from hoidata.hands import HandPair
@@ -123,7 +124,10 @@ class Recorded(Protocol):
 
 
 class Described:
-    """The facts of an adapter, as ``facts.toml`` of its folder states them; it declares ``facts`` alone."""
+    """The facts of an adapter, as ``facts.toml`` of its folder states them; it declares ``facts`` alone.
+
+    Its settings are dataclass fields of type int (0 or more), bool or Literal, and checked by that type.
+    """
 
     facts: ClassVar[DatasetFacts]
     # The setting with which no MANO files are needed, where there is one: ``hands=keypoints``.
@@ -134,8 +138,15 @@ class Described:
     licence = property(attrgetter("facts.licence"))
     may_be_shared = property(attrgetter("facts.may_be_shared"))
     where_to_register = property(attrgetter("facts.where_to_register"))
-    needs_mano = property(attrgetter("facts.needs_mano"))
     licences = property(attrgetter("facts.licences"))
+
+    def __post_init__(self) -> None:
+        checks.settings(self)
+
+    @property
+    def needs_mano(self) -> bool:
+        setting, _, value = self.without_mano.partition("=")
+        return self.facts.needs_mano and (not setting or getattr(self, setting) != value)
 
     @property
     def source_fps(self) -> float:

@@ -1,7 +1,7 @@
 """Checks every adapter makes on raw numbers: each failure is a BadInput that names the file, expected and got."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, NoReturn, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -76,23 +76,17 @@ def entry(where: str, mapping: Any, key: str) -> Any:
     return mapping[key]
 
 
-def whole_setting(adapter: str, name: str, value: Any) -> None:
-    """Refuse a setting that is not a whole number of 0 or more."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        _refuse_setting(adapter, name, "a whole number of 0 or more", value)
+def settings(adapter: Any) -> None:
+    """Refuse a value that the type of its setting excludes: a whole number of 0 or more, true or false, a choice."""
+    for name, kind in get_type_hints(type(adapter)).items():
+        value = getattr(adapter, name)
+        if kind is int and (isinstance(value, bool) or not isinstance(value, int) or value < 0):
+            refuse_setting(adapter.name, name, "a whole number of 0 or more", value)
+        if kind is bool and not isinstance(value, bool):
+            refuse_setting(adapter.name, name, "true or false", value)
+        if get_origin(kind) is Literal and value not in get_args(kind):
+            refuse_setting(adapter.name, name, " or ".join(get_args(kind)), value)
 
 
-def switch_setting(adapter: str, name: str, value: Any) -> None:
-    """Refuse a setting that is not true or false."""
-    if not isinstance(value, bool):
-        _refuse_setting(adapter, name, "true or false", value)
-
-
-def choice_setting(adapter: str, name: str, value: Any, choices: Sequence[str]) -> None:
-    """Refuse a setting that is none of the choices."""
-    if value not in choices:
-        _refuse_setting(adapter, name, " or ".join(choices), value)
-
-
-def _refuse_setting(adapter: str, name: str, expected: str, value: Any) -> None:
+def refuse_setting(adapter: str, name: str, expected: str, value: Any) -> NoReturn:
     raise BadInput(f"settings of the adapter {adapter}: {name}", expected, repr(value)[:40], "correct params.yaml")

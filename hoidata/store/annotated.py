@@ -2,7 +2,7 @@
 
     clips/        the store (see ``hoidata.store.store``)
     annotation/   text.parquet        clip_id, form, sentence, text_row (row of embeddings.npz); per clip the four
-                                      forms, then its variations, if any were asked for
+                                      forms
                   hand_type.parquet   clip_id, hand_type, source (proximity or annotated), min_left_m, min_right_m,
                                       labelled_hand, agreement (of it with the hand that comes near), reason (why a
                                       clip is left out), verb, verb_source (source: the clip came with it; derived:
@@ -10,7 +10,7 @@
                   hand_distance.npz   how near each hand is in every frame (``hoidata.store.hand_evidence``)
                   embeddings.npz      features (sentence, 512) float32, sentences (sentence,) text, identity JSON bytes
                   info.json           encoder, threshold_m, points, hand (where it is not proximity), forms,
-                                      variations (and what their guard dropped), counts
+                                      counts
     contact/      objects.parquet     object, row, method        points.npz    (object, 1024, ...) sampled points
                   clips.parquet       clip_id, row, shard, and per side <side>_start, <side>_stop: rows of the shard
                   contact.npz         <side>_frames (clip, 1024) uint16: in how many frames each point is touched
@@ -43,8 +43,6 @@ from hoidata.store.hand_evidence import HandDistances, HandEvidence
 from hoidata.store.mapped import map_npz
 from hoidata.store.store import Store, open_store
 
-# The form of a sentence beyond the four.
-VARIATION = "variation"
 SUBSETS = ("train", "validation", "test")
 STAGES = {"clips": "convert", "annotation": "annotate", "contact": "contact", "splits": "split"}
 MEASURED: dict[str, Shape] = {"threshold_m": NUMBER, "points": int}
@@ -82,8 +80,7 @@ class AnnotatedStore:
         embeddings = read_npz(annotation / "embeddings.npz")
         self.encoder_identity: dict[str, Any] = orjson.loads(embeddings["identity"].tobytes())
         self._features = embeddings["features"]
-        self._sentences = _by_clip(self.text.query("form != @VARIATION"))
-        self._variations = _by_clip(self.text.query("form == @VARIATION"))
+        self._sentences = _by_clip(self.text)
         self._objects = read_table(contact / "objects.parquet").set_index("object")
         self._clips = read_table(contact / "clips.parquet").set_index("clip_id")
         self._points = read_npz(contact / "points.npz")
@@ -161,15 +158,6 @@ class AnnotatedStore:
     def text_embedding(self, clip_id: str) -> np.ndarray:
         """(4, 512) float32 features of the four sentences, of the encoder ``encoder_identity``."""
         return self._features[self._sentences[clip_id]["text_row"].to_numpy()]
-
-    def variations(self, clip_id: str) -> tuple[str, ...]:
-        """Further sentences that say the same, as many as the stage was asked for; by default none."""
-        return tuple(self._variations[clip_id]["sentence"]) if clip_id in self._variations else ()
-
-    def variation_features(self, clip_id: str) -> np.ndarray:
-        """(variation, 512) float32 features of :meth:`variations`."""
-        rows = self._variations[clip_id]["text_row"].to_numpy() if clip_id in self._variations else []
-        return self._features[np.asarray(rows, np.int64)]
 
     def object_key(self, clip_id: str) -> str:
         """Name of the manipulated object within this dataset."""

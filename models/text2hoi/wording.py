@@ -13,10 +13,9 @@ from functools import cache
 from lemminflect import getAllLemmas
 
 from hoidata.annotation.encoders import TextEncoder
-from hoidata.annotation.grammar import VerbForms, default_grammar
+from hoidata.annotation.grammar import default_grammar, default_phrases
 from hoidata.annotation.hand_choice import PHRASES
 from hoidata.annotation.prompts import HAND_PHRASE
-from hoidata.annotation.variations import word_table
 from hoidata.errors import BadInput
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.sentences import (
@@ -153,14 +152,13 @@ def _table_words() -> frozenset[str]:
 @cache
 def synonym_of(verb: str) -> str | None:
     """The other verb of a pair of synonyms in the word table, either way: lift and raise."""
-    pairs = word_table().synonyms
+    pairs = default_phrases().synonyms
     return pairs.get(verb) or next((base for base, other in pairs.items() if other == verb), None)
 
 
 def forms_of(verb: str) -> tuple[str, str, str, str]:
     """Base, gerund, past participle and third person."""
-    forms: VerbForms = default_grammar().verb(verb)
-    return forms.base, forms.gerund, forms.past_participle, forms.third_singular
+    return default_grammar().verb(verb).forms
 
 
 def _near(word: str, known: Iterable[str], most: int) -> list[tuple[int, str]]:

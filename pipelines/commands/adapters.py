@@ -2,7 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
 app = typer.Typer(no_args_is_help=True)
+# Datasets whose sentences come from a list of verbs and objects.
+TEMPLATED = ("grab", "h2o", "arctic")
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 Name = Annotated[str, typer.Argument(help="A name that `hoidata adapters list` shows.")]
 Root = Annotated[Path, typer.Option(help="A raw folder it can read.", exists=True, file_okay=False, resolve_path=True)]
@@ -43,6 +45,25 @@ def list_adapters() -> None:
         shared = "yes" if facts.may_be_shared else "no"
         table.add_row(*map(escape, (row.name, facts.version, facts.licence, shared, row.origin, settings)))
     Console().print(table)
+
+
+@app.command()
+def sentences(
+    names: Annotated[list[str] | None, typer.Argument(help="grab, h2o or arctic; all three by default.")] = None,
+    hand: Annotated[Literal["left", "right", "both"], typer.Option(help="The hand that the sentences name.")] = "right",
+) -> None:
+    """Print the four sentences of every verb and object of GRAB, H2O and ARCTIC, as the stage annotate writes them."""
+    from importlib import import_module
+
+    from hoidata.annotation.sentences import four_sentences
+
+    for name in names or TEMPLATED:
+        if name not in TEMPLATED:
+            raise BadInput("hoidata adapters sentences", " or ".join(TEMPLATED), name, "choose one of them")
+        pairs = import_module(f"hoidata.datasets.{name}.words").PAIRS
+        typer.echo(f"{name}: {len(pairs)} pairs of verb and object")
+        for verb, words in pairs:
+            typer.echo(f"  {verb}, {words}: {' '.join(four_sentences(verb, words, hand))}")
 
 
 @app.command()

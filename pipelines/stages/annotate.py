@@ -1,11 +1,6 @@
 """Stage annotate: hand type, sentences and text features of every clip."""
 
-from pathlib import Path
-
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, print_counts, write_empty
-
-# Text features of earlier runs, of all datasets and profiles; they spare time and change no output.
-FEATURES = Path(".hoidata", "features")
 
 
 def run(paths: StagePaths) -> None:
@@ -25,6 +20,5 @@ def run(paths: StagePaths) -> None:
         contact=read_contact_settings(paths.contact),
         hands=load_hands(paths.profile),
         left_out=left_out_reasons(paths.quality),
-        features=FEATURES,
     )
     print_counts(paths, counts)

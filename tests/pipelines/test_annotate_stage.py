@@ -1,16 +1,17 @@
 """Stage annotate in the pipeline: every setting of params.yaml reaches the library."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import orjson
 import pandas as pd
 import pytest
+from typer.testing import CliRunner
 
-from hoidata.annotation.reference_mode import reference_sentences
+from hoidata.annotation.sentences import reference_sentences
 from hoidata.errors import BadInput, MissingResource
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from pipelines.commands.adapters import app
 from pipelines.stages import annotate, contact, quality
 from pipelines.stages.base import StagePaths
 
@@ -74,14 +75,6 @@ def test_whose_word_counts_for_the_hand_is_written_down_where_it_is_not_the_dist
         annotated_with(hand="nearest")
 
 
-def test_as_many_variations_are_written_as_asked_for(annotated_with) -> None:
-    _, text, info = annotated_with(variations={"per_clip": 3, "adverbs": False})
-    assert text.groupby("clip_id").size().tolist() == [7, 7]
-    assert (info["variations"]["per_clip"], info["variations"]["adverbs"]) == (3, False)
-    with pytest.raises(BadInput, match="per_clip"):
-        annotated_with(variations={"per_clip": -1, "adverbs": False})
-
-
 def test_verbs_from_motion_can_be_turned_off(annotated_with) -> None:
     with_them, _, _ = annotated_with()
     assert with_them["verb_source"].tolist() == ["source", "derived"]
@@ -91,6 +84,13 @@ def test_verbs_from_motion_can_be_turned_off(annotated_with) -> None:
     assert info["counts"]["derived_verbs"] == 0
 
 
-def test_features_are_kept_where_they_are_said_to_be(annotated_with) -> None:
-    annotated_with()
-    assert len(list(Path(".hoidata/features").rglob("*.npz"))) == 1
+def test_the_sentences_of_a_dataset_are_printed_by_a_command() -> None:
+    def printed(*arguments: str) -> str:
+        return CliRunner().invoke(app, ["sentences", *arguments], catch_exceptions=False).output
+
+    whole = printed().splitlines()
+    assert len(whole) == 3 + 202 + 36 + 91
+    assert whole[0] == "grab: 202 pairs of verb and object"
+    assert "  see, binoculars: Look through a pair of binoculars in both hands. " in printed("grab", "--hand", "both")
+    with pytest.raises(BadInput, match="grab or h2o or arctic"):
+        printed("taco")

@@ -324,7 +324,7 @@ DAMAGED = {
     "an array": ("data/embedded/grab/clips/arrays/frames-00000.npz", ["info", "data/embedded/grab/clips"]),
     "a table": ("data/embedded/grab/clips/meta/sequences.parquet", ["info", "data/embedded/grab/clips"]),
     "facts": ("data/embedded/grab/clips/meta/info.json", ["info", "data/embedded/grab/clips"]),
-    "words": ("data/embedded/grab/annotation/text.parquet", ["corpus", "data/embedded/grab"]),
+    "words": ("data/embedded/grab/annotation/text.parquet", ["show", "grab"]),
     "a checkpoint": ("checkpoints/embedded/grab/contact/model.safetensors", ["validate", "checkpoints/embedded/grab"]),
     "figures": ("metrics/embedded/grab/text2hoi.json", ["table", "metrics/embedded/grab", "--metrics", "contact_f1"]),
 }

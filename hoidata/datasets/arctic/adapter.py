@@ -4,7 +4,7 @@ import re
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -102,13 +102,6 @@ class ArcticAdapter(Described):
     body: bool = False
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
-
-    def __post_init__(self) -> None:
-        for name in ("margin_frames", "shortest_frames", "trimmed_frames"):
-            checks.whole_setting(self.name, name, getattr(self, name))
-        checks.choice_setting(self.name, "clips", self.clips, get_args(Stretches))
-        for name in ("all_pairs", "body"):
-            checks.switch_setting(self.name, name, getattr(self, name))
 
     @property
     def parts(self) -> tuple[DatasetPart, ...]:

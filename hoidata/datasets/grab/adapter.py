@@ -65,11 +65,6 @@ class GrabAdapter(Described):
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
 
-    def __post_init__(self) -> None:
-        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
-        checks.switch_setting(self.name, "contact", self.contact)
-        checks.switch_setting(self.name, "body", self.body)
-
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per ``grab/sN/*.npz``."""
         found = {path for top in ROOTS for path in (Path(root) / top / "grab").glob("s*/*.npz")}

@@ -28,6 +28,32 @@ OBJECTS = {
     "waterbottle": "water bottle",
     "wineglass": "wine glass",
 }
+# Intents recorded with an object beyond lift, pass and offhand, which GRAB recorded with all but those of ``_NEVER``.
+_RECORDED = {
+    **{shape + size: "inspect" for shape in _SHAPES for size in _SIZES},
+    **{name: "inspect" for name in ("duck", "elephant", "stanfordbunny")},
+    **{name: "use" for name in ("doorknob", "hammer", "headphones", "mouse", "piggybank", "scissors")},
+    **{name: "play" for name in ("flute", "gamecontroller", "train")},
+    **{"airplane": "fly", "alarmclock": "see", "apple": "eat", "banana": "eat peel", "binoculars": "see"},
+    **{"bowl": "drink", "camera": "browse takepicture", "cup": "drink pour", "eyeglasses": "clean wear"},
+    **{"flashlight": "switchON", "fryingpan": "cook", "hand": "inspect shake", "knife": "chop peel"},
+    **{"lightbulb": "screw", "mug": "drink toast", "phone": "call", "stamp": "stamp", "stapler": "staple"},
+    **{"teapot": "pour", "toothbrush": "brush", "toothpaste": "squeeze", "watch": "set"},
+    **{"waterbottle": "drink open pour shake", "wineglass": "drink toast"},
+}
+_NEVER = {
+    "lift": ("lightbulb", "pyramidsmall", "scissors"),
+    "pass": ("doorknob",),
+    "offhand": (
+        "doorknob", "hammer", "knife", "lightbulb", "pyramidsmall", "teapot", "toothbrush", "toothpaste", "toruslarge",
+    ),
+}  # fmt: skip
+# The 202 pairs of verb and object that GRAB has, in words.
+PAIRS = tuple(
+    (INTENTS[intent], words)
+    for name, words in OBJECTS.items()
+    for intent in (*_RECORDED[name].split(), *(known for known, names in _NEVER.items() if name not in names))
+)
 # Further meshes in GRAB's folder of objects.
 OTHER_MESHES = {
     "coffeemug": "coffee mug",

@@ -8,14 +8,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
 from hoidata.clips.clip import CameraTrack, Clip, ObjectTrack, SourceFile, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
 from hoidata.dataset_folders import facts_beside
-from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
@@ -91,15 +90,6 @@ class H2OAdapter(Described):
     hands: HandSource = "mano"
     frame: WorldFrame = FRAME
     parts: tuple[DatasetPart, ...] = PARTS
-
-    def __post_init__(self) -> None:
-        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
-        checks.whole_setting(self.name, "shortest_frames", self.shortest_frames)
-        checks.choice_setting(self.name, "hands", self.hands, get_args(HandSource))
-
-    @property
-    def needs_mano(self) -> bool:
-        return self.hands == "mano"
 
     @property
     def hand_convention(self) -> HandConvention:

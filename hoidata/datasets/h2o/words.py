@@ -16,3 +16,4 @@ ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is
     ("spray", "spray"),
     ("squeeze", "lotion"),
 )
+PAIRS = ACTIONS[1:]

@@ -7,14 +7,13 @@ have 30 frames per second, of which every second one is made (``twice.py``).
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from hoidata.clips.clip import SIDES, CameraTrack, Clip, HandTrack, HandType, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import FrameChange, HandConvention, SourceHand, to_track
 from hoidata.dataset_folders import facts_beside
-from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered, trimmed
 from hoidata.datasets.gravity import TrackedObject, estimate_gravity
@@ -115,11 +114,6 @@ class Hoi4dAdapter(Described):
     most_off_deg: int = 10
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
-
-    def __post_init__(self) -> None:
-        for name in ("margin_frames", "shortest_frames", "most_off_mm", "most_off_deg"):
-            checks.whole_setting(self.name, name, getattr(self, name))
-        checks.choice_setting(self.name, "clips", self.clips, get_args(Cut))
 
     @property
     def parts(self) -> tuple[DatasetPart, ...]:

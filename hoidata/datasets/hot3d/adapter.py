@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
 import numpy as np
 
@@ -127,15 +127,9 @@ class Hot3dAdapter(Described):
     parts: tuple[DatasetPart, ...] = PARTS
 
     def __post_init__(self) -> None:
-        for name in ("margin_frames", "shortest_frames", "longest_frames", "most_fit_error_mm"):
-            checks.whole_setting(self.name, name, getattr(self, name))
+        super().__post_init__()
         if not self.longest_frames:
-            checks.choice_setting(self.name, "longest_frames", self.longest_frames, ["1 or more"])
-        checks.choice_setting(self.name, "hands", self.hands, get_args(HandFormat))
-
-    @property
-    def needs_mano(self) -> bool:
-        return self.hands == "mano"
+            checks.refuse_setting(self.name, "longest_frames", "1 or more", self.longest_frames)
 
     @property
     def hand_convention(self) -> HandConvention:

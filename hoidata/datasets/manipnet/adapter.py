@@ -15,7 +15,6 @@ from hoidata.clips.clip import FPS, SIDES, Clip, ObjectTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, hand_track
 from hoidata.clips.recording import HandRecording, OwnHandTrack
 from hoidata.dataset_folders import facts_beside
-from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.manipnet.bvh import BvhMotion, angles_yxz_to_rotmat, parse_bvh, unpack_text
 from hoidata.datasets.manipnet.hand import (
@@ -144,9 +143,6 @@ class ManipNetAdapter(Described):
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
-
-    def __post_init__(self) -> None:
-        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per folder below ``sequences``; all recordings are of one subject."""

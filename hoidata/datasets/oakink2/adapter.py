@@ -15,7 +15,6 @@ import numpy as np
 from hoidata.clips.clip import SIDES, Clip, HandTrack, Side, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention, to_track
 from hoidata.dataset_folders import facts_beside
-from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gaps import has_pose, missing_poses, numbered, trimmed
 from hoidata.datasets.oakink2.files import LARGEST_JSON_BYTES, STEP, Range, Segment, read_annotation, read_program
@@ -65,10 +64,6 @@ class Oakink2Adapter(Described):
     frame: WorldFrame = FRAME
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
-
-    def __post_init__(self) -> None:
-        for name in ("margin_frames", "shortest_frames", "most_off_mm", "most_off_deg"):
-            checks.whole_setting(self.name, name, getattr(self, name))
 
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per annotation; its subject is what ends the scene's name, ``A001`` of ``scene_01__A001``."""

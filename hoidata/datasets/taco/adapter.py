@@ -63,9 +63,6 @@ class TacoAdapter(Described):
     hand_convention: HandConvention = CONVENTION
     parts: tuple[DatasetPart, ...] = PARTS
 
-    def __post_init__(self) -> None:
-        checks.whole_setting(self.name, "margin_frames", self.margin_frames)
-
     def sequences(self, root: Path) -> list[SequenceKey]:
         """One key per recording that has hand or object poses, in a folder named as a triplet."""
         found = {path for kind in (HANDS, OBJECTS) for path in Path(root).glob(f"{kind}/(*)/*") if path.is_dir()}

@@ -8,17 +8,17 @@ import pytest
 
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.prompts import Lexicon, read_prompt
-from hoidata.annotation.reference_mode import reference_sentences, reference_words
-from hoidata.annotation.sentences import four_sentences
-from hoidata.datasets.grab.words import INTENTS, OBJECTS
-from hoidata.datasets.h2o.adapter import ACTIONS
-from tests.builders.words import ARCTIC_OBJECTS, ARCTIC_VERBS
+from hoidata.annotation.sentences import four_sentences, reference_sentences, reference_words
+from hoidata.datasets.arctic import words as arctic
+from hoidata.datasets.grab import words as grab
+from hoidata.datasets.grab.words import OBJECTS
+from hoidata.datasets.h2o import words as h2o
 
-# Every verb with every object: 36 of H2O's pairs and 55 of ARCTIC's are real actions, GRAB's are all.
+# Every verb with every object: 36 of H2O's pairs, 202 of GRAB's and 55 of ARCTIC's are real actions.
 PAIRS = [
-    *product(sorted({verb for verb, _ in ACTIONS[1:]}), sorted({noun for _, noun in ACTIONS[1:]})),
-    *product(INTENTS.values(), OBJECTS.values()),
-    *product(ARCTIC_VERBS, ARCTIC_OBJECTS),
+    *product(sorted({verb for verb, _ in h2o.PAIRS}), sorted({noun for _, noun in h2o.PAIRS})),
+    *product(grab.INTENTS.values(), OBJECTS.values()),
+    *product(arctic.VERBS, map(arctic.object_words, arctic.OBJECTS)),
 ]
 
 
@@ -38,6 +38,16 @@ def shares(forms: Callable, named: Callable[[str], str] = str) -> np.ndarray:
     share = np.mean(right, axis=0)
     print(f"{forms.__name__}: {len(right):,} prompts; hand {share[0]:.2%}, object {share[1]:.2%}, verb {share[2]:.2%}")
     return share
+
+
+@pytest.mark.parametrize(("dataset", "count"), [(grab, 202), (h2o, 36), (arctic, 91)], ids=["grab", "h2o", "arctic"])
+def test_every_sentence_of_a_recorded_pair_reads_back(dataset, count: int) -> None:
+    assert len(set(dataset.PAIRS)) == len(dataset.PAIRS) == count
+    for verb, noun in dataset.PAIRS:
+        for hand in HAND_TYPES:
+            for sentence in four_sentences(verb, noun, hand):
+                found = read_prompt(sentence)
+                assert (found.verb, found.object_words, found.hand.hand) == (verb, noun, hand), sentence
 
 
 @pytest.mark.slow
@@ -85,6 +95,29 @@ def test_forms_are_found_as_whole_words_wherever_a_search_for_each_finds_them(te
             places += [] if joined else [(number, start, stop)]
             start = start + 1 if joined else stop
         assert places == [match for match in matches if match[0] == number]
+
+
+def test_a_form_that_stands_for_two_words_is_refused() -> None:
+    with pytest.raises(ValueError, match="lifts"):
+        Lexicon([("lifts", "lift"), ("lifts", "raise")], [])
+
+
+@pytest.mark.parametrize(
+    ("text", "verb", "noun"),
+    [
+        ("Use a knife to chop with the right hand.", "chop", "knife"),
+        ("Hold the cup in your left hand to drink from it.", "drink", "cup"),
+        ("Use the right hand to lift a mug.", "lift", "mug"),
+        ("Hold a book with both hands.", "hold", "book"),
+        ("Put the binoculars to use: look through the binoculars.", "see", "binoculars"),
+        ("Put on the glasses' lens with both hands.", "put on", "lens"),
+        ("Put on eyeglasses.", "wear", "eyeglasses"),
+        ("Wear eyeglasses.", "wear", "eyeglasses"),
+    ],
+)
+def test_a_purpose_and_a_phrase_name_the_verb(text: str, verb: str, noun: str) -> None:
+    found = read_prompt(text)
+    assert (found.verb, found.object_words) == (verb, noun)
 
 
 @pytest.mark.parametrize(

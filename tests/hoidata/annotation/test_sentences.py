@@ -12,10 +12,11 @@ from hoidata.annotation.grammar import (
     DETERMINERS,
     Grammar,
     default_grammar,
+    default_phrases,
     mass_nouns,
     regular_forms,
 )
-from hoidata.annotation.sentences import four_sentences
+from hoidata.annotation.sentences import four_sentences, reference_sentences
 from hoidata.errors import BadInput
 
 
@@ -36,22 +37,68 @@ def test_the_four_forms_are_those_of_the_paper() -> None:
 @pytest.mark.parametrize(
     ("verb", "words", "hand", "expected"),
     [
-        ("take out", "milk", "both", "Milk is taken out by both hands."),
-        ("take out", "milk", "left", "The left hand takes out milk."),
-        ("put in", "cappuccino", "right", "Cappuccino is put in by the right hand."),
-        ("cut", "scissors", "right", "Scissors are cut by the right hand."),
-        ("open", "chips", "both", "Opening chips with both hands."),
+        ("take out", "milk", "both", "A carton of milk is taken out by both hands."),
+        ("take out", "milk", "left", "The left hand takes out a carton of milk."),
+        ("put in", "cappuccino", "right", "A pack of cappuccino is put in by the right hand."),
+        ("open", "chips", "both", "Opening a pack of chips with both hands."),
         ("hand over", "Stanford bunny", "both", "Handing over a Stanford bunny with both hands."),
-        ("take a picture with", "camera", "right", "A camera is used to take a picture by the right hand."),
-        ("fly", "airplane", "left", "An airplane is flown by the left hand."),
-        ("wear", "eyeglasses", "both", "Eyeglasses are worn by both hands."),
-        ("drink", "mug", "right", "The right hand drinks a mug."),
-        ("lift", "hand", "left", "Lift a hand with the left hand."),
+        ("lift", "keys", "left", "Keys are lifted by the left hand."),
         (None, "large cube", "both", "Both hands move a large cube."),
         (None, "teapot", "right", "Moving a teapot with the right hand."),
     ],
 )
 def test_sentences_of_known_words_read_right(verb: str | None, words: str, hand, expected: str) -> None:
+    assert expected in four_sentences(verb, words, hand)
+
+
+@pytest.mark.parametrize(
+    ("verb", "words", "hand", "expected"),
+    [
+        ("chop", "knife", "right", "Chop with a knife in the right hand."),
+        ("chop", "knife", "right", "A knife is used by the right hand to chop."),
+        ("peel", "knife", "left", "Peeling with a knife in the left hand."),
+        ("peel", "banana", "both", "Both hands peel a banana."),
+        ("cut", "scissors", "right", "A pair of scissors is used by the right hand to cut."),
+        ("use", "scissors", "right", "Use a pair of scissors with the right hand."),
+        ("staple", "stapler", "left", "Staple with a stapler in the left hand."),
+        ("stamp", "stamp", "right", "The right hand stamps with a stamp."),
+        ("brush", "toothbrush", "right", "A toothbrush is used by the right hand to brush."),
+        ("cook", "frying pan", "left", "Cooking with a frying pan in the left hand."),
+        ("spray", "spray", "right", "Spray with a spray bottle in the right hand."),
+        ("take a picture with", "camera", "both", "Take a picture with a camera in both hands."),
+        ("take a picture with", "camera", "right", "A camera is used by the right hand to take a picture."),
+        ("browse", "camera", "both", "Both hands browse the pictures on a camera."),
+        ("call", "phone", "right", "Make a call with a phone in the right hand."),
+        ("type", "laptop", "both", "A laptop is used by both hands to type."),
+        ("drink", "cup", "right", "Drink from a cup with the right hand."),
+        ("drink", "wine glass", "left", "The left hand holds a wine glass to drink from."),
+        ("drink", "milk", "right", "Drink milk with the right hand."),
+        ("pour", "teapot", "right", "The right hand pours from a teapot."),
+        ("pour", "milk", "right", "Milk is poured by the right hand."),
+        ("toast", "mug", "right", "A mug is held by the right hand to toast."),
+        ("eat", "apple", "left", "An apple is held by the left hand to eat."),
+        ("see", "binoculars", "both", "Look through a pair of binoculars in both hands."),
+        ("see", "binoculars", "both", "A pair of binoculars is held by both hands to look through."),
+        ("see", "alarm clock", "left", "Looking at an alarm clock in the left hand."),
+        ("read", "book", "both", "Both hands hold a book to read."),
+        ("read", "espresso", "right", "Read the label on a pack of espresso in the right hand."),
+        ("wear", "eyeglasses", "both", "A pair of eyeglasses is put on by both hands."),
+        ("play", "train", "right", "A toy train is played with by the right hand."),
+        ("play", "flute", "both", "Both hands play a flute."),
+        ("play", "game controller", "both", "A game controller is used by both hands to play."),
+        ("screw", "light bulb", "right", "The right hand screws in a light bulb."),
+        ("point", "notebook", "right", "A notebook is pointed at by the right hand."),
+        ("fly", "airplane", "left", "A toy airplane is flown by the left hand."),
+        ("pass", "elephant", "right", "Pass a toy elephant with the right hand."),
+        ("shake", "hand", "right", "Shake a model hand with the right hand."),
+        ("squeeze", "toothpaste", "both", "Squeeze a tube of toothpaste with both hands."),
+        ("apply", "lotion", "both", "Both hands apply lotion."),
+        ("sprinkle", "ketchup", "right", "Sprinkle ketchup with the right hand."),
+        ("open", "ketchup", "both", "Open a bottle of ketchup with both hands."),
+        ("write with", "pen", "right", "A pen is used by the right hand to write."),
+    ],
+)
+def test_a_verb_and_an_object_are_said_as_a_person_says_them(verb: str, words: str, hand, expected: str) -> None:
     assert expected in four_sentences(verb, words, hand)
 
 
@@ -76,7 +123,10 @@ def test_sentences_of_unknown_words_follow_the_rules(verb: str, words: str, expe
 
 
 def test_every_verb_and_object_of_the_table_stands_in_its_sentences_as_written() -> None:
+    phrases = default_phrases()
     for row in table_rows("verb"):
+        if (row["base"], "*") in phrases.verbs:
+            continue
         sentences = four_sentences(row["base"], "box", "left")
         assert sentences[0].lower().startswith(row["base"] + " a box")
         assert f" is {row['past_participle']} by the left hand." in sentences[1]
@@ -84,8 +134,10 @@ def test_every_verb_and_object_of_the_table_stands_in_its_sentences_as_written()
         assert sentences[3].lower().startswith(row["gerund"] + " a box")
     for row in table_rows("object"):
         sentences = four_sentences("lift", row["base"], "both")
-        assert sentences[2] == f"Both hands lift {row['noun_phrase']}."
-        assert (" are " if row["number"] == "plural" else " is ") in sentences[1]
+        is_phrase = row["base"] in phrases.nouns
+        words = phrases.nouns[row["base"]].format(row["base"]) if is_phrase else row["noun_phrase"]
+        assert sentences[2] == f"Both hands lift {words}."
+        assert (" are " if row["number"] == "plural" and not is_phrase else " is ") in sentences[1]
 
 
 def without_own_row(row: dict[str, str]) -> Grammar:
@@ -189,3 +241,24 @@ MASS = {row["base"] for row in table_rows("object") if row["number"] == "mass"}
 def test_a_sentence_without_an_object_is_refused(words: str) -> None:
     with pytest.raises(BadInput, match="object of a sentence"):
         four_sentences("lift", words, "left")
+
+
+@pytest.mark.parametrize(
+    ("verb", "thing", "hand", "expected"),
+    [
+        ("place", "book", "both", ("Place book with both hands.", "Book is placed with both hands.",
+                                   "Both hands place book.", "Placing book with both hands.")),
+        ("open", "wine glass", "left", ("Open wineglass with left hand.", "Wineglass is opened with left hand.",
+                                        "Left hand opens wineglass.", "Opening wineglass with left hand.")),
+        ("take out", "large cube", "right", ("Take out cube with right hand.", "Cube is taken out with right hand.",
+                                             "Right hand takes out cube.", "Taking out cube with right hand.")),
+        ("hand over", "Stanford bunny", "both", (
+            "Hand over stanford bunny with both hands.", "Stanford bunny is handed over with both hands.",
+            "Both hands hand over stanford bunny.", "Handing over stanford bunny with both hands.")),
+        ("take a picture with", "camera", "right", (
+            "Take picture camera with right hand.", "Camera is pictured with right hand.",
+            "Right hand takes picture camera.", "Taking picture camera with right hand.")),
+    ],
+)  # fmt: skip
+def test_reference_sentences_are_the_references_without_its_misspellings(verb, thing, hand, expected) -> None:
+    assert reference_sentences(verb, thing, hand) == expected

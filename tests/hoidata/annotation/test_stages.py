@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from hoidata.annotation.encoders import load_encoder
+from hoidata.annotation.sentences import reference_sentences
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.annotation.stage import annotate_store
 from hoidata.batches.dataset import HoiDataset
@@ -54,9 +55,20 @@ def annotated(root: Path) -> AnnotatedStore:
     return load_annotated(root)
 
 
+def test_reference_forms_are_written_where_asked_for(root: Path, tmp_path: Path, annotated: AnnotatedStore) -> None:
+    for folder in ("clips", "contact", "splits"):
+        (tmp_path / folder).symlink_to(root / folder)
+    annotate_store(root / "clips", tmp_path / "annotation", encoder="hash", forms="reference")
+    found = load_annotated(tmp_path)
+    said = {"toy/s1/1": ("lift", "box", "left"), "toy/s2/2": ("take out", "milk", "right")}
+    assert all(found.sentences(key) == reference_sentences(*words) for key, words in said.items())
+    assert found.annotation_info["forms"] == "reference"
+    assert found.ids() == annotated.ids()
+
+
 def test_sentences_name_the_hand_that_was_found(annotated: AnnotatedStore) -> None:
     assert annotated.sentences("toy/s1/1")[2] == "The left hand lifts a box."
-    assert annotated.sentences("toy/s2/2")[1] == "Milk is taken out by the right hand."
+    assert annotated.sentences("toy/s2/2")[1] == "A carton of milk is taken out by the right hand."
     assert annotated.sentences("toy/s3/3")[0] == "Open a notebook with both hands."
     assert [annotated.hand_type(key) for key in annotated.ids()] == ["left", "right", "both"]
 

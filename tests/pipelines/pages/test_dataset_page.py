@@ -13,7 +13,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files.written import read_table
 from hoidata.store.annotated import load_annotated
 from pipelines.pages.contact_facts import contact_by_object
-from pipelines.pages.dataset_facts import read_dataset
+from pipelines.pages.dataset_facts import majority_verb, read_dataset
 from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
 from pipelines.pages.report import ReportFolders, write_report
 from pipelines.pages.view import view_of
@@ -83,6 +83,18 @@ def test_minutes_are_of_frames_at_30_per_second(page_clip, hands, tmp_path):
     write_clips(tmp_path / "clips", clips, "grab")
     tiles = {name: number for number, name in read_dataset(tmp_path, "grab", hands).tiles}
     assert (tiles["clips"], tiles["frames at 30 fps"], tiles["minutes"]) == ("2", "2,700", "1.5")
+
+
+def test_the_most_frequent_training_verb_is_compared_with_the_test_clips(page_clip, tmp_path):
+    words = ["place", "lift", "lift", "place", "lift", "lift", "place", "open"]
+    clips = [
+        replace(page_clip(frames=10 + number), clip_id=f"grab/{number}", subject=f"s{1 + number // 4}", verb=verb)
+        for number, verb in enumerate(words)
+    ]
+    root = write_annotated(tmp_path, clips, "grab", SPLIT, 0.09)
+    assert majority_verb(load_annotated(root)) == [("50%", "of test clips show the most frequent training verb, lift")]
+    alone = write_annotated(tmp_path / "alone", clips[:4], "grab", SPLIT, 0.09)
+    assert majority_verb(load_annotated(alone)) == []
 
 
 def test_contact_and_penetration_by_object_are_counted_over_frames(page_clip, hands, tmp_path):
