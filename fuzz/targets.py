@@ -50,7 +50,7 @@ from hoidata.hands import mano, model
 from hoidata.object_paths import keyframes, script
 from hoidata.objects import glb, mesh, stl, user_mesh
 from hoidata.objects import ply as ply_reader
-from hoidata.store import mapped, store, versions
+from hoidata.store import mapped, store
 from models.manipnet import trajectory_files
 from pipelines import params
 from pipelines.lineage import manifests
@@ -648,7 +648,7 @@ def _json_files() -> list[Target]:
             "store-info",
             [info, {**info, "schema_version": "1.0.0"}, {**info, "schema_version": "9.0.0"}, {**info, "hand_model": 1}],
             on_disk("meta/info.json", lambda path: _store_info(path.parent.parent)),
-            (store.read_info, versions.checked_version, versions.filled_info),
+            (store.read_info,),
         ),
     ]
 
@@ -659,9 +659,6 @@ def _json_target(name: str, values: Sequence[Any], run: Callable[[bytes], Any], 
 
 
 def _store_info(folder: Path) -> None:
-    info = store.read_info(folder)
-    version = versions.checked_version(folder, info["schema_version"])
-    versions.filled_info(info, version)
     store.open_store(folder)  # ends at the tables, which are not there
 
 

@@ -1,7 +1,5 @@
 """``hoidata info`` says what a store holds in words a person can read."""
 
-from pathlib import Path
-
 from typer.testing import CliRunner
 
 from hoidata.clips.quarantine import Quarantined
@@ -47,8 +45,6 @@ def test_the_command_prints_them_and_all_on_request(tmp_path, clips, monkeypatch
     assert "test/s9/[bad]_14" in CliRunner().invoke(app, ["info", "--all", str(tmp_path / "clips")]).output
 
 
-def test_an_empty_store_and_an_old_one_are_described_too(tmp_path):
+def test_an_empty_store_is_described_too(tmp_path):
     write_store(tmp_path / "clips", [], generated_info("test"))
     assert dict(fact_rows(open_store(tmp_path / "clips")))["gravity of the clips"] == "no clips"
-    old = fact_rows(open_store(Path(__file__).parent / "stores" / "1.0.0"))
-    assert dict(old)["schema"] == "1.0.0; hoidata migrate brings it to 1.1.0"
