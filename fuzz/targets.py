@@ -47,7 +47,7 @@ from hoidata.files import (
     torch_pickle,
 )
 from hoidata.hands import mano, model
-from hoidata.object_paths import keyframes, script
+from hoidata.object_paths import keyframes
 from hoidata.objects import glb, mesh, stl, user_mesh
 from hoidata.objects import ply as ply_reader
 from hoidata.store import mapped, store
@@ -506,13 +506,6 @@ def _object_paths() -> list[Target]:
             lambda data: keyframes.keyframed_path(thing, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0)),
             functions_of(keyframes, ("read_keyframes",)),
             words,
-        ),
-        Target(
-            "object-scripts",
-            lambda: [line.encode() for line in seeds.OBJECT_SCRIPTS],
-            lambda data: script.scripted_path(thing, data.decode("utf-8", "replace"), (0.0, 2.0)),
-            functions_of(script),
-            (b" to ", b" by ", b" in ", b" and ", b" cm", b" deg", b"9e9", b"-", "°".encode(), "٣".encode(), b"#"),
         ),
     ]
 
