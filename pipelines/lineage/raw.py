@@ -113,9 +113,8 @@ def raw_sources(root: Path | None, record: dict[str, Any]) -> list[RawSource]:
 
 
 def clips_of(record: dict[str, Any]) -> set[str]:
-    """The clips a checkpoint learned from or was chosen by; none where a published one only says so in words."""
-    clips = record.get("clips", {})
-    return {clip for ids in clips.values() for clip in ids} if isinstance(clips, dict) else set()
+    """The clips a checkpoint learned from or was chosen by."""
+    return {clip for ids in record.get("clips", {}).values() for clip in ids}
 
 
 def stores_behind(record: dict[str, Any]) -> list[str]:

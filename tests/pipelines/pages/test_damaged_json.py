@@ -18,7 +18,7 @@ from hoidata.store.annotated import load_annotated
 from hoidata.surface.stage import surface_store
 from hoidata.surface.store import open_surface
 from pipelines.figures import LEADING, write_figures
-from pipelines.lineage.made import compare_made
+from pipelines.lineage.check import compare_made
 from pipelines.lineage.manifests import read_manifest
 from pipelines.pages import quality
 from pipelines.pages.clip_page_facts import clip_quality
