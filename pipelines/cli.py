@@ -26,7 +26,6 @@ from pipelines.commands import (
     settings,
     share,
     show,
-    store,
     synth,
 )
 
@@ -48,7 +47,7 @@ app.command("up")(graph.up)
 app.command("down")(graph.down)
 app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
-app.command("validate")(store.validate)
+app.command("validate")(inspect.validate)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)

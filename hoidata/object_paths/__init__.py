@@ -3,11 +3,4 @@
 from hoidata.object_paths.keyframes import Keyframes, keyframed_path, parse_keyframes, read_keyframes
 from hoidata.object_paths.path import ObjectPath, PathStep
 
-__all__ = [
-    "Keyframes",
-    "ObjectPath",
-    "PathStep",
-    "keyframed_path",
-    "parse_keyframes",
-    "read_keyframes",
-]
+__all__ = ["Keyframes", "ObjectPath", "PathStep", "keyframed_path", "parse_keyframes", "read_keyframes"]

@@ -6,16 +6,7 @@ from typing import Any
 
 from hoidata.clips.validation import check_clip
 from hoidata.errors import BadInput, MissingResource
-from hoidata.store.fields import (
-    BODY,
-    FRAMES,
-    INFO,
-    RECORDINGS,
-    SOURCE_CONTACT,
-    SOURCE_HANDS,
-    STORE_FILES,
-    TABLES,
-)
+from hoidata.store.fields import BODY, FRAMES, INFO, RECORDINGS, SOURCE_CONTACT, SOURCE_HANDS, STORE_FILES, TABLES
 from hoidata.store.info import info_problems
 from hoidata.store.store import open_store, read_info
 from hoidata.store_check.arrays import mesh_problems, read_shards, recording_problems, shard_problems, template_problems

@@ -24,10 +24,7 @@ def fact_rows(store: Store) -> Rows:
         ("schema", str(info["schema_version"])),
         ("licence", f"{info['licence']}; derived data {sharing}"),
         ("clips", f"{counts['clips']:,}; subjects: {store.sequences['subject'].nunique()}"),
-        (
-            "frames",
-            f"{counts['frames']:,} at {FPS} per second, {minutes:,.1f} minutes; source {rates} per second",
-        ),
+        ("frames", f"{counts['frames']:,} at {FPS} per second, {minutes:,.1f} minutes; source {rates} per second"),
         ("objects", f"{counts['objects']}, {sum(store.objects['articulated'])} with a hinge"),
         ("raw files", f"{counts['files']:,}, {store.files['size'].sum() / 1e6:,.1f} MB"),
         ("world frame", _frame(info["frame"])),

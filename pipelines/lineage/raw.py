@@ -67,15 +67,8 @@ def read_raw(root: Path, store: str, wanted: set[str] | None = None) -> RawSourc
         return None
     info = read_json(folder / "meta/info.json")
     files = _rows(folder / "meta/files.parquet", ["path", "sha256"])
-    columns = [
-        "clip_id",
-        "subject",
-        "object",
-        "other_objects",
-        "first_source_frame",
-        "last_source_frame",
-        "source_files",
-    ]
+    frames = ["first_source_frame", "last_source_frame"]
+    columns = ["clip_id", "subject", "object", "other_objects", *frames, "source_files"]
     rows = _rows(folder / TABLE, columns)
     clips = [_clip(row, files) for row in rows if wanted is None or row["clip_id"] in wanted]
     used = {path for clip in clips for path in clip.files}
