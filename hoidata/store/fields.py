@@ -225,9 +225,7 @@ SEQUENCES = StoreFile(
         Field("sequence", _TEXT, "the source sequence it was cut from"),
         Field("verb", _TEXT, "the action in words; null without a label", required=False),
         Field("object_words", _TEXT, "noun of the object, without article"),
-        Field(
-            "labelled_hand", _TEXT, "the hand an annotator named", required=False, choices=("left", "right", "both")
-        ),
+        Field("labelled_hand", _TEXT, "the hand an annotator named", required=False, choices=("left", "right", "both")),
         Field("object", _TEXT, "the manipulated object: its row in objects.parquet"),
         Field("other_objects", _TEXT, "further objects of the scene", ("other object",), ("other object",)),
         Field("n_frames", _WHOLE, "frames at 30 per second"),
@@ -255,9 +253,7 @@ SEQUENCES = StoreFile(
         Field(
             "gravity_note", _TEXT, "how gravity was estimated, or why it is not known; empty when the source states it",
         ),
-        Field(
-            "hands_from", _TEXT, "what the source gave", choices=("parameters", "keypoints")
-        ),
+        Field("hands_from", _TEXT, "what the source gave", choices=("parameters", "keypoints")),
         Field(
             "fit_error_m", "float64", "mean error of hands fitted to keypoints; null for parameters", unit="metre",
             required=False,
