@@ -66,4 +66,4 @@ bench: install-dev
 
 # Removes what the graph made and the generated raw data; your own raw files are never touched.
 clean:
-	rm -rf code data checkpoints evaluators samples metrics report .hoidata dvc.lock pipelines/dvc.lock models/*/dvc.lock
+	rm -rf code data checkpoints evaluators samples metrics report .hoidata

@@ -753,18 +753,6 @@ def _archive(arrays: dict[str, np.ndarray]) -> bytes:
     return stream.getvalue()
 
 
-OBJECT_SCRIPTS = (
-    "lift 15 cm, open to 70 deg in 1.5 s, tilt 30° left, hold, put down",
-    "raise by 2 inches and turn 90 degrees clockwise; move right 0.2 m\n# a remark\nshake left 3 cm 4 times then level",
-    "open, close 10 deg, close to 5 deg, lift to 20 cm, lower, rotate 1 rad, pause 500 ms. put it down",
-    "lift 5",
-    "tilt up",
-    "lift 1 m in 0.1 s",
-    "open to 170 deg",
-    "",
-)
-
-
 def hinged_object() -> ObjectModel:
     """A tetrahedron with a second one on a hinge, metres."""
     points = np.array([[0, 0, 0], [0.1, 0, 0], [0, 0.1, 0], [0, 0, 0.1]])

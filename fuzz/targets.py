@@ -47,10 +47,10 @@ from hoidata.files import (
     torch_pickle,
 )
 from hoidata.hands import mano, model
-from hoidata.object_paths import keyframes, script
+from hoidata.object_paths import keyframes
 from hoidata.objects import glb, mesh, stl, user_mesh
 from hoidata.objects import ply as ply_reader
-from hoidata.store import mapped, store, versions
+from hoidata.store import mapped, store
 from models.manipnet import trajectory_files
 from pipelines import params
 from pipelines.lineage import manifests
@@ -507,13 +507,6 @@ def _object_paths() -> list[Target]:
             functions_of(keyframes, ("read_keyframes",)),
             words,
         ),
-        Target(
-            "object-scripts",
-            lambda: [line.encode() for line in seeds.OBJECT_SCRIPTS],
-            lambda data: script.scripted_path(thing, data.decode("utf-8", "replace"), (0.0, 2.0)),
-            functions_of(script),
-            (b" to ", b" by ", b" in ", b" and ", b" cm", b" deg", b"9e9", b"-", "°".encode(), "٣".encode(), b"#"),
-        ),
     ]
 
 
@@ -648,7 +641,7 @@ def _json_files() -> list[Target]:
             "store-info",
             [info, {**info, "schema_version": "1.0.0"}, {**info, "schema_version": "9.0.0"}, {**info, "hand_model": 1}],
             on_disk("meta/info.json", lambda path: _store_info(path.parent.parent)),
-            (store.read_info, versions.checked_version, versions.filled_info),
+            (store.read_info,),
         ),
     ]
 
@@ -659,9 +652,6 @@ def _json_target(name: str, values: Sequence[Any], run: Callable[[bytes], Any], 
 
 
 def _store_info(folder: Path) -> None:
-    info = store.read_info(folder)
-    version = versions.checked_version(folder, info["schema_version"])
-    versions.filled_info(info, version)
     store.open_store(folder)  # ends at the tables, which are not there
 
 

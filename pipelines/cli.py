@@ -24,7 +24,6 @@ from pipelines.commands import (
     settings,
     share,
     show,
-    store,
     synth,
 )
 
@@ -46,10 +45,7 @@ app.command("up")(graph.up)
 app.command("down")(graph.down)
 app.command("doctor")(inspect.doctor)
 app.command("info")(inspect.info)
-app.command("validate")(store.validate)
-app.command("migrate")(store.migrate)
-app.command("push")(store.push)
-app.command("pull")(store.pull)
+app.command("validate")(inspect.validate)
 app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)

@@ -18,7 +18,7 @@ from hoidata.files import sha256_file
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair
-from hoidata.object_paths import keyframed_path, read_keyframes, scripted_path
+from hoidata.object_paths import keyframed_path, read_keyframes
 from hoidata.object_paths.path import MOST_S, PathStep, check_pace
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.user_mesh import read_user_object
@@ -37,7 +37,6 @@ from pipelines.stages.base import StagePaths, empty_reason, load_hands
 LEAST_S = 0.3
 MOST_FRAMES = round(MOST_S * FPS) + 1
 CLIPS_FOR_RANGE = 60  # of an object, whose hinge angles say how far it opens
-SCRIPT_FILES = (".txt", ".md", ".script")
 GENERATED = ("object_rotvec", "object_translation_m", "object_vertices_m", "object_faces", "object_part")
 
 
@@ -45,13 +44,12 @@ GENERATED = ("object_rotvec", "object_translation_m", "object_vertices_m", "obje
 class HandsWish:
     """What ``hoidata hands`` is told; "" for what is not.
 
-    object: a mesh file, or the name of a dataset's object. script: its words, or a file of them; keyframes: a file;
-    clip: a stored clip's id; motion: a motion.npz of ``hoidata generate``. One of these four. hinge_range: "0:110",
+    object: a mesh file, or the name of a dataset's object. keyframes: a file; clip: a stored clip's id; motion: a
+    motion.npz of ``hoidata generate``. One of these three. hinge_range: "0:110",
     degrees. length_s: how long the motion is to last instead of its own time. model: the dataset whose networks to use.
     """
 
     object: str = ""
-    script: str = ""
     keyframes: str = ""
     clip: str = ""
     motion: str = ""
@@ -100,10 +98,10 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
 def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Asked:
     """The motion of the object that hands are asked for."""
     _check_dataset(wish.model, profile, datasets)
-    given = {name: value for name in ("script", "keyframes", "clip", "motion") if (value := getattr(wish, name))}
+    given = {name: value for name in ("keyframes", "clip", "motion") if (value := getattr(wish, name))}
     if len(given) != 1:
         got = " and ".join(f"--{name}" for name in given) or "none"
-        raise BadInput("object's motion", "one of --script, --keyframes, --clip or --motion", got, "give one of them")
+        raise BadInput("object's motion", "one of --keyframes, --clip or --motion", got, "give one of them")
     own = MotionWish(wish.seed, wish.samples, wish.hand)
     if wish.clip:
         asked = _of_clip(wish, profile, datasets, hands, own)
@@ -243,24 +241,9 @@ def hinge_range(text: str) -> tuple[float, float]:
 
 def _of_path(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:
     thing = _object(wish, profile, datasets, hands)
-    if wish.keyframes:
-        keys = read_keyframes(wish.keyframes)
-        path = keyframed_path(thing.model, keys, thing.limits_rad, wish.keyframes, thing.standing)
-        return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", thing.notes)
-    text = _script_text(wish.script)
-    path = scripted_path(thing.model, text, thing.limits_rad, standing=thing.standing)
-    return Asked(path.track, own, path.steps, f"script: {' '.join(text.split())}", thing.notes)
-
-
-def _script_text(script: str) -> str:
-    """A script, or that of the file it names."""
-    if "\n" in script or len(script) >= 250:
-        return script
-    if isfile(script):
-        return Path(script).read_text(encoding="utf-8", errors="replace")
-    if Path(script).suffix.lower() in SCRIPT_FILES or ("/" in script and " " not in script):
-        raise BadInput("--script", "steps, or a file of them", f"{script}, which is not there", "correct the path")
-    return script
+    keys = read_keyframes(wish.keyframes)
+    path = keyframed_path(thing.model, keys, thing.limits_rad, wish.keyframes, thing.standing)
+    return Asked(path.track, own, path.steps, f"keyframes of {Path(wish.keyframes).name}", thing.notes)
 
 
 def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair, own: MotionWish) -> Asked:

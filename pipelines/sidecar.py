@@ -42,23 +42,9 @@ def noted_run(name: str) -> Iterator[None]:
             **_machine(),
         }
         with suppress(OSError):  # of a full disk the stage itself has told
-            path = run_file(Path(), stage)
+            path = RUNS / f"{stage.replace('/', '-').replace(':', '-')}.json"
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(json.dumps(facts, indent=1) + "\n")
-
-
-def run_file(root: Path, stage: str) -> Path:
-    return root / RUNS / f"{stage.replace('/', '-').replace(':', '-')}.json"
-
-
-def read_run(root: Path, stage: str) -> dict[str, Any]:
-    """The facts of a stage's last run here; empty where none are kept."""
-    try:
-        facts = json.loads(run_file(root, stage).read_bytes())
-        datetime.fromisoformat(facts["began_at"])
-        return facts if facts["schema"] == SCHEMA and isinstance(facts["seconds"], float | int) else {}
-    except (OSError, ValueError, KeyError, TypeError):
-        return {}
 
 
 def _cost() -> dict[str, float]:

@@ -138,7 +138,7 @@ class HoiDataset(Dataset):
         self.annotated, self.split = annotated, split
         self.max_frames, self.crop, self.seed = max_frames, crop, seed
         self.epoch = 0
-        self.ids = list(annotated.split_ids(split))
+        self.ids = list(annotated.ids(split))
         self._samples: dict[str, ClipSample] = {}
 
     def __len__(self) -> int:

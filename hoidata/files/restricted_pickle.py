@@ -331,10 +331,7 @@ def checked_keys(items: Sequence[Any]) -> Sequence[Any]:
 
 def _numpy_globals() -> dict[tuple[str, str], Any]:
     """NumPy 1 calls its inner package ``numpy.core``, NumPy 2 ``numpy._core``; files of both are read."""
-    allowed: dict[tuple[str, str], Any] = {
-        ("numpy", "ndarray"): _NDARRAY,
-        ("numpy", "dtype"): _dtype,
-    }
+    allowed: dict[tuple[str, str], Any] = {("numpy", "ndarray"): _NDARRAY, ("numpy", "dtype"): _dtype}
     for core in ("numpy.core", "numpy._core"):
         allowed[f"{core}.multiarray", "_reconstruct"] = _reconstruct
         allowed[f"{core}.multiarray", "scalar"] = _scalar

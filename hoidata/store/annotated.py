@@ -106,10 +106,6 @@ class AnnotatedStore:
         """Subsets of the chosen split without clips, with what that means in words."""
         return self.split_info.get("missing", {})
 
-    def split_ids(self, split: str) -> list[str]:
-        """Clips of one subset of the chosen split, in the store's order."""
-        return self.ids(split)
-
     @property
     def info(self) -> dict[str, Any]:
         """The store's ``meta/info.json``: dataset, synthetic, hand model, licence."""

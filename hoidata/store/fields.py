@@ -1,7 +1,6 @@
 """Every field of a store, once: what the writer writes, the checker checks and README.md documents.
 
-Versions are ``major.minor.patch``. A minor version adds fields (``since``); a reader fills them in stores written
-before (``hoidata.store.migrate``). A major version changes or removes some; ``hoidata migrate`` rewrites such stores.
+A store of another schema version is refused: convert its raw files again.
 """
 
 from dataclasses import dataclass, replace
@@ -15,7 +14,6 @@ from hoidata.hands.model import N_VERTICES
 
 SCHEMA_VERSION = "1.1.0"
 UNITS = {"length": "metre", "angle": "radian", "time": "second"}
-Version = tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,6 @@ class Field:
     dtype: of NumPy, Parquet or JSON. shape: numbers, or names of lengths that vary; () is one value. axes: what each
     axis counts. unit: "" where there is none. frame: the frame of reference of coordinates, "" where there is none.
     required: never null (tables, info.json); members of arrays are always there. choices: the only texts allowed.
-    since: the minor version that added it.
     """
 
     name: str
@@ -37,7 +34,6 @@ class Field:
     frame: str = ""
     required: bool = True
     choices: tuple[str, ...] = ()
-    since: Version = (1, 0)
 
     @property
     def row_shape(self) -> tuple[int, ...]:
@@ -53,17 +49,6 @@ class StoreFile:
     meaning: str
     order: str
     fields: tuple[Field, ...]
-    since: Version = (1, 0)
-
-    def fields_of(self, version: Version) -> tuple[Field, ...]:
-        """The fields a store of this version has."""
-        return tuple(field for field in self.fields if field.since <= version)
-
-
-def parse_version(text: str) -> Version:
-    """(major, minor) of ``1.1.0``. Raises ValueError for anything else."""
-    major, minor, _ = (int(part) for part in text.split("."))
-    return major, minor
 
 
 def _both(field: Field) -> tuple[Field, ...]:
@@ -73,17 +58,17 @@ def _both(field: Field) -> tuple[Field, ...]:
     )
 
 
-def _rotvec(name: str, rows: str, meaning: str, frame: str = "world", since: Version = (1, 0)) -> Field:
-    return Field(name, "float32", meaning, (rows, 3), (rows, "axis-angle"), "radian", frame, since=since)
+def _rotvec(name: str, rows: str, meaning: str, frame: str = "world") -> Field:
+    return Field(name, "float32", meaning, (rows, 3), (rows, "axis-angle"), "radian", frame)
 
 
-def _point(name: str, rows: str, meaning: str, since: Version = (1, 0)) -> Field:
-    return Field(name, "float32", meaning, (rows, 3), (rows, "xyz"), "metre", "world", since=since)
+def _point(name: str, rows: str, meaning: str) -> Field:
+    return Field(name, "float32", meaning, (rows, 3), (rows, "xyz"), "metre", "world")
 
 
-def _angles(name: str, rows: str, joints: int, meaning: str, since: Version = (1, 0)) -> Field:
+def _angles(name: str, rows: str, joints: int, meaning: str) -> Field:
     axes = (rows, "joint x axis-angle")
-    return Field(name, "float32", meaning, (rows, 3 * joints), axes, "radian", "parent joint", since=since)
+    return Field(name, "float32", meaning, (rows, 3 * joints), axes, "radian", "parent joint")
 
 
 def _hand(side: str) -> tuple[Field, ...]:
@@ -116,11 +101,9 @@ FRAMES = StoreFile(
         *_hand("right"),
         *_object("object", "frame", "the manipulated object"),
         *_object("other", "other object x frame", "the further objects, one after another"),
-        _rotvec("camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)",
-                since=(1, 1)),
-        _point("camera_position_m", "camera row", "where the camera is", since=(1, 1)),
-        Field("camera_images", "int32", "number of the image in the source", ("camera row",), ("camera row",),
-              since=(1, 1)),
+        _rotvec("camera_rotvec", "camera row", "world_from_camera, OpenCV axes (x right, y down, z ahead)"),
+        _point("camera_position_m", "camera row", "where the camera is"),
+        Field("camera_images", "int32", "number of the image in the source", ("camera row",), ("camera row",)),
     ),
 )  # fmt: skip
 
@@ -135,7 +118,6 @@ BODY = StoreFile(
         _angles("face_pose", "body row", 3, "jaw, left eye, right eye"),
         Field("expression", "float32", "SMPL-X", ("expression row", 10), ("expression row", "component")),
     ),
-    since=(1, 1),
 )
 
 SOURCE_CONTACT = StoreFile(
@@ -147,7 +129,6 @@ SOURCE_CONTACT = StoreFile(
         Field("vertex", "int32", "vertex of the clip's object mesh", ("entry",), ("entry",)),
         Field("label", "uint8", "the source's own number of what touches", ("entry",), ("entry",)),
     ),
-    since=(1, 1),
 )
 
 OBJECT_ARRAYS = StoreFile(
@@ -229,9 +210,8 @@ SOURCE_HANDS = StoreFile(
 _TEXT, _WHOLE, _ROW = "string", "int32", "int64"
 
 
-def _rows_of(name: str, array: str, since: Version = (1, 0)) -> Field:
-    absent = "" if since == (1, 0) else "; -1 for a clip without"
-    return Field(name, _ROW, f"first row of {array}{absent}", since=since)
+def _rows_of(name: str, array: str, optional: bool = False) -> Field:
+    return Field(name, _ROW, f"first row of {array}{'; -1 for a clip without' if optional else ''}")
 
 
 SEQUENCES = StoreFile(
@@ -245,9 +225,7 @@ SEQUENCES = StoreFile(
         Field("sequence", _TEXT, "the source sequence it was cut from"),
         Field("verb", _TEXT, "the action in words; null without a label", required=False),
         Field("object_words", _TEXT, "noun of the object, without article"),
-        Field(
-            "labelled_hand", _TEXT, "the hand an annotator named", required=False, choices=("left", "right", "both")
-        ),
+        Field("labelled_hand", _TEXT, "the hand an annotator named", required=False, choices=("left", "right", "both")),
         Field("object", _TEXT, "the manipulated object: its row in objects.parquet"),
         Field("other_objects", _TEXT, "further objects of the scene", ("other object",), ("other object",)),
         Field("n_frames", _WHOLE, "frames at 30 per second"),
@@ -274,25 +252,22 @@ SEQUENCES = StoreFile(
         Field("synthetic", "bool", "whether the raw data was generated"),
         Field(
             "gravity_note", _TEXT, "how gravity was estimated, or why it is not known; empty when the source states it",
-            since=(1, 1),
         ),
-        Field(
-            "hands_from", _TEXT, "what the source gave", choices=("parameters", "keypoints"), since=(1, 1)
-        ),
+        Field("hands_from", _TEXT, "what the source gave", choices=("parameters", "keypoints")),
         Field(
             "fit_error_m", "float64", "mean error of hands fitted to keypoints; null for parameters", unit="metre",
-            required=False, since=(1, 1),
+            required=False,
         ),
-        Field("camera_name", _TEXT, "as in the source; null without a camera", required=False, since=(1, 1)),
+        Field("camera_name", _TEXT, "as in the source; null without a camera", required=False),
         Field(
             "camera_intrinsics", "float64", "fx, fy, cx, cy, width, height", (6,), ("value",), "pixel",
-            required=False, since=(1, 1),
+            required=False,
         ),
-        _rows_of("camera_row", "the camera_ arrays", since=(1, 1)),
-        _rows_of("body_row", "the arrays of body-*.npz", since=(1, 1)),
-        _rows_of("expression_row", "expression in body-*.npz", since=(1, 1)),
-        _rows_of("source_contact_row", "the arrays of source_contact-*.npz", since=(1, 1)),
-        Field("source_contact_count", _ROW, "how many rows; 0 for a clip without", since=(1, 1)),
+        _rows_of("camera_row", "the camera_ arrays", optional=True),
+        _rows_of("body_row", "the arrays of body-*.npz", optional=True),
+        _rows_of("expression_row", "expression in body-*.npz", optional=True),
+        _rows_of("source_contact_row", "the arrays of source_contact-*.npz", optional=True),
+        Field("source_contact_count", _ROW, "how many rows; 0 for a clip without"),
     ),
 )  # fmt: skip
 
@@ -345,7 +320,7 @@ INFO = StoreFile(
     (
         Field("schema_version", "string", "major.minor.patch"),
         Field("dataset", "string", "name of the dataset, lower case"),
-        Field("dataset_version", "string", "release the adapter reads", since=(1, 1)),
+        Field("dataset_version", "string", "release the adapter reads"),
         Field("synthetic", "boolean", "whether the raw data was generated"),
         Field("fps", "number", "of every clip", unit="1 / second"),
         Field("source_fps", "number", "of the raw files", unit="1 / second"),
@@ -353,19 +328,18 @@ INFO = StoreFile(
         Field("units.angle", "string", "radian"),
         Field("units.time", "string", "second"),
         Field("axes", "object", "what the axes of each member of frames-*.npz count"),
-        Field("frame.handedness", "string", "of the world frame", choices=("right",), since=(1, 1)),
+        Field("frame.handedness", "string", "of the world frame", choices=("right",)),
         Field("frame.up_axis", "string", "null when the source does not say", required=False,
-              choices=("+x", "-x", "+y", "-y", "+z", "-z"), since=(1, 1)),
-        Field("frame.gravity", "string", "where gravity comes from", choices=("stated", "estimated", "unknown"),
-              since=(1, 1)),
-        Field("frame.note", "string", "one sentence for people", since=(1, 1)),
+              choices=("+x", "-x", "+y", "-y", "+z", "-z")),
+        Field("frame.gravity", "string", "where gravity comes from", choices=("stated", "estimated", "unknown")),
+        Field("frame.note", "string", "one sentence for people"),
         Field("hand_model.name", "string", "mano, or embedded"),
         Field("hand_model.digest", "string", "SHA-256 of the hand model the parameters belong to"),
         Field("hand_convention.left_shape", "string", "sign of the left hand's shape directions in the source",
-              choices=("as released", "corrected", "unused", "unknown"), since=(1, 1)),
-        Field("hand_convention.note", "string", "what the source's hand parameters meant", since=(1, 1)),
+              choices=("as released", "corrected", "unused", "unknown")),
+        Field("hand_convention.note", "string", "what the source's hand parameters meant"),
         Field("licence", "string", "of the raw data"),
-        Field("may_be_shared", "boolean", "whether the licence lets derived data be passed on", since=(1, 1)),
+        Field("may_be_shared", "boolean", "whether the licence lets derived data be passed on"),
         Field("counts.clips", "integer", "rows of sequences.parquet"),
         Field("counts.frames", "integer", "sum of n_frames"),
         Field("counts.objects", "integer", "rows of objects.parquet"),
@@ -388,10 +362,9 @@ _ARROW = {
 }  # fmt: skip
 
 
-def arrow_schema(file: StoreFile, version: Version | None = None) -> pa.Schema:
+def arrow_schema(file: StoreFile) -> pa.Schema:
     """The Parquet schema of a table; fields with an axis are lists."""
-    fields = file.fields if version is None else file.fields_of(version)
-    return pa.schema([(f.name, pa.list_(_ARROW[f.dtype]) if f.shape else _ARROW[f.dtype]) for f in fields])
+    return pa.schema([(f.name, pa.list_(_ARROW[f.dtype]) if f.shape else _ARROW[f.dtype]) for f in file.fields])
 
 
 def empty_array(field: Field) -> np.ndarray:

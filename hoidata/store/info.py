@@ -8,7 +8,7 @@ from hoidata.clips.clip import FPS, WorldFrame
 from hoidata.clips.hand_parameters import HandConvention
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair, load_embedded_hands
-from hoidata.store.fields import INFO, Field, Version, value_at
+from hoidata.store.fields import INFO, Field, value_at
 
 _WHERE = "meta/info.json"
 # Of real recordings with the embedded hand, compared with published joints of MANO.
@@ -86,15 +86,15 @@ def check_info(info: dict[str, Any]) -> None:
 
     Facts the writer itself adds (version, units, counts) are not looked at.
     """
-    for problem in info_problems(info, (10**9, 0)):
+    for problem in info_problems(info):
         if problem.where.removeprefix(f"{_WHERE}: ").split(".")[0] not in _OF_THE_WRITER:
             raise problem
 
 
-def info_problems(info: Any, version: Version) -> list[BadInput]:
-    """Every fact that a store of this schema version must state and does not, or not as documented."""
+def info_problems(info: Any) -> list[BadInput]:
+    """Every fact that a store must state and does not, or not as documented."""
     problems = []
-    for field in INFO.fields_of(version):
+    for field in INFO.fields:
         try:
             value = value_at(info, field.name)
         except KeyError:

@@ -10,12 +10,14 @@
 
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from hoidata.clips.clip import (
     SIDES,
@@ -38,10 +40,63 @@ from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.store.fields import SCHEMA_VERSION, TABLES
 from hoidata.store.info import info_problems
 from hoidata.store.mapped import map_npz
-from hoidata.store.reading import FrameShard, clip_rows
 from hoidata.store.recordings import read_hand, read_recording
-from hoidata.store.versions import CURRENT, checked_version, filled_info, filled_sequences
 from hoidata.store.writing import write_store
+
+_POSE = ("rotvec", "translation_m", "hinge_rad")
+_FACTS = ("clip_id", "dataset", "subject", "sequence", "verb", "object_words", "labelled_hand", "source_fps")
+_FURTHER_FACTS = ("synthetic", "gravity_note", "hands_from", "fit_error_m")
+
+
+def clip_rows(sequences: pd.DataFrame) -> dict[str, dict[str, Any]]:
+    """The row of every clip by its id, as Python values; a row of a pandas table costs more than reading the clip.
+
+    Added: ``frames``, the rows of its shard; ``hands``, per side the rows of its betas and its template; ``facts``, the
+    fields of ``Clip`` that stand in the row as they are. gravity (3,) and source_from_world (4, 4) become arrays.
+    """
+    rows = {}
+    for row in pa.Table.from_pandas(sequences, preserve_index=False).to_pylist():
+        row["frames"] = slice(row["first_row"], row["first_row"] + row["n_frames"])
+        row["hands"] = {side: _hand_rows(row, side) for side in SIDES}
+        row["facts"] = {name: row[name] for name in (*_FACTS, *_FURTHER_FACTS)}
+        row["gravity"] = None if row["gravity"] is None else np.array(row["gravity"])
+        row["source_from_world"] = np.array(row["source_from_world"]).reshape(4, 4)
+        rows[row["clip_id"]] = row
+    return rows
+
+
+def _hand_rows(row: dict[str, Any], side: Side) -> tuple[slice, str | None]:
+    first = row[f"{side}_betas_row"]
+    return slice(first, first + row[f"{side}_betas_count"]), row[f"{side}_template"]
+
+
+@dataclass(frozen=True)
+class FrameShard:
+    """The mapped members of one ``frames-*.npz``.
+
+    hands: per side wrist_m, global_orient, hand_pose, betas, valid. object, other: rotvec, translation_m, hinge_rad.
+    camera: rotvec, position_m, images; none in stores before 1.1.
+    """
+
+    source_frames: np.ndarray
+    hands: Mapping[Side, tuple[np.ndarray, ...]]
+    object: tuple[np.ndarray, ...]
+    other: tuple[np.ndarray, ...]
+    camera: tuple[np.ndarray, ...]
+
+    @classmethod
+    def open(cls, path: Path) -> "FrameShard":
+        arrays = map_npz(path)
+        names = ("wrist_m", "global_orient", "hand_pose", "betas", "valid")
+        camera = [f"camera_{name}" for name in ("rotvec", "position_m", "images")]
+        return cls(
+            arrays["source_frames"],
+            {side: tuple(arrays[f"{side}_{name}"] for name in names) for side in SIDES},
+            tuple(arrays[f"object_{name}"] for name in _POSE),
+            tuple(arrays[f"other_{name}"] for name in _POSE),
+            tuple(arrays[name] for name in camera if name in arrays),
+        )
+
 
 __all__ = ["SCHEMA_VERSION", "Quarantined", "Store", "open_store", "write_store"]
 
@@ -50,13 +105,11 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
     """Open a store for reading.
 
     hands: the hand model its parameters belong to; not needed when that is the embedded one, or when no joints are
-    asked for. A store of an earlier minor version is read with what later ones added filled in; nothing is written.
-    Raises MissingResource when ``folder`` is no store, BadInput for another major version or other hands.
+    asked for. Raises MissingResource when ``folder`` is no store, BadInput for another schema version or other hands.
     """
     folder = Path(folder)
     info = read_info(folder)
     path = folder / "meta" / "info.json"
-    version = checked_version(folder, info["schema_version"])
     model = info.get("hand_model", {})
     if not isinstance(model, dict):
         raise BadInput(path, "a hand_model with name and digest", repr(model)[:80], "run the conversion again")
@@ -65,9 +118,8 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
         remedy = "open it with the hands it was converted with"
         raise BadInput(path, f"hand model {written[:12]}", f"{hands.name} {hands.digest[:12]}", remedy)
     sequences, objects, files, quarantine = (read_table(folder / file.path) for file in TABLES.values())
-    sequences = filled_sequences(sequences, version).set_index("clip_id", drop=False).rename_axis(None)
-    info = filled_info(info, version)
-    if problems := info_problems(info, CURRENT):
+    sequences = sequences.set_index("clip_id", drop=False).rename_axis(None)
+    if problems := info_problems(info):
         raise BadInput(folder / problems[0].where, problems[0].expected, problems[0].got, REMEDY)
     return Store(folder, info, sequences, objects, files, quarantine, hands)
 
@@ -75,7 +127,7 @@ def open_store(folder: str | Path, hands: HandPair | None = None) -> "Store":
 def read_info(folder: str | Path) -> dict[str, Any]:
     """``meta/info.json`` as it is on disk.
 
-    Raises MissingResource when ``folder`` is no store, BadInput when the file is no JSON object with a schema_version.
+    Raises MissingResource when ``folder`` is no store, BadInput when the file is no JSON object or of another version.
     """
     path = Path(folder) / "meta" / "info.json"
     for noted in (Path(folder), Path(folder).parent):  # a family without motions has the note in the place of clips/
@@ -84,7 +136,9 @@ def read_info(folder: str | Path) -> dict[str, Any]:
     if not path.is_file():
         raise MissingResource(f"{folder} is no store: {path} is missing; run the conversion of this dataset first")
     info = read_json(path)
-    _ = info["schema_version"]
+    if info["schema_version"] != SCHEMA_VERSION:
+        remedy = "run the conversion again, or use the hoidata that wrote it"
+        raise BadInput(path, f"schema version {SCHEMA_VERSION}", str(info["schema_version"])[:80], remedy)
     return info
 
 

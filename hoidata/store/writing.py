@@ -1,5 +1,7 @@
 """Writing a store: clips stream in, at most one shard of them is in memory, equal clips give equal bytes."""
 
+import shutil
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -24,22 +26,141 @@ from hoidata.clips.validation import check_clip
 from hoidata.files import atomic_folder, canonical_json, sha256_bytes
 from hoidata.files.arrays import write_npz
 from hoidata.files.tables import write_table
+from hoidata.objects.model import ObjectModel
 from hoidata.store.fields import (
     AXES,
     BODY,
     FRAMES,
+    OBJECT_ARRAYS,
     RECORDINGS,
     SCHEMA_VERSION,
     SOURCE_CONTACT,
     SOURCE_HANDS,
     TABLES,
     UNITS,
+    StoreFile,
     arrow_schema,
+    empty_array,
 )
 from hoidata.store.info import check_info
-from hoidata.store.meshes import MeshKey, MeshWriter
+from hoidata.store.mapped import map_npz
 from hoidata.store.recordings import RecordingWriter
-from hoidata.store.shards import ShardWriter
+
+FRAMES_PER_SHARD = 65536
+CONTACTS_PER_SHARD = 1 << 23  # 9 bytes each: GRAB's labels can be ten times the motion
+
+
+class ShardWriter:
+    """Collects the rows of one shard of ``frames-*``, ``body-*`` and ``source_contact-*`` files.
+
+    At most one shard is in memory; a clip lies in one shard.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.number = 0
+        self._start()
+
+    def _start(self) -> None:
+        self.pieces = {file.path: {f.name: [empty_array(f)] for f in file.fields} for file in _SHARDED}
+        self.lengths = {file.path: {field.name: 0 for field in file.fields} for file in _SHARDED}
+
+    def append(self, file: StoreFile, name: str, array: np.ndarray) -> int:
+        """Add rows to one member, in its dtype; the row they start at."""
+        pieces, lengths = self.pieces[file.path], self.lengths[file.path]
+        pieces[name].append(np.array(array, pieces[name][0].dtype))
+        lengths[name] += len(array)
+        return lengths[name] - len(array)
+
+    def append_all(self, file: StoreFile, arrays: dict[str, np.ndarray]) -> int:
+        """Add rows to several members that grow together; the row they start at."""
+        (first,) = {self.append(file, name, array) for name, array in arrays.items()}
+        return first
+
+    def rows(self, file: StoreFile, name: str) -> int:
+        return self.lengths[file.path][name]
+
+    def end_clip(self) -> None:
+        """Write the shard if it is full."""
+        full = self.rows(FRAMES, "source_frames") >= FRAMES_PER_SHARD
+        if full or self.rows(SOURCE_CONTACT, "frame") >= CONTACTS_PER_SHARD:
+            self._flush()
+
+    def finish(self) -> None:
+        """Write what is left; a store has at least one shard."""
+        if self.number == 0 or self.rows(FRAMES, "source_frames"):
+            self._flush()
+
+    def _flush(self) -> None:
+        for file in _SHARDED:
+            pieces = self.pieces.pop(file.path)
+            if file is FRAMES or any(self.lengths[file.path].values()):
+                arrays = {name: np.concatenate(pieces.pop(name)) for name in list(pieces)}
+                write_npz(self.folder / file.path.replace("*", f"{self.number:05d}"), arrays)
+        self.number += 1
+        self._start()
+
+
+_SHARDED = (FRAMES, BODY, SOURCE_CONTACT)
+
+MeshKey = tuple[str, str]
+_DIGITS = 8
+
+
+class MeshWriter:
+    """Collects the distinct meshes of a store by (name, digest); only their facts stay in memory.
+
+    The key of a mesh in the store is its name. Where several meshes share a name, all of them get the name followed by
+    ``#`` and the first 8 digits of their digest: which came first does not matter.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._aside = folder / "meshes.part"
+        self._facts: dict[MeshKey, dict[str, Any]] = {}
+
+    def add(self, model: ObjectModel) -> MeshKey:
+        arrays = mesh_arrays(model)
+        key = model.name, mesh_digest(arrays, model)
+        if key not in self._facts:
+            write_npz(self._aside / f"{len(self._facts)}.npz", arrays)
+            hinge = model.hinge
+            self._facts[key] = {
+                "n_vertices": len(model.vertices_m),
+                "n_faces": len(model.faces),
+                "articulated": hinge is not None,
+                "hinge_axis": None if hinge is None else hinge.axis.tolist(),
+                "hinge_origin_m": None if hinge is None else hinge.origin_m.tolist(),
+                "digest": key[1],
+            }
+        return key
+
+    def names(self) -> dict[MeshKey, str]:
+        """The final name of every mesh added so far."""
+        meshes_of = Counter(name for name, _ in self._facts)
+        return {key: key[0] if meshes_of[key[0]] == 1 else f"{key[0]}#{key[1][:_DIGITS]}" for key in self._facts}
+
+    def finish(self, path: Path) -> list[dict[str, Any]]:
+        """Write the arrays of all meshes to ``path``; the rows of objects.parquet."""
+        names, members, rows = self.names(), {}, {}
+        for number, (key, facts) in enumerate(self._facts.items()):
+            name = names[key]
+            rows[name] = {"object": name, **facts}
+            members |= {f"{name}/{kind}": array for kind, array in map_npz(self._aside / f"{number}.npz").items()}
+        write_npz(path, dict(sorted(members.items())))
+        shutil.rmtree(self._aside, ignore_errors=True)
+        return [rows[name] for name in sorted(rows)]
+
+
+def mesh_arrays(model: ObjectModel) -> dict[str, np.ndarray]:
+    """vertices_m, faces and part in the dtypes of the store."""
+    return {f.name: np.ascontiguousarray(getattr(model, f.name), f.dtype) for f in OBJECT_ARRAYS.fields}
+
+
+def mesh_digest(arrays: dict[str, np.ndarray], model: ObjectModel) -> str:
+    """SHA-256 of vertices_m, faces, part and, where there is a hinge, its axis and origin (float64)."""
+    hinge = () if model.hinge is None else (model.hinge.axis, model.hinge.origin_m)
+    ordered = [arrays[field.name] for field in OBJECT_ARRAYS.fields]
+    return sha256_bytes(b"".join(array.tobytes() for array in (*ordered, *map(np.float64, hinge))))
 
 
 def write_store(

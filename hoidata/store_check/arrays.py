@@ -14,18 +14,19 @@ from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.store.fields import (
     BODY,
     FRAMES,
+    INFO,
     OBJECT_ARRAYS,
     OBJECTS,
+    RECORDINGS,
     SEQUENCES,
     SOURCE_CONTACT,
+    SOURCE_HANDS,
     TEMPLATES,
     Field,
     StoreFile,
-    Version,
 )
 from hoidata.store.mapped import map_npz
-from hoidata.store.meshes import mesh_digest
-from hoidata.store.writing import template_key
+from hoidata.store.writing import mesh_digest, template_key
 from hoidata.store_check.tables import REMEDY, Columns
 
 Arrays = dict[str, np.ndarray]
@@ -56,9 +57,7 @@ _RANGES = (
 )
 
 
-def read_shards(
-    folder: Path, file: StoreFile, paths: Iterable[str], version: Version
-) -> tuple[dict[int, Arrays], list[BadInput]]:
+def read_shards(folder: Path, file: StoreFile, paths: Iterable[str]) -> tuple[dict[int, Arrays], list[BadInput]]:
     """The shards of one kind whose members are as documented, by number; and what is wrong with the others.
 
     paths: of all files the store has.
@@ -66,10 +65,10 @@ def read_shards(
     start, end = file.path.split("*")
     shards, problems = {}, []
     for path in sorted(path for path in paths if path.startswith(start)):
-        arrays, found = read_members(folder, path, {field.name: field for field in file.fields_of(version)})
+        arrays, found = read_members(folder, path, {field.name: field for field in file.fields})
         problems += found
         if arrays is not None:
-            found = list(_equal_lengths(path, file.fields_of(version), arrays))
+            found = list(_equal_lengths(path, file.fields, arrays))
             problems += found
             if not found:
                 shards[int(path.removeprefix(start).removesuffix(end))] = arrays
@@ -127,7 +126,7 @@ def shard_problems(file: StoreFile, shards: dict[int, Arrays], sequences: Column
         found = [
             problem
             for kind in _RANGES
-            if kind.file is file and kind.column in sequences
+            if kind.file is file
             for problem in _range_problems(kind, number, clips, len(arrays[kind.member]))
         ]
         yield from found
@@ -215,3 +214,50 @@ def _mesh_problems(row: dict[str, Any], arrays: Arrays) -> Iterator[BadInput]:
     digest = mesh_digest(mesh, ObjectModel(name, hinge=hinge, **mesh))
     if digest != row["digest"]:
         yield BadInput(f"{OBJECTS.path}: digest of {name}", f"{digest} as its mesh says", f"{row['digest']}", REMEDY)
+
+
+_RECORDING_FACTS = ("subject", "fps", "frames", "object", "hand", "gravity", "source_files")
+
+
+def recording_problems(folder: Path, info: dict[str, Any], objects: set[str], n_files: int) -> Iterator[BadInput]:
+    """What is wrong with the recordings; nothing in a store without any. objects: keys of meshes; n_files: rows."""
+    recordings, hands = info.get("recordings", {}), info.get("source_hands", {})
+    if not isinstance(recordings, dict) or not isinstance(hands, dict):
+        yield BadInput(f"{INFO.path}: recordings", "facts by sequence, and of hands", "something else", REMEDY)
+        return
+    sound = True
+    for name, facts in recordings.items():
+        for problem in _recording_facts(f"{INFO.path}: recordings.{name}", facts, objects, set(hands), n_files):
+            sound = False
+            yield problem
+    if recordings and sound:
+        yield from _recorded_arrays(folder, recordings, hands)
+
+
+def _recording_facts(where: str, facts: Any, objects: set[str], hands: set[str], n_files: int) -> Iterator[BadInput]:
+    if not isinstance(facts, dict) or set(_RECORDING_FACTS) - set(facts):
+        yield BadInput(where, f"an object with {', '.join(_RECORDING_FACTS)}", repr(facts)[:80], REMEDY)
+        return
+    for key, known in (("object", objects), ("hand", hands)):
+        if facts[key] not in known:
+            yield BadInput(f"{where}.{key}", "one the store has", f"{facts[key]}", REMEDY)
+    if not all(isinstance(number, int) and 0 <= number < n_files for number in facts["source_files"]):
+        yield BadInput(f"{where}.source_files", f"rows 0 to {n_files - 1}", f"{facts['source_files']}", REMEDY)
+
+
+def _recorded_arrays(folder: Path, recordings: dict[str, Any], hands: dict[str, Any]) -> Iterator[BadInput]:
+    for file, names in ((RECORDINGS, recordings), (SOURCE_HANDS, hands)):
+        members = {f"{name}/{field.name}": field for name in names for field in file.fields}
+        arrays, problems = read_members(folder, file.path, members)
+        yield from problems
+        if arrays is None:
+            return
+        counts = {name: len(facts["joints"]) for name, facts in hands.items()}
+        for member, field in members.items():
+            name = member.removesuffix(f"/{field.name}")
+            lengths: dict[int | str, int] = {"frame": recordings[name]["frames"]} if file is RECORDINGS else {}
+            lengths["joint"] = counts[recordings[name]["hand"] if file is RECORDINGS else name]
+            wanted = tuple(lengths.get(axis, axis) for axis in field.shape)
+            got = arrays[member].shape
+            if any(isinstance(n, int) and n != m for n, m in zip(wanted, got, strict=True)):
+                yield BadInput(f"{file.path}: {member}", f"shape {wanted}", f"{got}", REMEDY)

@@ -6,47 +6,29 @@ from typing import Any
 
 from hoidata.clips.validation import check_clip
 from hoidata.errors import BadInput, MissingResource
-from hoidata.store.fields import (
-    BODY,
-    FRAMES,
-    INFO,
-    RECORDINGS,
-    SOURCE_CONTACT,
-    SOURCE_HANDS,
-    STORE_FILES,
-    TABLES,
-    Version,
-)
+from hoidata.store.fields import BODY, FRAMES, INFO, RECORDINGS, SOURCE_CONTACT, SOURCE_HANDS, STORE_FILES, TABLES
 from hoidata.store.info import info_problems
 from hoidata.store.store import open_store, read_info
-from hoidata.store.versions import CURRENT, checked_version
-from hoidata.store_check.arrays import mesh_problems, read_shards, shard_problems, template_problems
-from hoidata.store_check.recordings import recording_problems
+from hoidata.store_check.arrays import mesh_problems, read_shards, recording_problems, shard_problems, template_problems
 from hoidata.store_check.tables import REMEDY, Columns, is_whole, read_columns, reference_problems, table_problems
 
 
 def check_store(folder: str | Path) -> list[BadInput]:
     """Everything that is wrong with the store ``folder``: file and field, expected, got, remedy; none when it is sound.
 
-    A store of an earlier minor version is held to that version's fields. Places are given below ``folder``. Raises
-    MissingResource when ``folder`` is no store.
+    Places are given below ``folder``. Raises MissingResource when ``folder`` is no store.
     """
     folder = Path(folder)
     if not folder.is_dir():
         raise MissingResource(f"{folder} is no folder: give the folder of a store")
     try:
         info = read_info(folder)
-        version = checked_version(folder, info["schema_version"])
     except BadInput as problem:
         return [BadInput(INFO.path, problem.expected, problem.got, problem.remedy)]
-    if version > CURRENT:
-        expected = f"schema version {CURRENT[0]}.{CURRENT[1]} or earlier"
-        remedy = "upgrade hoidata (pip install --upgrade hoidata)"
-        return [BadInput(INFO.path, expected, info["schema_version"], remedy)]
-    problems = info_problems(info, version)
+    problems = info_problems(info)
     tables: dict[str, Columns] = {}
     for name, file in TABLES.items():
-        columns, found = read_columns(folder, file, version)
+        columns, found = read_columns(folder, file)
         problems += found
         if columns is not None:
             tables[name] = columns
@@ -56,8 +38,8 @@ def check_store(folder: str | Path) -> list[BadInput]:
     problems += reference_problems(tables)
     problems += _count_problems(info, tables)
     recorded = info.get("recordings", {})
-    problems += _file_problems(folder, tables["sequences"], version, bool(recorded))
-    problems += _array_problems(folder, tables, version)
+    problems += _file_problems(folder, tables["sequences"], bool(recorded))
+    problems += _array_problems(folder, tables)
     problems += recording_problems(folder, info, set(tables["objects"]["object"]), len(tables["files"]["path"]))
     return problems or list(_clip_problems(folder))
 
@@ -77,7 +59,7 @@ def _count_problems(info: dict[str, Any], tables: dict[str, Columns]) -> Iterato
             yield BadInput(f"{INFO.path}: counts.{name}", f"{number}", f"{counts.get(name)}", REMEDY)
 
 
-def expected_files(sequences: Columns, version: Version, recorded: bool = False) -> set[str]:
+def expected_files(sequences: Columns, recorded: bool = False) -> set[str]:
     """The path of every file a store with these clips has. recorded: it has whole recordings, too."""
     shards = set(sequences["shard"]) or {0}
     with_rows = {
@@ -88,20 +70,17 @@ def expected_files(sequences: Columns, version: Version, recorded: bool = False)
     }
     paths = set()
     for file in STORE_FILES:
-        if file.since <= version:
-            numbers = with_rows.get(file.path)
-            paths |= {file.path} if numbers is None else {file.path.replace("*", f"{number:05d}") for number in numbers}
+        numbers = with_rows.get(file.path)
+        paths |= {file.path} if numbers is None else {file.path.replace("*", f"{number:05d}") for number in numbers}
     return paths
 
 
 def _shards_where(sequences: Columns, column: str, above: int) -> set[int]:
-    if column not in sequences:
-        return set()
     return {shard for shard, value in zip(sequences["shard"], sequences[column], strict=True) if value > above}
 
 
-def _file_problems(folder: Path, sequences: Columns, version: Version, recorded: bool) -> Iterator[BadInput]:
-    expected = expected_files(sequences, version, recorded)
+def _file_problems(folder: Path, sequences: Columns, recorded: bool) -> Iterator[BadInput]:
+    expected = expected_files(sequences, recorded)
     found = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir()}
     for path in sorted(expected - found):
         yield BadInput(path, "a file", "nothing there", REMEDY)
@@ -109,13 +88,12 @@ def _file_problems(folder: Path, sequences: Columns, version: Version, recorded:
         yield BadInput(path, "only the files of the schema", "a further file", "move it out of the store")
 
 
-def _array_problems(folder: Path, tables: dict[str, Columns], version: Version) -> Iterator[BadInput]:
-    paths = expected_files(tables["sequences"], version)
+def _array_problems(folder: Path, tables: dict[str, Columns]) -> Iterator[BadInput]:
+    paths = expected_files(tables["sequences"])
     for file in (FRAMES, BODY, SOURCE_CONTACT):
-        if file.since <= version:
-            shards, found = read_shards(folder, file, paths, version)
-            yield from found
-            yield from shard_problems(file, shards, tables["sequences"])
+        shards, found = read_shards(folder, file, paths)
+        yield from found
+        yield from shard_problems(file, shards, tables["sequences"])
     yield from mesh_problems(folder, tables["objects"])
     yield from template_problems(folder, tables["sequences"])
 

@@ -6,9 +6,9 @@ _HEAD = f"""# The store, schema {SCHEMA_VERSION}
 
 A store is a folder with the clips of one dataset: Parquet tables in `meta/`, stored (never compressed) NPZ files in
 `arrays/`. Any tool that reads Parquet and NPZ reads it; `hoidata.store.store.open_store(folder).clip(id)` puts a clip
-together. `hoidata info STORE` describes one, `hoidata validate STORE` checks it against the tables below, and
-`hoidata migrate STORE` rewrites one of an earlier version. This file is generated from `fields.py` by
-`python -m hoidata.store_check.describe`, the table that the writer and the checker use; a test keeps it equal.
+together. `hoidata info STORE` describes one, and `hoidata validate STORE` checks it against the tables
+below. This file is generated from `fields.py`, which the writer and the checker use, by
+`python -m hoidata.store_check.describe`; a test keeps it equal.
 
 ## Conventions
 - Metres, radians, seconds, 30 frames per second, column vectors, axis-angle rotations (rotation vectors).
@@ -34,10 +34,7 @@ expression have `n_frames` rows from their own `*_row`; contact labels have `sou
   the sequences with the other mesh are missing; `digest` never does.
 
 ## Versions
-`schema_version` is major.minor.patch. A minor version adds fields ("since" below); this code reads every 1.x store,
-fills what is missing in memory and ignores what it does not know. Another major version is refused with the command
-that helps. What 1.0 did not record is filled as unknown: no camera, body or contact labels, hands from parameters,
-not to be shared, up axis not known.
+A store of another `schema_version` is refused: convert its raw files again.
 """
 
 
@@ -47,10 +44,9 @@ def readme() -> str:
 
 
 def _section(file: StoreFile) -> str:
-    since = "" if file.since == (1, 0) else f" Since {_version(file)}."
-    lines = [f"## `{file.path}`", f"{file.meaning[0].upper()}{file.meaning[1:]}. Order: {file.order}.{since}", ""]
-    lines.append("| name | dtype | shape | axes | unit | frame | required | since | meaning |")
-    lines.append("|---|---|---|---|---|---|---|---|---|")
+    lines = [f"## `{file.path}`", f"{file.meaning[0].upper()}{file.meaning[1:]}. Order: {file.order}.", ""]
+    lines.append("| name | dtype | shape | axes | unit | frame | required | meaning |")
+    lines.append("|---|---|---|---|---|---|---|---|")
     return "\n".join([*lines, *(_row(field) for field in file.fields), ""])
 
 
@@ -64,14 +60,9 @@ def _row(field: Field) -> str:
         field.unit or "-",
         field.frame or "-",
         "yes" if field.required else "or null",
-        _version(field),
         f"{field.meaning}{choices}",
     )
     return f"| {' | '.join(cells)} |"
-
-
-def _version(part: Field | StoreFile) -> str:
-    return ".".join(str(number) for number in part.since)
 
 
 if __name__ == "__main__":

@@ -12,13 +12,13 @@ import pyarrow.parquet as pq
 
 from hoidata.clips.validation import UNIT_TOLERANCE
 from hoidata.errors import BadInput
-from hoidata.store.fields import FILES, OBJECTS, SEQUENCES, Field, StoreFile, Version, arrow_schema
+from hoidata.store.fields import FILES, OBJECTS, SEQUENCES, Field, StoreFile, arrow_schema
 
 REMEDY = "restore the store from a copy, or run the conversion again"
 Columns = dict[str, list[Any]]
 
 
-def read_columns(folder: Path, file: StoreFile, version: Version) -> tuple[Columns | None, list[BadInput]]:
+def read_columns(folder: Path, file: StoreFile) -> tuple[Columns | None, list[BadInput]]:
     """The columns of a table as Python values, None when it cannot be read or has other columns than the schema's."""
     path = folder / file.path
     if not path.is_file():
@@ -27,7 +27,7 @@ def read_columns(folder: Path, file: StoreFile, version: Version) -> tuple[Colum
         table = pq.read_table(path, use_threads=False)
     except (OSError, ValueError) as error:  # pyarrow's errors are both
         return None, [BadInput(file.path, "a Parquet table", str(error).splitlines()[0], REMEDY)]
-    problems = list(_column_problems(file, table.schema, arrow_schema(file, version)))
+    problems = list(_column_problems(file, table.schema, arrow_schema(file)))
     return (None if problems else table.to_pydict()), problems
 
 

@@ -9,9 +9,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from hoidata.errors import HoidataError
 from hoidata.files import atomic_folder
 from hoidata.hands import load_embedded_hands
+from hoidata.synthetic.actions import DATASET_IDS, Size
 from hoidata.synthetic.catalogue import OBJECTS, ObjectSpec
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
-from hoidata.synthetic.plan import DATASET_IDS, Size
 from hoidata.synthetic.study import clip_tasks, find_grasps, make_clips, pool_tasks
 from hoidata.synthetic.study_objects import STUDY_OBJECTS
 from hoidata.synthetic.study_plan import StudySize

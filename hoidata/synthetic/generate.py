@@ -7,10 +7,9 @@ import numpy as np
 
 from hoidata.errors import HoidataError
 from hoidata.hands import HandPair, load_embedded_hands
-from hoidata.synthetic.actions import ACTIONS
+from hoidata.synthetic.actions import ACTIONS, DATASET_IDS, Entry, Size, plan, subjects
 from hoidata.synthetic.catalogue import object_model, object_spec
 from hoidata.synthetic.grasps import Grip, Scene
-from hoidata.synthetic.plan import DATASET_IDS, Entry, Size, plan, subjects
 from hoidata.synthetic.pools import GRASPS_PER_PAIR, search_pool
 from hoidata.synthetic.sequences import Person, draw_length, make_person, make_sequence
 from hoidata.synthetic.soundness import measure

@@ -21,8 +21,7 @@ from hoidata.objects.model import ObjectModel
 from hoidata.physics.contact_forces import wrench_columns
 from hoidata.physics.surface import body_motion, hand_patches, patch_contacts, surface_distances
 from hoidata.synthetic.catalogue import ObjectSpec
-from hoidata.synthetic.closing import Placement, close_fingers, draw_placements
-from hoidata.synthetic.field import Field, gradient, grid_field, mirrored
+from hoidata.synthetic.closing import Field, Placement, close_fingers, draw_placements, gradient, grid_field, mirrored
 from hoidata.synthetic.hand_capsules import OPEN_RAD, CapsuleHands, capsule_points, hand_pose_rotvec
 
 MIRROR = np.array([-1.0, 1.0, 1.0])

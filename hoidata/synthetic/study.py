@@ -7,9 +7,9 @@ from scipy.spatial import KDTree
 
 from hoidata.errors import HoidataError
 from hoidata.hands import HandPair, load_embedded_hands
+from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.catalogue import model_of
 from hoidata.synthetic.grasps import Grip, PosedHands, Scene
-from hoidata.synthetic.plan import DATASET_IDS
 from hoidata.synthetic.pools import search_pool
 from hoidata.synthetic.sequences import Person, make_person
 from hoidata.synthetic.soundness import measure

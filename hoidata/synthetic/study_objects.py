@@ -147,10 +147,7 @@ GRAB_STUDY = (
     ),
     StudyObject(
         object_spec("grab", "teapot"),
-        (
-            _one("handle", (0.5, -0.4, 0.9), (0.125, 0, 0.08)),
-            _one("lid", _ABOVE, (0, 0, 0.1), yaw=180),
-        ),
+        (_one("handle", (0.5, -0.4, 0.9), (0.125, 0, 0.08)), _one("lid", _ABOVE, (0, 0, 0.1), yaw=180)),
         (
             _two("handle and body", (_LEFT, (-0.02, 0, 0.05)), ((0.5, -0.4, 0.9), (0.125, 0, 0.08))),
             _two("sides", (_LEFT, (0, 0, 0.05)), (_RIGHT, (0, 0, 0.05)), 90),

@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from hoidata.clips.clip import HandType
+from hoidata.synthetic.actions import DATASET_IDS
 from hoidata.synthetic.paths import Key, Motion, Swing
-from hoidata.synthetic.plan import DATASET_IDS
 from hoidata.synthetic.study_objects import STUDY_OBJECTS, Region, StudyObject
 
 StudySize = Literal["study", "study-small"]

@@ -1,7 +1,7 @@
 """Hands for one motion of an object, without a recording: several samples, before and after refinement, and how the
 contact stands.
 
-    path = scripted_path(model, "lift 15 cm, open to 70 deg, put down")
+    path = keyframed_path(model, read_keyframes("keys.csv"))
     sampler = load_family("bimart").load(Sources(...))
     motions = hands_for(sampler, path.track, MotionWish(seed=1, samples=2))
 """

@@ -1,4 +1,4 @@
-"""``hoidata doctor`` and ``info``: what is here."""
+"""``hoidata doctor``, ``info`` and ``validate``: what is here, and whether it is sound."""
 
 from pathlib import Path
 from typing import Annotated
@@ -45,6 +45,26 @@ def info(
     for column in ("object", "verb"):
         _print_rows(console, (column, "clips", "frames"), group_rows(opened, column), shown)
     _print_rows(console, ("left out", "where", "expected", "got"), left_out_rows(opened), shown)
+
+
+def validate(
+    output: Annotated[
+        Path, typer.Argument(help="A store, a checkpoint, or whatever a stage wrote.", exists=True, resolve_path=True)
+    ],
+) -> None:
+    """Check that files are those that were written (dvc.lock, seals, checksums), and a store against the schema.
+
+    Exit code 1 when something is wrong.
+    """
+    from pipelines.validation import problems_of
+
+    problems, sound = problems_of(output)
+    for problem in problems:
+        typer.echo(str(problem))
+    if problems:
+        typer.echo(f"{output}: {len(problems)} problem{'s' if len(problems) > 1 else ''}")
+        raise typer.Exit(1)
+    typer.echo(f"{output}: {sound}")
 
 
 def _print_rows(console, heads: tuple[str, ...], rows: list[tuple[str, ...]], shown: int | None) -> None:

@@ -5,7 +5,6 @@ a file of such a name is ``./diff``.
 """
 
 import json as json_module
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -36,7 +35,7 @@ class _OfUnlessNamed(TyperGroup):
 app = typer.Typer(
     cls=_OfUnlessNamed,
     no_args_is_help=True,
-    help="What a file was made from: hoidata lineage TARGET [--json|--mermaid|--openlineage|--prov|--page FILE|--raw]; "
+    help="What a file was made from: hoidata lineage TARGET [--json|--mermaid|--prov|--page FILE|--raw]; "
     "and what two differ in, what saw some data, whether all is whole, whether it can be made again.",
 )
 
@@ -46,7 +45,6 @@ def of(
     target: Annotated[str, typer.Argument(help="A checkpoint, store, metric file or motion: its path, or a digest.")],
     json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a tree.")] = False,
     mermaid: Annotated[bool, typer.Option("--mermaid", help="Print a Mermaid flowchart.")] = False,
-    openlineage: Annotated[bool, typer.Option("--openlineage", help="Print OpenLineage events, one a line.")] = False,
     prov: Annotated[bool, typer.Option("--prov", help="Print PROV-JSON.")] = False,
     page: Annotated[Path | None, typer.Option(help="Write a page to click through.", resolve_path=True)] = None,
     raw: Annotated[
@@ -56,12 +54,13 @@ def of(
 ) -> None:
     """What a file was made from (no need to type ``of``). Exit code 0 when all is the same or only recorded, else 1."""
     root, here = _project()
+    from pipelines.lineage import formats
     from pipelines.lineage.raw import raw_sources
     from pipelines.lineage.targets import find_target
     from pipelines.lineage.tree import overall_status, target_tree
 
-    if sum((json, mermaid, openlineage, prov)) > 1:
-        raise BadInput("hoidata lineage", "one form", "several", "choose --json, --mermaid, --openlineage or --prov")
+    if sum((json, mermaid, prov)) > 1:
+        raise BadInput("hoidata lineage", "one form", "several", "choose --json, --mermaid or --prov")
     found = find_target(root, target, here)
     tree, sources = target_tree(root, found), []
     if raw or page:
@@ -70,9 +69,11 @@ def of(
         from pipelines.pages.lineage_page import write_lineage_page
 
         write_lineage_page(page, tree, found.record, sources)
-    if json or mermaid or openlineage or prov:
-        form = "json" if json else "mermaid" if mermaid else "openlineage" if openlineage else "prov"
-        typer.echo(_written(form, tree, found, sources if raw else None, here, root), nl=False)
+    if mermaid:
+        typer.echo(formats.mermaid(tree, found.record), nl=False)
+    elif json or prov:
+        values = formats.prov(tree, found.record) if prov else _json(tree, found.record, sources if raw else None)
+        typer.echo(json_module.dumps(values, indent=2, ensure_ascii=False))
     elif raw:
         _print_raw(sources)
     else:
@@ -134,7 +135,7 @@ def check(
     """
     here, root = Path.cwd(), enter_project()
     from pipelines.lineage.check import check as check_all
-    from pipelines.lineage.made import compare_made, write_made
+    from pipelines.lineage.check import compare_made, write_made
     from pipelines.lineage.targets import find_target
     from pipelines.params import read_params
 
@@ -189,30 +190,6 @@ def _raw_of_motion(root: Path | None, checkpoints: dict[str, str]) -> list:
     return list({source.store: source for record in records for source in raw_sources(root, record)}.values())
 
 
-def _written(form: str, tree, target, sources: list | None, here: Path, root: Path | None) -> str:
-    """One of the forms for machines, with its last newline."""
-    from pipelines.lineage import formats
-
-    if form == "mermaid":
-        return formats.mermaid(tree, target.record)
-    if form == "openlineage":
-        from pipelines.sidecar import read_run
-
-        known = partial(read_run, root) if root else None
-        events = formats.openlineage(tree, target.record, _made_at(here, target), known)
-        return "".join(f"{json_module.dumps(event, ensure_ascii=False)}\n" for event in events)
-    values = formats.prov(tree, target.record) if form == "prov" else _json(tree, target.record, sources)
-    return json_module.dumps(values, indent=2, ensure_ascii=False) + "\n"
-
-
-def _made_at(here: Path, target) -> str:
-    """When the file was written, as far as its folder knows; records hold no time."""
-    from datetime import UTC, datetime
-
-    path = next((path for path in (Path(target.name), here / target.name) if path.exists()), None)
-    return datetime.fromtimestamp(path.stat().st_mtime if path else 0, UTC).isoformat()
-
-
 def _json(tree, record: dict, sources: list | None) -> dict[str, Any]:
     from pipelines.lineage.tree import overall_status, tree_as_json
 
@@ -242,9 +219,7 @@ def _print_tree(tree, record: dict, show_clips: bool) -> None:
         _grow(top, child)
     clips = {} if tree.kind == "motion" else record.get("clips", {})
     branch = top.add("clips it was trained and judged on") if clips else top
-    if isinstance(clips, str):
-        branch.add(f"clips seen: {escape(clips)}")
-    for split, ids in clips.items() if isinstance(clips, dict) else ():
+    for split, ids in clips.items():
         names = branch.add(f"{split}: {len(ids)}")
         for clip_id in ids if show_clips else ids[:3]:
             names.add(escape(clip_id))

@@ -15,10 +15,6 @@ def hands(
         str,
         typer.Argument(metavar="[MESH]", help="A mesh file (OBJ, PLY, STL, GLB), or a dataset's object."),
     ] = "",
-    script: Annotated[
-        str,
-        typer.Option(help="What the object does, or a file: 'lift 15 cm, open to 70 deg in 1.5 s, hold, put down'."),
-    ] = "",
     keyframes: Annotated[str, typer.Option(help="A .csv or .json file of times, places, turns and angles.")] = "",
     clip: Annotated[str, typer.Option(help="A stored clip, whose object and motion are taken.")] = "",
     motion: Annotated[
@@ -42,12 +38,8 @@ def hands(
     from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
-    def found(name: str) -> str:
-        return str(here / name) if name and isfile(here / name) else name
-
     wish = HandsWish(
-        found(object),
-        found(script),
+        str(here / object) if object and isfile(here / object) else object,
         str(here / keyframes) if keyframes else "",
         clip,
         str(here / motion) if motion else "",

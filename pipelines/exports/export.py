@@ -5,15 +5,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import orjson
 from rich.console import Console
 from rich.progress import Progress
 
-from hoidata.clips.clip import SIDES, Clip
+from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
 from hoidata.store.store import Store
-from pipelines.exports import bvh, glb, hugging_face, lerobot, spider, usd, web_dataset
+from pipelines.exports import bvh, hugging_face, lerobot, spider, usd, web_dataset
 from pipelines.exports.describe import Description, write_description
 from pipelines.exports.licences import (
     HANDS,
@@ -28,6 +29,7 @@ from pipelines.exports.licences import (
     licences_of,
 )
 from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source
+from pipelines.pages.glb import glb_bytes
 
 _MOTION = (HANDS, OBJECT, WORDS)
 _PARAMETERS = (*_MOTION, PERSON)
@@ -60,6 +62,19 @@ class Format:
         return tuple(kind for kind in self.kinds if kind is not PERSON or templates.to_numpy().any())
 
 
+def _write_glb(folder: Path, clips: Iterable[ExportedClip]) -> None:
+    """Write <clip>.glb: the animated scene of the pages, with the 21 joints of each hand as empty nodes.
+
+    The nodes are exact where glTF's skins are not: those leave out pose correctives, and shapes that change.
+    """
+    for item in clips:
+        markers: dict[Side, np.ndarray] = {
+            side: item.joints[side] for side in SIDES if item.clip.hands[side].valid.any()
+        }
+        scene = glb_bytes(item.clip, item.hands, extras=item.motion_facts, markers=markers)
+        (folder / f"{item.file_name}.glb").write_bytes(scene)
+
+
 FORMATS = {
     "croissant": Format("croissant.json and a dataset card for the store itself, to lie beside its meta/", (), None),
     "lerobot": Format(
@@ -71,7 +86,7 @@ FORMATS = {
     "webdataset": Format(
         "tar shards with .npz and .json of each clip", _PARAMETERS, web_dataset.write, columns=_COLUMNS
     ),
-    "glb": Format("an animated scene per clip", _SCENE, glb.write, world=Y_UP),
+    "glb": Format("an animated scene per clip", _SCENE, _write_glb, world=Y_UP),
     "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write, world=Y_UP),
     "bvh": Format("a skeleton per hand, and the object's motion", (HANDS, OBJECT), bvh.write, world=Y_UP),
     "spider": Format(

@@ -14,8 +14,7 @@ import orjson
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, Column, ExportedClip
-from pipelines.exports.tables import frames_array, row_type
+from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, Column, ExportedClip, frames_array, row_type
 
 _TEXTS = ("clip_id", "subject", "sequence", "verb", "object", "object_words", "gravity_note")
 WHOLE = "unsplit"  # the file of clips in no subset; datasets refuses "all"

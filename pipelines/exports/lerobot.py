@@ -18,8 +18,7 @@ import pyarrow.parquet as pq
 
 from hoidata.clips.clip import FPS, SIDES
 from hoidata.store.annotated import SUBSETS
-from pipelines.exports.motion import Column, ExportedClip, state_names
-from pipelines.exports.tables import frames_array, row_type
+from pipelines.exports.motion import Column, ExportedClip, frames_array, row_type, state_names
 
 VERSION = "v3.0"
 FRAMES_PER_FILE = 60_000  # about 100 MB, LeRobot's own size of a data file

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import pyarrow as pa
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, ObjectTrack, Side
 from hoidata.files.written import read_table
@@ -244,3 +245,22 @@ def _grouped(path: Path, column: str) -> dict[str, list[Any]]:
 def state_names(side: Side) -> list[str]:
     """Names of the 63 numbers of one hand's joints."""
     return [f"{side}.{joint}.{axis}" for joint in JOINT_NAMES for axis in "xyz"]
+
+
+_ARROW = {"float32": pa.float32(), "int32": pa.int32(), "int64": pa.int64(), "bool": pa.bool_()}
+
+
+def row_type(column: Column) -> pa.DataType:
+    """The Arrow type of one frame: a value, or lists; of a fixed length but for -1, which pyarrow too takes for any."""
+    kind: pa.DataType = _ARROW[column.dtype]
+    for length in reversed(column.shape):
+        kind = pa.list_(kind, length)
+    return kind
+
+
+def frames_array(values: np.ndarray, column: Column) -> pa.Array:
+    """(frame, ...) values as an Arrow array with one row per frame."""
+    array: Any = pa.array(np.ascontiguousarray(values, column.dtype).ravel())
+    for length in reversed(column.shape):
+        array = pa.FixedSizeListArray.from_arrays(array, length)
+    return array

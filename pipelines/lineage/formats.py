@@ -1,9 +1,6 @@
-"""A lineage in the forms of others: Mermaid, OpenLineage events, PROV-JSON. All come from the record alone."""
+"""A lineage in the forms of others: Mermaid and PROV-JSON. Both come from the record alone."""
 
-import uuid
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from datetime import datetime, timedelta
 from typing import Any
 from urllib.parse import quote
 
@@ -11,11 +8,6 @@ from pipelines.lineage.digests import value_digest
 from pipelines.lineage.tree import Node
 
 PRODUCER = "urn:hoidata:lineage"
-NAMESPACE = "hoidata"
-_RUN_EVENT = "https://openlineage.io/spec/2-0-2/OpenLineage.json#/$defs/RunEvent"
-_VERSION_FACET = (
-    "https://openlineage.io/spec/facets/1-0-1/DatasetVersionDatasetFacet.json#/$defs/DatasetVersionDatasetFacet"
-)
 _STATUS_COLOURS = {"same": "#e5f5e5", "recorded": "#eeeeee", "uncommitted": "#fff4cc", "changed": "#fff4cc"}
 _BAD_COLOUR = "#fadbd8"
 
@@ -36,9 +28,6 @@ def steps(tree: Node, record: dict[str, Any]) -> list[Step]:
     if tree.kind == "motion":
         inputs = {child.name: child.digest for child in tree.children}
         return [Step("generate", {}, "", inputs, {tree.name: tree.digest})]
-    if imported := record.get("imported"):
-        published = _with("sha256", {f"published {name}": digest for name, digest in imported.items()})
-        return [Step("import", {}, "", published, {tree.name: tree.digest})]
     last = record["stage"]
     algorithm = "md5" if record.get("schema", "").startswith("hoidata.lock") else "sha256"
     found = []
@@ -94,50 +83,6 @@ def mermaid(tree: Node, record: dict[str, Any]) -> str:
 def _mermaid_text(text: str) -> str:
     """Text in quotes: whatever is not plain goes as a character code."""
     return "".join(char if char.isalnum() or char in "/._-@: " else f"#{ord(char)};" for char in text)
-
-
-def openlineage(
-    tree: Node, record: dict[str, Any], when: str, run_facts: Callable[[str], dict[str, Any]] | None = None
-) -> list[dict[str, Any]]:
-    """A START and a COMPLETE event per run, the earliest stage first.
-
-    when: ISO time for runs whose own is not known; a record holds none. run_facts: by stage, as the sidecar has them;
-    those of a run other than the recorded one cannot be told apart, so they are of the stage's last run here.
-    """
-    return [event for step in reversed(steps(tree, record)) for event in _events(step, when, run_facts)]
-
-
-def _events(step: Step, when: str, run_facts: Callable[[str], dict[str, Any]] | None) -> Iterator[dict[str, Any]]:
-    facts = run_facts(step.name) if run_facts else {}
-    began = datetime.fromisoformat(facts["began_at"] if facts else when)
-    times = {"START": began, "COMPLETE": began + timedelta(seconds=facts.get("seconds", 0))}
-    for kind, time in times.items():
-        yield _event(step, kind, time.isoformat(), facts)
-
-
-def _event(step: Step, kind: str, when: str, facts: dict[str, Any]) -> dict[str, Any]:
-    run = uuid.uuid5(
-        uuid.NAMESPACE_URL, f"{PRODUCER}:{value_digest([step.name, step.params, step.code_digest, step.inputs])}"
-    )
-    facet = {"_producer": PRODUCER, "_schemaURL": f"{PRODUCER}:run-facet:1"}
-    return {
-        "eventType": kind,
-        "eventTime": when,
-        "producer": PRODUCER,
-        "schemaURL": _RUN_EVENT,
-        "run": {
-            "runId": str(run),
-            "facets": {"hoidata": {**facet, "params": step.params, "codeDigest": step.code_digest, "run": facts}},
-        },
-        "job": {"namespace": NAMESPACE, "name": step.name},
-        "inputs": [_dataset(path, digest) for path, digest in step.inputs.items()],
-        "outputs": [_dataset(path, digest) for path, digest in step.outputs.items()],
-    }
-
-
-def _dataset(path: str, digest: str) -> dict[str, Any]:
-    version = {"_producer": PRODUCER, "_schemaURL": _VERSION_FACET, "datasetVersion": digest}
-    return {"namespace": NAMESPACE, "name": path, "facets": {"version": version} if digest else {}}
 
 
 def prov(tree: Node, record: dict[str, Any]) -> dict[str, Any]:

@@ -12,20 +12,8 @@ from hoidata.errors import BadInput
 from pipelines.params import load_yaml, read_file
 
 # What ``written_graph`` knows of a stage in dvc.yaml; DVC is asked where there is anything else.
-_KNOWN = {
-    "desc",
-    "wdir",
-    "matrix",
-    "cmd",
-    "deps",
-    "params",
-    "outs",
-    "metrics",
-    "plots",
-    "always_changed",
-    "frozen",
-    "meta",
-}
+_OUTS = ("outs", "metrics", "plots")
+_KNOWN = {"desc", "wdir", "matrix", "cmd", "deps", "params", *_OUTS, "always_changed", "frozen", "meta"}
 _REFERENCE = re.compile(r"\$\{([\w.]+)\}")
 
 
@@ -101,9 +89,6 @@ def _written(root: Path, file: str, params: dict[str, Any]) -> Iterator[Stage]:
             paths, names, outs = (_listed(body, keys, values) for keys in (("deps",), ("params",), _OUTS))
             suffix = f"@{'-'.join(map(str, item.values()))}" if item else ""
             yield Stage(f"{prefix}{name}{suffix}", _below(base, paths), tuple(names), _below(base, outs))
-
-
-_OUTS = ("outs", "metrics", "plots")
 
 
 def _items(matrix: dict[str, Any], params: dict[str, Any]) -> list[dict[str, str]]:

@@ -67,15 +67,8 @@ def read_raw(root: Path, store: str, wanted: set[str] | None = None) -> RawSourc
         return None
     info = read_json(folder / "meta/info.json")
     files = _rows(folder / "meta/files.parquet", ["path", "sha256"])
-    columns = [
-        "clip_id",
-        "subject",
-        "object",
-        "other_objects",
-        "first_source_frame",
-        "last_source_frame",
-        "source_files",
-    ]
+    frames = ["first_source_frame", "last_source_frame"]
+    columns = ["clip_id", "subject", "object", "other_objects", *frames, "source_files"]
     rows = _rows(folder / TABLE, columns)
     clips = [_clip(row, files) for row in rows if wanted is None or row["clip_id"] in wanted]
     used = {path for clip in clips for path in clip.files}
@@ -113,9 +106,8 @@ def raw_sources(root: Path | None, record: dict[str, Any]) -> list[RawSource]:
 
 
 def clips_of(record: dict[str, Any]) -> set[str]:
-    """The clips a checkpoint learned from or was chosen by; none where a published one only says so in words."""
-    clips = record.get("clips", {})
-    return {clip for ids in clips.values() for clip in ids} if isinstance(clips, dict) else set()
+    """The clips a checkpoint learned from or was chosen by."""
+    return {clip for ids in record.get("clips", {}).values() for clip in ids}
 
 
 def stores_behind(record: dict[str, Any]) -> list[str]:

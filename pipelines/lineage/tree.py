@@ -78,12 +78,7 @@ def target_tree(root: Path | None, target: Target) -> Node:
     if target.kind == "motion":
         children = tuple(_named_checkpoint(root, name, digest) for name, digest in target.record.items())
         return Node("motion", target.name, target.status, f"made by {len(children)} networks", children)  # pyright: ignore
-    if imported := target.record.get("imported"):
-        children = tuple(
-            Node("data", f"published {name}", "same", digest=f"sha256 {value}") for name, value in imported.items()
-        )
-    else:
-        children = (_Comparison(root, target).stage(target.record["stage"]),)
+    children = (_Comparison(root, target).stage(target.record["stage"]),)
     detail = "; ".join(filter(None, (_summary(target.record), target.note)))
     return Node(target.kind, target.name, target.status, detail, children, digest=_own_digest(target))  # pyright: ignore
 
@@ -113,8 +108,7 @@ def _own_digest(target: Target) -> str:
 def _summary(record: dict[str, Any]) -> str:
     if "clips" not in record:
         return ""
-    clips = record["clips"]
-    counts = clips if isinstance(clips, str) else ", ".join(f"{len(ids)} {split}" for split, ids in clips.items())
+    counts = ", ".join(f"{len(ids)} {split}" for split, ids in record["clips"].items())
     kind = "synthetic data" if record.get("synthetic") else "real data"
     return f"{record.get('model', '')}, seed {record.get('seed')}, {kind}, clips: {counts}"
 

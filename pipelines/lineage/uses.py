@@ -13,7 +13,6 @@ from pipelines.lineage.targets import WEIGHTS
 from pipelines.stages.base import empty_reason
 
 _STORE = "clips"
-_CHECKPOINTS = ("checkpoints", "evaluators")
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ from pipelines.pages.surface import ContactPaint
 
 def shown_subset(annotated: AnnotatedStore) -> str:
     """The subset that examples are of: test, else validation, else train; "" without clips."""
-    return next((subset for subset in reversed(SUBSETS) if annotated.split_ids(subset)), "")
+    return next((subset for subset in reversed(SUBSETS) if annotated.ids(subset)), "")
 
 
 def shown_ids(annotated: AnnotatedStore, count: int) -> list[str]:
     """Up to ``count`` clips of ``shown_subset``, of different objects first."""
     subset = shown_subset(annotated)
-    ids = annotated.split_ids(subset) if subset else []
+    ids = annotated.ids(subset) if subset else []
     first_of_object = list({annotated.object_key(clip_id): clip_id for clip_id in reversed(ids)}.values())[::-1]
     rest = [clip_id for clip_id in ids if clip_id not in first_of_object]
     return (first_of_object + rest)[:count]

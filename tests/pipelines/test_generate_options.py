@@ -11,7 +11,6 @@ from models.common.vocabulary import Vocabulary
 from models.text2hoi.sampler import SamplingConfig
 from pipelines.cli import app
 from pipelines.generation import Asked, Models, _clips_with, _of_project, chosen_model
-from pipelines.hands import _script_text
 from pipelines.stages.base import StagePaths
 from tests.pipelines.conftest import PROJECT
 
@@ -55,7 +54,6 @@ def test_an_option_that_would_change_nothing_is_refused(options, named, tmp_path
 
 
 LONG = "b" * 300
-LONG_IN_BYTES = "ü" * 200  # fewer than 250 characters, more bytes than a name may have
 
 
 @pytest.mark.parametrize(
@@ -64,17 +62,12 @@ LONG_IN_BYTES = "ü" * 200  # fewer than 250 characters, more bytes than a name 
         ["generate", "Lift a box.", "--object", LONG],
         ["animate", LONG],
         ["hands", LONG],
-        ["hands", "box", "--script", LONG_IN_BYTES],
     ],
-    ids=["generate", "animate", "hands", "script"],
+    ids=["generate", "animate", "hands"],
 )
 def test_a_name_longer_than_a_file_may_have(words, tmp_path) -> None:
     found = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out")])
     assert isinstance(found.exception, BadInput | MissingResource), found.output
-
-
-def test_steps_longer_than_a_name_are_no_file() -> None:
-    assert _script_text(LONG_IN_BYTES) == LONG_IN_BYTES
 
 
 def test_a_dataset_without_models_is_told_with_those_that_have_them(monkeypatch) -> None:

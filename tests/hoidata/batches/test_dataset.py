@@ -38,7 +38,7 @@ class Clips:
     sampled: dict[str, SampledPoints] = field(default_factory=dict)
     contact_threshold_m: float = 0.02
 
-    def split_ids(self, split: str) -> list[str]:
+    def ids(self, split: str) -> list[str]:
         return list(self.clips) if split == "train" else []
 
     def clip(self, clip_id: str) -> Clip:

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 
 from hoidata.clips.clip import BodyTrack, CameraTrack, Clip, SourceContact, SourceFile
 from hoidata.clips.quarantine import Quarantined
-from hoidata.conversion.packing import Packer, unpack
+from hoidata.conversion.finished import Packer, unpack
 from hoidata.objects.model import ObjectModel
 
 

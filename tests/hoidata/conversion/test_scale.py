@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hoidata.store.shards import FRAMES_PER_SHARD
+from hoidata.store.writing import FRAMES_PER_SHARD
 from tests.hoidata.conversion.killable import write_grab
 
 FRAMES = 1000

@@ -1,11 +1,16 @@
+import io
 import pickle
+import sys
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_npy_object, load_npz_objects
+from hoidata.files.arrays import read_npz, write_npz
+from hoidata.files.npy_header import read_npy_header
 from hoidata.files.numpy_files import load_npz_arrays
 
 
@@ -167,3 +172,147 @@ def test_the_pickles_of_one_archive_share_a_limit_of_opcodes(tmp_path, monkeypat
             assert len(load_npz_objects(tmp_path / "a.npz")) == 4
     with pytest.raises(BadInput, match="more than 700 opcodes"):
         load_npz_objects(tmp_path / "a.npz")
+
+
+ARRAYS = {
+    "points": np.asfortranarray(np.arange(12.0).reshape(3, 4)),
+    "number": np.array(7, np.int16),
+    "words": np.array(["a", "longer"]),
+    "none": np.zeros((0, 3), np.float32),
+}
+
+
+def test_arrays_come_back_with_their_shape_and_type(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", ARRAYS)
+    found = read_npz(tmp_path / "a.npz")
+    assert list(found) == list(ARRAYS)
+    for name, array in ARRAYS.items():
+        assert (found[name].shape, found[name].dtype) == (array.shape, array.dtype)
+        np.testing.assert_array_equal(found[name], array)
+
+
+def test_equal_arrays_give_equal_bytes_that_are_not_compressed(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", ARRAYS)
+    write_npz(tmp_path / "b.npz", {name: array.copy(order="C") for name, array in ARRAYS.items()})
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.npz") as archive:
+        assert {item.compress_type for item in archive.infolist()} == {zipfile.ZIP_STORED}
+
+
+def test_the_bytes_are_those_of_numpy_on_a_python_after_3_11_3(tmp_path: Path) -> None:
+    write_npz(tmp_path / "a.npz", {"number": ARRAYS["number"]})
+    found = (tmp_path / "a.npz").read_bytes()
+    # Signature, version 4.5, no flags, stored, 1 January 1980 at midnight, checksum, 2 x 32 bits of ones; the name has
+    # 10 letters, the extra field 20 bytes: its number 1, 16 bytes that follow, and the size twice in 64 bits.
+    assert found[:14] == b"PK\x03\x04" + bytes([45, 0, 0, 0, 0, 0, 0, 0, 33, 0])
+    assert found[18:40] == b"\xff" * 8 + bytes([10, 0, 20, 0]) + b"number.npy"
+    assert found[40:60] == bytes([1, 0, 16, 0]) + (130).to_bytes(8, "little") * 2
+    if sys.version_info >= (3, 11, 4):
+        np.savez(tmp_path / "b.npz", allow_pickle=False, number=ARRAYS["number"])
+        assert found == (tmp_path / "b.npz").read_bytes()
+
+
+def test_python_objects_are_neither_written_nor_read(tmp_path: Path) -> None:
+    objects = np.array([{"a": 1}], dtype=object)
+    with pytest.raises(ValueError, match="holds Python objects"):
+        write_npz(tmp_path / "a.npz", {"bad": objects})
+    assert not (tmp_path / "a.npz").exists()
+    np.savez(tmp_path / "b.npz", bad=objects)
+    with pytest.raises(BadInput, match=r"b\.npz"):
+        read_npz(tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"not a zip", b"PK\x03\x04 cut short"])
+def test_a_broken_file_is_named(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "a.npz").write_bytes(content)
+    with pytest.raises(BadInput, match=r"a\.npz"):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="nothing"):
+        read_npz(tmp_path / "a.npz")
+
+
+def file_of(header: str, body: bytes = b"", version: int = 1) -> bytes:
+    size = len(header).to_bytes(2 if version == 1 else 4, "little")
+    return b"\x93NUMPY" + bytes((version, 0)) + size + header.encode("latin1") + body
+
+
+def head(shape: str = "(2,)", descr: str = "'<f8'", order: str = "False") -> str:
+    return f"{{'descr': {descr}, 'fortran_order': {order}, 'shape': {shape}, }}\n"
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(6.0).reshape(2, 3),
+        np.asfortranarray(np.arange(24, dtype=">i2").reshape(2, 3, 4)),
+        np.array("wörter"),
+        np.array([b"ab", b"c"]),
+        np.array([[True], [False]]),
+        np.zeros((0, 3), np.float32),
+        np.array(2.5),
+    ],
+    ids=["c", "fortran", "text", "bytes", "flags", "empty", "scalar"],
+)
+def test_what_numpy_saves_is_read_alike_and_can_be_changed(tmp_path, array, version):
+    with open(tmp_path / "a.npy", "wb") as stream:
+        np.lib.format.write_array(stream, array, version=(version, 0))
+    loaded = load_npy(tmp_path / "a.npy")
+    np.testing.assert_array_equal(loaded, array, strict=True)
+    loaded[...] = loaded[...]
+
+
+def test_a_header_of_python_2_is_read():
+    assert read_npy_header(io.BytesIO(file_of(head("(3L, 4L)"))), "a.npy").shape == (3, 4)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        head("(3"),
+        head("(-1,)"),
+        head("(1.5,)"),
+        head("(True,)"),
+        head("5"),
+        head("(9999999999999999999999,)"),
+        head("(" + "1," * 33 + ")"),
+        head(descr="()"),
+        head(descr="[('a', '<f8')]"),
+        head(descr="'V8'"),
+        head(descr="'<M8[s]'"),
+        head(descr="'<f8', 5"),
+        head(order="1"),
+        "{'descr': '<f8', 'shape': ()}",
+        "{'descr': '<f8', 'shape': (), 'fortran_order': False, 'more': 1}",
+        "__import__('os').system('true')",
+        "(" * 200 + ")" * 200,
+        "'''",
+        "\0",
+        "",
+        " " * 20000,
+    ],
+    ids=range(21),
+)
+@pytest.mark.parametrize("load", [load_npy, load_npy_object])
+def test_a_damaged_header_is_a_bad_input(tmp_path, text, load):
+    """NumPy's reader answers these with seven kinds of error, from TokenError to MemoryError."""
+    (tmp_path / "a.npy").write_bytes(file_of(text, bytes(16)))
+    with pytest.raises(BadInput, match=r"a\.npy: expected"):
+        load(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("shape", ["(1000000000, 1000000000)", "(100000000000,)", "(0, 200000000000000, 100000)"])
+def test_no_shape_is_allocated_before_there_are_bytes_for_it(tmp_path, shape):
+    (tmp_path / "a.npy").write_bytes(file_of(head(shape), bytes(16)))
+    with pytest.raises(BadInput, match="shape"):
+        load_npy(tmp_path / "a.npy")
+
+
+def test_text_of_impossible_characters_is_refused(tmp_path):
+    for order in "<>":
+        (tmp_path / "a.npy").write_bytes(file_of(head("()", f"'{order}U1'"), b"\x7f\xff\xff\x7f"))
+        with pytest.raises(BadInput, match="impossible characters"):
+            load_npy_object(tmp_path / "a.npy")

@@ -224,9 +224,7 @@ BUFFER = b"cnumpy.core.numeric\n_frombuffer\n(h\x00" + DTYPE + b"(S'f8'\nI0\nI1\
 
 
 @pytest.mark.parametrize(
-    ("once", "call"),
-    [(TEXT, ENCODED), (TEXT, SWAPPED), (TEXT, BUFFER)],
-    ids=["bytes", "arrays", "buffers"],
+    ("once", "call"), [(TEXT, ENCODED), (TEXT, SWAPPED), (TEXT, BUFFER)], ids=["bytes", "arrays", "buffers"]
 )
 def test_one_long_text_made_into_values_again_and_again_is_refused(once, call):
     """A hundred bytes for each call, a megabyte for each result: a small file could fill any memory."""

@@ -1,14 +1,18 @@
 """Keyframes are reached at their times, and nothing happens between them that was not asked for."""
 
 import json
+import re
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import FPS
 from hoidata.errors import BadInput
-from hoidata.object_paths import keyframed_path, parse_keyframes, read_keyframes
-from tests.builders.objects import box_model, hinged_box
+from hoidata.geometry.rotations import rotvec_to_rotmat
+from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes, read_keyframes
+from hoidata.objects.model import ObjectModel
+from tests.builders.objects import box_model, hinged_box, two_parts
 
 CSV = b"""# a box is lifted, opened and put down elsewhere
 time_s,x_cm,z_cm,rz_deg,hinge_deg
@@ -18,6 +22,23 @@ time_s,x_cm,z_cm,rz_deg,hinge_deg
 3, 5, 20, 90,-60
 4.5, 5, 0, 90, 0
 """
+
+
+def laptop() -> ObjectModel:
+    """Base 30 x 20 x 2 cm, a lid on it of the same size that opens upward about its far edge; not at its origin."""
+    base = box_model((0.30, 0.20, 0.02), middle_m=(0.5, 0.2, 0.3))
+    lid = box_model((0.30, 0.20, 0.01), middle_m=(0.5, 0.2, 0.315))
+    return two_parts(base, lid, (1, 0, 0), (0.5, 0.1, 0.31), "laptop")
+
+
+def moved(keys: str, model: ObjectModel | None = None, **wish) -> ObjectPath:
+    return keyframed_path(model or laptop(), parse_keyframes(keys.encode(), "k.csv"), **wish)
+
+
+def heights(path: ObjectPath) -> np.ndarray:
+    """(frame,) of the lowest point of the base, metres."""
+    model = path.track.model
+    return path.track.points_in_world(model.vertices_m, model.part)[:, model.part == 0, 2].min(axis=1)
 
 
 def test_every_key_is_reached_at_its_time_and_a_hold_stays():
@@ -71,6 +92,8 @@ def test_velocity_passes_through_a_key_without_a_stop():
         (b"time_s,z_m\n0,0\n1,15\n", "x_cm or x_mm"),
         (b"time_s,qw\n0,1\n1,1\n", "one of the two, whole"),
         (b"time_s,qw,qx,qy,qz\n0,1,0,0,0\n1,2,0,0,0\n", "length 2"),
+        (b"time_s,z_cm\n0,0\n1,-3\n", "3.0 cm under it, from 0."),
+        (b"time_s,rx_deg\n0,0\n2,60\n", "lift it by"),
         (b"time_s,z_cm\n0,0\n1,-5\n", "under it"),
         (b"time_s,z_cm\n0,0\n0.1,100\n", "times as long"),
         (b"time_s,rx_deg,rz_deg\n0,20,0\n2,20,175\n", "add a key in between"),
@@ -121,3 +144,37 @@ def test_a_file_that_is_not_there_is_an_answer(tmp_path):
         read_keyframes(tmp_path / "none.csv")
     (tmp_path / "keys.csv").write_bytes(CSV)
     assert len(read_keyframes(tmp_path / "keys.csv").time_s) == 5
+
+
+def test_velocity_and_acceleration_never_jump():
+    keys = "time_s,x_cm,z_cm\n0,0,0\n1,0,20\n3,30,20\n4,30,0\n"
+    jerk = np.diff(moved(keys).track.translation_m.astype(float), 3, axis=0) * FPS**3
+    assert np.abs(jerk).max() < 60 * 0.2 * 1.05  # of least jerk, 60 way / time**3; at constant speed it were 180
+
+
+@pytest.mark.parametrize(("column", "end"), [("z_m", "0.1,1"), ("rz_deg", "0.5,720"), ("z_cm", "0.3,45")])
+def test_a_step_that_is_too_fast_is_taken_in_the_time_the_answer_names(column, end):
+    with pytest.raises(BadInput) as error:
+        moved(f"time_s,{column}\n0,0\n{end}\n")
+    seconds = re.findall(r"' ([\d.]+) s or more", str(error.value))[0]
+    path = moved(f"time_s,{column}\n0,0\n{seconds},{end.split(',')[1]}\n")
+    assert path.track.n_frames == round(float(seconds) * FPS) + 1
+
+
+def test_an_object_whose_own_z_is_not_up_begins_as_it_stands_and_is_lifted_from_there():
+    standing = rotvec_to_rotmat(np.array([np.pi / 2, 0, 0]))  # its y is up
+    path = moved("time_s,z_cm,rz_deg\n0,0,0\n1,10,0\n3,10,90\n", standing=standing)
+    assert heights(path)[0] == pytest.approx(0, abs=1e-3)  # of the base; the lid is part of what stands
+    assert heights(path)[-1] == pytest.approx(0.10, abs=1e-3)
+    first, last = rotvec_to_rotmat(path.track.rotvec[[0, -1]].astype(float))
+    assert first == pytest.approx(standing, abs=1e-6)
+    assert last @ [0, 1, 0] == pytest.approx([0, 0, 1], abs=1e-6)
+
+
+def test_a_rigid_object_has_no_hinge_angles():
+    assert moved("time_s,z_cm\n0,0\n1,10\n", box_model(name="mug")).track.hinge_rad is None
+
+
+def test_the_same_keyframes_give_the_same_bytes():
+    first, second = (keyframed_path(hinged_box(), parse_keyframes(CSV, "k.csv")).track for _ in range(2))
+    assert all(np.array_equal(getattr(first, name), getattr(second, name)) for name in first.PER_FRAME)

@@ -6,7 +6,7 @@ import torch
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.signed_distance_grid import DistanceFields
-from hoidata.synthetic.field import grid_field
+from hoidata.synthetic.closing import grid_field
 from hoidata.synthetic.shapes import sphere
 
 

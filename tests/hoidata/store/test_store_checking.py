@@ -306,7 +306,7 @@ def test_a_fault_is_found_and_named_with_its_file(folder, name):
 
 
 def test_clips_stand_in_the_order_of_their_shards(clips, tmp_path, monkeypatch):
-    monkeypatch.setattr("hoidata.store.shards.FRAMES_PER_SHARD", 1)
+    monkeypatch.setattr("hoidata.store.writing.FRAMES_PER_SHARD", 1)
     write_store(tmp_path / "clips", clips, generated_info("test"))
     assert check_store(tmp_path / "clips") == []
     swap_clips(tmp_path / "clips")

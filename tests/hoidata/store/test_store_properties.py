@@ -100,7 +100,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 @given(clips=st.lists(any_clip(), max_size=5), frames_per_shard=st.sampled_from((1, 8, 1000)))
 def test_writing_what_was_read_gives_the_same_bytes_and_a_sound_store(clips, frames_per_shard):
     with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setattr("hoidata.store.shards.FRAMES_PER_SHARD", frames_per_shard)
+        patch.setattr("hoidata.store.writing.FRAMES_PER_SHARD", frames_per_shard)
         first, second = Path(folder) / "first", Path(folder) / "second"
         write_store(first, clips, generated_info("any"))
         assert check_store(first) == []

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from hoidata.datasets.h2o.adapter import ACTIONS as H2O_LABELS
-from hoidata.synthetic.actions import ACTIONS, H2O_ACTION_IDS, LONGEST_CLIP, MEAN_LENGTH
+from hoidata.synthetic.actions import ACTIONS, CASTS, H2O_ACTION_IDS, LONGEST_CLIP, MEAN_LENGTH, plan, subjects
 from hoidata.synthetic.check import explained_by_verb
 from hoidata.synthetic.paths import MOTIONS, follow_path, minimum_jerk
-from hoidata.synthetic.plan import CASTS, plan, subjects
 from hoidata.synthetic.sequences import draw_length
 
 DATASETS = ("h2o", "grab", "arctic")

@@ -10,11 +10,13 @@ from scipy.spatial.transform import Rotation
 
 from bench.naive import READERS, NaiveHands
 from hoidata.clips import SIDES
+from hoidata.errors import HoidataError
+from hoidata.files import sha256_file
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.hands import load_embedded_hands, track_joints
 from hoidata.objects.mesh import load_mesh
-from hoidata.synthetic.check import sequence_figures
-from hoidata.synthetic.corpus import write_raw_sequence, write_shared_files
+from hoidata.synthetic.check import check_sequences, sequence_figures
+from hoidata.synthetic.corpus import write_corpus, write_raw_sequence, write_shared_files
 from hoidata.synthetic.generate import make_action, place_in_raw_sequences, tasks_of
 from hoidata.synthetic.grasps import closes_force
 from hoidata.synthetic.sequences import Person, idle_hand
@@ -212,3 +214,29 @@ def test_grab_clips_are_every_fourth_frame_of_the_contact(truths):
     assert truth.contact[0] <= frames[0] < truth.contact[0] + 4
     assert truth.contact[1] - 4 <= frames[-1] < truth.contact[1]
     assert truth.take(truth.clip_frames).n_frames == len(frames)
+
+
+def _digests(root) -> dict[str, str]:
+    return {str(path.relative_to(root)): sha256_file(path) for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.long
+def test_a_corpus_is_the_same_bytes_for_any_number_of_jobs(small_corpus, tmp_path):
+    write_corpus("grab", tmp_path / "together", seed=0, size="small", jobs=2)
+    assert _digests(tmp_path / "together") == _digests(small_corpus("grab").raw)
+
+
+@pytest.mark.parametrize("dataset", ["h2o", "grab", "arctic"])
+def test_a_corpus_is_sound(dataset, small_corpus):
+    figures = check_sequences(small_corpus(dataset).truths).iloc[0]
+    assert figures["sequences"] == 8
+    assert figures["pass %"] >= 98
+    assert figures["largest hand-object distance mm"] < 20
+    assert figures["largest penetration mm"] < 10
+    assert figures["pass % shifted 10 mm"] < 0.8 * figures["pass %"]
+    assert figures["pass % without contact"] < 1
+
+
+def test_an_unknown_corpus_is_refused_with_the_known_names(tmp_path):
+    with pytest.raises(HoidataError, match="h2o, grab, arctic"):
+        write_corpus("mimic", tmp_path / "x")

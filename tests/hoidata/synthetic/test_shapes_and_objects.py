@@ -8,7 +8,7 @@ from hoidata.objects.distance import signed_distance
 from hoidata.objects.mesh import mass_properties
 from hoidata.splits.published import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
-from hoidata.synthetic.field import gradient, grid_field, mirrored
+from hoidata.synthetic.closing import gradient, grid_field, mirrored
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
 
 ALL = [(dataset, spec.name) for dataset, specs in OBJECTS.items() for spec in specs]

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_vertices
-from hoidata.object_paths import ObjectPath, scripted_path
+from hoidata.object_paths import ObjectPath, keyframed_path, parse_keyframes
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings
@@ -52,7 +52,8 @@ def sampler() -> HandsForPaths:
 
 @pytest.fixture(scope="module")
 def path() -> ObjectPath:
-    return scripted_path(hinged_box(), "lift 5 cm in 0.4 s, open 20 deg in 0.4 s", (-0.1, 1.0), rest_s=0.1)
+    keys = b"time_s,z_cm,hinge_deg\n0,0,0\n0.1,0,0\n0.5,5,0\n0.9,5,20\n1,5,20\n"
+    return keyframed_path(hinged_box(), parse_keyframes(keys, "keys.csv"), (-0.1, 1.0))
 
 
 @pytest.fixture(scope="module")
@@ -125,7 +126,7 @@ def test_files_and_page_are_written_repeat_and_explain_every_array(made, path, t
         assert np.array_equal(arrays["object_hinge_axis"], path.track.model.hinge.axis)
     page = first[-1].read_text(encoding="utf-8")
     assert page.count('<figure class="player') == 2 * (2 + 4)
-    assert "lift 5 cm in 0.4 s" in page
+    assert "keyframes 2 to 3" in page
     assert "a &lt;script&gt;" in page
     assert "http" not in page.split("<main")[1].split("<script")[0]
 

@@ -16,7 +16,7 @@ from hoidata.errors import BadInput, HoidataError
 from hoidata.files.written import Facts, read_json, read_json_rows
 from hoidata.store.annotated import load_annotated
 from pipelines.figures import LEADING, write_figures
-from pipelines.lineage.made import compare_made
+from pipelines.lineage.check import compare_made
 from pipelines.lineage.manifests import read_manifest
 from pipelines.pages import quality
 from pipelines.pages.clip_page_facts import clip_quality

@@ -14,7 +14,6 @@ from hoidata.datasets import RawTree
 from hoidata.datasets.manipnet.adapter import HAND_JOINTS, ManipNetAdapter, read_hand_recording
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.store.migrate import migrate_store
 from hoidata.store.store import Store, open_store
 from hoidata.store_check.check import check_store
 from tests.builders.manipnet import KEY, MIRROR, POSE, lift_rows, write_skin, write_tree
@@ -114,16 +113,6 @@ def test_without_the_skin_file_there_are_clips_and_no_recordings(root, tmp_path)
     assert not (tmp_path / "clips/arrays/recordings.npz").exists()
     with pytest.raises(KeyError, match="there are: "):
         store.recording(KEY.name)
-
-
-def test_migration_keeps_recordings(stored, tmp_path):
-    shutil.copytree(stored.folder, tmp_path / "clips")
-    path = tmp_path / "clips/meta/info.json"
-    info = json.loads(path.read_text())
-    path.write_text(json.dumps(info | {"schema_version": "1.0.0"}))
-    migrate_store(tmp_path / "clips")
-    again = open_store(tmp_path / "clips").recording(KEY.name)
-    np.testing.assert_array_equal(again.hands["right"].rotvec, stored.recording(KEY.name).hands["right"].rotvec)
 
 
 @pytest.mark.parametrize(
