@@ -109,7 +109,7 @@ def _config(network: StoredNetwork, info: dict[str, Any], path: Path) -> Any:
     try:
         return build_config(network.config, info["config"], f"{path}: config")
     except BadInput as error:
-        remedy = "train, or import, it again with this version"
+        remedy = "train it again with this version"
         raise BadInput(path, "settings this version knows", str(error), remedy) from error
 
 
