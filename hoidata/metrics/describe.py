@@ -6,84 +6,96 @@ from hoidata.metrics.registry import METRICS, Metric
 
 _HEAD = """# Metrics
 
-Figures of predicted clips beside the clips they were made for. This file is generated from `registry.py` by
-`python -m hoidata.metrics.describe`; a test keeps it equal. `hoidata evaluate STORE --reference DATASET` prints them
-for any store of clips, whatever made it; ten lines that write one stand in docs/measure.md, and a test runs them.
-`hoidata.metrics.evaluate.evaluate_store` gives the figures to code.
+`hoidata evaluate STORE --reference DATASET` compares the clips of any store with recorded clips;
+`hoidata.metrics.evaluate.evaluate_store` does it in Python ([example](../../docs/measure.md)). `python -m
+hoidata.metrics.describe` generates this page from `registry.py` and `feature_metrics.py`.
 
-To add a metric: a function of (pair, every) that gives the values of one motion as an array, or `Unmeasured` with the
-reason, and a row in `METRICS`.
+To add a metric: a function of (pair, every) that returns the values of one motion as an array, or `Unmeasured` with
+the reason, and an entry in `METRICS`.
 
-- *nearer the truth*: the figure of the recorded clips themselves is best (family `ground-truth`), not more, not less.
-- *mean over motions*: of each motion's mean; *mean over frames*: of all values of all motions; *best of a clip's
-  samples*: of each motion's mean the best of a clip, then the mean over clips. A file says how many clips, motions and
-  values went into each figure (`counts`).
-- A clip without a value of a metric is not counted as 0. `unmeasured` gives, for each metric, the reasons (the object
-  has no inside, gravity is not known, no such frame) and how many clips have each. A metric without a value in any clip
-  has no figure, and tables and pages list it as not measured, with reasons and counts. Clips that could not be compared
-  at all are in `left_out`.
-- Acting hands and the frames they are seen in are those of the reference; other hands are not looked at.
-- Two 95 % intervals stand beside a figure. `repetitions`: Student's, over repetitions of the experiment, of which the
-  k-th is motion k of every clip; it says what another run of the sampler would give. `clips`: a bootstrap that draws
-  clips again by source sequence, with all their motions; it says what other clips would give. Neither covers training.
-- `asked.npz` beside the folder of clips holds the contact maps that were asked for (`asked.py`); without it there is no
-  adherence. `hoidata/actions` lists the numbers of what an object does, and the limits of verbs (`actions.toml`).
-- A store whose info says `"length": "own"` holds motions of lengths the family chose. Its hands are seen where it has
-  them, and what is compared frame by frame has no figure. Rows of given and of own length are never one row.
+- *nearer the truth*: the value of the recorded clips (family `ground-truth`) is best.
+- *Hand frames*: frames in which the recorded clip has an active hand. *Lifted frames*: frames in which the object is
+  more than 15 mm above the table, the 3rd percentile of the lowest vertex of the recorded clip. Interpolated frames
+  are never used.
+- Values are means over motions unless a row says otherwise. *Best sample*: the best motion of each clip. `counts`
+  gives the number of clips, motions and values.
+- A clip without a value is not counted as 0. `unmeasured` gives the reasons and the number of clips for each metric;
+  tables and pages list a metric without any value as not measured.
+- Two 95 % intervals. `repetitions`: Student's t over repetitions of sampling. `clips`: bootstrap over source
+  sequences. Neither covers training.
+- `asked.npz` next to the clips holds the requested contact maps. Without it adherence is not measured.
+- A store with `"length": "own"` has motions of estimated length. Metrics that compare frame by frame are not measured
+  for it.
 
 """
-_COLUMNS = """\
-| name | figure | unit | better | reduction | frames | every n-th | samples | frame by frame | thresholds | source |
-|---|---|---|---|---|---|---|---|---|---|---|
-"""
+_COLUMNS = "| name | unit | better | definition | source |\n|---|---|---|---|---|\n"
 _ASKED = """
-## Figures of the list `{}`
+## On request: `{}`
 
-Computed where it is asked for: `evaluate: {metrics: [{}]}` in `params.yaml`, `hoidata evaluate ... --metrics {}`.
+`evaluate: {metrics: [{}]}` in `params.yaml`, or `hoidata evaluate ... --metrics {}`.
 
 """
-
 _FEATURES = """
-## Figures of features
+## Features
 
-What the networks of `models/evaluator` see; generated from `feature_metrics.py`. They are handed to `evaluate_store`
-as `encoders`, trained on recorded clips of the training part alone, and every file of figures names the digest of
-their weights: rows of different digests are not compared. *paper*: 42 joints, no object, as Text2HOI left it;
-*corrected*: the object's motion and how near it is, not its shape; *text-motion*: sentences and motions in one space.
-Every figure is that of one motion per clip, the mean over repetitions. Besides a Student interval over repetitions
-there is one over clips: whole source sequences drawn again 2,000 times, the networks as they are.
+The networks of `models/evaluator` provide features. They are trained on recorded training clips only. A metrics
+file names the digest of their weights, and tables refuse to mix two. *paper*: 42 joints without object, as in
+Text2HOI. *corrected*: object motion and distances, without shape. *text-motion*: sentences and motions in one
+space.
 
-| name | figure | better | reduction | thresholds | source | note |
-|---|---|---|---|---|---|---|
 """
+_SHORTER = {
+    "frames in which the reference has the acting hand": "hand frames",
+    "frames in which the object is more than 15 mm above the table (3rd percentile of the true clip's lowest vertex)": (
+        "lifted frames"
+    ),
+    "the contact stage's distance and points (its info.json)": "the contact stage's threshold",
+}
 
 
 def readme() -> str:
     """The text of README.md."""
     asked = ((_ASKED.replace("{}", name) + _COLUMNS, map(_cells, rows)) for name, rows in ASKED_LISTS.items())
-    tables = (_HEAD + _COLUMNS, map(_cells, METRICS)), *asked, (_FEATURES, map(_feature_cells, FEATURE_METRICS))
+    tables = (_HEAD + _COLUMNS, map(_cells, METRICS)), *asked, (_FEATURES + _COLUMNS, _feature_rows())
     return "".join(head + "".join(f"| {' | '.join(cells)} |\n" for cells in rows) for head, rows in tables)
 
 
 def _cells(metric: Metric) -> tuple[str, ...]:
-    return (
-        f"`{metric.name}`",
-        metric.title,
-        metric.unit or "-",
-        _direction(metric),
-        metric.reduction,
-        metric.frames,
-        str(metric.every),
-        "all" if metric.samples is None else f"first {metric.samples}",
-        "yes" if metric.aligned else "-",
-        metric.thresholds or "-",
-        metric.source,
+    reduction = {"mean over motions": "", "best of a clip's samples": "best sample"}.get(
+        metric.reduction, metric.reduction
     )
+    every = f"every {metric.every}rd frame" if metric.every > 1 else ""
+    samples = f"first {metric.samples} sample(s)" if metric.samples else ""
+    frames = "" if metric.frames == "all" else metric.frames
+    parts = (metric.title, frames, metric.thresholds, reduction, every, samples)
+    return f"`{metric.name}`", metric.unit, _direction(metric), _joined(parts), metric.source
+
+
+def _feature_rows() -> list[tuple[str, ...]]:
+    """One row per feature metric; those that differ in the encoder alone share a row."""
+    rows: dict[str, tuple[str, ...]] = {}
+    names = {metric.name for metric in FEATURE_METRICS}
+    for metric in FEATURE_METRICS:
+        paper = metric.name.replace("_corrected", "_paper")
+        if metric.name != paper and paper in names:
+            continue
+        both = metric.name == paper and metric.name.replace("_paper", "_corrected") in names
+        row = _feature_cells(metric)
+        rows[metric.name] = tuple(cell.replace("_paper", "_paper\\|corrected") for cell in row) if both else row
+    return list(rows.values())
 
 
 def _feature_cells(metric: FeatureMetric) -> tuple[str, ...]:
-    texts = (metric.reduction, metric.thresholds or "-", metric.source, metric.note or "-")
-    return f"`{metric.name}`", metric.title, _direction(metric), *texts
+    reduction = "" if metric.reduction == "mean over motions" else metric.reduction
+    definition = _joined((metric.title.removesuffix(", paper"), metric.thresholds, reduction, metric.note))
+    return f"`{metric.name}`", metric.unit, _direction(metric), definition, metric.source
+
+
+def _joined(parts: tuple[str, ...]) -> str:
+    text = "; ".join(filter(None, parts))
+    for long, short in _SHORTER.items():
+        text = text.replace(long, short)
+    return text
 
 
 def _direction(metric: Metric | FeatureMetric) -> str:
