@@ -21,7 +21,7 @@ def commands() -> str:
         lines.append(f"## {name}\n\n{_one_line(command.help)}\n")
         rows = [_row(parameter) for parameter in command.params if parameter.name != "help"]
         if rows:
-            lines += ["| option | meaning | default |", "|---|---|---|", *rows, ""]
+            lines += [*rows, ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -36,12 +36,12 @@ def _row(parameter: Any) -> str:
     flags = ", ".join([*parameter.opts, *parameter.secondary_opts]) if parameter.opts[0].startswith("-") else ""
     shown = f"`{flags or parameter.metavar or parameter.name.upper()}`"
     empty = parameter.default is None or parameter.default in ("", [], ()) or callable(parameter.default)
-    default = "" if empty or parameter.required else f"`{parameter.default}`"
-    return f"| {shown} | {_one_line(getattr(parameter, 'help', ''))} | {default} |".replace("  ", " ")
+    default = "" if empty or parameter.required else f" Default: `{parameter.default}`."
+    return f"- {shown}: {_one_line(getattr(parameter, 'help', ''))}{default}"
 
 
 def _one_line(text: str | None) -> str:
-    return " ".join((text or "").split()).replace("|", r"\|")
+    return " ".join((text or "").split())
 
 
 def settings() -> str:
