@@ -22,7 +22,7 @@ def animate(
     fingers: Annotated[Literal["left", "right", "both"], typer.Option(help="Which hands.")] = "both",
     frames: Annotated[str, typer.Option(help="Of a clip, like 30:90; all when left out.")] = "",
     model: Annotated[str, typer.Option(help="Dataset whose network to use; the clip's own, or the first.")] = "",
-    rule: Annotated[Literal["ours", "paper", "released", "off"], typer.Option(help="Of post-processing.")] = "ours",
+    rule: Annotated[Literal["ours", "paper", "off"], typer.Option(help="Of post-processing.")] = "ours",
     trajectory_unit: Annotated[
         str, typer.Option(help="Of positions in .csv and .npz: m, cm, mm, dm, inch; metres when left out.")
     ] = "",
