@@ -4,6 +4,9 @@ import pytest
 
 from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.store.annotated import AnnotatedStore
+from models.common.corpus import Corpus
 from models.common.vocabulary import Vocabulary
 from models.text2hoi.sentences import further_verbs, is_english, read_sentence, unseen_words
 
@@ -104,3 +107,20 @@ def test_the_better_known_sentence_scores_higher():
 
 def test_a_checkpoint_keeps_the_vocabulary():
     assert Vocabulary.read({"vocabulary": KNOWN.rows}) == KNOWN
+
+
+@pytest.fixture
+def counts(annotated: AnnotatedStore) -> dict:
+    return Corpus.of(annotated, seed=0).facts(load_embedded_hands())["hand_types"]
+
+
+def test_hands_are_counted_on_training_clips_only(annotated: AnnotatedStore, counts: dict) -> None:
+    of_part = {
+        part: [annotated.hand_type(clip_id) for clip_id in annotated.ids(part)]
+        for part in ("train", "validation", "test")
+    }
+    assert counts == {hand: of_part["train"].count(hand) for hand in ("left", "right", "both")}
+    everywhere = [hand for hands in of_part.values() for hand in hands]
+    with_validation = of_part["train"] + of_part["validation"]
+    for others in (everywhere, with_validation):
+        assert counts != {hand: others.count(hand) for hand in ("left", "right", "both")}
