@@ -1,29 +1,15 @@
 """What the files of one recording, or of one clip cut from it, say: the full release and HOT3D-Clips, read alike."""
 
-import io
-import re
-import tarfile
-from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, get_args
+from collections.abc import Mapping
+from typing import NamedTuple, get_args
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import SIDES, Side
+from hoidata.clips.clip import Side
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, RawTree, SequenceKey
-from hoidata.datasets.hot3d import files, umetrack
-from hoidata.datasets.hot3d.files import (
-    LARGEST_JSON,
-    LARGEST_ROWS,
-    HandFormat,
-    Poses,
-    checked_name,
-    headset_of,
-    poses_of,
-    read_json,
-    row_of,
-)
+from hoidata.datasets.hot3d import files, packed, umetrack
+from hoidata.datasets.hot3d.files import LARGEST_JSON, LARGEST_ROWS, HandFormat, Poses
 from hoidata.errors import BadInput
 
 OBJECTS, METADATA, PROFILE = "dynamic_objects.csv", "metadata.json", "umetrack_hand_user_profile.json"
@@ -31,14 +17,6 @@ HANDS: Mapping[HandFormat, str] = {kind: f"{kind}_hand_pose_trajectory.jsonl" fo
 ASSETS, CHECKED = "assets", "masks/mask_qa_pass.csv"
 DEFINITIONS, MODEL_FOLDERS = "clip_definitions.json", ("object_models_eval", "object_models")
 WITHHELD = "nothing to do: of some participants the makers withhold the ground truth"
-# HOT3D-Clips: 150 frames as a tar with JSON files of each, and images, which are not read; its own clock is 30 Hz.
-SHAPES = "__hand_shapes.json__"
-MEMBER = re.compile(r"([0-9]{6})\.(hands|objects)\.json|" + SHAPES)
-STEP_NS = 1e9 / 30
-MOST_MEMBERS = 2000  # a clip has 301
-WRIST_NUMBERS = 6  # axis-angle, then place
-COLUMNS = {"t_xyz": 3, "q_wxyz": 4}
-Rows = dict[Any, list[tuple[int, list]]]
 PARTS = (
     DatasetPart(
         "hand motion",
@@ -111,18 +89,18 @@ def _folder(raw: RawTree, key: SequenceKey, wanted: HandFormat) -> Source:
 def _packed(raw: RawTree, key: SequenceKey, wanted: HandFormat) -> Source:
     """One of HOT3D-Clips, whose recording stands in a table of all."""
     path, number = f"{key.name}.tar", int(key.name.rpartition("-")[2])
-    recording, headset = definition(raw.read(DEFINITIONS, LARGEST_JSON), DEFINITIONS, number)
-    found = read_packed(raw.read(path), path)
+    recording, headset = packed.definition(raw.read(DEFINITIONS, LARGEST_JSON), DEFINITIONS, number)
+    found = packed.read_packed(raw.read(path), path)
     kinds: list[HandFormat] = [kind for kind in _formats(wanted) if found.hands[kind]]
     if not kinds:
         raise BadInput(path, "poses of a hand", "none", WITHHELD)
     kind = kinds[0]
-    shape, profile = checks.entry(f"{path}/{SHAPES}", found.shapes, kind), None
+    shape, profile = checks.entry(f"{path}/{packed.SHAPES}", found.shapes, kind), None
     poses: dict[Side, Poses] = dict(found.hands[kind])
     if kind == "umetrack":
-        profile = umetrack.profile_of(shape, f"{path}/{SHAPES}")
+        profile = umetrack.profile_of(shape, f"{path}/{packed.SHAPES}")
     else:
-        betas = files.small_table(f"{path}/{SHAPES}: mano", [shape], 10, 1)
+        betas = files.small_table(f"{path}/{packed.SHAPES}: mano", [shape], 10, 1)
         for side, own in poses.items():
             poses[side] = own._replace(numbers={**own.numbers, "betas": np.repeat(betas, len(own.time_ns), axis=0)})
     folder = next((folder for folder in MODEL_FOLDERS if raw.names(folder, ".glb")), MODEL_FOLDERS[0])
@@ -135,96 +113,3 @@ def _packed(raw: RawTree, key: SequenceKey, wanted: HandFormat) -> Source:
 def _formats(wanted: HandFormat) -> tuple[HandFormat, ...]:
     """In the order in which they are tried."""
     return ("mano", "umetrack") if wanted == "mano" else ("umetrack",)
-
-
-class Packed(NamedTuple):
-    """hands: by format and side; objects and names: by the number of the benchmark; shapes: MANO's and UmeTrack's."""
-
-    hands: dict[HandFormat, dict[Side, Poses]]
-    objects: dict[str, Poses]
-    names: dict[str, str]
-    shapes: Any
-
-
-def definition(data: bytes, where: str, number: int) -> tuple[str, str]:
-    """The recording a clip is from, and its headset, of ``clip_definitions.json``."""
-    about = checks.entry(where, read_json(data, where), str(number))
-    recording = checks.entry(f"{where}: {number}", about, "sequence_id")
-    if not isinstance(recording, str) or not re.fullmatch(r"P[0-9]{4}_[0-9a-f]+", recording):
-        raise BadInput(f"{where}: {number}.sequence_id", "a recording such as P0003_c701bd11", repr(recording)[:40])
-    return recording, headset_of(f"{where}: {number}", checks.entry(f"{where}: {number}", about, "device"))
-
-
-def read_packed(data: bytes, where: str) -> Packed:
-    """The JSON files of one clip. Raises BadInput where it has no hands or objects: of test clips they are withheld."""
-    shapes: Any = {}
-    hands: dict[HandFormat, Rows] = {"mano": {}, "umetrack": {}}
-    objects: Rows = {}
-    names: dict[str, str] = {}
-    for name, content in _members(data, where):
-        place, value = f"{where}/{name}", read_json(content, f"{where}/{name}")
-        time_ns = round(int(name[:6]) * STEP_NS) if name != SHAPES else 0
-        if name == SHAPES:
-            shapes = value
-        elif name.endswith("hands.json"):
-            _add_hands(place, value, time_ns, hands)
-        else:
-            _add_objects(place, value, time_ns, objects, names)
-    if not objects:
-        raise BadInput(where, "poses of hands and objects", "none", "nothing to do: of test clips they are withheld")
-    columns: dict[HandFormat, dict[str, int]] = {
-        "mano": {**COLUMNS, "pose": 15},
-        "umetrack": {**COLUMNS, "joint_angles": 20},
-    }
-    poses: dict[HandFormat, dict[Side, Poses]] = {
-        kind: {side: poses_of(f"{where}: {side} hand", rows, columns[kind]) for side, rows in found.items()}
-        for kind, found in hands.items()
-    }
-    placed = {key: poses_of(f"{where}: object {key}", rows, COLUMNS) for key, rows in sorted(objects.items())}
-    return Packed(poses, placed, names, shapes)
-
-
-def _members(data: bytes, where: str) -> Iterator[tuple[str, bytes]]:
-    try:
-        with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as archive:
-            wanted = (m for m in archive if MEMBER.fullmatch(m.name) and m.isfile() and m.size <= LARGEST_JSON)
-            for number, member in enumerate(wanted):
-                if number > MOST_MEMBERS:
-                    raise BadInput(where, f"at most {MOST_MEMBERS} JSON files", "more")
-                stream = archive.extractfile(member)
-                yield member.name, stream.read() if stream else b""
-    except (tarfile.TarError, OSError, EOFError, ValueError, OverflowError) as error:
-        raise BadInput(where, "a whole .tar archive", f"{type(error).__name__}: {str(error)[:80]}") from error
-
-
-def _add_hands(where: str, value: Any, time_ns: int, hands: Mapping[HandFormat, Rows]) -> None:
-    """A side that is null or not there was not tracked; MANO may be missing where UmeTrack is there."""
-    for side in SIDES:
-        hand = value.get(side) if isinstance(value, dict) else checks.entry(where, value, side)
-        if hand is None:
-            continue
-        place = f"{where}: {side}"
-        if isinstance(hand, dict) and "mano_pose" in hand:
-            orient_and_place = row_of(f"{place}.mano_pose", hand["mano_pose"], "wrist_xform", WRIST_NUMBERS)
-            turn = np.roll(Rotation.from_rotvec(np.clip(orient_and_place[:3], -100, 100)).as_quat(), 1).tolist()
-            pose = row_of(f"{place}.mano_pose", hand["mano_pose"], "thetas", 15)
-            hands["mano"].setdefault(side, []).append((time_ns, [*orient_and_place[3:], *turn, *pose]))
-        own = checks.entry(place, hand, "umetrack_pose")
-        angles = row_of(f"{place}.umetrack_pose", own, "joint_angles", 20)
-        placed = _placed(f"{place}.umetrack_pose", checks.entry(place, own, "T_world_from_wrist"))
-        hands["umetrack"].setdefault(side, []).append((time_ns, [*placed, *angles]))
-
-
-def _add_objects(where: str, value: Any, time_ns: int, objects: Rows, names: dict[str, str]) -> None:
-    if not isinstance(value, dict):
-        raise BadInput(where, "a dictionary of objects by number", type(value).__name__)
-    for key, things in value.items():
-        if not re.fullmatch(r"[0-9]{1,6}", key) or not isinstance(things, list) or len(things) != 1:
-            raise BadInput(f"{where}: {key}", "a number, and one object in a list", repr(things)[:40])
-        place = _placed(f"{where}: {key}", checks.entry(f"{where}: {key}", things[0], "T_world_from_object"))
-        objects.setdefault(key, []).append((time_ns, place))
-        names[key] = checked_name(f"{where}: {key}", checks.entry(f"{where}: {key}", things[0], "object_name"))
-
-
-def _placed(where: str, value: Any) -> list:
-    return [*row_of(where, value, "translation_xyz", 3), *row_of(where, value, "quaternion_wxyz", 4)]
