@@ -1,10 +1,9 @@
 """A verb for a clip whose source names none, from how the object moves and how its hinge turns.
 
 The verb says what the motion shows, never what it is for: a bottle that is tilted and shaken is shaken, whether it
-sprinkles or not. Rules are tried in the order of ``RULES``; the first that holds names the verb.
+sprinkles or not. The first rule of ``derive_verb`` that holds names the verb.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -68,8 +67,24 @@ def derive_verb(clip: Clip, evidence: HandEvidence) -> Derived:
     lift, place and grasp need ``clip.gravity``. evidence: of the same clip, at the threshold of its hand type.
     """
     motion = object_motion(clip, evidence)
-    found = (rule(motion) for rule in RULES)
-    return next(item for item in found if item is not None)
+    height_m, hinge = motion.height_m, _hinge(motion)
+    highest_m, last_m = (0.0, 0.0) if height_m is None else (float(height_m.max()), float(height_m[-1]))
+    if hinge is not None:
+        return hinge
+    if motion.shaken_frames >= SHAKE_SHARE * motion.n_frames:
+        return Derived("shake", f"{motion.shakes} swings in {motion.shaken_frames / FPS:.1f} s")
+    if last_m <= -LOWERED_M:
+        return Derived("place", f"ends {-last_m * 100:.1f} cm lower")
+    if highest_m >= LIFTED_M:
+        return Derived("lift", f"rises {highest_m * 100:.1f} cm")
+    if motion.turned_rad >= TURNED_RAD:
+        return Derived("turn", f"turns {np.rad2deg(motion.turned_rad):.0f} degrees")
+    if motion.travelled_m >= MOVED_M:
+        return Derived("move", f"moves {motion.travelled_m * 100:.1f} cm")
+    if highest_m >= RAISED_M:
+        return Derived("grasp", f"rises {highest_m * 100:.1f} cm, and does not leave its place")
+    verb = "hold" if motion.touched >= HELD_SHARE else "touch"
+    return Derived(verb, f"at rest; near in {motion.touched:.0%} of frames")
 
 
 def object_motion(clip: Clip, evidence: HandEvidence) -> ObjectMotion:
@@ -106,53 +121,6 @@ def _hinge(motion: ObjectMotion) -> Derived | None:
     if abs(opened) < HINGE_NET * np.ptp(angle):
         return Derived("operate", facts)
     return Derived("open" if opened > 0 else "close", facts)
-
-
-def _shake(motion: ObjectMotion) -> Derived | None:
-    if motion.shaken_frames < SHAKE_SHARE * motion.n_frames:
-        return None
-    return Derived("shake", f"{motion.shakes} swings in {motion.shaken_frames / FPS:.1f} s")
-
-
-def _place(motion: ObjectMotion) -> Derived | None:
-    if motion.height_m is None or motion.height_m[-1] > -LOWERED_M:
-        return None
-    return Derived("place", f"ends {-motion.height_m[-1] * 100:.1f} cm lower")
-
-
-def _lift(motion: ObjectMotion) -> Derived | None:
-    if motion.height_m is None or motion.height_m.max() < LIFTED_M:
-        return None
-    return Derived("lift", f"rises {motion.height_m.max() * 100:.1f} cm")
-
-
-def _turn(motion: ObjectMotion) -> Derived | None:
-    if motion.turned_rad < TURNED_RAD:
-        return None
-    return Derived("turn", f"turns {np.rad2deg(motion.turned_rad):.0f} degrees")
-
-
-def _move(motion: ObjectMotion) -> Derived | None:
-    if motion.travelled_m < MOVED_M:
-        return None
-    return Derived("move", f"moves {motion.travelled_m * 100:.1f} cm")
-
-
-def _grasp(motion: ObjectMotion) -> Derived | None:
-    if motion.height_m is None or motion.height_m.max() < RAISED_M:
-        return None
-    return Derived("grasp", f"rises {motion.height_m.max() * 100:.1f} cm, and does not leave its place")
-
-
-def _rest(motion: ObjectMotion) -> Derived:
-    return Derived(
-        "hold" if motion.touched >= HELD_SHARE else "touch", f"at rest; near in {motion.touched:.0%} of frames"
-    )
-
-
-RULES: tuple[Callable[[ObjectMotion], Derived | None], ...] = (
-    _hinge, _shake, _place, _lift, _turn, _move, _grasp, _rest,
-)  # fmt: skip
 
 
 def _shakes(centre_m: np.ndarray) -> tuple[int, int]:

@@ -107,14 +107,10 @@ def _undeclared(adapter: Adapter, loaded: list[Loaded]) -> Finding:
 
 def is_valid(clip: Clip) -> bool:
     """Whether its arrays are what a clip's are, so that it can be measured."""
-    return not _invalid(clip)
+    return not _validity(None, clip)
 
 
-def _validity(adapter: Adapter, clip: Clip) -> list[str]:
-    return _invalid(clip)
-
-
-def _invalid(clip: Clip) -> list[str]:
+def _validity(adapter: Adapter | None, clip: Clip) -> list[str]:
     try:
         check_clip(clip)
     except BadInput as error:

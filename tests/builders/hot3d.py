@@ -282,9 +282,3 @@ def write_two(root: Path) -> Path:
     write_recording(root, ARIA, "Aria", "mano", 0, MUG)
     write_recording(root, QUEST, "Quest3", "mano", 1, MOUSE)
     return root
-
-
-def write_hot3d(root: Path) -> Path:
-    """And one with UmeTrack's numbers alone."""
-    write_recording(write_two(root), UMETRACK, "Aria", "umetrack", 2, MUG)
-    return root

@@ -17,7 +17,6 @@ from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.taco.words import triplet
 from hoidata.errors import BadInput
 from hoidata.files import load_npy, load_torch_pickle
 from hoidata.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
@@ -29,6 +28,7 @@ from hoidata.objects.model import ObjectModel
 CENTIMETRES = 1e-2
 TOUCH_M = 0.02
 HANDS, OBJECTS, MODELS = "Hand_Poses", "Object_Poses", "Object_Models"
+TRIPLET = re.compile(r"\(([^,()]+),([^,()]+),([^,()]+)\)")
 FRAME_KEY = re.compile(r"\D*(\d{1,9})")  # 00012, or a word before it
 FRAME = WorldFrame(None, "unknown", "the capture rig's world of the recording day, right-handed, metres")
 SHAPE_NOTE = "no {side}_hand_shape.pkl: its betas are zero, as in TACO's own loader"
@@ -105,6 +105,16 @@ class TacoAdapter(Described):
             for side in without_shape
         ]
         return [replace(clip, sources=raw.sources, gravity_note="; ".join(notes)), *reasons]
+
+
+def triplet(name: str) -> tuple[str, str, str]:
+    """Action, tool and object in words of ``(put in, spoon, bowl)/20230927_034``. Raises BadInput for another form."""
+    folder = name.partition("/")[0]
+    found = TRIPLET.fullmatch(folder)
+    if found is None:
+        raise BadInput(f"Hand_Poses/{folder}", "a folder named (action, tool, object)", folder, "restore its name")
+    action, tool, thing = (" ".join(word.replace("_", " ").split()) for word in found.groups())
+    return action.lower(), tool, thing
 
 
 def frames_of(where: str, keys: Mapping[Side, list[Hashable]], n_frames: int) -> dict[Side, dict[Hashable, int]]:
