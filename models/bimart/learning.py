@@ -254,7 +254,7 @@ class Moments:
         return mean, torch.where(self.count > 0, spread, 1.0)
 
 
-def _network(name: str, build: type[Denoiser]) -> Network:
+def _network(name: str, build: type[ContactModel] | type[MotionModel]) -> Network:
     return Network(
         name, DenoiserConfig, build, lambda setup: (Objective(setup, build(setup.network)), None), LossConfig
     )
