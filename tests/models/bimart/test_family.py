@@ -189,6 +189,13 @@ def test_networks_that_do_not_see_alike_are_refused(sources: Sources, annotated_
         HandsForPaths.load(replace(sources, checkpoints=tmp_path))
 
 
+def test_figures_from_inside_name_both_networks_and_the_best_of_ten_is_no_worse_than_the_mean(sources: Sources) -> None:
+    found = BIMART.diagnose(sources)
+    assert set(found) == {"bimart-contact", "bimart-motion"}
+    assert all(np.isfinite(value) and value > 0 for own in found.values() for value in own.values())
+    assert found["bimart-contact"]["best_of_10_mm"] <= found["bimart-contact"]["map_error_mm"]
+
+
 def test_lookups_place_training_hands_at_the_object(sources: Sources, annotated: AnnotatedStore) -> None:
     train = HoiDataset(annotated, "train")
     sample = next(one for one in train if one.hand_type == "both")
