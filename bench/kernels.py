@@ -27,7 +27,6 @@ from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, HandModel, load_embedded_hands, track_joints, track_rotmats
-from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints, sample_points
@@ -126,7 +125,7 @@ def entry_errors(truth: np.ndarray, places: np.ndarray, distances: np.ndarray) -
     return f"{missing} / {extra} of {listed.sum():,}; {error_m * 1e6:.3f} um"
 
 
-def joints_rows(compiled_s: float) -> list[list[str]]:
+def joints_rows() -> list[list[str]]:
     model, tracks = load_embedded_hands().right, [random_track(seed) for seed in range(CLIPS)]
     layer, inputs = HandKinematics(model), [torch_inputs(track) for track in tracks]
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
@@ -135,12 +134,10 @@ def joints_rows(compiled_s: float) -> list[list[str]]:
             forwards["smplx, all vertices, a batch per clip"] = smplx_forward(model, tracks, Path(folder))
         forwards["own layer in torch, all vertices, float32"] = lambda: [layer(*own)[1].numpy() for own in inputs]
         forwards["own layer in torch, joints and tips, float64"] = lambda: [track_joints(own, model) for own in tracks]
-        forwards["compiled, joints and tips, float64"] = lambda: [fast_track_joints(own, model) for own in tracks]
         times = medians(forwards, RUNS)
         truth = HandKinematics(model, torch.float64)(*torch_inputs(tracks[0], torch.float64))[1].numpy()
         errors = [f"{np.abs(run()[0] - truth[:, : run()[0].shape[1]]).max() * 1e6:.3f} um" for run in forwards.values()]
-    notes = [""] * (len(forwards) - 1) + [f"compiling {compiled_s:.1f} s"]
-    return rows_of("joints: ", times, CLIPS, errors, notes)
+    return rows_of("joints: ", times, CLIPS, errors, [""] * len(forwards))
 
 
 def random_track(seed: int) -> HandTrack:
@@ -211,12 +208,11 @@ def first_calls_s() -> dict[str, float]:
     """Of each operation, the first call less the second, in seconds of the processor."""
     points = np.random.default_rng(0).normal(size=(4000, 3)).astype(np.float32)
     farthest = first_less_second_s(lambda: farthest_points(points, 1024))  # first: sampling a scene needs it, too
-    made, model, track = scene(True), load_embedded_hands().right, random_track(0)
+    made = scene(True)
     index, valid = ProximityIndex(made.points), np.ones(FRAMES, bool)
     return {
         "farthest": farthest,
         "distance": first_less_second_s(lambda: index.entries(made.clips[0][0], valid, made.clips[0][1])),
-        "joints": first_less_second_s(lambda: fast_track_joints(track, model)),
     }
 
 
@@ -248,7 +244,7 @@ def main() -> None:
     torch.set_num_threads(1)
     first = compiling_s()
     rows = [*distance_rows(False, first["distance"]), *distance_rows(True, first["distance"])]
-    rows += joints_rows(first["joints"])
+    rows += joints_rows()
     rows += [*farthest_rows(4000, 10, first["farthest"]), *farthest_rows(30000, 3, first["farthest"])]
     torch.set_num_threads(threads)
     columns = ["", "ms processor / clock", "x", "missing / extra; largest error", "apart"]
