@@ -17,7 +17,6 @@ from hoidata.clips import HandTrack, ObjectTrack
 from hoidata.contact.proximity import CONTACT_THRESHOLD_M, ProximityIndex
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, load_embedded_hands, track_joints, track_rotmats
-from hoidata.hands.fast_joints import fast_track_joints
 from hoidata.objects.farthest import farthest_points
 from hoidata.objects.model import Hinge, ObjectModel, articulate
 from hoidata.objects.sampling import SampledPoints, sample_points
@@ -117,7 +116,6 @@ def joints_rows() -> list[list[str]]:
     forwards: dict[str, Callable[[], list[np.ndarray]]] = {
         "all vertices in torch, float32": lambda: [layer(*own)[1].numpy() for own in inputs],
         "joints and tips in torch, float64": lambda: [track_joints(own, model) for own in tracks],
-        "joints and tips compiled, float64": lambda: [fast_track_joints(own, model) for own in tracks],
     }
     with torch.no_grad():
         times = medians(forwards, RUNS)

@@ -143,3 +143,12 @@ def _check_meaning(where: str, remedy: str, arrays: dict[str, np.ndarray]) -> No
     faces = arrays["faces"]
     if faces.min() < 0 or faces.max() >= N_VERTICES:
         raise BadInput(f"{where}: faces", f"vertex ids below {N_VERTICES}", f"{faces.min()} to {faces.max()}", remedy)
+
+
+# Index in our order of each of OpenPose's 21 joints; manopth and H2O use that order.
+OPENPOSE = (0, 13, 14, 15, 20, 1, 2, 3, 16, 4, 5, 6, 17, 10, 11, 12, 19, 7, 8, 9, 18)
+
+
+def openpose_to_mano_order(joints: np.ndarray) -> np.ndarray:
+    """Joints (..., 21, 3) in OpenPose's order (wrist, then thumb to pinky, each from its base to its tip), in ours."""
+    return joints[..., np.argsort(OPENPOSE), :]

@@ -2,9 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, NamedTuple
 
 from hoidata.errors import BadInput
+from hoidata.files.written import read_table, require_output
 
 Verdict = Literal["ok", "warned", "left out"]
 
@@ -159,3 +161,14 @@ def _reason(measure: Measure, values: Mapping[str, float], limit: float) -> str:
     unit = f" {measure.unit}" if measure.unit else ""
     frame = f" at frame {values[measure.frame]:g}" if measure.frame else ""
     return f"{measure.words}: {values[measure.name]:.3g}{unit}{frame}, above {limit:g}{unit}"
+
+
+def left_out_reasons(folder: str | Path) -> dict[str, str]:
+    """Why each clip that failed is left out, by clip id. Raises MissingResource where no stage has written."""
+    require_output(folder, "quality", "clips.parquet")
+    rows = read_table(Path(folder) / "clips.parquet", ["clip_id", "verdict", "reasons"])
+    failed = rows[rows["verdict"] == "left out"]
+    return {
+        clip_id: f"left out by quality control: {reasons}"
+        for clip_id, reasons in zip(failed["clip_id"].tolist(), failed["reasons"].tolist(), strict=True)
+    }

@@ -34,8 +34,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.clips.recording import HandRecording
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.written import REMEDY, empty_reason, read_json, read_table
-from hoidata.hands import HandPair, load_embedded_hands
-from hoidata.hands.fast_joints import fast_track_joints
+from hoidata.hands import HandPair, load_embedded_hands, track_joints
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.store.fields import SCHEMA_VERSION, TABLES
 from hoidata.store.info import info_problems
@@ -207,7 +206,7 @@ class Store:
 
     def joints(self, clip_id: str, side: Side) -> np.ndarray:
         """(frame, 21, 3) float32 world joints of one hand, metres, valid frames or not (see ``HandTrack.valid``)."""
-        return fast_track_joints(self._hand(self._row(clip_id), side), self.hand_pair()[side])
+        return track_joints(self._hand(self._row(clip_id), side), self.hand_pair()[side])
 
     def hand_pair(self) -> HandPair:
         """The hand model of this store. Raises MissingResource when it needs the user's MANO files."""

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hoidata.clips.clip import SIDES, HandTrack
 from hoidata.hands import HandPair, track_joints
-from hoidata.hands.joint_orders import OPENPOSE
+from hoidata.hands.model import OPENPOSE
 from hoidata.synthetic.actions import H2O_ACTION_IDS, H2O_OBJECT_IDS, H2O_VERB_IDS
 from hoidata.synthetic.catalogue import ObjectSpec, model_of
 from hoidata.synthetic.generate import GAP_FRAMES

@@ -11,7 +11,7 @@ def run(paths: StagePaths) -> None:
     from hoidata.annotation.settings import AnnotationSettings
     from hoidata.annotation.stage import annotate_store
     from hoidata.contact.settings import read_contact_settings
-    from hoidata.quality.verdicts import left_out_reasons
+    from hoidata.quality.thresholds import left_out_reasons
 
     counts = annotate_store(
         paths.clips,

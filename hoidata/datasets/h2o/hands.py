@@ -10,7 +10,7 @@ from hoidata.datasets.h2o.files import SequenceFrames
 from hoidata.geometry.intervals import runs
 from hoidata.hands import HandPair, track_joints
 from hoidata.hands.fitting import fit_hands, fit_shape
-from hoidata.hands.joint_orders import openpose_to_mano_order
+from hoidata.hands.model import openpose_to_mano_order
 
 PARAMETERS = HandConvention(
     translation="transl",

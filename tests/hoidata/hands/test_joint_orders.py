@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hoidata.hands import JOINT_NAMES, TIP_VERTICES, load_embedded_hands
-from hoidata.hands.joint_orders import OPENPOSE, openpose_to_mano_order
+from hoidata.hands.model import OPENPOSE, openpose_to_mano_order
 
 # smplx and MANO: wrist, index, middle, pinky, ring, thumb, three joints each; then the tips in the same order.
 MANO = [

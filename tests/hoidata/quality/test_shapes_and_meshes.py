@@ -6,8 +6,8 @@ import trimesh
 
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.solid import NoSolid, Solid, solid_of
+from hoidata.quality.measures import distances_to_others, largest_beta
 from hoidata.quality.meshes import part_facts, surface_facts
-from hoidata.quality.shape import distances_to_others, largest_beta
 from tests.builders.objects import box_model, two_parts
 
 BOX = trimesh.creation.box((0.1, 0.2, 0.3))

@@ -22,8 +22,7 @@ from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.quality import stage
 from hoidata.quality.stage import quality_store
-from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds
-from hoidata.quality.verdicts import left_out_reasons
+from hoidata.quality.thresholds import CLIP_MEASURES, DEFAULT_LIMITS, Limit, Thresholds, left_out_reasons
 from hoidata.store.store import open_store
 from tests.builders.clips import in_another_world, jumping
 from tests.builders.stores import write_clips

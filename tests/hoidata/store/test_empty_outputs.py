@@ -8,7 +8,7 @@ import pytest
 
 from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import MissingResource
-from hoidata.quality.verdicts import left_out_reasons
+from hoidata.quality.thresholds import left_out_reasons
 from hoidata.store.annotated import load_annotated
 from hoidata.store.info import generated_info
 from hoidata.store.store import open_store

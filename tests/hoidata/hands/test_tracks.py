@@ -1,4 +1,4 @@
-"""Compiled joints against skinning of the whole mesh, and against the layer in float64."""
+"""Joints of a track against skinning of the whole mesh in float64."""
 
 from dataclasses import replace
 
@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hoidata.clips import HandTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import TIP_VERTICES, HandKinematics, HandModel, load_embedded_hands, track_joints, track_vertices
-from hoidata.hands.fast_joints import fast_track_joints
 from tests.builders.clips import random_hand
 
 HANDS = load_embedded_hands()
@@ -43,7 +42,7 @@ def test_joints_equal_those_of_the_whole_mesh_in_float64(side, shared, betas_row
     model = with_shared_tips(HANDS[side]) if shared else HANDS[side]
     template = (model.template_m * 0.93 + 0.01).astype(np.float32) if personal else None
     track = random_hand(300, 4, betas_rows, template)
-    joints = fast_track_joints(track, model)
+    joints = track_joints(track, model)
     assert joints.shape == (300, 21, 3)
     assert joints.dtype == np.float32
     expected = layer_joints_m(track, model)
@@ -58,12 +57,5 @@ def test_small_and_large_angles_equal_the_layer(seed: int, n_frames: int, scale:
     track = random_hand(n_frames, seed)
     track = replace(track, hand_pose=track.hand_pose * scale, global_orient=track.global_orient * scale)
     np.testing.assert_allclose(
-        fast_track_joints(track, HANDS.right), layer_joints_m(track, HANDS.right), atol=2.5e-7, rtol=0
+        track_joints(track, HANDS.right), layer_joints_m(track, HANDS.right), atol=2.5e-7, rtol=0
     )
-
-
-def test_both_paths_agree_but_for_a_last_bit() -> None:
-    track = random_hand(600, 5)
-    slow, fast = track_joints(track, HANDS.left), fast_track_joints(track, HANDS.left)
-    np.testing.assert_array_max_ulp(slow, fast, maxulp=1)
-    assert (slow != fast).mean() < 1e-4
