@@ -41,7 +41,7 @@ def main() -> None:
     projects = [Path(folder) for folder in os.environ.get("HOIDATA_BENCH_PROJECTS", ".").split(":")]
     found = [one for project in projects for one in trained_in(project)]
     if not found:
-        print("no network for fingers: list manipnet under families in params.yaml, then dvc repro")
+        print("no network for fingers: name a dataset under family_datasets.manipnet in params.yaml, then dvc repro")
         return
     rows = []
     for model in found:

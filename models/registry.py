@@ -68,10 +68,6 @@ NETWORKS = {
     "bimart-motion": "models.bimart.motion_training:MOTION",
     "cams-b": "models.bimart_tables.cams:CAMS",
 }
-# Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
-IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
-# Networks of such a family under other names.
-LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
 # Networks of the tables that BimArt is compared in.
 IN_TABLES = ("bimart-contact", "bimart-motion", "cams-b")
 

@@ -253,7 +253,8 @@ def chosen_network(wish: AnimateWish, profile: str, datasets: tuple[str, ...], h
     if not trained:
         where = ", ".join(str(paths) for paths in found)
         raise MissingResource(
-            f"no network for fingers ({where}): list manipnet under families in params.yaml, then `dvc repro`"
+            f"no network for fingers ({where}): name a dataset under family_datasets.manipnet in params.yaml, "
+            "then `dvc repro`"
         )
     checkpoint = load_checkpoint(trained[0].checkpoints / MANIPNET.name, MANIPNET, torch.device("cpu"))
     assert isinstance(checkpoint.network, ManipNet)

@@ -132,7 +132,8 @@ def chosen_networks(
     if not trained:
         where = ", ".join(str(paths) for paths in runs)
         raise MissingResource(
-            f"no networks of bimart ({where}): list bimart under families in params.yaml, then `hoidata repro`"
+            f"no networks of bimart ({where}): name a dataset under family_datasets.bimart in params.yaml, "
+            "then `hoidata repro`"
         )
     paths = trained[0]
     for name in BIMART.uses:

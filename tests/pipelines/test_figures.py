@@ -13,7 +13,7 @@ def test_a_leading_metric_that_was_not_measured_is_named_with_its_reason_apart_f
     without = {"deep_share": {"the object has no inside": 257}, "slip_cm_s": {"no such frame": 3}}
     (metrics / "ours.json").write_text(json.dumps({"figures": figures, "unmeasured": without}))
     (metrics / "whole.json").write_text(json.dumps({"figures": figures}))
-    write_figures(out, tmp_path / "metrics", tmp_path / "checkpoints", ["arctic"], ["ours", "whole"])
+    write_figures(out, tmp_path / "metrics", tmp_path / "checkpoints", {"arctic": ["ours", "whole"]})
     assert json.loads((out / "figures.json").read_text()) == {
         "arctic": {"ours": figures, "whole": figures},
         "not measured": {"arctic": {"ours": {"deep_share": "the object has no inside: 257 clips"}}},
