@@ -19,7 +19,7 @@ def families_of(params: dict[str, Any], dataset: str) -> list[str]:
     Raises BadInput for names that have no stages.
     """
     chosen = params.get(KEY) or {}
-    refuse_unknown(chosen, OPTIONAL_FAMILIES, f"params.yaml: {KEY}")
+    refuse_unknown(chosen, list(OPTIONAL_FAMILIES), f"params.yaml: {KEY}")
     for folder, optional in OPTIONAL_FAMILIES.items():
         datasets = chosen.get(folder) or []
         if unknown := [name for name in datasets if name not in params["datasets"]]:
