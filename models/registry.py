@@ -66,10 +66,6 @@ NETWORKS = {
     "bimart-contact": "models.bimart.learning:CONTACT",
     "bimart-motion": "models.bimart.learning:MOTION",
 }
-# Families, with a network of the same name, that are made only where `families` of params.yaml lists them.
-IF_LISTED = ("manipnet", "bimart", "bimart-unrefined", "nearest-window", "mean-pose-at-object")
-# Networks of such a family under other names.
-LISTED_AS = {"bimart-contact": "bimart", "bimart-motion": "bimart"}
 
 
 def family_names() -> list[str]:

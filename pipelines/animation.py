@@ -9,13 +9,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from hoidata.clips.clip import SIDES, Clip, HandTrack, Side
+from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, Side
 from hoidata.errors import BadInput, MissingResource
+from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
 from hoidata.store.annotated import load_annotated
-from models.common.checkpoints import FILE_NAME, load_checkpoint
+from models.common.checkpoints import load_checkpoint
 from models.common.repeatable import make_repeatable
 from models.manipnet.animate import (
     Gap,
@@ -35,11 +36,20 @@ from models.manipnet.tracks import hands_of
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
 from pipelines.objects import MeshWish, stored_object
-from pipelines.pages.animation_page import write_animation
+from pipelines.pages.glb import write_glb
+from pipelines.pages.motion_files import ARRAYS as SHARED
+from pipelines.pages.motion_files import drawn, motion_arrays
+from pipelines.pages.player import motion_player, write_page
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, load_hands
+from pipelines.trained import trained_on, trained_run
 
 Way = Literal["auto", "network", "interpolate"]
+ARRAYS = SHARED | {"made": "(S, F) whether the fingers were made here"}
+FILE_WORDS = {
+    "motion.npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
+    "motion.glb": "an animated model for any glTF 2.0 viewer",
+}
 UPS = {"": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -120,8 +130,31 @@ class Animated:
 
 def animate_files(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...], out: Path) -> list[Path]:
     """Animate a stored clip (its id) or a file of trajectories (its path) into ``out``."""
-    made = animate(what, wish, profile, datasets)
-    return write_animation(out, made.clip, made.made, made.ghosts, made.hands, made.facts, made.notes)
+    return _write(out, animate(what, wish, profile, datasets))
+
+
+def _write(folder: Path, animated: Animated) -> list[Path]:
+    """Write motion.npz, motion.glb and index.html; gives their paths. The same motion gives the same bytes."""
+    clip, hands = animated.clip, animated.hands
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = motion_arrays(clip, hands) | {"made": animated.made}
+    write_npz(folder / "motion.npz", arrays)
+    write_glb(folder / "motion.glb", clip, hands, ghosts=animated.ghosts)
+    length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
+    write_page(
+        folder / "index.html",
+        "animation.html",
+        title=clip.clip_id,
+        synthetic=clip.synthetic,
+        ghost=bool(animated.ghosts),
+        notes=animated.notes,
+        player=motion_player(drawn(clip), hands, clip.clip_id, ghosts=animated.ghosts),
+        facts=[*animated.facts, length, ("hand model", hands.name)],
+        files=list(FILE_WORDS.items()),
+        arrays=[(name, ARRAYS[name]) for name in arrays],
+        has_players=True,
+    )
+    return [folder / name for name in (*FILE_WORDS, "index.html")]
 
 
 def animate(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...]) -> Animated:
@@ -244,26 +277,10 @@ def _object(
 
 def chosen_network(wish: AnimateWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Network:
     """The trained network of the dataset asked for, or of the first that has one."""
-    names = (wish.model,) if wish.model else tuple(dict.fromkeys(datasets))
-    found = [StagePaths(profile, name) for name in names]
-    trained = [paths for paths in found if (paths.checkpoints / MANIPNET.name / FILE_NAME).is_file()]
-    if not trained and wish.model and wish.model not in datasets:
-        there = ", ".join(dict.fromkeys(datasets))
-        raise BadInput("--model", f"a dataset of params.yaml: {there}", wish.model, "correct the name")
-    if not trained:
-        where = ", ".join(str(paths) for paths in found)
-        raise MissingResource(
-            f"no network for fingers ({where}): list manipnet under families in params.yaml, then `dvc repro`"
-        )
-    checkpoint = load_checkpoint(trained[0].checkpoints / MANIPNET.name, MANIPNET, torch.device("cpu"))
+    paths, facts = trained_run("manipnet", [MANIPNET.name], wish.model, profile, datasets, hands)
+    checkpoint = load_checkpoint(paths.checkpoints / MANIPNET.name, MANIPNET, torch.device("cpu"))
     assert isinstance(checkpoint.network, ManipNet)
-    facts = checkpoint.facts
-    if facts["hand_digest"] != hands.digest:
-        remedy = "train it with the hand of this profile"
-        raise BadInput(trained[0].checkpoints, f"hand {facts['hand']}", hands.name, remedy)
-    kind = "SYNTHETIC" if facts["synthetic"] else "recorded"
-    known = ", ".join(f"{count} {kind} {name} clips" for name, count in facts["datasets"].items())
-    rows = [("network", str(trained[0])), ("trained on", known), ("post-processing", wish.rule)]
+    rows = [("network", str(paths)), ("trained on", trained_on(facts)), ("post-processing", wish.rule)]
     return Network(Predictor(checkpoint.network, wish.rule), rows, facts)
 
 

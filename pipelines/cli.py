@@ -9,17 +9,13 @@ import typer
 from hoidata.errors import HoidataError, told_in_words
 from pipelines.commands import (
     adapters,
-    animate,
-    controls,
-    convert,
     evaluate,
     export,
-    generate,
     graph,
     init,
     inspect,
     lineage,
-    object_hands,
+    motions,
     raw,
     settings,
     share,
@@ -39,7 +35,7 @@ app.add_typer(adapters.app, name="adapters", help="Readers of datasets: list the
 app.add_typer(raw.app, name="raw", help="Your own raw files: scan them into a manifest, verify them.")
 app.add_typer(lineage.app, name="lineage")
 app.command("init")(init.init)
-app.command("convert")(convert.convert)
+app.command("convert")(adapters.convert)
 app.command("repro")(graph.repro)
 app.command("up")(graph.up)
 app.command("down")(graph.down)
@@ -50,11 +46,11 @@ app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
 app.command("evaluate")(evaluate.evaluate)
-app.command("controls")(controls.controls)
+app.command("controls")(evaluate.controls)
 app.command("table")(evaluate.table)
-app.command("generate")(generate.generate)
-app.command("animate")(animate.animate)
-app.command("hands")(object_hands.hands)
+app.command("generate")(motions.generate)
+app.command("animate")(motions.animate)
+app.command("hands")(motions.hands)
 app.command("show")(show.show)
 app.command("export")(export.export)
 

@@ -13,14 +13,14 @@ from pipelines.params import read_params
 FILE = Path(".hoidata/deployments.yaml")
 WHOLE_GRAPH = "full-graph"
 ENTRYPOINT = f"{FOLDER / 'pipelines/flows.py' if IS_INSTALLED else 'pipelines/flows.py'}:bring_up_to_date"
-# Data stages a person asks for by themselves; what comes before each of them is brought up to date with it.
-WORK = ("convert", "annotate", "contact")
+# Stages a person asks for by themselves; what comes before each of them is brought up to date with it.
+WORK = ("convert", "annotate", "contact", "evaluate")
 SCHEDULE = {"cron": "0 3 * * 1", "timezone": "UTC", "active": False}
 Targets = dict[str, list[str]]
 
 
 def deployment_targets(graph: dict[str, Stage], profile: str, datasets: list[str]) -> Targets:
-    """DVC targets by deployment name, such as annotate-arctic, train-grab-text2hoi or evaluate-h2o-mean-pose.
+    """DVC targets by deployment name, such as annotate-arctic, train-grab-text2hoi or evaluate-h2o.
 
     ``{profile}`` stands for the profile, which is chosen when a run starts.
     """
@@ -31,18 +31,16 @@ def deployment_targets(graph: dict[str, Stage], profile: str, datasets: list[str
             address, sign, rest = name.partition(at)
             if not sign or rest[:1] not in ("", "-"):
                 continue  # of another dataset, or of no dataset
-            if key := _deployment_name(address, dataset, rest):
+            if key := _deployment_name(address, dataset):
                 found.setdefault(key, []).append(f"{address}@{{profile}}-{dataset}{rest}")
     return found
 
 
-def _deployment_name(address: str, dataset: str, rest: str) -> str:
+def _deployment_name(address: str, dataset: str) -> str:
     """The deployment a stage belongs to; empty for stages nobody asks for by themselves."""
     work = address.rpartition(":")[2]
     if work in WORK:
         return f"{work}-{dataset}"
-    if work == "evaluate":
-        return f"{work}-{dataset}{rest}"
     return f"train-{dataset}-{Path(address).parent.name}" if work.split("-")[0] == "train" else ""
 
 

@@ -1,7 +1,7 @@
 """Leading figures and training curves in the forms ``dvc metrics``, ``dvc plots`` and ``dvc exp`` read."""
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +15,15 @@ LEADING = ("action_named", "contact_f1", "joint_error_mm", "deep_share", "jitter
 DIGITS = 6
 
 
-def write_figures(
-    out: Path, metrics: Path, checkpoints: Path, datasets: Sequence[str], families: Sequence[str]
-) -> None:
+def write_figures(out: Path, metrics: Path, checkpoints: Path, families: Mapping[str, Sequence[str]]) -> None:
     """``figures.json`` (dataset, family, metric), ``bars/<dataset>.csv`` (the same, a row per family) and
     ``losses/<dataset>-<network>.csv`` (validation loss by step) in the folder ``out``.
 
-    metrics, checkpoints: folders with an entry per dataset. What was not trained is left out. Of metrics that could
-    not be measured, ``figures.json`` has the reasons with counts under ``not measured`` (dataset, family, metric).
+    metrics, checkpoints: folders with an entry per dataset. families: by dataset, in the order of rows. What was not
+    trained is left out. Of metrics that could not be measured, ``figures.json`` has the reasons with counts under
+    ``not measured`` (dataset, family, metric).
     """
-    measured = {dataset: _read(metrics / dataset, families) for dataset in datasets}
+    measured = {dataset: _read(metrics / dataset, own) for dataset, own in families.items()}
     figures = {dataset: _leading(rows) for dataset, rows in measured.items()}
     missing = {dataset: rows for dataset, found in measured.items() if (rows := _unmeasured(found))}
     named = {dataset: rows for dataset, rows in figures.items() if rows}

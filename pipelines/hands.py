@@ -1,6 +1,5 @@
 """Hands for a motion of an object that a person made up, or that a clip or a generated motion has, as files."""
 
-import difflib
 from dataclasses import dataclass, field, replace
 from os.path import isfile  # of a name that is too long it says no, where a Path raises
 from pathlib import Path
@@ -13,7 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hoidata.clips.clip import FPS, SIDES, HandType, ObjectTrack
 from hoidata.clips.features import upright
-from hoidata.errors import BadInput, MissingResource
+from hoidata.errors import BadInput
 from hoidata.files import sha256_file
 from hoidata.files.numpy_files import load_npz_arrays
 from hoidata.geometry.rotations import rotvec_to_rotmat
@@ -33,6 +32,7 @@ from pipelines.objects import MeshWish, mesh_notes, nearest_name
 from pipelines.pages.hands_page import write_hands
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
+from pipelines.trained import check_dataset, trained_on, trained_run
 
 LEAST_S = 0.3
 MOST_FRAMES = round(MOST_S * FPS) + 1
@@ -89,15 +89,17 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
     asked = asked_motion(wish, profile, datasets, hands)
     paths, sampler = chosen_networks(wish.model, profile, datasets, hands)
     motions = hands_for(sampler, asked.thing, asked.wish)
-    made_from = {f"{paths.checkpoints}/{name}/{FILE_NAME}": _digest(paths, name) for name in sampler.used}
-    facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} ({_known(paths)})")]
+    used = [paths.checkpoints / name / FILE_NAME for name in sampler.used]
+    made_from = {str(path): sha256_file(path) for path in used}
+    learned = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
+    facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} (learnt from {learned})")]
     notes = [*asked.notes, *_notes(motions)]
     return WrittenHands(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)
 
 
 def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Asked:
     """The motion of the object that hands are asked for."""
-    _check_dataset(wish.model, profile, datasets)
+    check_dataset(wish.model, profile, datasets)
     given = {name: value for name in ("keyframes", "clip", "motion") if (value := getattr(wish, name))}
     if len(given) != 1:
         got = " and ".join(f"--{name}" for name in given) or "none"
@@ -124,46 +126,9 @@ def chosen_networks(
     model: str, profile: str, datasets: tuple[str, ...], hands: HandPair
 ) -> tuple[StagePaths, HandsForPaths]:
     """The networks of the dataset asked for, or of the first that has them. Raises MissingResource where none has."""
-    _check_dataset(model, profile, datasets)
-    runs = [StagePaths(profile, name) for name in ((model,) if model else datasets)]
-    trained = [paths for paths in runs if all(_is_trained(paths, name) for name in BIMART.uses)]
-    if not trained:
-        where = ", ".join(str(paths) for paths in runs)
-        raise MissingResource(
-            f"no networks of bimart ({where}): list bimart under families in params.yaml, then `hoidata repro`"
-        )
-    paths = trained[0]
-    for name in BIMART.uses:
-        facts = read_info(paths.checkpoints / name / FILE_NAME)["facts"]
-        if facts["hand_digest"] != hands.digest:
-            remedy = "train it with the hand of this profile"
-            raise BadInput(paths.checkpoints / name, f"hand {facts['hand']}", hands.name, remedy)
+    paths, _ = trained_run("bimart", BIMART.uses, model, profile, datasets, hands)
     sources = Sources(load_annotated(paths.data, hands), paths.checkpoints, hands, torch.device("cpu"))
     return paths, HandsForPaths.load(sources)
-
-
-def _check_dataset(name: str, profile: str, datasets: tuple[str, ...]) -> None:
-    """Raise BadInput that names the datasets there are, for one that is not among them; "" is none."""
-    paths = StagePaths(profile, name)
-    if name and name not in datasets and not paths.data.is_dir() and not paths.checkpoints.is_dir():
-        near = difflib.get_close_matches(name, datasets, 1, 0.5)
-        remedy = f"did you mean {near[0]!r}?" if near else "name one of them, or leave it out"
-        raise BadInput("--model", f"a dataset: {', '.join(datasets)}", name, remedy)
-
-
-def _is_trained(paths: StagePaths, name: str) -> bool:
-    folder = paths.checkpoints / name
-    return not empty_reason(folder) and (folder / FILE_NAME).is_file()
-
-
-def _digest(paths: StagePaths, name: str) -> str:
-    return sha256_file(paths.checkpoints / name / FILE_NAME)
-
-
-def _known(paths: StagePaths) -> str:
-    facts = read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"]
-    kind = "SYNTHETIC" if facts["synthetic"] else "recorded"
-    return ", ".join(f"learnt from {count} {kind} {name} clips" for name, count in facts["datasets"].items())
 
 
 def _notes(motions: list[MadeHands]) -> list[str]:

@@ -13,7 +13,7 @@ MOST_NESTED = 2000
 KEYS = "params.yaml: "
 # dvc.yaml itself reads these to write its stages out, from the top of params.yaml alone.
 TEMPLATED = (
-    *("profile", "profiles", "datasets", "families", "train.preset", "train.size"),
+    *("profile", "profiles", "datasets", "families", "family_datasets", "train.preset", "train.size"),
     *("tables.datasets", "tables.runs"),
 )
 

@@ -7,6 +7,7 @@ from hoidata.files.written import read_json
 from pipelines.figures import LEADING, read_metrics
 from pipelines.pages.metrics_table import markdown_table
 from pipelines.params import read_params
+from pipelines.stages.families import families_of
 
 
 def describe_results(project: Path, profile: str) -> str:
@@ -20,7 +21,7 @@ def describe_results(project: Path, profile: str) -> str:
         if (data / "clips/meta/info.json").is_file():
             lines.append(_counts(dataset, data))
             notes += [f"{dataset}: {words}." for words in _splits(data).get("missing", {}).values()]
-        families = [name for name in params["families"] if _measured(metrics / f"{name}.json")]
+        families = [name for name in families_of(params, dataset) if _measured(metrics / f"{name}.json")]
         if families:
             tables += [f"### {dataset}", markdown_table(metrics, families, LEADING)]
     report = project / "report" / profile / "index.html"

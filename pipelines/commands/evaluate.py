@@ -1,7 +1,8 @@
-"""``hoidata evaluate``: how near the motions of any store come to the recorded ones."""
+"""``hoidata evaluate``, ``table`` and ``controls``: metrics of a store, of a dataset, and of its negative controls."""
 
 import json
 import sys
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,11 +15,19 @@ from pipelines.commands.hands import hands_of
 from pipelines.commands.project import enter_project
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from hoidata.hands import HandPair
+    from pipelines.promises import Kept
 
 _FOLDER: Any = {"exists": True, "file_okay": False, "resolve_path": True}
 Store = Annotated[Path, typer.Argument(help="A store of predicted clips, <reference id>~<k>.", **_FOLDER)]
 Reference = Annotated[Path, typer.Option(help="An annotated dataset, such as data/embedded/grab.", **_FOLDER)]
+
+Metrics = Annotated[
+    Path, typer.Argument(help="Metrics of one dataset or more, such as metrics/study.", exists=True, file_okay=False)
+]
+WORDS = {True: "yes", False: "NO", None: "not measured"}
 
 
 def evaluate(
@@ -74,3 +83,39 @@ def table(
 
     families = sorted(path.stem for path in folder.glob("*.json"))
     typer.echo(markdown_table(folder, families, metrics.split(",")), nl=False)
+
+
+def controls(
+    folder: Metrics,
+    every: Annotated[bool, typer.Option("--all", help="Also list each that was not measured.")] = False,
+) -> None:
+    """Check what every control must lose against the truth or a model; exit code 1 where one does not."""
+    from pipelines.promises import datasets_below, kept, read_rows
+
+    console, broken = Console(width=None if sys.stdout.isatty() else 160), 0
+    for dataset in datasets_below(folder):
+        found = kept(read_rows(dataset))
+        console.print(_table(str(dataset), [item for item in found if every or item.holds is not None]))
+        counts = {holds: sum(item.holds is holds for item in found) for holds in WORDS}
+        typer.echo(f"{counts[True]} hold, {counts[False]} do not, {counts[None]} were not measured")
+        for why, count in sorted(Counter(item.why for item in found if item.holds is None).items()):
+            typer.echo(f"  not measured: {count}: {why}")
+        broken += counts[False]
+    raise typer.Exit(bool(broken))
+
+
+def _table(title: str, found: "list[Kept]") -> "Table":
+    from rich import box
+    from rich.table import Table
+
+    from pipelines.pages.metrics_table import number
+
+    table = Table("control", "metric", "beside", title=title, box=box.SIMPLE)
+    for name in ("figure there", "control"):
+        table.add_column(name, justify="right")
+    table.add_column("must")
+    table.add_column("holds")
+    for item in found:
+        promise, figures = item.promise, (number(item.reference), number(item.value))
+        table.add_row(promise.control, promise.metric, promise.beside, *figures, promise.must, WORDS[item.holds])
+    return table

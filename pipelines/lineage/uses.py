@@ -129,7 +129,7 @@ def _asked(root: Path, path: str, lock: Locked, recorded: set[str]) -> set[str]:
     """The recorded clips that motions stand for; of rows that look clips up all of the dataset."""
     if not path.startswith("samples/"):
         return set()
-    if path.endswith("/controls") or not any(dep.startswith("checkpoints/") for dep in lock.deps):
+    if Path(path).name.startswith("controls") or not any(dep.startswith("checkpoints/") for dep in lock.deps):
         return recorded
     import pyarrow.parquet as parquet
 

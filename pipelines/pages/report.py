@@ -1,6 +1,6 @@
 """The report of one profile: a self-contained page over all its datasets, and beside it a page per dataset."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -69,8 +69,7 @@ ENCODERS = {
 def write_report(
     out: str | Path,
     profile: str,
-    datasets: Sequence[str],
-    families: Sequence[str],
+    families: Mapping[str, Sequence[str]],
     hands: HandPair,
     folders: ReportFolders | None = None,
 ) -> Path:
@@ -78,11 +77,11 @@ def write_report(
 
     Beside it the page of each dataset, ``out/<dataset>.html``, and in ``out/clips`` those of its examples.
 
-    families: their figures are shown in this order; motions of the first one stand beside the recorded ones.
+    families: by dataset; metrics are shown in this order, and motions of the first one next to the recorded ones.
     Equal inputs give equal bytes. Datasets without clips are listed with their reason.
     """
     folders = folders or ReportFolders.of(profile)
-    all_sections = [_section(name, folders, families, hands) for name in datasets]
+    all_sections = [_section(name, folders, own, hands) for name, own in families.items()]
     sections = [section for section in all_sections if not section.facts.empty or section.facts.quarantine]
     synthetic = any(section.facts.synthetic for section in sections)
     has_players = any(section.motions or section.contact for section in sections)

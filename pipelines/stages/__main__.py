@@ -23,10 +23,9 @@ STAGES = (
     "split",
     "evaluator",
     "train",
-    "train_listed",
     "sample",
-    "evaluate",
     "controls",
+    "evaluate",
     "report",
 )
 

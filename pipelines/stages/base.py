@@ -59,7 +59,8 @@ class StagePaths:
     training = _At(".hoidata/training/{profile}/{dataset}/{model}")
     evaluators = _At("evaluators/{profile}/{dataset}")
     samples = _At("samples/{profile}/{dataset}/{family}")
-    metrics = _At("metrics/{profile}/{dataset}/{family}.json")
+    metrics = _At("metrics/{profile}/{dataset}")
+    measured = _At(".hoidata/measured/{profile}/{dataset}/{family}.json")
     report = _At("report/{profile}")
 
     @property

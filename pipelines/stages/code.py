@@ -13,10 +13,11 @@ from typing import Any
 from hoidata.dataset_folders import outside_folders
 from hoidata.files.atomic import atomic_folder
 from hoidata.files.digest import canonical_json
-from models.registry import IF_LISTED, LISTED_AS, NETWORKS, family_module, family_names, network_modules
+from models.registry import NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.params import chosen_params, read_file, read_params
 from pipelines.stages.base import StagePaths, write_json
+from pipelines.stages.families import families_of
 
 CODE = Path("code")
 STAGES_OF_DATASETS = ("raw", "convert", "quality", "annotate", "contact", "split")
@@ -47,6 +48,8 @@ def run(paths: StagePaths) -> None:
     Manifests the graph depends on and nobody has written are written too: those datasets are absent.
     """
     params = read_params(Path())
+    for name in params["datasets"]:
+        families_of(params, name)  # refuses names without stages
     runs = [StagePaths(params["profile"], name) for name in params["datasets"]]
     if not all(path.is_file() for paths in runs for path in (paths.manifest, paths.hand_manifest)):
         from pipelines.stages.adapters import ensure_manifests  # imports adapters, which takes longer than all the rest
@@ -91,8 +94,7 @@ def closures(params: dict[str, Any], tree: SourceTree) -> dict[str, Start]:
         every = {module: [*every.get(module, ()), *choices] for module, choices in chosen.items()}
     sizes = [section for section in params["train"].values() if isinstance(section, dict)]
     for network in dict.fromkeys([*NETWORKS, *(name for section in sizes for name in section)]):
-        stage = "train_listed" if network in LISTED_AS else "train"
-        found[f"train/{network}"] = _start(stage, every | _families(network_modules(network)))
+        found[f"train/{network}"] = _start("train", every | _families(network_modules(network)))
     for family in dict.fromkeys([*family_names(), *params["families"]]):
         found[f"sample/{family}"] = _start("sample", every | _families([family_module(family)]))
     rows = (params.get("controls") or {}).get("families") or []
@@ -111,14 +113,8 @@ def _start(stage: str, chosen: dict[str, list[Choice]]) -> Start:
 
 
 def own_settings(params: dict[str, Any], name: str) -> dict[str, str]:
-    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same.
-
-    Of a family or network that is made only where it is listed: whether it is.
-    """
+    """What params.yaml sets for the one dataset of a file of ``code/``, as JSON; nothing and ``{}`` are the same."""
     stage, _, dataset = name.partition("/")
-    family = LISTED_AS.get(dataset, dataset)
-    if stage in ("train", "sample") and family in IF_LISTED:
-        return {"params.yaml families": canonical_json(family in params["families"])}
     if stage not in SECTIONS_OF_DATASETS:
         return {}
     keys, value = (*SECTIONS_OF_DATASETS[stage], dataset), params
@@ -146,7 +142,7 @@ def _settings_read(params: dict[str, Any], name: str) -> Any:
         return section.get("seed"), *_trained(section, of)
     if stage in SECTIONS_OF_DATASETS:
         return section.get("margin_frames")
-    return (section, params.get("sample"), params.get("evaluate")) if stage == "controls" else section
+    return (section, params.get("sample")) if stage == "controls" else section
 
 
 def _trained(section: dict[str, Any], network: str) -> list[Any]:

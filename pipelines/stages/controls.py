@@ -1,12 +1,13 @@
-"""Stage controls: the rows that show what a figure sees, sampled and measured one after another in one process."""
+"""Stage controls: motions of retrieval baselines and negative controls, sampled one after another in one process."""
 
 import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from models.registry import family_module
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
-from pipelines.stages.evaluate import run as evaluate
+from pipelines.stages.families import OPTIONAL_FAMILIES
 from pipelines.stages.sample import sample
 
 OFF = "off: params.yaml names no families under controls"
@@ -21,26 +22,27 @@ class ControlSettings:
 
 
 def run(paths: StagePaths) -> None:
-    """Write motions and metrics of every row, as sample and evaluate would, into folders ``controls`` beside theirs."""
+    """Write motions of every row, as the stage sample would, into the folder ``controls``.
+
+    paths.family: the optional family whose rows are meant, in ``controls-<family>``; without, those of no such family.
+    """
     settings = load_settings(ControlSettings, "controls")
-    rows = {name: replace(paths, family=f"controls/{name}") for name in settings.families}
-    folders = [replace(paths, family="controls").samples, paths.metrics.parent / "controls"]
-    if reason := empty_reason(paths.clips) if rows else OFF:
-        for folder in folders:
-            write_empty(folder, reason)
+    folder = replace(paths, family="-".join(filter(None, ("controls", paths.family)))).samples
+    names = [name for name in settings.families if _optional_family(name) == paths.family]
+    if reason := empty_reason(paths.clips) if names else OFF:
+        write_empty(folder, reason)
         return
     params = read_params(Path())
     if settings.samples is not None:
         params = params | {"sample": params["sample"] | {"samples": settings.samples}}
-    for folder in folders:
-        _clear(folder, {path.name for row in rows.values() for path in (row.samples, row.metrics)})
-    for name, row in rows.items():
-        sample(row, params, name)
-        evaluate(row)
-
-
-def _clear(folder: Path, kept: set[str]) -> None:
-    """Remove what earlier runs left of rows that are asked for no more."""
     for path in folder.iterdir() if folder.is_dir() else ():
-        if path.name not in kept:
+        if path.name not in names:  # an earlier run sampled it
             shutil.rmtree(path) if path.is_dir() else path.unlink()
+    for name in names:
+        sample(replace(paths, family=f"{folder.name}/{name}"), params, name)
+
+
+def _optional_family(name: str) -> str:
+    """The optional family whose networks a row uses; empty for all other rows."""
+    folder = family_module(name).split(".")[1]
+    return folder if folder in OPTIONAL_FAMILIES else ""

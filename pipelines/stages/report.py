@@ -4,6 +4,7 @@ from pathlib import Path
 
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, load_hands
+from pipelines.stages.families import families_of
 
 
 def run(paths: StagePaths) -> None:
@@ -14,6 +15,7 @@ def run(paths: StagePaths) -> None:
 
     params = read_params(Path())
     with atomic_folder(paths.report) as partial:
-        write_report(partial, paths.profile, params["datasets"], params["families"], load_hands(paths.profile))
+        families = {dataset: families_of(params, dataset) for dataset in params["datasets"]}
+        write_report(partial, paths.profile, families, load_hands(paths.profile))
         folders = ReportFolders.of(paths.profile)
-        write_figures(partial, folders.metrics, folders.checkpoints, params["datasets"], params["families"])
+        write_figures(partial, folders.metrics, folders.checkpoints, families)

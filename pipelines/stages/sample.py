@@ -1,18 +1,23 @@
-"""Stage sample: the motions of one family for the test clips of one dataset, as an ordinary store of clips."""
+"""Stage sample: the motions of families for the test clips of one dataset, each as an ordinary store of clips."""
 
+from dataclasses import replace
 from pathlib import Path
 
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, write_empty
-from pipelines.stages.listed import off_reason
 
 
 def run(paths: StagePaths) -> None:
-    """Write the motions; a dataset without clips, or a family that is not trained, gives an empty output."""
-    if reason := off_reason(paths.family) or empty_reason(paths.clips):
-        write_empty(paths.samples, reason)
-        return
-    sample(paths, read_params(Path()), paths.family)
+    """Write the motions of the families in ``paths.family``, separated by commas.
+
+    A dataset without clips, or a family that is not trained, gives an empty output.
+    """
+    for family in paths.family.split(","):
+        own = replace(paths, family=family)
+        if reason := empty_reason(paths.clips):
+            write_empty(own.samples, reason)
+        else:
+            sample(own, read_params(Path()), family)
 
 
 def sample(paths: StagePaths, params: dict, family: str) -> None:

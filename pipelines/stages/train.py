@@ -14,7 +14,6 @@ from pipelines.lineage.graph import producers, written_graph
 from pipelines.lineage.provenance import build_provenance
 from pipelines.params import laid_over, read_file, read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands, load_settings, write_empty
-from pipelines.stages.listed import off_reason
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ def run(paths: StagePaths) -> None:
     A killed training goes on where it was: what it needs for that, and its losses, lie in ``paths.training``.
     """
     needed = [paths.checkpoints / name for name in load_network(paths.model).needs]
-    if reason := off_reason(paths.model) or next(filter(None, map(empty_reason, [paths.clips, *needed])), None):
+    if reason := next(filter(None, map(empty_reason, [paths.clips, *needed])), None):
         write_empty(paths.checkpoint, reason)
         return
     from models.common.team import run_team

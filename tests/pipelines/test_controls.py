@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,7 @@ from models.evaluator.stage import train_evaluators
 from models.registry import family_names, load_family
 from pipelines.cli import app
 from pipelines.promises import CONFUSED, PROMISES, TRUTH, Promise, datasets_below, kept, read_rows, taken_for_reverse
-from pipelines.stages import controls
+from pipelines.stages import controls, evaluate
 from pipelines.stages.base import StagePaths, empty_reason
 from pipelines.stages.sample import sample
 from tests.builders.annotated import write_annotated_dataset
@@ -44,9 +45,11 @@ def project(tmp_path, monkeypatch, make_clip):
 
 
 def run_with(**settings) -> None:
-    params = {"profile": "embedded", "sample": {"samples": 2, "seed": 0}, "controls": settings}
-    Path("params.yaml").write_text(yaml.safe_dump(params))
+    """Sample the controls, then measure them."""
+    base = {"profile": "embedded", "datasets": ["grab"], "families": []}
+    Path("params.yaml").write_text(yaml.safe_dump(base | {"sample": {"samples": 2, "seed": 0}, "controls": settings}))
     controls.run(PATHS)
+    evaluate.run(PATHS)
 
 
 def names(folder: Path) -> set[str]:
@@ -68,7 +71,7 @@ def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
         "controls.run(StagePaths('embedded', 'grab')); sys.exit('torch' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], env={"PYTHONPATH": str(PROJECT)}, check=True, capture_output=True)
-    assert empty_reason(SAMPLES) == empty_reason(METRICS_OF) == "off: params.yaml names no families under controls"
+    assert empty_reason(SAMPLES) == "off: params.yaml names no families under controls"
 
 
 def test_every_row_gets_motions_and_figures_and_rows_no_longer_asked_for_go(project):
@@ -85,6 +88,17 @@ def test_every_row_gets_motions_and_figures_and_rows_no_longer_asked_for_go(proj
     assert (METRICS_OF / "static.json").read_bytes() == before
     run_with(families=["static"], samples=3)
     assert json.loads((METRICS_OF / "static.json").read_text())["motions"] == found["motions"] * 3 // 2
+
+
+def test_rows_of_an_optional_family_are_sampled_by_its_own_stage(project, monkeypatch):
+    """It alone waits for the networks of that family."""
+    settings = {"profile": "embedded", "sample": {}, "controls": {"families": ["static", "bimart-no-map"]}}
+    Path("params.yaml").write_text(yaml.safe_dump(settings))
+    sampled = []
+    monkeypatch.setattr(controls, "sample", lambda paths, params, name: sampled.append((paths.family, name)))
+    for family in ("", "bimart"):
+        controls.run(replace(PATHS, family=family))
+    assert sampled == [("controls/static", "static"), ("controls-bimart/bimart-no-map", "bimart-no-map")]
 
 
 def test_a_clip_left_out_of_a_row_stands_in_its_metrics_with_the_reason_of_the_row(project):

@@ -15,29 +15,33 @@ from hoidata.store.store import write_store
 from pipelines.cli import app
 from pipelines.stages import evaluate
 from pipelines.stages.base import StagePaths, write_empty
+from pipelines.stages.families import families_of
 from tests.builders.annotated import write_annotated_dataset
 
 PROJECT = Path(__file__).parents[2]
 PATHS = StagePaths("embedded", "grab", family="ours")
+METRICS = PATHS.metrics / "ours.json"
 BIMART = ("--metrics", "bimart")
 
 
 @pytest.fixture
 def clips(stage_folder, make_clip):
     """An annotated dataset where the stage looks for it; its test clips."""
+    stage_folder(families=["ours"])
     return write_annotated_dataset(PATHS.data, make_clip)[1]
 
 
-def write_samples(clips):
+def write_samples(clips, family="ours"):
+    folder = replace(PATHS, family=family).samples
     predicted = [replace(clip, clip_id=f"{clip.clip_id}~0") for clip in clips.values()]
-    write_store(PATHS.samples / "clips", predicted, generated_info("ours"))
-    (PATHS.samples / "diagnostics.json").write_text(json.dumps({"length": {"mae_frames": 3.5}}))
+    write_store(folder / "clips", predicted, generated_info(family))
+    (folder / "diagnostics.json").write_text(json.dumps({"length": {"mae_frames": 3.5}}))
 
 
 def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
     write_samples(clips)
     evaluate.run(PATHS)
-    found = json.loads(Path("metrics/embedded/grab/ours.json").read_text())
+    found = json.loads(METRICS.read_text())
     assert found["figures"]["contact_f1"] == 1
     assert found["held_out_clips"] == found["motions"] == 2
     assert found["diagnostics"] == {"length": {"mae_frames": 3.5}}
@@ -45,13 +49,74 @@ def test_the_stage_writes_figures_and_what_the_family_says_of_itself(clips):
 
 def test_lists_of_figures_are_computed_where_params_name_them(clips):
     write_samples(clips)
-    Path("params.yaml").write_text("{profile: embedded, evaluate: {metrics: [bimart]}}")
+    Path("params.yaml").write_text(
+        "{profile: embedded, datasets: [grab], families: [ours], evaluate: {metrics: [bimart]}}"
+    )
     evaluate.run(PATHS)
-    figures = json.loads(PATHS.metrics.read_text())["figures"]
+    figures = json.loads(METRICS.read_text())["figures"]
     assert (figures["contact_f1"], figures["bimart_con_paper"], figures["bimart_pen_1cm_corrected"]) == (1, 100, 0)
-    Path("params.yaml").write_text("{profile: embedded, evaluate: {metrics: [omomo]}}")
+    Path("params.yaml").write_text(
+        "{profile: embedded, datasets: [grab], families: [ours], evaluate: {metrics: [omomo]}}"
+    )
     with pytest.raises(BadInput, match=r"evaluate.metrics: expected names of bimart, got omomo"):
         evaluate.run(PATHS)
+
+
+def test_a_further_family_measures_that_family_alone_and_one_no_longer_listed_goes(clips, stage_folder, monkeypatch):
+    write_samples(clips)
+    evaluate.run(PATHS)
+    before, measured = METRICS.read_bytes(), []
+    monkeypatch.setattr(evaluate, "_measured", lambda paths, settings: measured.append(paths.family) or {"empty": ""})
+    stage_folder(families=["ours", "theirs"])
+    with pytest.raises(BadInput, match="samples/embedded/grab/theirs: expected motions of every family"):
+        evaluate.run(PATHS)
+    write_samples(clips, "theirs")
+    evaluate.run(PATHS)
+    assert (measured, METRICS.read_bytes()) == (["theirs"], before)
+    assert (PATHS.metrics / "theirs.json").is_file()
+    stage_folder(families=["ours"])
+    evaluate.run(PATHS)
+    assert [path.name for path in PATHS.metrics.iterdir()] == ["ours.json"]
+    assert measured == ["theirs"]
+
+
+@pytest.mark.parametrize("changed", ["settings", "code", "data", "motions", "record"])
+def test_what_was_measured_is_measured_again_after_each_change_it_depends_on(clips, stage_folder, monkeypatch, changed):
+    measured = []
+    monkeypatch.setattr(evaluate, "_measured", lambda paths, settings: measured.append(paths.family) or {"empty": ""})
+    write_samples(clips)
+    for _ in range(2):
+        evaluate.run(PATHS)
+    assert measured == ["ours"]
+    files = {
+        "code": evaluate.CODE,
+        "data": PATHS.contact / "more.json",
+        "motions": PATHS.samples / "diagnostics.json",
+        "record": PATHS.measured,
+    }
+    if changed == "settings":
+        stage_folder(families=["ours"], evaluate={"metrics": ["bimart"]})
+    else:
+        files[changed].parent.mkdir(exist_ok=True)
+        files[changed].write_text("{")
+    evaluate.run(PATHS)
+    assert measured == ["ours"] * 2
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"families": ["bimart"]}, "families: .*family_datasets.bimart instead"),
+        ({"family_datasets": {"bimart": ["taco"]}}, "family_datasets.bimart: .*taco"),
+        ({"family_datasets": {"toy": ["grab"]}}, "family_datasets: expected keys among: manipnet, bimart, got toy"),
+    ],
+)
+def test_an_optional_family_is_chosen_by_its_datasets_alone(settings, message):
+    params = {"datasets": ["grab", "h2o"], "families": ["ours"], "family_datasets": {}}
+    with pytest.raises(BadInput, match=message):
+        families_of(params | settings, "grab")
+    chosen = params | {"family_datasets": {"manipnet": ["grab"], "bimart": None}}
+    assert [families_of(chosen, name) for name in ("grab", "h2o")] == [["ours", "manipnet"], ["ours"]]
 
 
 def test_a_subset_no_split_has_is_refused_and_not_empty(clips):
@@ -62,7 +127,7 @@ def test_a_subset_no_split_has_is_refused_and_not_empty(clips):
 def test_the_reason_passes_through_where_there_are_no_motions(clips):
     write_empty(PATHS.samples, "not trained: length")
     evaluate.run(PATHS)
-    assert json.loads(PATHS.metrics.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
+    assert json.loads(METRICS.read_text()) == {"empty": "not trained: length", "held_out_clips": 0}
 
 
 def test_a_store_written_by_the_ten_line_script_of_the_docs_is_measured_by_the_command(clips):

@@ -18,7 +18,7 @@ from tests.builders.clips import build_clip
 from tests.builders.stores import write_annotated
 
 PROJECT = Path(__file__).parents[2]
-PATHS = StagePaths("embedded", "grab", family="ours")
+PATHS = StagePaths("embedded", "grab", family="text2hoi")
 IMPORTED = """
 import sys
 from pipelines.stages import evaluator
@@ -40,7 +40,7 @@ def project(tmp_path, monkeypatch) -> Path:
 
 def choose(project: Path, **settings) -> None:
     params = yaml.safe_load((project / "params.yaml").read_text())
-    (project / "params.yaml").write_text(yaml.safe_dump({**params, "evaluator": settings}))
+    (project / "params.yaml").write_text(yaml.safe_dump({**params, "families": ["text2hoi"], "evaluator": settings}))
 
 
 def test_off_it_writes_the_reason_without_loading_torch(project):
@@ -68,7 +68,7 @@ def test_on_its_figures_and_digests_stand_in_the_metrics_of_a_family(project):
     write_store(PATHS.samples / "clips", predicted, generated_info("ours"))
     (PATHS.samples / "diagnostics.json").write_text("{}")
     evaluate.run(PATHS)
-    found = json.loads(PATHS.metrics.read_text())
+    found = json.loads((PATHS.metrics / "text2hoi.json").read_text())
     info = json.loads((PATHS.evaluators / "info.json").read_text())
     assert found["evaluators"].pop("path")
     assert {name: known["digest"] for name, known in found["evaluators"].items()} == {

@@ -15,8 +15,10 @@ from hoidata.hands import load_embedded_hands
 from hoidata.object_paths import keyframed_path, parse_keyframes
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
+from models.bimart.hands import Standing
 from pipelines.hands import Asked, HandsWish, asked_motion, chosen_networks, hinge_range
 from pipelines.objects import MeshWish, stored_object
+from pipelines.pages.hands_page import _figures
 from pipelines.pages.motion_files import mesh_arrays, motion_arrays
 from tests.builders.clips import clip_of
 from tests.builders.objects import hinged_box
@@ -107,7 +109,7 @@ def test_datasets_that_are_not_converted_are_passed_over_and_unknown_ones_are_na
             look_up(f"{name}s")
     with pytest.raises(BadInput, match="did you mean 'arctic'"):
         asked_motion(HandsWish(object=name, keyframes=rest, model="acrtic"), "embedded", names, HANDS)
-    with pytest.raises(BadInput, match="a dataset: grab, arctic, got nothing"):
+    with pytest.raises(BadInput, match=r"a dataset of params\.yaml: grab, arctic, got nothing"):
         chosen_networks("nothing", "embedded", names, HANDS)
 
 
@@ -183,3 +185,13 @@ def test_an_open_mesh_is_moved_like_any_other(tmp_path, keys):
     sheet.export(tmp_path / "open.obj")
     wish = HandsWish(object=str(tmp_path / "open.obj"), keyframes=keys("time_s,z_cm 0,0 2,5"))
     assert asked_motion(replace(wish, mesh=MeshWish("m", "z")), "embedded", (), HANDS).thing.n_frames > 30
+
+
+def test_depths_of_an_object_without_an_inside_are_not_measured_and_not_dropped():
+    touching = {"right": np.array([True, False])}
+    open_mesh, solid = (Standing(touching, depth, 1.0) for depth in (None, np.array([0.004, 0.012])))
+    rows = {name: values for name, *values in _figures(open_mesh, open_mesh)}
+    reason = "not measured: the object has no inside"
+    assert rows["deepest vertex"] == rows["frames deeper than 1 cm"] == [reason, reason]
+    rows = {name: values for name, *values in _figures(solid, solid)}
+    assert (rows["deepest vertex"], rows["frames deeper than 1 cm"]) == (["12.0 mm"] * 2, ["50 %"] * 2)

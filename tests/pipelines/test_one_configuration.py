@@ -44,6 +44,7 @@ def annotated_at(folder: Path, threshold_m: float, make_clip, monkeypatch) -> An
     folder.mkdir()
     shutil.copytree(PROJECT / "manifests" / "embedded", folder / "manifests" / "embedded")
     params = {"contact": {"threshold_m": threshold_m, "points": 256}, "annotate": {"encoder": "hash"}}
+    params |= {"datasets": ["grab"], "families": ["ours"]}
     (folder / "params.yaml").write_text(yaml.safe_dump({**params, "split": {"grab": RULE}}))
     monkeypatch.chdir(folder)
     subjects = ("s1", "s9", "s10")
@@ -94,7 +95,7 @@ def test_the_figures_of_evaluation_use_the_threshold_the_contact_stage_was_told(
         write_store(paths.samples / "clips", [made], generated_info("ours"))
         (paths.samples / "diagnostics.json").write_text("{}")
         evaluate.run(paths)
-        found[name] = json.loads(paths.metrics.read_text())
+        found[name] = json.loads((paths.metrics / "ours.json").read_text())
         touched = [
             touched_points(clip, store.points(store.object_key(key)).points_m, THRESHOLD_M[name])
             for clip in (made, true)

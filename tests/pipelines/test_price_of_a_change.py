@@ -94,7 +94,7 @@ class Change:
 
 
 CHANGES = (
-    Change("a metric: `hoidata/metrics/touch.py`", touch("hoidata/metrics/touch.py"), "controls, evaluate, report"),
+    Change("a metric: `hoidata/metrics/touch.py`", touch("hoidata/metrics/touch.py"), "evaluate, report"),
     Change("a page: `pipelines/pages/glb.py`", touch("pipelines/pages/glb.py"), "report"),
     Change(
         "a network: `models/text2hoi/refiner.py`",
@@ -104,7 +104,7 @@ CHANGES = (
     Change(
         "a family is added: `models/toy/`, its row, its word",
         add_family,
-        "evaluate (toy), report, sample (toy)",
+        "evaluate, report, sample (toy)",
     ),
     Change(
         "an adapter: `hoidata/datasets/grab/adapter.py`",
@@ -187,9 +187,8 @@ def stale_stages() -> set[str]:
         return set(repo.status()) - {CODE}
 
 
-def what_follows(stages: set[str]) -> set[str]:
+def what_follows(stages: set[str], graph: dict[str, Stage]) -> set[str]:
     """The stages that depend on an output of these, directly or not."""
-    graph = read_graph(Path())
     reached = set(stages)
     while more := {stage.name for stage in graph.values() if reads_from(stage, reached, graph)} - reached:
         reached |= more
@@ -201,14 +200,14 @@ def reads_from(stage: Stage, makers: set[str], graph: dict[str, Stage]) -> bool:
     return any(f"{out}/".startswith(f"{dep}/") or f"{dep}/".startswith(f"{out}/") for dep in stage.data for out in outs)
 
 
-def stages_in_words(names: set[str], datasets: list[str]) -> str:
+def stages_in_words(names: set[str], datasets: list[str], graph: dict[str, Stage]) -> str:
     """``convert of grab``: the datasets only where not all of them are meant, families where not all."""
     families = read_params(Path())["families"]
     of: dict[str, set[str]] = {}
     for name in names:
         stage, _, rest = name.rpartition(":")[2].partition("@")
-        dataset, _, last = rest.removeprefix("embedded").strip("-").partition("-")
-        asked = {last} if last in families else set()
+        dataset = rest.removeprefix("embedded").strip("-").partition("-")[0]
+        asked = {Path(out).name for out in graph[name].outs if out.startswith("samples/")} & set(families)
         of.setdefault(stage, set()).add(dataset)
         of.setdefault(f"families of {stage}", set()).update(asked)
     groups: dict[str, list[str]] = {}
@@ -220,18 +219,18 @@ def stages_in_words(names: set[str], datasets: list[str]) -> str:
     return "; ".join(f"{', '.join(stages)}{where}" for where, stages in sorted(groups.items())) or "nothing"
 
 
-def price(change: Change) -> tuple[str, str]:
+def price(change: Change) -> tuple[str, ...]:
     """What DVC runs again after the change, and what may follow, in words; the copy is as before afterwards."""
     change.edit(Path())
     try:
-        stale, datasets = stale_stages(), read_params(Path())["datasets"]
-        return stages_in_words(stale, datasets), stages_in_words(what_follows(stale), datasets)
+        stale, datasets, graph = stale_stages(), read_params(Path())["datasets"], read_graph(Path())
+        return tuple(stages_in_words(names, datasets, graph) for names in (stale, what_follows(stale, graph)))
     finally:
         run("git", "reset", "-q", "--hard")
         run("git", "clean", "-fdq")
 
 
-def table(prices: dict[str, tuple[str, str]]) -> str:
+def table(prices: dict[str, tuple[str, ...]]) -> str:
     rows = [f"| {words} | {runs} | {follows} |" for words, (runs, follows) in prices.items()]
     return "\n".join(
         [BEGIN, "| you touch | runs again | follows, if that gives other bytes |", "|---|---|---|", *rows, END]
@@ -245,7 +244,7 @@ def copy(tmp_path_factory) -> Iterator[Path]:
 
 
 @pytest.fixture(scope="module")
-def prices(copy: Path) -> dict[str, tuple[str, str]]:
+def prices(copy: Path) -> dict[str, tuple[str, ...]]:
     return {change.words: price(change) for change in CHANGES}
 
 

@@ -65,6 +65,7 @@ def test_an_empty_section_of_an_overlay_says_nothing(plain):
         ({"study": ["annotate"]}, "profiles.study: expected keys with values"),
         ({"study": {"datasets": ["grab"]}}, "profiles.study.datasets: .*at the top of params.yaml"),
         ({"study": {"families": []}}, "profiles.study.families: "),
+        ({"study": {"family_datasets": {}}}, "profiles.study.family_datasets: "),
         ({"study": {"profile": "own"}}, "profiles.study.profile: "),
         ({"study": {"train": {"size": "full"}}}, "profiles.study.train.size: "),
     ],
@@ -87,7 +88,7 @@ def test_a_stage_runs_again_when_a_setting_it_reads_is_laid_over_and_no_other_do
     keys = {(file, key) for stage in stages for file in stage.code for key in stage.params}
     keys |= {(file, f"{'.'.join(SECTIONS_OF_DATASETS[name])}.grab") for name in SECTIONS_OF_DATASETS
              for file in [f"code/{name}/grab.json"]}  # fmt: skip
-    checked = {(file, key) for file, key in keys if key not in ("datasets", "families")}
+    checked = {(file, key) for file, key in keys if key not in ("datasets", "families", "family_datasets")}
     files = {file for stage in stages for file in stage.code}
     for key in sorted({key for _, key in checked}):
         assert changed_by_overlay(plain, key, files) == {file for file, other in checked if other == key}, key

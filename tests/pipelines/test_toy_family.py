@@ -18,7 +18,7 @@ OWN_STAGES = [
     for name in (
         f"models/toy/dvc.yaml:train@embedded-{dataset}",
         f"models/toy/dvc.yaml:sample@embedded-{dataset}",
-        f"evaluate@embedded-{dataset}-toy",
+        f"evaluate@embedded-{dataset}",
     )
 ]
 

@@ -103,7 +103,7 @@ def read_all_metrics() -> None:
     kept(read_rows(METRICS))
     shutil.rmtree("figures", ignore_errors=True)
     Path("figures").mkdir()
-    write_figures(Path("figures"), METRICS.parent, Path("checkpoints"), ["grab"], families)
+    write_figures(Path("figures"), METRICS.parent, Path("checkpoints"), {"grab": families})
 
 
 def read_a_manifest() -> None:

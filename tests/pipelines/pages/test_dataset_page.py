@@ -170,8 +170,7 @@ def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, h
     page = write_report(
         tmp_path / "report",
         "embedded",
-        ["h2o", "grab"],
-        ["ground-truth"],
+        {"h2o": ["ground-truth"], "grab": ["ground-truth"]},
         hands,
         ReportFolders.of("embedded", tmp_path),
     )
@@ -179,7 +178,7 @@ def test_report_links_the_page_of_each_dataset_that_has_what_it_needs(project, h
     assert "<h1>GRAB" in (tmp_path / "report" / "grab.html").read_text()
     (project / "splits" / "splits.parquet").unlink()
     page = write_report(
-        tmp_path / "less", "embedded", ["grab"], ["ground-truth"], hands, ReportFolders.of("embedded", tmp_path)
+        tmp_path / "less", "embedded", {"grab": ["ground-truth"]}, hands, ReportFolders.of("embedded", tmp_path)
     )
     assert "grab.html" not in page.read_text()
 

@@ -33,7 +33,7 @@ def folders(hands, page_clip, tmp_path_factory):
 
 
 def test_page_says_what_was_left_out_and_why(folders, hands, tmp_path):
-    text = write_report(tmp_path / "report", "embedded", ["grab"], ["ground-truth"], hands, folders).read_text()
+    text = write_report(tmp_path / "report", "embedded", {"grab": ["ground-truth"]}, hands, folders).read_text()
     assert "Of 3 clips 2 are sound, 0 are warned of and kept, 1 are left out of annotation" in text
     assert f"<td>test/s1/1</td><td>{JUMP}</td>" in text
     assert "<td>open box</td><td>warned</td><td>share of edges at a hole" in text

@@ -9,6 +9,7 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.store.annotated import load_annotated
 from models.common.predicting import sample_family
 from models.registry import load_family
+from pipelines.figures import write_figures
 from pipelines.pages.curves import Curve, Panel, log_curves, panels_svg, read_log
 from pipelines.pages.examples import shown_ids
 from pipelines.pages.player import three_javascript
@@ -50,7 +51,7 @@ def sampled(folders, hands):
 
 
 def write(folders, hands, out, *datasets):
-    return write_report(out, "embedded", datasets, FAMILIES, hands, folders).read_text(encoding="utf-8")
+    return write_report(out, "embedded", dict.fromkeys(datasets, FAMILIES), hands, folders).read_text(encoding="utf-8")
 
 
 def test_report_tells_what_is_in_each_dataset_and_what_was_left_out(folders, hands, tmp_path):
@@ -122,3 +123,18 @@ def test_wide_positive_ranges_are_drawn_logarithmically():
     assert Panel("", [Curve("", x, np.array([1.0, 10, 30]))]).is_logarithmic
     assert not Panel("", [Curve("", x, np.array([-1.0, 10, 30]))]).is_logarithmic
     assert not Panel("", [Curve("", x, np.array([10.0, 20, 30]))]).is_logarithmic
+
+
+def test_a_leading_metric_that_was_not_measured_is_named_with_its_reason_apart_from_the_numbers(tmp_path):
+    metrics, out = tmp_path / "metrics" / "arctic", tmp_path / "out"
+    metrics.mkdir(parents=True)
+    out.mkdir()
+    figures = {"contact_f1": 0.5}
+    without = {"deep_share": {"the object has no inside": 257}, "slip_cm_s": {"no such frame": 3}}
+    (metrics / "ours.json").write_text(json.dumps({"figures": figures, "unmeasured": without}))
+    (metrics / "whole.json").write_text(json.dumps({"figures": figures}))
+    write_figures(out, tmp_path / "metrics", tmp_path / "checkpoints", {"arctic": ["ours", "whole"]})
+    assert json.loads((out / "figures.json").read_text()) == {
+        "arctic": {"ours": figures, "whole": figures},
+        "not measured": {"arctic": {"ours": {"deep_share": "the object has no inside: 257 clips"}}},
+    }
