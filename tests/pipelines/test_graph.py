@@ -10,7 +10,6 @@ import pytest
 import yaml
 
 from hoidata.datasets.registry import adapter_names
-from pipelines.deployments import deployment_targets
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import read_params
 from pipelines.stages.__main__ import STAGES
@@ -114,6 +113,8 @@ def test_the_graph_names_no_dataset_and_no_raw_data():
 
 
 def test_deployments_are_the_graphs_own_work_by_dataset_and_family(graph):
+    from pipelines.flows import deployment_targets
+
     params = read_params(PROJECT)
     found = deployment_targets(graph, params["profile"], params["datasets"])
     assert found["full-graph"] == []
