@@ -20,6 +20,7 @@ from hoidata.errors import BadInput
 from pipelines.commands.project import current_profile, set_profile
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import PROFILES, read_params
+from pipelines.prefect_server import KEY_FILE
 from pipelines.repro import reproduce
 from pipelines.run_facts import describe_results
 from pipelines.side_by_side import RunStage, describe_run, log_of
@@ -110,7 +111,8 @@ def make_deployments(project: Path) -> list[RunnerDeployment]:
     params = read_params(project)
     targets = deployment_targets(read_graph(project), params["profile"], params["datasets"])
     return [
-        bring_up_to_date.to_deployment(
+        RunnerDeployment.from_flow(
+            bring_up_to_date,
             name,
             description=f"Brings {', '.join(targets[name]) or 'the report'}, and all it is made from, up to date.",
             parameters={"targets": targets[name], "profile": "", "jobs": 0, "force": False},
@@ -141,6 +143,7 @@ def serve_flows() -> None:
     """
     end_abandoned_runs()
     runner = Runner(pause_on_shutdown=False, limit=None)
+    runner._tmp_dir = KEY_FILE.parent.resolve() / "runner"  # Prefect's own choice is a folder that all users share
     for deployment in make_deployments(Path()):
         runner.add_deployment(deployment)
     print(READY, flush=True)
