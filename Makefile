@@ -9,7 +9,7 @@ export PREFECT_SERVER_ANALYTICS_ENABLED := false
 export HF_HUB_OFFLINE := 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo install install-dev docs test test-fast test-long chaos fuzz lint types imports check bench clean
+.PHONY: demo install install-dev docs test test-fast test-long chaos fuzz mutation lint types imports check bench clean
 
 demo: $(VENV)/.installed
 	hoidata repro
@@ -46,7 +46,12 @@ chaos: install-dev
 
 # 50,000 damaged files for each parser, over a million in all; inputs that fail are kept in .fuzz/.
 fuzz: install-dev
-	OMP_NUM_THREADS=1 python -m fuzz --full --jobs 2 --executions 50000
+	OMP_NUM_THREADS=1 python -m fuzz --jobs 2 --executions 50000
+
+# Small changes of the code, each of which a test must notice. Of other packages: make mutation PATHS="hoidata/geometry"
+PATHS ?= hoidata/contact hoidata/annotation hoidata/clips
+mutation: install-dev
+	OMP_NUM_THREADS=1 python -m tests.mutation $(PATHS)
 
 lint: install-dev
 	ruff check .

@@ -1,174 +1,159 @@
-"""Every parser of files from outside, each with seeds, words of its format and the functions whose lines count."""
+"""Every parser of files from outside, with small valid files as seeds."""
 
 import contextlib
+import gzip
 import io
+import json
 import os
 import pickle
-import random
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextvars import ContextVar
+from collections.abc import Callable
 from dataclasses import asdict
+from fnmatch import fnmatch
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
+import trimesh
 
-from fuzz import seeds
-from fuzz.coverage import functions_of
-from fuzz.engine import Target
-from fuzz.structure import (
-    LONGEST,
-    mutate,
-    npy_mutation,
-    pickle_mutation,
-    storage_mutation,
-    zip_mutation,
-)
+from fuzz.engine import LONGEST, Target
 from hoidata.clips.clip import SourceFile
-from hoidata.datasets.arctic import files as arctic_files
+from hoidata.datasets.arctic import files as arctic
 from hoidata.datasets.base import RawTree
-from hoidata.datasets.h2o import files as h2o_files
-from hoidata.datasets.hoi4d import files as hoi4d_files
-from hoidata.datasets.hot3d import files as hot3d_files
+from hoidata.datasets.h2o import files as h2o
+from hoidata.datasets.hoi4d import files as hoi4d
+from hoidata.datasets.hot3d import files as hot3d
 from hoidata.datasets.hot3d import packed, umetrack
 from hoidata.datasets.manipnet import adapter as manipnet
 from hoidata.datasets.manipnet import bvh
-from hoidata.datasets.oakink2 import files as oakink2_files
+from hoidata.datasets.oakink2 import files as oakink2
 from hoidata.errors import BadInput
-from hoidata.files import (
-    array_pieces,
-    arrays,
-    npy_header,
-    numpy_files,
-    pickle_check,
-    restricted_pickle,
-    torch_pickle,
-)
-from hoidata.hands import mano, model
+from hoidata.files import array_pieces, arrays, npy_header, numpy_files, pickle_check, restricted_pickle, torch_pickle
+from hoidata.hands import load_embedded_hands, mano, model
 from hoidata.object_paths import keyframes
-from hoidata.objects import glb, mesh, stl, user_mesh
-from hoidata.objects import ply as ply_reader
+from hoidata.objects import glb, mesh, ply, stl, user_mesh
 from hoidata.store import mapped, store
 from models.manipnet import trajectory_files
 from pipelines import params
 from pipelines.lineage import manifests
 from pipelines.stages import base
 from pipelines.stages.adapters import ConvertSettings
+from tests.builders.objects import hinged_box
 
 ABSENT = b"absent"  # stands for a file that is not there
-GLOBALS = (
-    *(b"cnumpy.core.multiarray\n_reconstruct\n", b"cnumpy._core.multiarray\nscalar\n", b"cnumpy\nndarray\n"),
-    *(b"cnumpy\ndtype\n", b"cnumpy._core.numeric\n_frombuffer\n", b"c_codecs\nencode\n", b"cbuiltins\nset\n"),
-    *(b"c__builtin__\nbytes\n", b"cos\nsystem\n", b"cbuiltins\neval\n", b"\x8c\x02os\x8c\x06system\x93"),
+BVH = (
+    b"HIERARCHY\nROOT Hand\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation\n"
+    b"JOINT Finger\n{\nOFFSET 1 0.5 0\nCHANNELS 3 Yrotation Xrotation Zrotation\nEnd Site\n{\nOFFSET 1 0 0\n}\n}\n}\n"
+    b"MOTION\nFrames: 2\nFrame Time: 0.008333\n0 0 0 1 2 3 4 5 6\n1 0 0 1 2 3 4 5 -6.5\n"
 )
-OPCODES = (
-    *(b"N", b"\x88", b"]", b"}", b")", b"(", b"t", b"\x85", b"\x86", b"\x87", b"a", b"e", b"s", b"u", b"R", b"b"),
-    *(b"0", b"1", b"2", b"\x94", b"q\x00", b"h\x00", b"h\x01", b"r\xff\xff\xff\x7f", b"j\x00\x00\x00\x00", b"."),
-    *(b"K\x05", b"J\xff\xff\xff\xff", b"\x8a\x08\x00\x00\x00\x00\x00\x00\x00\x40", b"\x8a\x00", b"\x81", b"\x92"),
-    *(b"G\x7f\xf8\x00\x00\x00\x00\x00\x00", b"X\x02\x00\x00\x00f8", b"U\x02O8", b"C\x04\x00\x00\x00\x00", b"\x8f"),
-    *(b"\x90", b"\x91", b"Q", b"P1\n", b"\x97", b"\x98", b"I-1\n", b"L5L\n", b"S'<'\n", b"Vlatin1\n", b"\x80\x05"),
+OBJ = (
+    b"v 0 0 0\nv 1.5 0 0 0.5 0.5 0.5\nv 0 1e0 0\nv 0 0 -1\nvn 0 0 1\ng part\nf 1 2 3\nf 1/1/1 2/1/1 4/1/1\nf -1 -2 -3\n"
 )
-MANO_GLOBALS = (b"cchumpy.ch\nCh\n", b"cchumpy.reordering\nSelect\n", b"cscipy.sparse.csc\ncsc_matrix\n")
-TORCH_GLOBALS = (
-    *(b"ctorch._utils\n_rebuild_tensor_v2\n", b"ctorch._utils\n_rebuild_parameter\n"),
-    *(b"ctorch.storage\n_load_from_bytes\n", b"ccollections\nOrderedDict\n", b"ctorch\nFloatStorage\n"),
-    *(b"ctorch.cuda\nHalfStorage\n", b"ctorch\nBFloat16Storage\n"),
+PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face 3\n"
+    b"property list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n3 0 1 2\n3 0 1 3\n4 0 1 2 3\n"
 )
-MESH_WORDS = (
-    *(b"v ", b"f ", b"vn 0 0 1\n", b"1/2/3", b"//", b"-1", b"\\\n", b"end_header\n", b"element face 1000000000\n"),
-    *(b"property list uchar int vertex_indices\n", b"property double x\n", b"element vertex 1000000000\n", b"ply\n"),
-    *(b"format ascii 1.0\n", b"format binary_little_endian 1.0\n", b"comment TextureFile x.png\n", b"obj_info\n"),
-    *(b"property list int double vertex_index\n", b"element more 2\n", b"property uchar red\n", b"nan ", b"\xff\xfe"),
-)
-BVH_WORDS = (b"MOTION\n", b"JOINT ", b"End Site", b"{", b"}", b"OFFSET 0 0 0", b"CHANNELS 3 ", b"Frames: ", b"ROOT ")
-PICKLE = pickle_mutation((*OPCODES, *GLOBALS))
-TORCH_POOL = (*OPCODES, *TORCH_GLOBALS)
-ARCTIC_TEXT = "12-100 grab, right hand\n1-30 use, both hand\n\n31-45 type, left hand\n"
-_SCRATCH: ContextVar[Path] = ContextVar("scratch")
+SEGMENTS = b"id path action_label start_act end_act start_frame end_frame\n1 subject1/h1/0 8 56 92 0 640\n"
+TREE = b'[{"id": 0, "children": [{"id": 1, "objs": ["new-0"]}, {"id": 2, "objs": ["new-1"]}]}]'
+KEYFRAMES = b"time_s,x_cm,z_mm,rx_deg,hinge_rad\n0,0,0,0,0\n1,5,150,20,0.5\n2,5,0,0,0\n"
+TOML = b'[roots]\ngrab = "/data/grab"\nh2o = "x"\n\n[other]\na = [1, 2.5, true, 1979-05-27]\n'
+PARAMS = b"profile: own\nconvert: {margin_frames: 3}\nsplit: {h2o: text2hoi}\n"
 
 
-@contextlib.contextmanager
-def scratch_folder() -> Iterator[None]:
-    """A folder in memory for parsers that take a path; forked processes use it in turn."""
-    shared = Path("/dev/shm")
-    with tempfile.TemporaryDirectory(prefix="hoidata-fuzz-", dir=shared if shared.is_dir() else None) as root:
-        for folder in ("meta", str(Path(manipnet.HAND_REFERENCE).parent)):
-            (Path(root) / folder).mkdir()
-        token = _SCRATCH.set(Path(root))
-        try:
-            yield
-        finally:
-            _SCRATCH.reset(token)
+def made(*files: bytes) -> Callable[[], list[bytes]]:
+    return lambda: [*files, ABSENT]
 
 
-def _written(name: str, data: bytes) -> Path:
-    path = _SCRATCH.get() / name
-    if data == ABSENT:
-        path.unlink(missing_ok=True)
-    else:
-        path.write_bytes(data)
-    return path
+@cache
+def _raw(dataset: str) -> dict[str, bytes]:
+    """Raw files of two recordings, as the tests of an adapter write them."""
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        import_module(f"tests.builders.{dataset}").write_two(root)
+        return {str(path.relative_to(root)): path.read_bytes() for path in root.rglob("*") if path.is_file()}
 
 
-def on_disk(name: str, parse: Callable[[Path], Any]) -> Callable[[bytes], Any]:
-    return lambda data: parse(_written(name, data))
+def raw(dataset: str, *patterns: str, lines: int | None = None) -> Callable[[], list[bytes]]:
+    """The smallest raw file that fits each pattern; of a long text its first lines."""
+
+    def seeds() -> list[bytes]:
+        fitting = [[data for name, data in _raw(dataset).items() if fnmatch(name, pattern)] for pattern in patterns]
+        smallest = [min(files, key=len) for files in fitting]
+        return smallest if lines is None else [b"".join(data.splitlines(keepends=True)[:lines]) for data in smallest]
+
+    return seeds
 
 
+def pickled(value: object, protocol: int = 2) -> bytes:
+    """With NumPy's names before version 2, as released files have them, where no length stands before a name."""
+    data = pickle.dumps(value, protocol)
+    return data if protocol > 3 else data.replace(b"numpy._core", b"numpy.core")
+
+
+def archive(save: Callable, **values: Any) -> bytes:
+    stream = io.BytesIO()
+    save(stream, **values)
+    return stream.getvalue()
+
+
+def boxed(value: object) -> np.ndarray:
+    array = np.empty((), dtype=object)
+    array[()] = value
+    return array
+
+
+def parse(function: Callable, *names: Any) -> Callable[[bytes, Path], Any]:
+    """A parser of bytes, which is also told the file's name."""
+    return lambda data, _: function(data, *names)
+
+
+def on_disk(name: str, function: Callable[[Path], Any]) -> Callable[[bytes, Path], Any]:
+    """A parser of a file of this name."""
+
+    def run(data: bytes, folder: Path) -> Any:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if data == ABSENT:
+            path.unlink(missing_ok=True)
+        else:
+            path.write_bytes(data)
+        return function(path)
+
+    return run
+
+
+@cache
 def all_targets() -> dict[str, Target]:
-    groups = (
-        _pickles(),
-        _numpy_files(),
-        _hand_files(),
-        _meshes(),
-        _texts(),
-        _trajectories(),
-        _hoi4d(),
-        _hot3d(),
-        _oakink2(),
-        _object_paths(),
-        _json_files(),
-        _settings(),
+    return _pickles() | _numpy_files() | _meshes_and_tables() | _datasets() | _json_files()
+
+
+def _pickles() -> dict[str, Target]:
+    values = (
+        {"a": np.arange(4.0).reshape(2, 2), "b": [1, 2.5, "x", None, True, (1, "y")], "c": np.float32(2)},
+        [np.asfortranarray(np.arange(6, dtype=np.int16).reshape(2, 3)), b"\xff", {1, 2}, np.array(["cup", "b"])],
+        {"deep": {"x": np.array([1, "x", np.arange(2)], dtype=object)}, "big": np.arange(3, dtype=">i4")},
     )
-    return {target.name: target for group in groups for target in group}
-
-
-UNPICKLER = [*functions_of(restricted_pickle), *functions_of(pickle_check)]
-
-
-def _pickles() -> list[Target]:
-    return [
-        Target(
-            "pickle-arrays",
-            lambda: [*seeds.array_pickles(), *seeds.near_array_pickles()],
-            _restricted,
-            UNPICKLER,
-            (*OPCODES, *GLOBALS),
-            PICKLE,
+    arrays_ = [pickled(value, protocol) for value in values for protocol in (0, 2, 5)]
+    hand = {"poseCoeff": np.zeros(48, "f4"), "beta": np.zeros(10, "f4"), "trans": np.zeros(3, "f4")}
+    turn = {"pose_coeffs": np.eye(4, dtype="f4")[[0] * 16][None], "tsl": np.zeros((1, 3)), "betas": np.zeros((1, 10))}
+    both = {f"{side}__{name}": array for side in ("lh", "rh") for name, array in turn.items()}
+    annotation = {"mocap_frame_id_list": [0, 1, 4], "obj_list": ["a", "b"], "raw_mano": {0: both}}
+    annotation["obj_transf"] = {"a": {0: np.eye(4), 4: np.eye(4)}}
+    load_hand = on_disk("MANO_RIGHT.pkl", lambda path: mano._load_side(path.parent, "right"))
+    load_tensors = parse(torch_pickle.load_torch_pickle, "hand.pkl")
+    tensors = raw("taco", "*hand_shape.pkl", "*right_hand.pkl")
+    return {
+        "pickle-arrays": Target(made(*arrays_), parse(_restricted), [restricted_pickle, pickle_check], "pickle"),
+        "pickle-mano": Target(_chumpy_pickles, parse(_mano_values), [mano], "pickle"),
+        "pickle-torch": Target(tensors, load_tensors, [torch_pickle], "pickle"),
+        "mano-file": Target(_mano_file, load_hand, [mano, model], "pickle"),
+        "hoi4d-hand": Target(made(pickled(hand)), parse(hoi4d.hand_frame, "0.pickle"), [hoi4d], "pickle"),
+        "oakink2-annotation": Target(
+            made(pickled(annotation, 4)), parse(oakink2.read_annotation, "a.pkl"), [oakink2], "pickle"
         ),
-        Target(
-            "pickle-mano",
-            seeds.mano_pickles,
-            _mano_values,
-            (mano._dense, mano._dense_csc),
-            (*OPCODES, *GLOBALS, *MANO_GLOBALS),
-            pickle_mutation((*OPCODES, *MANO_GLOBALS)),
-        ),
-        Target(
-            "pickle-torch",
-            lambda: [*seeds.torch_pickles(), *seeds.near_torch_pickles()],
-            _torch,
-            functions_of(torch_pickle),
-            TORCH_POOL,
-            pickle_mutation(TORCH_POOL, storage_mutation(TORCH_POOL)),
-        ),
-    ]
-
-
-def _torch(data: bytes) -> Any:
-    source = _written("hand.pkl", data) if len(data) % 2 else data
-    return torch_pickle.load_torch_pickle(source, "hand.pkl")
+    }
 
 
 def _restricted(data: bytes) -> Any:
@@ -178,520 +163,208 @@ def _restricted(data: bytes) -> Any:
 
 def _mano_values(data: bytes) -> Any:
     content = restricted_pickle.restricted_load(data, mano._ALLOW, encoding="latin1", where="MANO_RIGHT.pkl")
-    if isinstance(content, dict):
-        return [mano._dense(f"MANO_RIGHT.pkl: {key}", value) for key, value in content.items()]
-    return mano._dense("MANO_RIGHT.pkl", content)
+    return [mano._dense("MANO_RIGHT.pkl", value) for value in (content if isinstance(content, dict) else {}).values()]
 
 
-def _numpy_files() -> list[Target]:
-    words = (b"\x93NUMPY", b"'descr': '|O'", b"(1000000000, 1000000000)", b"True", b"<f8", b"()", *OPCODES[:8])
-    zip_words = (
-        b"PK\x03\x04",
-        b"PK\x01\x02",
-        b"PK\x05\x06",
-        b"PK\x06\x06",
-        b"PK\x06\x07",
-        b".npy",
-        b"\xff\xff\xff\xff",
-    )
-    plain = npy_mutation(mutate)
-    objects = npy_mutation(PICKLE)
-    reading = [numpy_files._read, *functions_of(npy_header)]
-    members = [numpy_files.load_npz_objects, numpy_files._chosen_members, numpy_files._check_size]
-    members += [numpy_files._read_member, numpy_files.open_archive, numpy_files._item]
-    return [
-        Target(
-            "npy",
-            lambda: [*seeds.npy_files(), *seeds.near_npy_files()],
-            on_disk("a.npy", numpy_files.load_npy),
-            functions_of(npy_header),
-            words,
-            plain,
+def _chumpy_pickles() -> list[bytes]:
+    """A chumpy array, a selection of one and a sparse matrix, as Python 2 wrote them, in a dictionary each."""
+
+    def instance(module: bytes, state: bytes) -> bytes:
+        return b"c" + module + b"\n)\x81" + state + b"b"
+
+    def inner(value: object) -> bytes:
+        return pickled(value)[2:-1]  # without PROTO and STOP
+
+    array = instance(b"chumpy.ch\nCh", inner({"x": np.arange(6.0).reshape(2, 3)}))
+    chosen = b"}(U\x01a" + array + b"U\x04idxs" + inner(np.array([0, 2, 4])) + b"U\x0fpreferred_shape" + inner((3, 1))
+    matrix = {"_shape": (3, 2), "data": np.ones(3), "indices": np.array([0, 1, 2]), "indptr": np.array([0, 2, 3])}
+    select = instance(b"chumpy.reordering\nSelect", chosen + b"u")
+    sparse = instance(b"scipy.sparse.csc\ncsc_matrix", inner(matrix))
+    return [b"\x80\x02}U\x01a" + part + b"s." for part in (array, select, sparse, inner(np.arange(3.0)))]
+
+
+def _mano_file() -> list[bytes]:
+    """A whole right hand in MANO's layout; its bulk in one-byte numbers, so that one reading is quick."""
+    hand = load_embedded_hands().right
+    content = {
+        **{"shapedirs": np.zeros((778, 3, 10), np.int8), "posedirs": np.zeros((778, 3, 135), np.int8)},
+        **{"J_regressor": hand.joint_regressor, "weights": hand.skin_weights, "v_template": hand.template_m},
+        **{"hands_mean": hand.mean_pose, "hands_components": hand.components, "f": hand.faces.astype(np.uint16)},
+        "kintree_table": np.array([[2**32 - 1, *hand.parents[1:]], range(16)], np.int64),
+    }
+    return [pickled(content)]
+
+
+def _numpy_files() -> dict[str, Target]:
+    hand = boxed({"params": {"transl": np.zeros((2, 3))}, "vtemp": "a.ply"})
+    contact = boxed({"object": np.zeros((2, 4), np.int8), "body": np.zeros((2, 4100), np.int8)})
+    grab = {"obj_name": np.array("cup"), "n_frames": np.array(2), "lhand": hand, "contact": contact}
+    small = {"a": np.arange(4.0), "b": np.array("x"), "c": np.zeros((0, 2))}
+    objects = made(*(archive(save, **grab) for save in (np.savez, np.savez_compressed)))
+    numbers = made(*(archive(save, **small) for save in (np.savez, np.savez_compressed)))
+    turns = np.tile([1.0, 0, 0, 0], (4, 1))
+    still = {"time_s": np.arange(4) / 30, "object_position": np.zeros((4, 3)), "object_quaternion": turns}
+    tracked = made(archive(np.savez, **still, left_position=np.ones((4, 3)), left_quaternion=turns))
+    plain = [archive(np.save, arr=array) for array in (np.arange(6.0).reshape(2, 3), np.array("text"))]
+
+    def read_objects(path: Path) -> Any:
+        return numpy_files.load_npz_objects(path, ("obj_name", "n_frames", "lhand"))
+
+    def pieces(path: Path) -> None:
+        for array in array_pieces.locate_arrays(path, "contact").values():
+            # An array of rows without columns may have any number of pieces.
+            _ = [piece.sum() for _, (_, piece) in zip(range(4), array.pieces(), strict=False)]
+
+    def map_all(path: Path) -> None:
+        _ = [array.ravel()[:10].tolist() for array in mapped.map_npz(path).values()]
+
+    def trajectories(path: Path) -> Any:
+        return trajectory_files.from_arrays(numpy_files.load_npz_arrays(path), "a.npz")
+
+    read_any = on_disk("a.npy", numpy_files.load_npy_object)
+    return {
+        "npy": Target(made(*plain), on_disk("a.npy", numpy_files.load_npy), [npy_header]),
+        "npy-object": Target(made(archive(np.save, arr=hand), *plain), read_any, [npy_header, numpy_files]),
+        "npz-object": Target(objects, on_disk("a.npz", read_objects), [numpy_files], "zip"),
+        "npz-pieces": Target(objects, on_disk("a.npz", pieces), [array_pieces], "zip"),
+        "npz-read": Target(numbers, on_disk("a.npz", arrays.read_npz), [arrays], "zip"),
+        "npz-map": Target(numbers, on_disk("a.npz", map_all), [mapped], "zip"),
+        "trajectories-npz": Target(tracked, on_disk("a.npz", trajectories), [trajectory_files], "zip"),
+    }
+
+
+def _meshes_and_tables() -> dict[str, Target]:
+    box, hinged = trimesh.creation.box(), hinged_box()
+    binary_ply, ascii_stl = box.export(file_type="ply"), box.export(file_type="stl_ascii").encode()
+    names = [f"{body}_{part}" for body in ("object", "right") for part in ("x", "y", "z", "qw", "qx", "qy", "qz")]
+    rows = [f"{number / 30:.4f},0,0,0,1,0,0,0,0.1,0,0,1,0,0,0" for number in range(4)]
+    table = "\n".join([",".join(["time_s", *names]), *rows]).encode()
+    listed = b'[{"time_s": 0, "z_cm": 0, "hinge_deg": 0}, {"time_s": 1.5, "z_cm": 20, "hinge_deg": 45}]'
+    manipnet_rows = b"120\n" + b"\n".join([b",".join([b"0,0,0,1,0.5,1,2"] * 3)] * 4)
+
+    def keyframed(data: bytes) -> Any:
+        return keyframes.keyframed_path(hinged, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0))
+
+    def meshes(suffix: str) -> Callable[[bytes, Path], Any]:
+        return on_disk(f"a.{suffix}", mesh.load_mesh if suffix in ("obj", "ply") else user_mesh.read_mesh_file)
+
+    return {
+        "obj": Target(made(OBJ), meshes("obj"), [mesh]),
+        "ply-ascii": Target(made(PLY), meshes("ply"), [mesh, ply]),
+        "ply-binary": Target(made(binary_ply), meshes("ply"), [mesh, ply]),
+        "glb": Target(made(box.export(file_type="glb")), meshes("glb"), [user_mesh, glb]),
+        "stl": Target(made(ascii_stl, box.export(file_type="stl")), meshes("stl"), [user_mesh, stl]),
+        "trajectories-csv": Target(made(table), parse(trajectory_files.parse_csv, "a.csv"), [trajectory_files]),
+        "trajectories-manipnet": Target(
+            made(manipnet_rows), parse(trajectory_files.parse_manipnet, "a.txt"), [trajectory_files]
         ),
-        Target(
-            "npy-object",
-            lambda: [*seeds.npy_object_files(), *seeds.near_npy_files()],
-            on_disk("a.npy", numpy_files.load_npy_object),
-            reading,
-            words,
-            objects,
+        "object-keyframes": Target(made(KEYFRAMES, listed), parse(keyframed), [keyframes]),
+    }
+
+
+def _datasets() -> dict[str, Target]:
+    described = b"12-100 grab, right hand\n1-30 use, both hand\n\n31-45 type, left hand\n"
+
+    def hot3d_tables(data: bytes) -> Any:
+        return (hot3d.failed_times if b"mask" in data else hot3d.object_poses)(data, "a.csv")
+
+    def h2o_rows(data: bytes) -> Any:
+        return h2o.parse_rows([b"1 2 3\n", data], 3, "cam_pose", ["000000.txt", "000001.txt"])
+
+    def bvh_text(data: bytes) -> Any:
+        return bvh.parse_bvh(data.decode("utf-8", "replace"), "a.bvh")
+
+    return {
+        "bvh": Target(made(BVH), parse(bvh_text), [bvh]),
+        "gzip-text": Target(made(gzip.compress(BVH, mtime=0)), parse(bvh.unpack_text, "a.bvh.gz", 4096), [bvh]),
+        "h2o-rows": Target(made(b"1 2.5 -3e-2\n4", b"1.0  2 3\r\n"), parse(h2o_rows), [h2o]),
+        "h2o-segments": Target(made(SEGMENTS), parse(h2o.parse_segments, "action_train.txt"), [h2o]),
+        "arctic-descriptions": Target(made(described), parse(arctic.parse_descriptions, "description.txt"), [arctic]),
+        "hoi4d-camera": Target(raw("hoi4d", "*output.log", lines=10), parse(hoi4d.camera_poses, "output.log"), [hoi4d]),
+        "hot3d-hands": Target(
+            raw("hot3d", "*mano*.jsonl", lines=2), parse(hot3d.hand_poses, "a.jsonl", "mano"), [hot3d]
         ),
-        Target(
-            "npz-object",
-            lambda: [*seeds.npz_object_files(), *seeds.near_object_archives()],
-            on_disk("a.npz", lambda path: numpy_files.load_npz_objects(path, ("obj_name", "n_frames", "lhand"))),
-            members,
-            zip_words,
-            zip_mutation(objects),
+        "hot3d-tables": Target(raw("hot3d", "*objects.csv", "*mask*.csv", lines=3), parse(hot3d_tables), [hot3d]),
+        "hot3d-tar": Target(_packed_clip, parse(packed.read_packed, "a.tar"), [packed]),
+    }
+
+
+def _packed_clip() -> list[bytes]:
+    builders = import_module("tests.builders.hot3d")
+    with tempfile.TemporaryDirectory() as folder:
+        whole = builders.truth("Aria", "mano", 0)
+        return [builders.write_clip(Path(folder), "Aria", 1, "P0001_4bf4e21a", whole).read_bytes()]
+
+
+def _json_files() -> dict[str, Target]:
+    capsules = [{"joint": joint, "end_local": [0.1, -0.2, 3]} for joint in manipnet.TIP_JOINTS]
+    entry = asdict(SourceFile("grab/s1/a.npz", 12, "0" * 64))
+    manifest = {"schema": manifests.SCHEMA, "dataset": "grab", "present": True, "source": "files", "licence": "x"}
+    generated = {**manifest, "recipe": {"seed": 0}, "source": "generated"}
+    info = {"schema_version": store.SCHEMA_VERSION, "dataset": "grab", "hand_model": {"digest": "x"}, "synthetic": True}
+    misc = {"s01": {"ioi_offset": 644, "gender": "male"}, "s02": {"ioi_offset": 1}}
+    hoi4d_seeds = raw("hoi4d", "*color.json", "*objpose/*.json", "*mobility_v2.json", "*result.json")
+    hot3d_seeds = raw("hot3d", "*metadata.json", "*instance.json", "*profile.json")
+    oakink2_seeds = raw("oakink2", "*program_info/*.json", "*obj_desc.json", "*part_tree.json")
+
+    def values(*contents: object) -> Callable[[], list[bytes]]:
+        return made(*(json.dumps(content).encode() for content in contents))
+
+    def own_root(path: Path) -> Any:
+        os.environ.pop(base.root_variable("grab"), None)
+        with contextlib.chdir(path.parent):
+            return base.own_root("grab")
+
+    def settings(path: Path) -> Any:
+        return base.load_settings(ConvertSettings, "convert", path)
+
+    def tips(path: Path) -> Any:
+        return manipnet._read_tips(RawTree(path.parent.parent))
+
+    read_manifest = on_disk("grab.json", manifests.read_manifest)
+    open_store = on_disk("meta/info.json", lambda path: store.open_store(path.parent.parent))
+    return {
+        "arctic-parts": Target(values([0, 1, 0, 1]), parse(arctic.parse_parts, "parts.json", 4), [arctic]),
+        "arctic-misc": Target(values(misc), parse(arctic.parse_misc, "misc.json"), [arctic]),
+        "manipnet-hand-reference": Target(
+            values({"capsules": capsules}), on_disk(manipnet.HAND_REFERENCE, tips), [manipnet]
         ),
-        Target(
-            "npz-pieces",
-            lambda: [*seeds.npz_object_files(), *seeds.near_pieces()],
-            on_disk("a.npz", _pieces),
-            functions_of(array_pieces),
-            zip_words,
-            zip_mutation(objects),
-        ),
-        Target(
-            "npz-read",
-            lambda: [*seeds.npz_files(False), *seeds.npz_files(True), *seeds.near_object_archives(), ABSENT],
-            on_disk("a.npz", arrays.read_npz),
-            [item for item in functions_of(arrays) if item.__name__ != "write_npz"],
-            zip_words,
-            zip_mutation(plain),
-        ),
-        Target(
-            "npz-map",
-            lambda: [*seeds.npz_files(False), seeds.npz_files(True)[0], seeds.npz_object_files()[0], ABSENT],
-            on_disk("a.npz", _mapped),
-            functions_of(mapped),
-            zip_words,
-            zip_mutation(plain),
-        ),
-    ]
-
-
-def _pieces(path: Path) -> None:
-    for name, array in array_pieces.locate_arrays(path, "contact").items():
-        for number, (_, piece) in enumerate(array.pieces()):
-            if number > 3:  # an array of rows without columns may have any number of them
-                break
-            _ = name, piece.sum()
-
-
-def _mapped(path: Path) -> None:
-    for array in mapped.map_npz(path).values():
-        _ = array.ravel()[:10].tolist()
-
-
-def _hand_files() -> list[Target]:
-    checks = (mano._load_side, mano._find, mano._fields, mano._parents, mano._check_side)
-    return [
-        Target(
-            "mano-file",
-            seeds.mano_files,
-            on_disk("MANO_RIGHT.pkl", lambda path: mano._load_side(path.parent, "right")),
-            (*checks, model.checked_model, model._check_meaning),
-            structure=_mano_mutation,
-            longest=1 << 20,
-            structured_only=True,
-        )
-    ]
-
-
-_change_mano = pickle_mutation((*OPCODES, *GLOBALS, *MANO_GLOBALS))
-
-
-def _mano_mutation(rng: random.Random, data: bytes) -> bytes:
-    """Mostly other opcodes; now and then a changed place in the bulk, or a cut."""
-    if rng.random() < 0.7:
-        return _change_mano(rng, data)
-    at = rng.randrange(len(data))
-    if rng.random() < 0.3:
-        return data[:at]
-    start = max(0, at - 64)
-    return data[:start] + mutate(rng, data[start:at], OPCODES) + data[at:]
-
-
-def _meshes() -> list[Target]:
-    quick = (mesh._plain_triangles, mesh._numbers_of, mesh._position_index)
-    slow = (mesh._any_polygons, mesh._whole_lines, mesh._obj_index, mesh._Names)
-    obj = (mesh._read_obj, mesh.load_named_mesh, mesh._parse_named_obj, *quick, *slow, mesh.checked_mesh)
-    text = [mesh._read_ply, *functions_of(ply_reader)]
-    binary = [item for item in text if item not in (ply_reader._numbers, ply_reader._as_numbers)]
-    return [
-        Target(
-            "obj", lambda: [seeds.OBJ, *seeds.near_meshes(), ABSENT], on_disk("a.obj", mesh.load_mesh), obj, MESH_WORDS
-        ),
-        Target(
-            "ply-ascii",
-            lambda: [*seeds.ply_texts(), *seeds.near_ply(True)],
-            on_disk("a.ply", mesh.load_mesh),
-            text,
-            MESH_WORDS,
-        ),
-        Target(
-            "ply-binary",
-            lambda: [*seeds.ply_binaries(), *seeds.near_ply(False)],
-            on_disk("a.ply", mesh.load_mesh),
-            binary,
-            MESH_WORDS,
-        ),
-        Target(
-            "glb",
-            lambda: [*seeds.glb_files(), ABSENT],
-            on_disk("a.glb", user_mesh.read_mesh_file),
-            (user_mesh.read_mesh_file, user_mesh._read, user_mesh._of_glb, user_mesh._joined, *functions_of(glb)),
-            (
-                b'"count": 9',
-                b"5126",
-                b"5125",
-                b"VEC3",
-                b'"mesh": 0',
-                b'"nodes": [0]',
-                b"null",
-                b"JSON",
-                b"BIN\0",
-                b"-1",
-            ),
-        ),
-        Target(
-            "stl",
-            lambda: [*seeds.stl_files(), ABSENT],
-            on_disk("a.stl", user_mesh.read_mesh_file),
-            (user_mesh._read, user_mesh._of_stl, user_mesh._joined, *functions_of(stl)),
-            (b"solid", b"endsolid", b"facet", b"endfacet", b"vertex 0 0 1\n", b"nan", b"\xff", b"\0"),
-        ),
-    ]
-
-
-def _texts() -> list[Target]:
-    return [
-        Target(
-            "bvh",
-            lambda: [seeds.BVH],
-            lambda data: bvh.parse_bvh(data.decode("utf-8", "replace"), "a.bvh"),
-            (bvh.parse_bvh, bvh._SkeletonReader, bvh._parse_motion_head, bvh._parse_rows),
-            BVH_WORDS,
-        ),
-        Target(
-            "gzip-text",
-            seeds.gzipped,
-            lambda data: bvh.unpack_text(data, "a.bvh.gz", 4096),
-            (bvh.unpack_text,),
-            (b"\x1f\x8b\x08", b"\0", b"\xff"),
-        ),
-        Target(
-            "h2o-rows",
-            lambda: [b"1 2.5 -3e-2\n4", b"-0 1 2", b"1.0  2 3\r\n", b"0.5 1 nan"],
-            lambda data: h2o_files.parse_rows([b"1 2 3\n", data], 3, "cam_pose", ["000000.txt", "000001.txt"]),
-            (h2o_files.parse_rows, h2o_files._parse_as_json, h2o_files._parse_line),
-            (b" ", b"\n", b"e", b"-", b"_", b"],[", b"Infinity", b"\xd9\xa3"),
-        ),
-        Target(
-            "h2o-segments",
-            lambda: list(map(str.encode, _segment_lists())),
-            lambda data: h2o_files.parse_segments(data, "action_train.txt"),
-            (h2o_files.parse_segments, h2o_files._segment),
-            (b"subject1/h1/0", b"\n", b"id ", b"action_label", "٣".encode(), b"\xff", b"99999999999"),
-        ),
-        Target(
-            "arctic-descriptions",
-            lambda: [ARCTIC_TEXT.encode()],
-            lambda data: arctic_files.parse_descriptions(data, "description.txt"),
-            (arctic_files.parse_descriptions, arctic_files.parse_description),
-            (b"1-2 grab, both hand\n", b"left", b"-", b"\n", "٣".encode(), b"\xff"),
-        ),
-    ]
-
-
-def _trajectories() -> list[Target]:
-    shared = (
-        trajectory_files.from_arrays,
-        trajectory_files._array,
-        trajectory_files._check_times,
-        trajectory_files._body,
-    )
-    words = (
-        b",",
-        b"\n",
-        b"nan",
-        b"1e400",
-        b"-",
-        b'"',
-        b"time_s",
-        b"object_qw",
-        b"left_x",
-        b"hinge_rad",
-        b"\xff",
-        b"\0",
-    )
-    rows = (trajectory_files._numbers, *shared)
-    return [
-        Target(
-            "trajectories-csv",
-            seeds.trajectory_tables,
-            lambda data: trajectory_files.parse_csv(data, "a.csv"),
-            (trajectory_files.parse_csv, *rows),
-            words,
-        ),
-        Target(
-            "trajectories-manipnet",
-            seeds.trajectory_texts,
-            lambda data: trajectory_files.parse_manipnet(data, "a.txt"),
-            (trajectory_files.parse_manipnet, trajectory_files._numbers),
-            words,
-        ),
-        Target(
-            "trajectories-npz",
-            seeds.trajectory_archives,
-            on_disk("a.npz", lambda path: trajectory_files.from_arrays(numpy_files.load_npz_arrays(path), "a.npz")),
-            shared,
-            (b"PK\x03\x04", b".npy", b"(1, 3)", b"<f8", b"|O"),
-            zip_mutation(npy_mutation(mutate)),
-        ),
-    ]
-
-
-def _hoi4d() -> list[Target]:
-    values = {"poseCoeff": np.zeros(48, "f4"), "beta": np.zeros(10, "f4"), "trans": np.zeros(3, "f4")}
-    return [
-        Target(
-            "hoi4d-camera",
-            lambda: [b"0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n" * 2],
-            lambda data: hoi4d_files.camera_poses(data, "output.log"),
-            (hoi4d_files.camera_poses,),
-            (b"\n", b" ", b"0 0 1\n", b"nan", b"1e400", b"-", b"\xff", b"inf"),
-        ),
-        Target(
-            "hoi4d-hand",
-            lambda: [pickle.dumps(rows, 2) for rows in (values, {**values, "poseCoeff": np.zeros(1)}, {"beta": [1]})],
-            lambda data: hoi4d_files.hand_frame(data, "0.pickle"),
-            (hoi4d_files.hand_frame,),
-            (*OPCODES, *GLOBALS),
-            PICKLE,
-        ),
-        _json_target(
-            "hoi4d-json",
-            _hoi4d_values(),
-            _hoi4d_json,
-            (
-                *(hoi4d_files.object_poses, hoi4d_files._part_pose, hoi4d_files._numbers, hoi4d_files.action_events),
-                *(hoi4d_files._numbers_of, hoi4d_files._clock_s, hoi4d_files.hinge_joint, hoi4d_files._mesh_of),
-            ),
-        ),
-    ]
-
-
-def _oakink2() -> list[Target]:
-    entry = {"primitive": "stir", "interaction_mode": "bh_main", "obj_list": ["a"], "obj_list_lh": None}
-    entry |= {"obj_list_rh": ["b"]}
-    keys = ("((1595, 2340), None)", "(None, (3, 9))", "((1, 2), (3, 4))", "(None, None)", "((2, 1), 1)", "x", "((" * 30)
-    programs = [{key: entry} for key in keys]
-    programs += [{keys[0]: {**entry, "interaction_mode": "foot"}}, {keys[0]: {**entry, "obj_list": "a"}}]
-    others = [{"a": {"obj_id": "a", "obj_name": "mug"}}, {"a": {"obj_name": 1}}, {"a": ["b"], "b": ["c"]}, {"a": ["a"]}]
-    texts = (
-        *(oakink2_files.read_program, oakink2_files._segment, oakink2_files._ranges, oakink2_files._range),
-        *(oakink2_files.read_names, oakink2_files.read_roots, oakink2_files._json),
-        oakink2_files.Segment,
-    )
-    return [
-        Target(
-            "oakink2-annotation",
-            seeds.oakink2_annotations,
-            lambda data: oakink2_files.read_annotation(data, "a.pkl"),
-            functions_of(oakink2_files, [item.__name__ for item in texts]),
-            (*OPCODES, *GLOBALS),
-            PICKLE,
-        ),
-        _json_target("oakink2-json", [*programs, *others, [1]], _oakink2_json, texts),
-    ]
-
-
-def _oakink2_json(data: bytes) -> None:
-    """As each of the three kinds of file."""
-    for parse in (oakink2_files.read_program, oakink2_files.read_names, oakink2_files.read_roots):
-        with contextlib.suppress(BadInput):
-            found = parse(data, "a.json")
-            _ = [(own.span, own.hand, own.name) for own in found] if isinstance(found, list) else found
-
-
-def _object_paths() -> list[Target]:
-    thing = seeds.hinged_object()
-    words = (b",", b"\n", b"nan", b"1e400", b"-", b"time_s", b"hinge_deg", b"z_cm", b"\xff", b'{"', b"[", b"null")
-    return [
-        Target(
-            "object-keyframes",
-            seeds.keyframe_files,
-            lambda data: keyframes.keyframed_path(thing, keyframes.parse_keyframes(data, "keys"), (0.0, 2.0)),
-            functions_of(keyframes, ("read_keyframes",)),
-            words,
-        ),
-    ]
-
-
-def _hoi4d_values() -> list[Any]:
-    three = {"x": 1, "y": 2.5, "z": -3}
-    part = {"label": "a", "center": three, "rotation": three, "dimensions": {"length": 1, "width": 2, "height": 3}}
-    events = [{"event": "cut", "startTime": 1.5, "endTime": 3}]
-    marks = {"marks": [{"event": "cut", "hdTimeStart": 1, "hdTimeEnd": 9}]}
-    axis = {"axis": {"origin": [0, 0, 1], "direction": [0, 1, 0]}}
-    joints = zip((1, 2), (hoi4d_files.FIXED[0], hoi4d_files.REVOLUTE), strict=True)
-    return [
-        {"dataList": [part, {**part, "label": "b"}]},
-        {"objects": [part]},
-        {"info": {"duration": 20.0}, "events": events},
-        {"info": {"Duration": 10}, "markResult": marks},
-        {"events": events},
-        [{"id": id_, "parent": -1, "joint": joint, "parts": [{"id": id_}], "jointData": axis} for id_, joint in joints],
-    ]
+        "manifest": Target(values({**manifest, "files": [entry]}, generated), read_manifest, [manifests]),
+        "store-info": Target(values(info, {**info, "schema_version": "9.0.0"}), open_store, [store]),
+        "hoi4d-json": Target(hoi4d_seeds, parse(_hoi4d_json), [hoi4d]),
+        "oakink2-json": Target(oakink2_seeds, parse(_oakink2_json), [oakink2]),
+        "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d, packed, umetrack]),
+        "hoidata-toml": Target(made(TOML), on_disk("hoidata.toml", own_root), [base]),
+        "params-yaml": Target(made(PARAMS), on_disk("params.yaml", settings), [base, params]),
+    }
 
 
 def _hoi4d_json(data: bytes) -> object:
     """Whichever of the three kinds of file it looks like; and as a tree of parts."""
     if b"dataList" in data or b"objects" in data:
-        return hoi4d_files.object_poses(data, "0.json")
+        return hoi4d.object_poses(data, "0.json")
     if b"event" in data or not data.strip():
-        return hoi4d_files.action_events(data, "color.json")
-    tree = b'[{"id": 0, "children": [{"id": 1, "objs": ["new-0"]}, {"id": 2, "objs": ["new-1"]}]}]'
+        return hoi4d.action_events(data, "color.json")
     with contextlib.suppress(BadInput):
-        hoi4d_files._meshes_by_id(hoi4d_files.read_json(data, "result.json"), "result.json")
-    return hoi4d_files.hinge_joint(data, tree, "mobility_v2.json", "result.json")
+        hoi4d._meshes_by_id(hoi4d.read_json(data, "result.json"), "result.json")
+    return hoi4d.hinge_joint(data, TREE, "mobility_v2.json", "result.json")
 
 
-def _hot3d() -> list[Target]:
-    words = (b"NaN", b"null", b"-", b"1e999", b"[", b"]", b"{", b'"', b",", b"\n", b"\xff", b"true", b"_", b"0")
-    rows = (hot3d_files._table, hot3d_files._time, hot3d_files.poses_of)
-    return [
-        Target(
-            "hot3d-hands",
-            seeds.hot3d_hands,
-            lambda data: hot3d_files.hand_poses(data, "a.jsonl", "umetrack" if b"angles" in data else "mano"),
-            (hot3d_files.hand_poses, hot3d_files._lines, hot3d_files.row_of, hot3d_files.poses_of),
-            (*words, b'"hand_poses"', b'"q_wxyz"', b'"pose"', b'"2"'),
-        ),
-        Target(
-            "hot3d-tables",
-            seeds.hot3d_tables,
-            lambda data: (hot3d_files.failed_times if b"mask" in data else hot3d_files.object_poses)(data, "a.csv"),
-            (hot3d_files.object_poses, hot3d_files.failed_times, *rows),
-            (*words, b"True", b"False", b"mask", "٣".encode(), b"1e400", b"object_uid"),
-        ),
-        Target(
-            "hot3d-tar",
-            seeds.hot3d_tars,
-            lambda data: packed.read_packed(data, "a.tar"),
-            functions_of(packed),
-            (
-                *words,
-                b"000001.hands.json\0",
-                b"__hand_shapes.json__\0",
-                b'"mano_pose"',
-                b'"thetas"',
-                b"ustar",
-                b"0000777",
-            ),
-        ),
-        Target(
-            "hot3d-json",
-            seeds.hot3d_json,
-            _hot3d_json,
-            (
-                hot3d_files.headset,
-                hot3d_files.headset_of,
-                hot3d_files.object_names,
-                hot3d_files.checked_name,
-                hot3d_files.read_json,
-                *functions_of(umetrack),
-            ),
-            (*words, b'"headset"', b"17", b"1.5", b'"instance_name"', b'"hand_model"'),
-        ),
-    ]
+def _oakink2_json(data: bytes) -> None:
+    """As each of the three kinds of file."""
+    for read in (oakink2.read_program, oakink2.read_names, oakink2.read_roots):
+        with contextlib.suppress(BadInput):
+            parsed = read(data, "a.json")
+            _ = [(own.span, own.hand, own.name) for own in parsed] if isinstance(parsed, list) else parsed
 
 
 def _hot3d_json(data: bytes) -> object:
-    """Whichever of the three kinds of file it looks like; joints of a profile that was read are finite or not told."""
+    """Whichever of the four kinds of file it looks like; the joints of a profile are computed, too."""
     if b"sequence_id" in data:
         return packed.definition(data, "clip_definitions.json", 7)
     if b"headset" in data:
-        return hot3d_files.headset(data, "metadata.json")
+        return hot3d.headset(data, "metadata.json")
     if b"hand_model" not in data:
-        return hot3d_files.object_names(data, "instance.json")
-    still = hot3d_files.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
+        return hot3d.object_names(data, "instance.json")
+    still = hot3d.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
     return umetrack.joints_m(umetrack.parse_profile(data, "profile.json"), still, "right")
-
-
-def _segment_lists() -> tuple[str, str]:
-    head = "id path action_label start_act end_act start_frame end_frame\n"
-    row = "1 subject1/h1/0 8 56 92 0 640\n"
-    return head + row + "\n" + row, head.replace("action_label ", "") + row.replace(" 8 ", " ")
-
-
-def _json_files() -> list[Target]:
-    capsules = [{"joint": joint, "end_local": [0.1, -0.2, 3]} for joint in manipnet.TIP_JOINTS]
-    entry = asdict(SourceFile("grab/s1/a.npz", 12, "0" * 64))
-    manifest = {"schema": manifests.SCHEMA, "dataset": "grab", "present": True, "source": "files", "licence": "x"}
-    info = {"schema_version": store.SCHEMA_VERSION, "dataset": "grab", "hand_model": {"digest": "x"}, "synthetic": True}
-    return [
-        _json_target(
-            "arctic-parts",
-            [[0, 1, 0, 1], [True, False, 1, 0]],
-            lambda data: arctic_files.parse_parts(data, "parts.json", 4),
-            (arctic_files.parse_parts,),
-        ),
-        _json_target(
-            "arctic-misc",
-            [{"s01": {"ioi_offset": 644, "gender": "male"}, "s02": {"ioi_offset": 1}}],
-            lambda data: arctic_files.parse_misc(data, "misc.json"),
-            (arctic_files.parse_misc,),
-        ),
-        _json_target(
-            "manipnet-hand-reference",
-            [{"capsules": capsules}, {"capsules": [{**capsule, "end_local": [1, 2]} for capsule in capsules]}],
-            on_disk(manipnet.HAND_REFERENCE, lambda path: manipnet._read_tips(RawTree(path.parent.parent))),
-            (manipnet._read_tips,),
-        ),
-        _json_target(
-            "manifest",
-            [{**manifest, "files": [entry, entry]}, {**manifest, "recipe": {"seed": 0}, "source": "generated"}],
-            on_disk("grab.json", manifests.read_manifest),
-            (manifests.read_manifest, manifests.Manifest.by_path.fget),
-        ),
-        _json_target(
-            "store-info",
-            [info, {**info, "schema_version": "1.0.0"}, {**info, "schema_version": "9.0.0"}, {**info, "hand_model": 1}],
-            on_disk("meta/info.json", lambda path: _store_info(path.parent.parent)),
-            (store.read_info,),
-        ),
-    ]
-
-
-def _json_target(name: str, values: Sequence[Any], run: Callable[[bytes], Any], code: Sequence[Any]) -> Target:
-    words = (b"[", b"]", b"{", b'"', b",", b"null", b"NaN", b"1e999", b"-", b"\xff", b"\\ud800", b"true")
-    return Target(name, lambda: [*seeds.as_json(*values), ABSENT], run, code, words)
-
-
-def _store_info(folder: Path) -> None:
-    store.open_store(folder)  # ends at the tables, which are not there
-
-
-def _settings() -> list[Target]:
-    toml = b'[roots]\ngrab = "/data/grab"\nh2o = "x"\n\n[other]\na = [1, 2.5, true, 1979-05-27]\n'
-    text = yaml.safe_dump({"profile": "own", "convert": {"margin_frames": 3}, "split": {"h2o": "text2hoi"}}).encode()
-    return [
-        Target(
-            "hoidata-toml",
-            lambda: [toml],
-            on_disk("hoidata.toml", _own_root),
-            (base.own_root, base._registered_roots),
-            (
-                b"[roots]\n",
-                b"=",
-                b'"',
-                b"'''",
-                b"[[a]]\n",
-                b"roots = 5\n",
-                b"{",
-                b"\xff",
-                b"grab = 1\n",
-                b"a.b.c = 1\n",
-            ),
-        ),
-        Target(
-            "params-yaml",
-            lambda: [text],
-            on_disk("params.yaml", _params),
-            (base.load_settings, params.read_file),
-            (b"convert: ", b"- ", b"!!python/object/apply:os.system ", b"&a ", b"*a", b"<<: *a\n", b"{", b"]", b"? "),
-        ),
-    ]
-
-
-def _params(path: Path) -> Any:
-    return base.load_settings(ConvertSettings, "convert", path)
-
-
-def _own_root(path: Path) -> Any:
-    os.environ.pop(base.root_variable("grab"), None)
-    with contextlib.chdir(path.parent):
-        return base.own_root("grab")

@@ -1,28 +1,35 @@
-"""One function over many items in worker processes: bounded, and honest about a worker that is killed.
+"""One function over many items in worker processes, or on Dask.
 
 Unlike ``concurrent.futures`` and loky, whose pools break as a whole, it knows which item each worker had when it died
 and of what; only that item is done again. Its workers end with their parent.
+
+Dask is an optional extra (``pip install 'hoidata[dask]'``): a cluster of this machine, or one that runs already. It is
+chosen for a process, not for a call: results never depend on it. Its workers need the same environment and the same
+files at the same paths.
 """
 
 import contextlib
+import math
 import multiprocessing
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from multiprocessing import reduction
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
-from hoidata.cluster import is_used_for, on_cluster
-from hoidata.errors import BadInput, HoidataError
+from hoidata.errors import BadInput, HoidataError, MissingResource
 from hoidata.lifetime import begin_worker, ctrl_c_blocked
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+LOCAL, DASK = "local", "dask"
+CHUNKS_PER_WORKER = 4
+PATIENCE_S = 30
+_chosen = [LOCAL]
 
 
 class WorkerLost(BadInput):
@@ -62,12 +69,11 @@ def in_workers(
 
     jobs: fresh processes, each with one thread; 1 does the work here, where a death ends all. lock: a file descriptor
     each worker keeps open as long as it lives. on_lost: gives the result of an item whose worker died twice, from a
-    WorkerLost; without it that is raised, after all others are done. Raises what the function raised. On a cluster,
-    where one is chosen (``hoidata.cluster``), chunks of items are given out instead.
+    WorkerLost; without it that is raised, after all others are done. Raises what the function raised. On a cluster
+    (``choose_workers``) chunks of items are given out instead.
     """
     if is_used_for(jobs) and len(items) > 1:
-        given_up = partial(_given_up, on_lost)
-        yield from on_cluster(function, items, jobs, _answer_alone, lambda *lost: given_up(WorkerLost(*lost)))
+        yield from _on_cluster(function, items, jobs, on_lost)
         return
     if jobs <= 1:
         with one_thread():
@@ -223,11 +229,6 @@ def _serve(connection: Connection, lock: _Descriptor) -> None:
         connection.send(_answer(function, item))
 
 
-def _answer_alone(function: Function, item: Any) -> tuple[Any, Exception | None]:
-    with one_thread():
-        return _answer(function, item)
-
-
 def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
     """The result, or what was raised."""
     try:
@@ -236,3 +237,101 @@ def _answer(function: Function, item: Any) -> tuple[Any, Exception | None]:
         return None, error
     except Exception:
         return None, RuntimeError(f"{item}: {traceback.format_exc()}")
+
+
+def choose_workers(where: str) -> None:
+    """Where the workers of this process are from now on.
+
+    where: "local" (processes), "dask" (a Dask cluster started here for each fan-out), or the address of a scheduler
+    such as tcp://host:8786. Raises BadInput for anything else, MissingResource without the extra.
+    """
+    if where not in (LOCAL, DASK) and "://" not in where:
+        raise BadInput(
+            "workers", f"{LOCAL}, {DASK} or a scheduler's address such as tcp://host:8786", where, "correct it"
+        )
+    if where != LOCAL:
+        try:
+            import distributed  # noqa: F401
+        except ImportError as error:
+            raise MissingResource("workers on Dask need the extra: pip install 'hoidata[dask]'") from error
+    _chosen[0] = where
+
+
+def is_used_for(jobs: int) -> bool:
+    """Whether work for so many workers goes to a cluster: one that runs already always, a new one not for a single."""
+    return _chosen[0] not in (LOCAL, DASK) or (_chosen[0] == DASK and jobs > 1)
+
+
+def _on_cluster(
+    function: Function, items: Sequence[Any], jobs: int, on_lost: Function | None
+) -> Iterator[tuple[Any, Any]]:
+    """``in_workers`` on the chosen cluster. jobs: workers of a cluster started here.
+
+    A worker that dies costs its chunk, which others do again; a chunk that has ended several is done item by item.
+    """
+    from distributed import KilledWorker
+
+    with _client(jobs) as client:
+        workers = len(client.scheduler_info()["workers"]) or 1
+        size = max(1, math.ceil(len(items) / (CHUNKS_PER_WORKER * workers)))
+        chunks = [list(items[start : start + size]) for start in range(0, len(items), size)]
+
+        # The function goes with every chunk: shared by `scatter` it would be lost with the workers that hold it.
+        def submitted(chunk: list[Any]) -> Any:
+            return client.submit(_work, function, chunk, os.getcwd(), pure=False)
+
+        running = {submitted(chunk): chunk for chunk in chunks}
+        while running:
+            for future in _done(client, running):
+                chunk = running.pop(future)
+                try:
+                    found = future.result()
+                except KilledWorker:  # also of a chunk that was done, whose result went with the worker that held it
+                    if len(chunk) == 1:
+                        error = WorkerLost(chunk[0], "each of several workers it was given to ended")
+                        yield chunk[0], _given_up(on_lost, error)
+                    else:
+                        running |= {submitted([item]): [item] for item in chunk}
+                    continue
+                for item, (result, problem) in zip(chunk, found, strict=True):
+                    if problem is not None:
+                        raise problem
+                    yield item, result
+                future.release()
+
+
+def _done(client: Any, running: Iterable[Any]) -> set[Any]:
+    """Those that have ended, once one has. Raises BadInput when there is no worker to wait for."""
+    from distributed import wait as wait_for
+
+    while True:
+        try:
+            with client.as_current():
+                ended: Any = wait_for(list(running), timeout=PATIENCE_S, return_when="FIRST_COMPLETED")
+                return ended.done
+        except TimeoutError:
+            if not client.scheduler_info()["workers"]:
+                remedy = "start one (`dask worker ADDRESS --nthreads 1`) and run it again"
+                raise BadInput("workers", "a Dask cluster with a worker", f"none for {PATIENCE_S} s", remedy) from None
+
+
+def _client(jobs: int) -> Any:
+    """A client of the chosen cluster; leaving it ends a cluster that was started for it."""
+    from distributed import Client
+
+    if _chosen[0] == DASK:
+        # security: TLS with new certificates. Without it any user of this machine could run code as this one.
+        started = {"n_workers": jobs, "threads_per_worker": 1, "dashboard_address": None, "security": True}
+        return Client(**started, set_as_default=False)
+    try:
+        return Client(_chosen[0], timeout=PATIENCE_S, set_as_default=False)
+    except OSError as error:
+        remedy = "start it (`dask scheduler`, `dask worker ADDRESS --nthreads 1`), or set workers to local"
+        raise BadInput("workers", f"a Dask scheduler at {_chosen[0]}", str(error)[:200] or "none", remedy) from error
+
+
+def _work(function: Function, chunk: list[Any], folder: str) -> list[tuple[Any, Exception | None]]:
+    """In a worker: the results of a chunk, or what was raised; paths are those of the one that asks."""
+    os.chdir(folder)
+    with one_thread():
+        return [_answer(function, item) for item in chunk]

@@ -1,19 +1,37 @@
-"""The Prefect flow: brings DVC targets up to date, a task per stage. Which there are, and their order, is DVC's."""
+"""The Prefect flow, which brings DVC targets up to date with a task per stage, and the deployments of the graph.
 
+``python -m pipelines.flows`` registers the deployments and runs their flows until it is ended; `hoidata up` starts it.
+"""
+
+import asyncio
 from pathlib import Path
 
 from prefect import flow, get_run_logger, task
 from prefect.artifacts import create_markdown_artifact
+from prefect.client.orchestration import get_client
+from prefect.client.schemas.filters import FlowRunFilter, FlowRunFilterState, FlowRunFilterStateType
+from prefect.client.schemas.objects import StateType
+from prefect.deployments.runner import RunnerDeployment
+from prefect.runner import Runner
+from prefect.schedules import Cron
+from prefect.states import Crashed
 
 from hoidata.errors import BadInput
 from pipelines.commands.project import current_profile, set_profile
-from pipelines.params import PROFILES
+from pipelines.lineage.graph import Stage, read_graph
+from pipelines.params import PROFILES, read_params
+from pipelines.prefect_server import KEY_FILE
 from pipelines.repro import reproduce
 from pipelines.run_facts import describe_results
 from pipelines.side_by_side import RunStage, describe_run, log_of
 
 # How DVC tells that the system ended a stage, most often for want of memory: worth a second try, unlike its own errors.
 KILLED = "exited with -9"
+WHOLE_GRAPH = "full-graph"
+# Stages that can be run by themselves; the stages before each of them are brought up to date with it.
+WORK = ("convert", "annotate", "contact", "evaluate")
+READY = "ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder"
+Targets = dict[str, list[str]]
 
 
 class StageError(RuntimeError):
@@ -59,3 +77,76 @@ def stages_as_tasks(run_stage: RunStage) -> RunStage:
 
 def _was_killed(_task, _run, state) -> bool:
     return KILLED in str(state.message)
+
+
+def deployment_targets(graph: dict[str, Stage], profile: str, datasets: list[str]) -> Targets:
+    """DVC targets by deployment name, such as annotate-arctic, train-grab-text2hoi or evaluate-h2o.
+
+    ``{profile}`` stands for the profile, which is chosen when a run starts.
+    """
+    found: Targets = {WHOLE_GRAPH: []}
+    for dataset in datasets:
+        at = f"@{profile}-{dataset}"
+        for name in graph:
+            address, sign, rest = name.partition(at)
+            if not sign or rest[:1] not in ("", "-"):
+                continue  # of another dataset, or of no dataset
+            if key := _deployment_name(address, dataset):
+                found.setdefault(key, []).append(f"{address}@{{profile}}-{dataset}{rest}")
+    return found
+
+
+def _deployment_name(address: str, dataset: str) -> str:
+    """The deployment a stage belongs to; empty for stages nobody asks for by themselves."""
+    work = address.rpartition(":")[2]
+    if work in WORK:
+        return f"{work}-{dataset}"
+    return f"train-{dataset}-{Path(address).parent.name}" if work.split("-")[0] == "train" else ""
+
+
+def make_deployments(project: Path) -> list[RunnerDeployment]:
+    """The deployments of this project's graph; the one schedule of each is inactive."""
+    params = read_params(project)
+    targets = deployment_targets(read_graph(project), params["profile"], params["datasets"])
+    return [
+        RunnerDeployment.from_flow(
+            bring_up_to_date,
+            name,
+            description=f"Brings {', '.join(targets[name]) or 'the report'}, and all it is made from, up to date.",
+            parameters={"targets": targets[name], "profile": "", "jobs": 0, "force": False},
+            schedules=[Cron("0 3 * * 1", timezone="UTC", active=False)],
+            concurrency_limit=1,
+        )
+        for name in sorted(targets)
+    ]
+
+
+def end_abandoned_runs() -> None:
+    """Mark runs as crashed whose `hoidata up` has ended; each would keep its deployment's only place for ever.
+
+    For the moment before flows are served, when nothing can be under way in this folder.
+    """
+    under_way = [StateType.RUNNING, StateType.PENDING, StateType.CANCELLING]
+    state = FlowRunFilterState(type=FlowRunFilterStateType(any_=under_way))
+    with get_client(sync_client=True) as client:
+        for run in client.read_flow_runs(flow_run_filter=FlowRunFilter(state=state)):
+            client.set_flow_run_state(run.id, Crashed(message="its `hoidata up` ended before it did"))
+            print(f"{run.name}: its `hoidata up` ended before it did; a new run completes what it began")
+
+
+def serve_flows() -> None:
+    """Register the deployments of this folder and start a process for each run that is asked for.
+
+    Only the deployment decides what that process runs: ``prefect.engine`` with the flow above.
+    """
+    end_abandoned_runs()
+    runner = Runner(pause_on_shutdown=False, limit=None)
+    runner._tmp_dir = KEY_FILE.parent.resolve() / "runner"  # Prefect's own choice is a folder that all users share
+    for deployment in make_deployments(Path()):
+        runner.add_deployment(deployment)
+    print(READY, flush=True)
+    asyncio.run(runner.start())
+
+
+if __name__ == "__main__":
+    serve_flows()

@@ -1,22 +1,28 @@
-"""A Prefect server, work pool, deployments and worker for this folder, all on the loopback interface.
+"""`hoidata up`: a Prefect server for this folder, on the loopback interface, and one process that serves the flows.
 
-Every page open in a browser and every user of the machine reaches that interface, so the server answers nobody without
-the project's key (``prefect_key``; only the health check, the empty shell of its pages and Prefect's API reference are
-open), no other origin, and no change without a CSRF token. Its work pool has no variable, so a run cannot bring a
-command, an environment or a folder of its own. And since the worker obeys whoever answers at the address, only our own
-server may, as long as the worker lives.
+Every page open in a browser and every user of the machine reaches that interface. So the server answers nobody without
+the project's key, no other origin, and no change without a CSRF token. Only the health check, the empty shell of its
+pages and Prefect's API reference are open. Whoever has the key can run code as you. It is new at every start, for the
+owner alone, and never appears in an argument, a log or a committed file.
+
+A run cannot bring a command, an environment or a folder of its own. The process that serves the flows obeys whoever
+answers at the address, so it lives only as long as our server does.
 """
 
 import os
+import secrets
 import signal
+import stat
 import subprocess
 import sys
+import tempfile
 import time
 import tomllib
 import urllib.error
 import urllib.request
 from contextlib import suppress
 from functools import partial
+from ipaddress import ip_address
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,17 +33,14 @@ from hoidata.beside import python_path
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.atomic import exclusive
 from hoidata.lifetime import end_with_parent
-from pipelines.deployments import write_deployments
-from pipelines.prefect_key import KEY_FILE, is_loopback, write_key
 
+KEY_FILE = Path(".prefect/api-key")
 START_TIMEOUT_S = 180
-STOP_TIMEOUT_S = {"worker": 4, "server": 3}  # together less than what Ctrl-C leaves a command
-POOL = "local"
-POOL_TEMPLATE = Path(__file__).with_name("prefect_pool.json")
+STOP_TIMEOUT_S = 4  # less than what Ctrl-C leaves a command
 
 
 def serve() -> int:
-    """Start the server, deploy, and work until interrupted; server and worker end together. Returns the exit code."""
+    """Start the server and serve the flows until interrupted; both processes end together. Returns the exit code."""
     url = api_url()
     with exclusive(KEY_FILE, wait_s=0):
         if _answers(f"{url}/health"):
@@ -46,22 +49,20 @@ def serve() -> int:
 
 
 def _serve(url: str, environment: dict[str, str]) -> int:
-    server, worker = _start_server(url, environment), None
+    server, flows = _start_server(url, environment), None
     try:
         wait_until_healthy(url, server)
-        deploy(environment)
-        worker = _start(_prefect("worker", "start", "--pool", POOL), environment)
-        print(f"{_origin(url)} asks for a password: the text in {KEY_FILE}, new at every start")
-        print("ready: run `prefect deployment run annotate-arctic` in another terminal, in this folder", flush=True)
-        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)  # until server or worker ends
-        return server.poll() or worker.poll() or 1
+        print(f"{_origin(url)} asks for a password: the text in {KEY_FILE}, new at every start", flush=True)
+        flows = _start(_module("pipelines.flows"), environment)
+        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOWAIT)  # until one of them ends
+        return server.poll() or flows.poll() or 1
     except KeyboardInterrupt:
         return 0
     finally:
-        if worker is not None:
-            # Without its server it would obey whoever listens at the address next, and so would the flow it runs.
-            _stop(worker, STOP_TIMEOUT_S["worker"] if server.poll() is None else 0)
-        _stop(server, STOP_TIMEOUT_S["server"])
+        if flows is not None:  # first: without its server it would obey whoever listens at the address next
+            flows.kill()
+            flows.wait()
+        _stop(server)
 
 
 def stop_running() -> bool:
@@ -72,15 +73,15 @@ def stop_running() -> bool:
     except BadInput:
         with suppress(ProcessLookupError, FileNotFoundError):  # it has just ended by itself
             os.kill(int((KEY_FILE.parent / f".{KEY_FILE.name}.lock").read_text()), signal.SIGTERM)
-        with exclusive(KEY_FILE, wait_s=3 * sum(STOP_TIMEOUT_S.values())):
+        with exclusive(KEY_FILE, wait_s=5 * STOP_TIMEOUT_S):
             return True
 
 
-def _stop(process: subprocess.Popen, patience_s: float) -> None:
-    """Ask a process to end; one that has not ended after ``patience_s`` is killed."""
+def _stop(process: subprocess.Popen) -> None:
+    """Ask a process to end; one that has not ended after ``STOP_TIMEOUT_S`` is killed."""
     process.terminate()
     try:
-        process.wait(patience_s)
+        process.wait(STOP_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         process.kill()
         process.wait()
@@ -102,7 +103,7 @@ def _origin(url: str) -> str:
 
 
 def server_environment(url: str, key: str) -> dict[str, str]:
-    """What server, worker and deployments run with: only who has the key is let in, nothing is reported home.
+    """What the two processes run with: only who has the key is let in, nothing is reported home.
 
     Prefect's state is in ``.prefect/`` of this folder unless PREFECT_HOME says otherwise.
     """
@@ -112,24 +113,12 @@ def server_environment(url: str, key: str) -> dict[str, str]:
         "PREFECT_SERVER_API_CORS_ALLOWED_ORIGINS": _origin(url),
         "PREFECT_SERVER_API_CSRF_PROTECTION_ENABLED": "true",
         "PREFECT_CLIENT_CSRF_SUPPORT_ENABLED": "true",
-        "PREFECT_PLUGINS_ENABLED": "true",  # pipelines.prefect_names guards the processes of flow runs
+        "PREFECT_PLUGINS_ENABLED": "true",  # pipelines.prefect_hook guards the processes of flow runs
         "PREFECT_PLUGINS_SAFE_MODE": "false",
     }
     home = os.environ.get("PREFECT_HOME", str(Path(".prefect").resolve()))
     quiet = {"DO_NOT_TRACK": "1", "PREFECT_SERVER_ANALYTICS_ENABLED": "false"}
     return {**os.environ, **python_path(), **quiet, **guards, "PREFECT_HOME": home, "PREFECT_API_URL": url}
-
-
-def deploy(environment: dict[str, str]) -> None:
-    """Make the work pool (again) and the deployments of this project's graph, and end runs of earlier servers."""
-    template = ("--base-job-template", str(POOL_TEMPLATE))
-    pool = _prefect("work-pool", "create", POOL, "--type", "process", "--overwrite", *template)
-    deployments = _prefect("--no-prompt", "deploy", "--all", "--prefect-file", str(write_deployments(Path())))
-    abandoned = [sys.executable, "-m", "pipelines.prefect_abandoned"]
-    for command in (abandoned, pool, deployments):
-        code = _start(command, environment, stdin=subprocess.DEVNULL).wait()
-        if code:
-            raise MissingResource(f"`{' '.join(command[2:])}` ended with exit code {code}; its output says why")
 
 
 def wait_until_healthy(url: str, server: subprocess.Popen) -> None:
@@ -162,7 +151,7 @@ def _start_server(url: str, environment: dict[str, str]) -> subprocess.Popen:
     """The server; what it writes, its database above all, is for the owner alone."""
     address = urlsplit(url)
     where = ("--host", str(address.hostname), "--port", str(address.port))
-    command = _prefect("server", "start", *where, "--analytics-off")
+    command = _module("prefect", "server", "start", *where, "--analytics-off")
     return _start(command, environment, umask=0o077)
 
 
@@ -171,5 +160,43 @@ def _start(command: list[str], environment: dict[str, str], **options: Any) -> s
     return subprocess.Popen(command, env=environment, preexec_fn=partial(end_with_parent, os.getpid()), **options)
 
 
-def _prefect(*arguments: str) -> list[str]:
-    return [sys.executable, "-m", "prefect", *arguments]
+def _module(*words: str) -> list[str]:
+    return [sys.executable, "-m", *words]
+
+
+def write_key(path: Path = KEY_FILE) -> str:
+    """Put a new key in the place of the one before; returns it. Its folder is closed to other users first.
+
+    A key that others may have read, or that was sent to a stranger's server while ours was down, is worth nothing
+    from then on.
+    """
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    path.parent.chmod(0o700)
+    key = f"hoidata:{secrets.token_urlsafe(32)}"
+    handle, partial = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)  # mode 0600
+    with os.fdopen(handle, "w") as stream:
+        stream.write(key)
+    os.replace(partial, path)
+    return key
+
+
+def read_key(path: Path = KEY_FILE) -> str | None:
+    """The key; None where no server was started. Raises PermissionError when others can read it or wrote it."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+    except FileNotFoundError:
+        return None
+    with os.fdopen(descriptor) as stream:
+        found = os.fstat(descriptor)
+        if found.st_uid != os.geteuid() or stat.S_IMODE(found.st_mode) & 0o077:
+            raise PermissionError(f"{path}: expected a file of mode 0600 that is yours; `hoidata up` makes a new one")
+        return stream.read()
+
+
+def is_loopback(url: str | None) -> bool:
+    """Whether an address is a port of this machine out of reach for others; "localhost" is a name, and may be two."""
+    try:
+        address = urlsplit(url or "")
+        return bool(address.port) and ip_address(address.hostname or "").is_loopback
+    except ValueError:
+        return False

@@ -23,7 +23,7 @@ def repro(
 
 
 def up() -> None:
-    """Start a Prefect server and worker for this folder, with its deployments; Ctrl-C stops both.
+    """Start a Prefect server for this folder and serve the flows of its graph; Ctrl-C stops both.
 
     They listen on this machine alone, and only to who can read .prefect/api-key: `prefect` typed here finds it itself.
     """
@@ -34,7 +34,7 @@ def up() -> None:
 
 
 def down() -> None:
-    """Stop the server and worker that `hoidata up` started for this folder, and what they run."""
+    """Stop the server that `hoidata up` started for this folder, and what they run."""
     enter_project()
     from pipelines.prefect_server import stop_running
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hoidata import cluster
+from hoidata import workers
 from hoidata.contact.stage import contact_store
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets.grab.adapter import GrabAdapter
@@ -68,9 +68,9 @@ def scheduler():
 
 @pytest.fixture
 def on_it(scheduler):
-    cluster.choose_workers(scheduler)
+    workers.choose_workers(scheduler)
     yield
-    cluster.choose_workers("local")
+    workers.choose_workers("local")
 
 
 def digests(folder: Path) -> dict[str, str]:
@@ -102,16 +102,16 @@ def test_a_sequence_that_ends_every_worker_is_left_out_and_the_others_are_not(co
 
 
 def test_nobody_else_on_this_machine_gets_into_a_cluster_started_here():
-    cluster.choose_workers("dask")
+    workers.choose_workers("dask")
     try:
-        with cluster._client(1) as client:
+        with workers._client(1) as client:
             address = client.scheduler.address
             assert client.submit(doubled, 2).result() == 4
             for theirs, at in ((None, address.replace("tls:", "tcp:")), (distributed.Security.temporary(), address)):
                 with pytest.raises(OSError):  # noqa: PT011 - of the handshake, in words of the system
                     distributed.Client(at, security=theirs, timeout=2, set_as_default=False)
     finally:
-        cluster.choose_workers("local")
+        workers.choose_workers("local")
 
 
 def doubled(number: int) -> int:
@@ -128,33 +128,33 @@ def test_what_the_function_raises_is_raised_here_and_results_come_in_order_when_
 
 
 def test_a_cluster_without_a_worker_is_told_and_not_waited_for(monkeypatch):
-    monkeypatch.setattr(cluster, "PATIENCE_S", 1)
+    monkeypatch.setattr(workers, "PATIENCE_S", 1)
     with distributed.LocalCluster(n_workers=0, dashboard_address=None) as empty:
-        cluster.choose_workers(empty.scheduler_address)
+        workers.choose_workers(empty.scheduler_address)
         try:
             with pytest.raises(BadInput, match="none for 1 s"):
                 list(in_workers(doubled, [1, 2], 1))
         finally:
-            cluster.choose_workers("local")
+            workers.choose_workers("local")
 
 
 @only_in_chaos
 def test_a_cluster_started_for_the_work_ends_with_it(monkeypatch):
-    cluster.choose_workers("dask")
+    workers.choose_workers("dask")
     try:
-        assert not cluster.is_used_for(1)
+        assert not workers.is_used_for(1)
         assert sorted(in_workers(doubled, [1, 2, 3], 2)) == [(1, 2), (2, 4), (3, 6)]
     finally:
-        cluster.choose_workers("local")
+        workers.choose_workers("local")
 
 
 def test_an_address_where_nothing_runs_or_no_address_says_so(monkeypatch):
-    monkeypatch.setattr(cluster, "PATIENCE_S", 1)
+    monkeypatch.setattr(workers, "PATIENCE_S", 1)
     with pytest.raises(BadInput, match="local, dask or"):
-        cluster.choose_workers("ray")
-    cluster.choose_workers("tcp://127.0.0.1:9")
+        workers.choose_workers("ray")
+    workers.choose_workers("tcp://127.0.0.1:9")
     try:
         with pytest.raises(BadInput, match="a Dask scheduler at"):
             list(in_workers(doubled, [1, 2], 1))
     finally:
-        cluster.choose_workers("local")
+        workers.choose_workers("local")

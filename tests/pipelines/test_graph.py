@@ -10,7 +10,6 @@ import pytest
 import yaml
 
 from hoidata.datasets.registry import adapter_names
-from pipelines.deployments import deployment_targets
 from pipelines.lineage.graph import Stage, read_graph
 from pipelines.params import read_params
 from pipelines.stages.__main__ import STAGES
@@ -128,6 +127,8 @@ def test_a_family_that_is_off_has_no_stage_and_one_dataset_turns_it_on(graph, pr
 
 
 def test_deployments_are_the_graphs_own_work_by_dataset_and_family(graph):
+    from pipelines.flows import deployment_targets
+
     params = read_params(PROJECT)
     found = deployment_targets(graph, params["profile"], params["datasets"])
     assert found["full-graph"] == []

@@ -1,4 +1,4 @@
-"""The bare name in ``prefect deployment run annotate-arctic``; test_prefect_security.py types it."""
+"""The hook that Prefect loads, and runs whose server ended; test_prefect_security.py has a server."""
 
 import asyncio
 import os
@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipelines.prefect_names import WORKER, only_one, wrap_lookup
+from pipelines.prefect_hook import SERVING, only_one, wrap_lookup
 
 PROJECT = Path(__file__).parents[2]
 
@@ -55,16 +55,16 @@ def test_a_name_that_none_or_several_have_is_refused(found, message):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("between", ["", "sh"])
-def test_a_process_of_a_flow_run_begins_only_below_its_worker(between):
-    """The worker may have ended before its flow run has imported Prefect."""
+def test_a_process_of_a_flow_run_begins_only_below_its_starter(between):
+    """The process that serves the flows may have ended before its flow run has imported Prefect."""
     gone = subprocess.Popen(["true"])
     gone.wait()
     code = "import prefect; print('began', end='')"
     words = ["sh", "-c", f'{sys.executable} -c "{code}"; exit $?'] if between else [sys.executable, "-c", code]
     told = {}
-    for worker in (gone.pid, os.getpid()):
-        environment = {**os.environ, WORKER: str(worker), "PREFECT__FLOW_RUN_ID": "any"}
-        told[worker] = subprocess.run(words, cwd=PROJECT, env=environment, capture_output=True, text=True).stdout
+    for starter in (gone.pid, os.getpid()):
+        environment = {**os.environ, SERVING: str(starter), "PREFECT__FLOW_RUN_ID": "any"}
+        told[starter] = subprocess.run(words, cwd=PROJECT, env=environment, capture_output=True, text=True).stdout
     assert told == {gone.pid: "", os.getpid(): "began"}
 
 
@@ -100,3 +100,25 @@ def test_a_result_that_a_server_names_is_never_unpickled_in_this_folder(tmp_path
     done = subprocess.run(words, cwd=PROJECT, env=environment, capture_output=True, text=True)
     assert harm.exists() is not guarded, done.stdout + done.stderr
     assert ("no stored result" in done.stdout) is guarded
+
+
+@pytest.mark.slow
+def test_runs_that_were_under_way_have_crashed_and_finished_or_waiting_ones_stay_what_they_are():
+    from prefect import flow
+    from prefect.client.orchestration import get_client
+    from prefect.states import Completed, Pending, Running, Scheduled
+    from prefect.testing.utilities import prefect_test_harness
+
+    from pipelines.flows import end_abandoned_runs
+
+    @flow
+    def some() -> None: ...
+
+    with prefect_test_harness(server_startup_timeout=120), get_client(sync_client=True) as client:
+        began = [Running(), Pending(), Completed(), Scheduled()]
+        runs = [client.create_flow_run(some, state=state) for state in began]
+        end_abandoned_runs()
+        after = [client.read_flow_run(run.id).state for run in runs]
+    told = [(state.type.value, state.message or "") for state in after if state]
+    assert [kind for kind, _ in told] == ["CRASHED", "CRASHED", "COMPLETED", "SCHEDULED"]
+    assert "hoidata up" in told[0][1]

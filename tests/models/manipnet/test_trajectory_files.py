@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from fuzz.seeds import trajectory_tables
 from hoidata.clips.clip import SIDES
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
@@ -46,6 +45,29 @@ def table(
         numbers = [frame * step, *thing * scale, *quaternions[0], *hand * scale, *quaternions[1]]
         lines.append(",".join(f"{number:.9g}" for number in numbers))
     return "\n".join(lines)
+
+
+def trajectory_tables() -> list[bytes]:
+    """A table that is good, then one of every kind that is refused."""
+    names = ["time_s", *(f"{body}_{part}" for body in ("object", "right") for part in PARTS)]
+    row = "0,0,0,1,0,0,0,0.1,0,0,1,0,0,0"
+    good = [",".join(names), *(f"{number / 30:.4f},{row}" for number in range(4))]
+    hinged = [good[0] + ",hinge_rad", *(line + ",0.5" for line in good[1:])]
+    late = [good[0], *(f"{step},{row}" for step in (0, 33, 66, 100))]
+    frames = [good[0], *(f"{step},{row}" for step in range(4))]
+    falling = [good[0], *(f"{step},{row}" for step in (0, 0.1, 0.05))]
+    changed = [
+        *("\n".join(good).replace(old, new) for old, new in ((",1,0,0,0,0.1", ",2,0,0,0,0.1"), ("0.0333", "x"))),
+        *("\n".join(good).replace(old, new) for old, new in (("0.0333", "nan"), ("right_qz", "right_q"))),
+        *("\n".join(good).replace(old, new) for old, new in (("object_x", "object_y"), ("0.0333,", "0.0333,1,"))),
+        *("\n".join(good).replace(old, new) for old, new in (("time_s", "time"), ("right_", "wrist_"))),
+    ]
+    return [
+        *("\n".join(lines).encode() for lines in (good, hinged, late, frames, falling)),
+        *map(str.encode, changed),
+        b"\xff",
+        b"",
+    ]
 
 
 def given(text: str, model=BOX, unit: str = "m", axes: Axes = "model"):

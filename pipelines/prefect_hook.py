@@ -1,12 +1,12 @@
-"""Lets ``prefect deployment run annotate-arctic`` work as typed in this folder: a start-up hook of Prefect.
+"""What Prefect loads at its start in a project's folder (entry point group ``prefect.plugins``, see prefect.toml).
 
-(Entry point group ``prefect.plugins``, switched on in prefect.toml.) Prefect wants FLOW/DEPLOYMENT and has no setting
-for less, so its look-up by name is wrapped; the form with a slash always works. And this project's server lets nobody
-in without its key, which the hook takes from ``.prefect/``.
+The hook does four things:
 
-The hook also guards a flow run before it contacts the server. The run ends with its worker, because it would obey
-whoever listens at the server's address next. And no process loads results that a server points to, because reading
-them can run code.
+- ``prefect deployment run annotate-arctic`` works as typed. Prefect wants FLOW/DEPLOYMENT and has no setting for less,
+  so its look-up by name is wrapped; the form with a slash always works.
+- It hands over the key to this project's server.
+- A flow run ends with the process that serves the flows, because it would obey whoever listens at the address next.
+- No process loads results that a server points to, because reading them can run code.
 """
 
 import os
@@ -21,31 +21,31 @@ from prefect.plugins import SetupResult, register_hook
 
 from hoidata.errors import BadInput
 from hoidata.lifetime import end_with_parent
-from pipelines.prefect_key import is_loopback, read_key
+from pipelines.prefect_server import is_loopback, read_key
 
-WORKER = "HOIDATA_PREFECT_WORKER"
+SERVING = "HOIDATA_PREFECT_SERVING"
 
 
 @register_hook
 def setup_environment(*, ctx) -> SetupResult | None:
     """Called once when Prefect is imported; Prefect reads its settings again when variables are returned."""
-    end_flow_run_with_worker()
+    end_flow_run_with_its_starter()
     refuse_stored_results()
     accept_bare_names(ctx)
     return key_for(ctx.api_url)
 
 
-def end_flow_run_with_worker() -> None:
-    """A worker leaves its process id to the processes of its flow runs, which the kernel then ends with it.
+def end_flow_run_with_its_starter() -> None:
+    """The process that serves the flows leaves its id to those of its flow runs, which the kernel then ends with it.
 
-    A process whose worker ended while Prefect was imported ends now.
+    A flow run whose starter ended while Prefect was imported ends now.
     """
     if "PREFECT__FLOW_RUN_ID" not in os.environ:
-        os.environ[WORKER] = str(os.getpid())
+        os.environ[SERVING] = str(os.getpid())
         return
-    worker = int(os.environ.get(WORKER, os.getppid()))
+    starter = int(os.environ.get(SERVING, os.getppid()))
     end_with_parent(os.getppid())
-    if worker not in (process.pid for process in psutil.Process().parents()):
+    if starter not in (process.pid for process in psutil.Process().parents()):
         os.kill(os.getpid(), signal.SIGKILL)
 
 

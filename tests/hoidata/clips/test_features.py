@@ -1,0 +1,111 @@
+"""The feature layout, held poses, slips and quarantine of clips, by formulas of their own."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hoidata.clips import SIDES
+from hoidata.clips.clip import FPS, ObjectTrack
+from hoidata.clips.features import hand_features, object_features, upright
+from hoidata.clips.quarantine import Quarantined
+from hoidata.clips.recording import HandRecording, OwnHandTrack
+from hoidata.clips.slip import MOVING_CM_S, joint_slips_cm_s
+from hoidata.errors import BadInput
+from hoidata.hands import load_embedded_hands
+from hoidata.hands.tracks import track_rotmats
+from hoidata.sensors.mano_hand import mano_hand
+from tests.builders.clips import build_clip
+from tests.builders.objects import box_model
+
+TURN = Rotation.from_euler("xyz", (20, -35, 70), degrees=True)
+ORIGIN_M = np.array([0.3, -0.2, 0.9])
+
+
+def columns(rotations: Rotation) -> np.ndarray:
+    """The first two columns, row by row."""
+    return rotations.as_matrix()[..., :2].reshape(*rotations.as_matrix().shape[:-2], 6)
+
+
+def test_hand_features_are_the_turned_wrist_and_sixteen_rotations_in_float32():
+    track = build_clip().hands["right"]
+    features = hand_features(track, TURN.as_matrix(), ORIGIN_M)
+    assert (features.shape, features.dtype) == ((30, 99), np.float32)
+    np.testing.assert_allclose(features[:, :3], TURN.apply(track.wrist_m - ORIGIN_M), atol=1e-6)
+    np.testing.assert_allclose(features[:, 3:9], columns(TURN * Rotation.from_rotvec(track.global_orient)), atol=1e-6)
+    fingers = track_rotmats(track)[:, 1:, :, :2].reshape(30, -1)
+    np.testing.assert_allclose(features[:, 9:], fingers, atol=1e-6)
+
+
+@pytest.mark.parametrize("articulated", [False, True])
+def test_object_features_are_the_turned_pose_and_the_hinge_angle(articulated):
+    track = build_clip(articulated=articulated).object
+    features = object_features(track, TURN.as_matrix(), ORIGIN_M)
+    assert (features.shape, features.dtype) == ((30, 10), np.float32)
+    np.testing.assert_allclose(features[:, :3], TURN.apply(track.translation_m - ORIGIN_M), atol=1e-6)
+    np.testing.assert_allclose(features[:, 3:9], columns(TURN * Rotation.from_rotvec(track.rotvec)), atol=1e-6)
+    np.testing.assert_array_equal(features[:, 9], track.hinge_rad if articulated else 0)
+
+
+@pytest.mark.parametrize("gravity", [(0, 0, -1), (0, 0, 9.81), (0, -9.81, 0), (0.3, 0.5, -0.1), (-1e-12, 0, -1)])
+def test_upright_is_the_smallest_rotation_that_turns_gravity_down(gravity):
+    direction = np.array(gravity) / np.linalg.norm(gravity)
+    turn = upright(np.array(gravity))
+    np.testing.assert_allclose(turn @ direction, (0, 0, -1), atol=1e-9)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    angle = Rotation.from_matrix(turn).magnitude()
+    assert angle == pytest.approx(np.arccos(np.clip(-direction[2], -1, 1)), abs=1e-6)
+
+
+def test_upright_is_the_identity_where_gravity_is_unknown():
+    np.testing.assert_array_equal(upright(None), np.eye(3))
+
+
+def test_a_held_hand_shows_the_last_valid_pose_and_stays_invalid_there():
+    track = build_clip().hands["right"]
+    valid = np.arange(30) % 3 == 1
+    held = replace(track, valid=valid).held()
+    np.testing.assert_array_equal(held.valid, valid)
+    np.testing.assert_array_equal(held.wrist_m[:6], track.wrist_m[[1, 1, 1, 1, 4, 4]])
+
+
+def test_a_joint_slips_by_its_motion_over_a_part_that_moves_and_nowhere_else():
+    """A box moves along x at 10 cm/s, then stands; a joint moves along y over it at 4 cm/s."""
+    frames = np.arange(20)
+    along_x = np.minimum(frames, 10) * 0.10 / FPS
+    place = np.stack((along_x, np.zeros(20), np.zeros(20)), axis=1)
+    track = ObjectTrack(box_model(), np.tile([0.0, 0, 0.5], (20, 1)), place, None)
+    joints = np.repeat(place[:, None], 21, axis=1) + np.array([0.0, 1, 0]) * (frames * 0.04 / FPS)[:, None, None]
+    touched = np.full((20, 21), -1)
+    touched[3:15, 7] = 0  # seven intervals while it moves, from frame 3 to frame 10
+    np.testing.assert_allclose(joint_slips_cm_s(track, joints, touched), np.full(7, 4.0), rtol=1e-6)
+    slow = replace(track, translation_m=place * 0.9 * MOVING_CM_S / 10)
+    assert len(joint_slips_cm_s(slow, joints, touched)) == 0
+
+
+def test_a_quarantined_sequence_keeps_every_part_of_its_error():
+    error = BadInput("a.npz", "a clip", "nothing", "download it again")
+    expected = ("grab/s1/a", "a.npz", "a clip", "nothing", "download it again")
+    left_out = Quarantined.from_error("grab/s1/a", error)
+    assert (left_out.source_key, left_out.where, left_out.expected, left_out.got, left_out.remedy) == expected
+
+
+def test_frames_of_a_recording_keep_hands_object_and_usable_together():
+    clip, hand = build_clip(), mano_hand(load_embedded_hands(), "right")
+    rng = np.random.default_rng(0)
+    joints = len(hand.parents) if hasattr(hand, "parents") else 16
+    own = {side: OwnHandTrack(rng.normal(size=(30, 3)), rng.normal(0, 0.3, (30, joints, 3))) for side in SIDES}
+    usable = np.arange(30) != 4
+    whole = HandRecording("test", "s1", "a", 60.0, hand, own, clip.object, usable, np.array([0.0, 0, -1]))
+    some = whole.take(slice(0, 30, 2))
+    np.testing.assert_array_equal(some.usable, usable[::2])
+    np.testing.assert_array_equal(some.object.translation_m, clip.object.translation_m[::2])
+    for side in SIDES:
+        np.testing.assert_array_equal(some.hands[side].rotvec, own[side].rotvec[::2])
+        wrist = whole.world_from_wrist(side)
+        turned = Rotation.from_rotvec(own[side].rotvec[:, 0]).apply(np.tile([0.1, 0.2, 0.3], (30, 1)))
+        point = wrist @ np.tile([0.1, 0.2, 0.3], (30, 1, 1))
+        np.testing.assert_allclose(point[:, 0], turned + own[side].wrist_m, atol=1e-9)
+    assert whole.tracked_hand("right") is hand
+    assert whole.tracked_hand("left") is not hand
