@@ -67,8 +67,8 @@ def _end_with_dvc() -> None:
 
 
 def _run(module, options: argparse.Namespace) -> int:
-    from hoidata.workers import choose_workers
     from hoidata.errors import BadInput, HoidataError, told_in_words
+    from hoidata.workers import choose_workers
     from pipelines.params import read_params
     from pipelines.sidecar import noted_run
     from pipelines.stages.base import StagePaths
