@@ -5,8 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hoidata.datasets.grab.adapter import GrabAdapter
-from hoidata.datasets.grab.contact import read_contact
+from hoidata.datasets.grab.adapter import GrabAdapter, read_contact
 from hoidata.errors import BadInput
 from tests.builders import grab as recording
 

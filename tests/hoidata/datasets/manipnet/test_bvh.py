@@ -5,7 +5,7 @@ import gzip
 import numpy as np
 import pytest
 
-from hoidata.datasets.manipnet.bvh import parse_bvh, unpack_text
+from hoidata.datasets.manipnet.hand import parse_bvh, unpack_text
 from hoidata.errors import BadInput
 
 ARM = """HIERARCHY
