@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hoidata.annotation.encoders import HashEncoder
-from hoidata.annotation.hand_choice import most_similar_hand, select_hand
-from hoidata.annotation.hand_mentions import find_mentions
+from hoidata.annotation.hand_choice import find_mentions, most_similar_hand, select_hand
 
 
 @pytest.mark.parametrize(

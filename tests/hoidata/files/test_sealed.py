@@ -7,7 +7,7 @@ import pytest
 from safetensors.numpy import load, save
 
 from hoidata.errors import BadInput
-from hoidata.files.digest import canonical_json, sha256_bytes
+from hoidata.files.atomic import canonical_json, sha256_bytes
 from hoidata.files.sealed import OPEN_SEAL, check_seal, payload_digest, read_metadata, seal_fault, sealed
 
 TENSORS = {"weight": np.arange(3, dtype=np.float32)}
