@@ -1,7 +1,7 @@
 """Named splits, kept as data: rules in the folder of the dataset they split, ``splits/<name>.json``.
 
-Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here.
-One that stands there with its rule is any dataset's.
+Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here,
+with the rule where that is the same. A split of ``OF_ANY_DATASET`` needs no file in the dataset's folder.
 """
 
 from collections.abc import Mapping
