@@ -25,9 +25,9 @@ from hoidata.datasets.base import RawTree
 from hoidata.datasets.h2o import files as h2o
 from hoidata.datasets.hoi4d import files as hoi4d
 from hoidata.datasets.hot3d import files as hot3d
-from hoidata.datasets.hot3d import packed, umetrack
+from hoidata.datasets.hot3d import sources
 from hoidata.datasets.manipnet import adapter as manipnet
-from hoidata.datasets.manipnet import bvh
+from hoidata.datasets.manipnet import hand as own_hand
 from hoidata.datasets.oakink2 import files as oakink2
 from hoidata.errors import BadInput
 from hoidata.files import array_pieces, arrays, npy_header, numpy_files, pickle_check, restricted_pickle, torch_pickle
@@ -272,11 +272,13 @@ def _datasets() -> dict[str, Target]:
         return h2o.parse_rows([b"1 2 3\n", data], 3, "cam_pose", ["000000.txt", "000001.txt"])
 
     def bvh_text(data: bytes) -> Any:
-        return bvh.parse_bvh(data.decode("utf-8", "replace"), "a.bvh")
+        return own_hand.parse_bvh(data.decode("utf-8", "replace"), "a.bvh")
 
     return {
-        "bvh": Target(made(BVH), parse(bvh_text), [bvh]),
-        "gzip-text": Target(made(gzip.compress(BVH, mtime=0)), parse(bvh.unpack_text, "a.bvh.gz", 4096), [bvh]),
+        "bvh": Target(made(BVH), parse(bvh_text), [own_hand]),
+        "gzip-text": Target(
+            made(gzip.compress(BVH, mtime=0)), parse(own_hand.unpack_text, "a.bvh.gz", 4096), [own_hand]
+        ),
         "h2o-rows": Target(made(b"1 2.5 -3e-2\n4", b"1.0  2 3\r\n"), parse(h2o_rows), [h2o]),
         "h2o-segments": Target(made(SEGMENTS), parse(h2o.parse_segments, "action_train.txt"), [h2o]),
         "arctic-descriptions": Target(made(described), parse(arctic.parse_descriptions, "description.txt"), [arctic]),
@@ -285,7 +287,7 @@ def _datasets() -> dict[str, Target]:
             raw("hot3d", "*mano*.jsonl", lines=2), parse(hot3d.hand_poses, "a.jsonl", "mano"), [hot3d]
         ),
         "hot3d-tables": Target(raw("hot3d", "*objects.csv", "*mask*.csv", lines=3), parse(hot3d_tables), [hot3d]),
-        "hot3d-tar": Target(_packed_clip, parse(packed.read_packed, "a.tar"), [packed]),
+        "hot3d-tar": Target(_packed_clip, parse(sources.read_packed, "a.tar"), [sources]),
     }
 
 
@@ -333,7 +335,7 @@ def _json_files() -> dict[str, Target]:
         "store-info": Target(values(info, {**info, "schema_version": "9.0.0"}), open_store, [store]),
         "hoi4d-json": Target(hoi4d_seeds, parse(_hoi4d_json), [hoi4d]),
         "oakink2-json": Target(oakink2_seeds, parse(_oakink2_json), [oakink2]),
-        "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d, packed, umetrack]),
+        "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d, sources]),
         "hoidata-toml": Target(made(TOML), on_disk("hoidata.toml", own_root), [base]),
         "params-yaml": Target(made(PARAMS), on_disk("params.yaml", settings), [base, params]),
     }
@@ -361,10 +363,10 @@ def _oakink2_json(data: bytes) -> None:
 def _hot3d_json(data: bytes) -> object:
     """Whichever of the four kinds of file it looks like; the joints of a profile are computed, too."""
     if b"sequence_id" in data:
-        return packed.definition(data, "clip_definitions.json", 7)
+        return sources.definition(data, "clip_definitions.json", 7)
     if b"headset" in data:
         return hot3d.headset(data, "metadata.json")
     if b"hand_model" not in data:
         return hot3d.object_names(data, "instance.json")
     still = hot3d.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
-    return umetrack.joints_m(umetrack.parse_profile(data, "profile.json"), still, "right")
+    return sources.joints_m(sources.parse_profile(data, "profile.json"), still, "right")

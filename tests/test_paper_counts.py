@@ -16,8 +16,7 @@ from hoidata.contact.settings import ContactSettings
 from hoidata.datasets.grab.words import OBJECTS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.splits.definitions import definitions_for
-from hoidata.splits.published import published
+from hoidata.splits.definitions import definitions_for, published
 from models.common.sampling import alphas_cumprod
 from models.common.transformer import Encoder, TransformerConfig
 from models.text2hoi.diffusion import Condition, DiffusionConfig, DiffusionModel

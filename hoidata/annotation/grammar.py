@@ -2,7 +2,7 @@
 
 ``grammar.csv`` holds one row per word: kind (verb or object), base, gerund, past_participle, third_singular for verbs,
 noun_phrase and number (singular, plural or mass) for objects. Rules: lemminflect on the head word of an unknown verb;
-the first spoken sound for the article; the head noun's number, mass where ``mass_nouns.csv`` lists it: substances and
+the first spoken sound for the article; the head noun's number, mass where ``mass_nouns.json`` lists it: substances and
 collections of everyday English, which no rule of spelling gives away.
 
 ``phrases.csv`` holds what English says for a verb with an object, one kind per row; lists are divided by semicolons.
@@ -15,6 +15,7 @@ synonym: another verb of the same meaning.
 """
 
 import csv
+import json
 import logging
 import re
 from dataclasses import dataclass
@@ -217,13 +218,16 @@ def default_grammar() -> Grammar:
 @lru_cache(maxsize=1)
 def mass_nouns() -> frozenset[str]:
     """Nouns that take no article and a singular verb: water, bread, luggage."""
-    return frozenset(row["noun"] for row in _rows("mass_nouns.csv"))
+    return frozenset(json.loads(_text("mass_nouns.json")))
 
 
 def _rows(table: str) -> list[dict[str, str]]:
     """The rows of one of this package's tables."""
-    text = files("hoidata.annotation").joinpath(table).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
+    return list(csv.DictReader(_text(table).splitlines()))
+
+
+def _text(name: str) -> str:
+    return files("hoidata.annotation").joinpath(name).read_text(encoding="utf-8")
 
 
 def _words(text: str, kind: str) -> str:

@@ -14,7 +14,6 @@ import pyarrow as pa
 
 from hoidata.annotation.derived import derive_verb
 from hoidata.annotation.encoders import TextEncoder, load_encoder
-from hoidata.annotation.hand_distances import write_hand_distances
 from hoidata.annotation.sentences import FORMS, FourSentences, four_sentences, reference_sentences
 from hoidata.annotation.settings import AnnotationSettings
 from hoidata.clips import SIDES, Clip, HandType, Side
@@ -25,9 +24,9 @@ from hoidata.contact.stage import sample_objects
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.arrays import write_npz
-from hoidata.files.tables import write_table
+from hoidata.files.written import write_table
 from hoidata.hands import HandPair
-from hoidata.store.hand_evidence import HandEvidence
+from hoidata.store.hand_evidence import HandEvidence, write_hand_distances
 from hoidata.store.store import Store, open_store
 
 VerbSource = Literal["source", "derived"]

@@ -16,7 +16,7 @@ from hoidata.contact.proximity import ENTRY, ProximityIndex
 from hoidata.contact.settings import ContactSettings
 from hoidata.files import atomic_folder, canonical_json
 from hoidata.files.arrays import write_npz
-from hoidata.files.tables import write_table
+from hoidata.files.written import write_table
 from hoidata.hands import HandPair
 from hoidata.objects.sampling import SampledPoints, sample_points
 from hoidata.store.store import Store, open_store

@@ -1,7 +1,14 @@
 """Files written whole or not at all, read without executing anything, and known by their content."""
 
-from hoidata.files.atomic import atomic_file, atomic_folder, remove_dead_leftovers, write_whole
-from hoidata.files.digest import canonical_json, sha256_bytes, sha256_file
+from hoidata.files.atomic import (
+    atomic_file,
+    atomic_folder,
+    canonical_json,
+    remove_dead_leftovers,
+    sha256_bytes,
+    sha256_file,
+    write_whole,
+)
 from hoidata.files.numpy_files import load_npy, load_npy_object, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, Record, restricted_load
 from hoidata.files.torch_pickle import load_torch_pickle

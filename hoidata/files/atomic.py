@@ -1,6 +1,10 @@
-"""Writing that leaves either the old file or the whole new one, never half of one; and one writer at a time."""
+"""Writing that leaves either the old file or the whole new one, never half of one; and one writer at a time.
+
+Also content digests and canonical JSON: equal content, equal bytes.
+"""
 
 import hashlib
+import json
 import os
 import re
 import shutil
@@ -9,6 +13,7 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from filelock import FileLock, Timeout
 
@@ -143,3 +148,17 @@ def exclusive(path: str | Path, wait_s: float = _WAIT_S) -> Iterator[int]:
     finally:
         lock.unlink(missing_ok=True)  # while it is held: filelock holds none on a file that has lost its name
         holding.release()
+
+
+def sha256_bytes(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
+
+
+def sha256_file(path: str | Path) -> str:
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def canonical_json(value: Any) -> str:
+    """JSON with sorted keys and no spaces; refuses NaN and infinity (ValueError)."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)

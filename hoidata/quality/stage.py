@@ -18,7 +18,7 @@ from rich.progress import Progress
 
 from hoidata.clips.clip import SIDES
 from hoidata.files import atomic_folder, canonical_json
-from hoidata.files.tables import write_table
+from hoidata.files.written import write_table
 from hoidata.hands import HandPair
 from hoidata.quality.measures import ObjectFacts, clip_row, distances_to_others, meant_betas, object_row
 from hoidata.quality.thresholds import (

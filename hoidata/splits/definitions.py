@@ -1,7 +1,7 @@
 """Named splits, kept as data: rules in the folder of the dataset they split, ``splits/<name>.json``.
 
-Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here.
-One that stands there with its rule is any dataset's.
+Where a split is from and its version stand there too; for one that several datasets have, in ``definitions/`` here,
+with the rule where that is the same. A split of ``OF_ANY_DATASET`` needs no file in the dataset's folder.
 """
 
 from collections.abc import Mapping
@@ -14,8 +14,8 @@ import orjson
 
 from hoidata.dataset_folders import dataset_facts, dataset_folder
 from hoidata.errors import BadInput
+from hoidata.settings import build_config
 from hoidata.splits.leaks import PROMISES, Promise
-from hoidata.splits.published import published
 from hoidata.splits.rules import KINDS, SplitRule
 
 FOLDER = Path(__file__).with_name("definitions")
@@ -123,3 +123,45 @@ def _read(path: Path) -> Definition:
         raise BadInput(path, "the split's version and source", f"{origin}", "state them there")
     rule, promises = _rule_and_promises(str(path), values)
     return Definition(path.stem, origin["version"], origin["source"], rule, promises, bool(if_chosen))
+
+
+@dataclass(frozen=True)
+class Published:
+    """What ``published.json`` states; what it leaves out is not known.
+
+    source: where the lists are from, or why there is none. sequences: all names. without_ground_truth: beginnings of
+    withheld ones.
+
+    motion_files: patterns of the raw files that hold motion; other raw files (meshes, templates) serve many sequences.
+    segments, frames: per sequence, where the source tells.
+    """
+
+    source: str
+    sequences: tuple[str, ...] = ()
+    without_ground_truth: tuple[str, ...] = ()
+    motion_files: tuple[str, ...] = ()
+    segments: tuple[int, ...] = ()
+    frames: tuple[int, ...] = ()
+
+    @property
+    def usable(self) -> tuple[str, ...]:
+        """The sequences whose ground truth is published."""
+        return tuple(name for name in self.sequences if not name.startswith(self.without_ground_truth))
+
+
+@lru_cache
+def published(dataset: str) -> Published:
+    """What is known of a dataset; nothing (an empty ``source``) of one without a list."""
+    folder = dataset_folder(dataset)
+    path = None if folder is None else folder / "published.json"
+    if path is None or not path.is_file():
+        return Published("")
+    try:
+        values = orjson.loads(path.read_bytes())
+    except orjson.JSONDecodeError as error:
+        raise BadInput(path, "a JSON object", str(error), "correct it") from error
+    found = build_config(Published, values, str(path))
+    if empty := sorted(key for key, value in values.items() if value == []):
+        remedy = "leave it out, and say in its source why there is none"
+        raise BadInput(f"{path}: {empty[0]}", "a list of one entry or more", "an empty one", remedy)
+    return found

@@ -23,11 +23,9 @@ import pyarrow as pa
 from hoidata.clips.clip import SIDES, Clip
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
-from hoidata.files.tables import write_table
-from hoidata.files.written import read_table
-from hoidata.splits.definitions import Definition, choose, definitions_for
+from hoidata.files.written import read_table, write_table
+from hoidata.splits.definitions import Definition, choose, definitions_for, published
 from hoidata.splits.leaks import Leaks, find_leaks
-from hoidata.splits.published import published
 from hoidata.splits.rules import PARTS, assign_split, missing_parts
 from hoidata.splits.statistics import training_statistics
 from hoidata.store.store import Store, open_store

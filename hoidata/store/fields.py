@@ -58,8 +58,8 @@ def _both(field: Field) -> tuple[Field, ...]:
     )
 
 
-def _rotvec(name: str, rows: str, meaning: str, frame: str = "world") -> Field:
-    return Field(name, "float32", meaning, (rows, 3), (rows, "axis-angle"), "radian", frame)
+def _rotvec(name: str, rows: str, meaning: str) -> Field:
+    return Field(name, "float32", meaning, (rows, 3), (rows, "axis-angle"), "radian", "world")
 
 
 def _point(name: str, rows: str, meaning: str) -> Field:
@@ -172,7 +172,7 @@ RECORDINGS = StoreFile(
     ),
 )  # fmt: skip
 
-_JOINT, _CAPSULE, _SKIN = ("joint",), ("capsule",), ("skin point",)
+_JOINT, _CAPSULE = ("joint",), ("capsule",)
 
 
 def _of_hand(name: str, rows: str, meaning: str, frame: str = "joint", unit: str = "metre") -> Field:

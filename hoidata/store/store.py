@@ -74,7 +74,7 @@ class FrameShard:
     """The mapped members of one ``frames-*.npz``.
 
     hands: per side wrist_m, global_orient, hand_pose, betas, valid. object, other: rotvec, translation_m, hinge_rad.
-    camera: rotvec, position_m, images; none in stores before 1.1.
+    camera: rotvec, position_m, images.
     """
 
     source_frames: np.ndarray
@@ -87,13 +87,12 @@ class FrameShard:
     def open(cls, path: Path) -> "FrameShard":
         arrays = map_npz(path)
         names = ("wrist_m", "global_orient", "hand_pose", "betas", "valid")
-        camera = [f"camera_{name}" for name in ("rotvec", "position_m", "images")]
         return cls(
             arrays["source_frames"],
             {side: tuple(arrays[f"{side}_{name}"] for name in names) for side in SIDES},
             tuple(arrays[f"object_{name}"] for name in _POSE),
             tuple(arrays[f"other_{name}"] for name in _POSE),
-            tuple(arrays[name] for name in camera if name in arrays),
+            tuple(arrays[f"camera_{name}"] for name in ("rotvec", "position_m", "images")),
         )
 
 

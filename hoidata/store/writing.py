@@ -25,7 +25,7 @@ from hoidata.clips.recording import HandRecording
 from hoidata.clips.validation import check_clip
 from hoidata.files import atomic_folder, canonical_json, sha256_bytes
 from hoidata.files.arrays import write_npz
-from hoidata.files.tables import write_table
+from hoidata.files.written import write_table
 from hoidata.objects.model import ObjectModel
 from hoidata.store.fields import (
     AXES,

@@ -15,8 +15,7 @@ from itertools import accumulate
 from pathlib import Path
 
 from hoidata.beside import INSTALLED, home_of
-from hoidata.files.atomic import write_whole
-from hoidata.files.digest import sha256_file
+from hoidata.files.atomic import sha256_file, write_whole
 
 # An import statement: the module after ``from`` or None, how many folders up, the names.
 Statement = tuple[str | None, int, list[str]]

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
-from hoidata.files.digest import sha256_file
+from hoidata.files.atomic import sha256_file
 from hoidata.files.numpy_files import load_npz_objects
 from hoidata.files.sealed import payload_digest, seal_fault
 from hoidata.files.written import read_json

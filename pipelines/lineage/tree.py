@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from hoidata.errors import BadInput
-from hoidata.files.digest import sha256_file
+from hoidata.files.atomic import sha256_file
 from pipelines.lineage.digests import path_digest
 from pipelines.lineage.graph import Stage, look_up, written_graph
 from pipelines.lineage.history import History

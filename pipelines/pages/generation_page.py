@@ -10,7 +10,7 @@ from hoidata.clips.clip import FPS, SIDES
 from hoidata.contact.maps import f1_score
 from hoidata.contact.proximity import ProximityIndex
 from hoidata.files.arrays import write_npz
-from hoidata.files.digest import canonical_json
+from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair, track_joints
 from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import GeneratedMotion

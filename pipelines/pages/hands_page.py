@@ -8,7 +8,7 @@ import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.files.arrays import write_npz
-from hoidata.files.digest import canonical_json
+from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair
 from hoidata.metrics.unmeasured import NO_INSIDE
 from hoidata.object_paths.path import PathStep

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files.atomic import atomic_folder
-from hoidata.files.digest import canonical_json
+from hoidata.files.atomic import atomic_folder, canonical_json
 from hoidata.files.written import EMPTY, read_json
 from hoidata.files.written import empty_reason as empty_reason  # for the stages
 from hoidata.machine_folder import SETTINGS, machine_folder

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hoidata.dataset_folders import outside_folders
-from hoidata.files.atomic import atomic_folder
-from hoidata.files.digest import canonical_json
+from hoidata.files.atomic import atomic_folder, canonical_json
 from models.registry import NETWORKS, family_module, family_names, network_modules
 from pipelines.lineage.closure import Choice, SourceTree
 from pipelines.params import chosen_params, read_file, read_params
@@ -25,8 +24,7 @@ DATASETS = "hoidata.datasets"
 # Modules that read files in the folder of a dataset they are given by name, and which.
 READERS = {
     "hoidata.dataset_folders": ("facts.toml",),
-    "hoidata.splits.definitions": ("splits/*.json",),
-    "hoidata.splits.published": ("published.json",),
+    "hoidata.splits.definitions": ("splits/*.json", "published.json"),
 }
 
 

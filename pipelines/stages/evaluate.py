@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from hoidata.errors import BadInput
 from hoidata.files import write_whole
-from hoidata.files.atomic import atomic_folder
-from hoidata.files.digest import canonical_json
+from hoidata.files.atomic import atomic_folder, canonical_json
 from hoidata.files.written import read_json, read_json_rows
 from pipelines.lineage.digests import path_digest, value_digest
 from pipelines.params import read_params

@@ -12,7 +12,7 @@ from hoidata.contact.stage import contact_store
 from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets.grab.adapter import GrabAdapter
 from hoidata.errors import BadInput
-from hoidata.files.digest import sha256_file
+from hoidata.files.atomic import sha256_file
 from hoidata.hands import load_embedded_hands
 from hoidata.workers import in_order, in_workers
 from tests.hoidata.conversion.killable import write_grab

@@ -13,13 +13,14 @@ from hoidata.clips.hand_parameters import HandConvention, SourceHand, to_track
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.arctic.files import (
+    EXCLUDED,
     Description,
     head_camera,
+    object_words,
     parse_descriptions,
     parse_misc,
     parse_parts,
 )
-from hoidata.datasets.arctic.words import EXCLUDED, object_words
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput

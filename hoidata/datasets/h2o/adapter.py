@@ -19,14 +19,15 @@ from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, 
 from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered
 from hoidata.datasets.gravity import GravityEstimate, TrackedObject, estimate_gravity
 from hoidata.datasets.h2o.files import (
+    ACTIONS,
     LISTS,
+    OBJECTS,
     HandSource,
     SequenceFrames,
     listed_segments,
     read_frames,
 )
 from hoidata.datasets.h2o.hands import FITTED, PARAMETERS, KeypointHands, ParameterHands
-from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec

@@ -1,5 +1,7 @@
 """H2O's text files: frame files of one line of numbers, and the lists of segments in label_split.
 
+Objects by class id and actions by label are as the dataset's README lists them.
+
 Layouts: Kwon et al. 2021, README of the dataset; a hand's MANO block has 62 numbers, not the 59 printed there.
 """
 
@@ -13,8 +15,26 @@ import orjson
 
 from hoidata.datasets import checks
 from hoidata.datasets.base import RawTree
-from hoidata.datasets.h2o.words import ACTIONS, OBJECTS
 from hoidata.errors import BadInput
+
+OBJECTS = ("", "book", "espresso", "lotion", "spray", "milk", "cocoa", "chips", "cappuccino")  # by class id
+_SHELF = OBJECTS[1:]
+ACTIONS: tuple[tuple[str, str], ...] = (  # (verb, object) by action label; 0 is background
+    ("", ""),
+    *(("grab", noun) for noun in _SHELF),
+    *(("place", noun) for noun in _SHELF),
+    *(("open", noun) for noun in ("lotion", "milk", "chips")),
+    *(("close", noun) for noun in ("lotion", "milk", "chips")),
+    ("pour", "milk"),
+    *(("take out", noun) for noun in ("espresso", "cocoa", "chips", "cappuccino")),
+    *(("put in", noun) for noun in ("espresso", "cocoa", "cappuccino")),
+    *(("apply", noun) for noun in ("lotion", "spray")),
+    *(("read", noun) for noun in ("book", "espresso")),
+    ("spray", "spray"),
+    ("squeeze", "lotion"),
+)
+PAIRS = ACTIONS[1:]
+
 
 HandSource = Literal["mano", "keypoints"]
 HAND_FOLDERS: dict[HandSource, tuple[str, int]] = {"mano": ("hand_pose_mano", 124), "keypoints": ("hand_pose", 128)}

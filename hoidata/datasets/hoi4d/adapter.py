@@ -1,7 +1,7 @@
 """HOI4D (Liu et al. 2022): a head-worn camera, MANO hands, rigid and hinged objects, 15 frames per second.
 
 All numbers are in the camera's frame; the world is that of the camera's own trajectory, whose axes nobody states. Clips
-have 30 frames per second, of which every second one is made (``twice.py``).
+have 30 frames per second, of which every second one is made (``twice_frames``).
 """
 
 from collections.abc import Iterator
@@ -19,6 +19,10 @@ from hoidata.datasets.gaps import bridge, has_pose, missing_poses, numbered, tri
 from hoidata.datasets.gravity import TrackedObject, estimate_gravity
 from hoidata.datasets.hinge import box_corners, fit_hinge, hinged_model
 from hoidata.datasets.hoi4d.files import (
+    CATEGORIES,
+    EVENTS,
+    TASKS,
+    Category,
     PartPose,
     ShortPose,
     action_events,
@@ -28,9 +32,14 @@ from hoidata.datasets.hoi4d.files import (
     hinge_joint,
     object_poses,
 )
-from hoidata.datasets.hoi4d.parts import aligned_from_whole, matched
-from hoidata.datasets.hoi4d.twice import twice_frames, twice_hand, twice_rotvecs, twice_values
-from hoidata.datasets.hoi4d.words import CATEGORIES, EVENTS, TASKS, Category
+from hoidata.datasets.hoi4d.parts import (
+    aligned_from_whole,
+    matched,
+    twice_frames,
+    twice_hand,
+    twice_rotvecs,
+    twice_values,
+)
 from hoidata.datasets.known_meshes import raw_mesh
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import runs

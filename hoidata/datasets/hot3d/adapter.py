@@ -21,10 +21,8 @@ from hoidata.dataset_folders import facts_beside
 from hoidata.datasets import checks
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
 from hoidata.datasets.gaps import LONGEST_BRIDGED, bridge, has_pose, missing_poses, numbered, trimmed
-from hoidata.datasets.hot3d import umetrack
-from hoidata.datasets.hot3d.files import HandFormat, Poses
-from hoidata.datasets.hot3d.sources import PARTS, Source, read_source
-from hoidata.datasets.hot3d.words import object_words
+from hoidata.datasets.hot3d.files import HandFormat, Poses, object_words
+from hoidata.datasets.hot3d.sources import PARTS, Profile, Source, joints_m, read_source
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import Interval, bridged, runs, widened
 from hoidata.geometry.rotations import rotmat_to_rotvec
@@ -296,12 +294,10 @@ def _parameter_hands(poses: dict[Side, Poses], times: np.ndarray, hands: HandPai
 
 
 def _fitted_hands(
-    profile: umetrack.Profile, poses: dict[Side, Poses], times: np.ndarray, hands: HandPair, world: np.ndarray
+    profile: Profile, poses: dict[Side, Poses], times: np.ndarray, hands: HandPair, world: np.ndarray
 ) -> _Hands:
     """A MANO-layout hand on UmeTrack's joints; each run of frames with a hand is fitted by itself, with one shape."""
-    points: dict[Side, np.ndarray] = {
-        side: umetrack.joints_m(profile, own, side) @ world.T for side, own in poses.items()
-    }
+    points: dict[Side, np.ndarray] = {side: joints_m(profile, own, side) @ world.T for side, own in poses.items()}
     betas = fit_shape(points, hands)
     tracks: dict[Side, HandTrack] = {}
     errors = np.full((len(SIDES), len(times)), np.nan)

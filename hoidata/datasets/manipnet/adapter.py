@@ -16,14 +16,17 @@ from hoidata.clips.hand_parameters import HandConvention, hand_track
 from hoidata.clips.recording import HandRecording, OwnHandTrack
 from hoidata.dataset_folders import facts_beside
 from hoidata.datasets.base import DatasetPart, Described, Quarantined, RawTree, SequenceKey
-from hoidata.datasets.manipnet.bvh import BvhMotion, angles_yxz_to_rotmat, parse_bvh, unpack_text
 from hoidata.datasets.manipnet.hand import (
     HAND_REFERENCE,
     HAND_SKIN,
     LARGEST_REFERENCE,
     METRES_PER_UNIT,
     MIRROR_X,
+    BvhMotion,
+    angles_yxz_to_rotmat,
+    parse_bvh,
     read_hand,
+    unpack_text,
 )
 from hoidata.datasets.manipnet.segments import (
     LIFTED_M,
@@ -36,8 +39,8 @@ from hoidata.datasets.manipnet.segments import (
     height_above_table,
     interactions,
     motion_verb,
+    object_words,
 )
-from hoidata.datasets.manipnet.words import object_words
 from hoidata.errors import BadInput
 from hoidata.geometry.intervals import widened
 from hoidata.geometry.rotations import rotmat_to_rotvec

@@ -4,6 +4,7 @@ Pure functions on arrays. Two clocks: *source frames* (120 per second, where fau
 All stretches are half-open, ``start`` to ``stop``.
 """
 
+import re
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
@@ -12,6 +13,24 @@ import numpy as np
 
 from hoidata.geometry.intervals import Interval, bridged, runs, sudden_steps
 from hoidata.geometry.rotations import rotation_angle
+
+SIZES = {"small": "small", "med": "medium", "large": "large"}
+NOUNS = {
+    "cyl": "cylinder",
+    "hemi": "hemisphere",
+    "tetra": "tetrahedron",
+    "tri prism": "triangular prism",
+    "wineglass": "wine glass",
+}
+
+
+def object_words(name: str) -> str:
+    """A released object's file name in words: ``cyl_med`` -> "medium cylinder", ``teapot2`` -> "teapot"."""
+    words = [re.sub(r"\d+$", "", word) for word in name.split("_")]
+    sizes = [SIZES[word] for word in words if word in SIZES]
+    noun = " ".join(word for word in words if word not in SIZES and word not in ("body", "old", "simplified"))
+    return " ".join([*sizes, NOUNS.get(noun, noun)])
+
 
 FROZEN_SOURCE_FRAMES = 12
 FAR_WRIST_M = 1.0

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hoidata.annotation import clip_weights
-from hoidata.annotation.clip_tensors import read_tower
+from hoidata.annotation.clip_encoder import read_tower
 from hoidata.annotation.clip_weights import is_reachable, parse_weights_name, tagged_weights
 from hoidata.annotation.encoders import load_encoder
 from hoidata.errors import BadInput, MissingResource

@@ -7,7 +7,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from hoidata.annotation.hand_distances import hand_types_at
 from hoidata.annotation.stage import annotate_store
 from hoidata.clips import SIDES, Clip, Side
 from hoidata.contact.maps import acting_hands
@@ -16,7 +15,7 @@ from hoidata.errors import BadInput, MissingResource
 from hoidata.files.arrays import read_npz, write_npz
 from hoidata.objects.sampling import sample_points
 from hoidata.store.annotated import AnnotatedStore, load_annotated
-from hoidata.store.hand_evidence import HandDistances, HandEvidence
+from hoidata.store.hand_evidence import HandDistances, HandEvidence, hand_types_at
 from tests.builders.clips import clip_of, flat_hand, still_object
 from tests.builders.objects import box_model
 from tests.builders.stores import write_annotated

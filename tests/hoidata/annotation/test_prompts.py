@@ -9,10 +9,10 @@ import pytest
 from hoidata.annotation.hand_choice import HAND_TYPES
 from hoidata.annotation.prompts import Lexicon, read_prompt
 from hoidata.annotation.sentences import four_sentences, reference_sentences, reference_words
-from hoidata.datasets.arctic import words as arctic
+from hoidata.datasets.arctic import files as arctic
 from hoidata.datasets.grab import words as grab
 from hoidata.datasets.grab.words import OBJECTS
-from hoidata.datasets.h2o import words as h2o
+from hoidata.datasets.h2o import files as h2o
 
 # Every verb with every object: 36 of H2O's pairs, 202 of GRAB's and 55 of ARCTIC's are real actions.
 PAIRS = [

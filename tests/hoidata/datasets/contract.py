@@ -20,8 +20,7 @@ from hoidata.dataset_folders import dataset_facts, dataset_folder
 from hoidata.datasets import RawTree, get_adapter
 from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
-from hoidata.splits.definitions import definitions_for
-from hoidata.splits.published import published
+from hoidata.splits.definitions import definitions_for, published
 from hoidata.store.store import open_store
 from tests.builders.formulas import has_its_own_side, seated_person, sits_as_described
 from tests.builders.spoilt import CANARY, Spoil

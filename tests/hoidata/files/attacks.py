@@ -16,7 +16,7 @@ from hoidata.datasets.checks import table
 from hoidata.datasets.h2o.files import listed_segments
 from hoidata.datasets.hot3d.files import LARGEST_ROWS, POSE_COLUMNS, hand_poses, object_poses
 from hoidata.datasets.manipnet.adapter import _read_tips
-from hoidata.datasets.manipnet.bvh import ROOT_CHANNELS, parse_bvh, unpack_text
+from hoidata.datasets.manipnet.hand import ROOT_CHANNELS, parse_bvh, unpack_text
 from hoidata.files.numpy_files import load_npz_arrays, load_npz_objects
 from hoidata.files.restricted_pickle import ARRAYS, restricted_load
 from hoidata.files.sealed import read_metadata

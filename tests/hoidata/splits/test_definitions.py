@@ -10,8 +10,7 @@ import pytest
 from hoidata.dataset_folders import BUILT_IN, built_in_names, dataset_facts
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.errors import BadInput
-from hoidata.splits.definitions import OF_ANY_DATASET, choose, definitions_for
-from hoidata.splits.published import published
+from hoidata.splits.definitions import OF_ANY_DATASET, choose, definitions_for, published
 from hoidata.splits.rules import assign_split
 
 H2O = tuple(f"subject{number}" for number in (1, 2, 3, 4))

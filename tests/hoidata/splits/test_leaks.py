@@ -1,9 +1,18 @@
-"""The leak check finds whatever two parts have in common, promised or not."""
+"""The leak check finds whatever two parts have in common, promised or not; statistics of the training part."""
 
+import math
+from dataclasses import replace
+
+import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
+from hoidata.clips import SIDES
 from hoidata.splits.leaks import PROMISES, find_leaks
+from hoidata.splits.statistics import QUANTILES, summary, training_statistics
+from hoidata.store.info import generated_info
+from hoidata.store.store import open_store, write_store
 
 FILES = ["raw/a.npz", "raw/b.npz", "mesh/box.ply", "raw/sub/c.npz"]
 
@@ -98,3 +107,88 @@ def test_what_is_not_promised_is_still_recorded():
     found = leaks([row("a", subject="s1"), row("b", subject="s1")], {"a": "train", "b": "test"}, ["object"])
     assert found.broken == ()
     assert found.as_json()["subject"] == {"promised": False, "in_two_parts": 1, "first": ["s1"]}
+
+
+def hand_types(clip_ids, nearest=0.01) -> pd.DataFrame:
+    rows = {"clip_id": clip_ids, "min_left_m": [nearest] * len(clip_ids), "min_right_m": [None] * len(clip_ids)}
+    return pd.DataFrame(rows).set_index("clip_id", drop=False)
+
+
+@pytest.fixture
+def store(make_clip, tmp_path):
+    """A rigid and an articulated clip; the left hand is lost in some frames, its betas vary; no right hand in b."""
+    a = make_clip(12, "both", seed=1, clip_id="test/s1/a")
+    b = make_clip(20, "both", articulated=True, seed=2, clip_id="test/s2/b")
+    left, right = a.hands["left"], b.hands["right"]
+    valid = np.arange(12) % 3 > 0
+    betas = np.random.default_rng(0).normal(size=(12, 10)).astype(np.float32)
+    wild = np.where(valid[:, None], left.wrist_m, 1e6).astype(np.float32)
+    a = replace(a, hands={**a.hands, "left": replace(left, valid=valid, betas=betas, wrist_m=wild)})
+    b = replace(b, hands={**b.hands, "right": replace(right, valid=np.zeros(20, bool))})
+    write_store(tmp_path / "clips", [a, b], generated_info("test"))
+    return open_store(tmp_path / "clips")
+
+
+def test_figures_of_one_column_are_those_of_the_definition():
+    values = [3.0, -1.0, 4.0, 1.5, 9.25]
+    found = summary(np.array(values)[:, None])
+    mean = sum(values) / 5
+    assert found["count"] == 5
+    assert found["mean"] == [pytest.approx(mean, rel=1e-8)]
+    assert found["std"] == [pytest.approx(math.sqrt(sum((v - mean) ** 2 for v in values) / 5), rel=1e-8)]
+    assert (found["min"], found["max"]) == ([-1.0], [9.25])
+    ordered = sorted(values)
+    for share, got in zip(QUANTILES, found["quantile_values"][0], strict=True):
+        place = share * 4
+        below = int(place)
+        above = min(below + 1, 4)
+        assert got == pytest.approx(ordered[below] + (place - below) * (ordered[above] - ordered[below]), rel=1e-8)
+
+
+def test_quantities_of_hands_count_valid_frames_only(store):
+    found = training_statistics(store, store.ids, hand_types(store.ids))
+    assert (found["clips"], found["frames"]) == (2, 32)
+    counts = {name: facts["count"] for name, facts in found["quantities"].items()}
+    assert counts["left_wrist_m"] == counts["left_orient_6d"] == counts["left_wrist_to_object_m"] == 8 + 20
+    assert counts["right_hand_pose"] == 12
+    assert counts["left_betas"] == 8 + 1
+    assert counts["right_betas"] == 1
+    assert counts["object_translation_m"] == 32
+    assert counts["object_hinge_rad"] == 20
+    assert counts["n_frames"] == 2
+    assert found["quantities"]["n_frames"]["mean"] == [16.0]
+    assert (counts["left_closest_m"], counts["right_closest_m"]) == (2, 0)
+    assert max(found["quantities"]["left_wrist_m"]["max"]) < 10
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_positions_and_rotations_agree_with_another_computation(store, side):
+    found = training_statistics(store, store.ids, hand_types(store.ids))["quantities"]
+    clips = [store.clip(clip_id) for clip_id in store.ids]
+    shift, rows, turned = [], [], []
+    for clip in clips:
+        hand, moved = clip.hands[side], clip.object
+        for frame in np.flatnonzero(hand.valid):
+            shift.append(hand.wrist_m[frame].astype(float) - moved.translation_m[frame].astype(float))
+            rows.append(Rotation.from_rotvec(hand.global_orient[frame]).as_matrix()[:, :2].ravel())
+        turned += [Rotation.from_rotvec(turn).as_matrix()[:, :2].ravel() for turn in moved.rotvec]
+    np.testing.assert_allclose(found[f"{side}_wrist_from_object_m"]["mean"], np.mean(shift, axis=0), atol=1e-6)
+    distances = [math.dist(row, (0, 0, 0)) for row in shift]
+    np.testing.assert_allclose(found[f"{side}_wrist_to_object_m"]["max"], [max(distances)], atol=1e-6)
+    np.testing.assert_allclose(found[f"{side}_orient_6d"]["std"], np.std(rows, axis=0), atol=1e-6)
+    np.testing.assert_allclose(found["object_orient_6d"]["mean"], np.mean(turned, axis=0), atol=1e-6)
+
+
+def test_every_stored_number_of_a_hand_has_its_columns(store):
+    found = training_statistics(store, store.ids, hand_types(store.ids))["quantities"]
+    widths = {"wrist_m": 3, "wrist_from_object_m": 3, "orient_6d": 6, "hand_pose": 45, "betas": 10, "closest_m": 1}
+    for name, width in widths.items():
+        facts = found[f"left_{name}"]
+        assert {len(facts[key]) for key in ("mean", "std", "min", "max", "quantile_values")} == {width}
+        assert all(len(values) == len(QUANTILES) == 7 for values in facts["quantile_values"])
+        assert facts["unit"]
+
+
+def test_no_training_clip_gives_counts_of_zero(store):
+    found = training_statistics(store, [], hand_types(store.ids))
+    assert {facts["count"] for facts in found["quantities"].values()} == {0}

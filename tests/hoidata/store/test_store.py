@@ -1,19 +1,33 @@
+"""Stores: written, read and mapped; the field table, which files hold and README.md says; and empty outputs."""
+
+import io
 import json
+import zipfile
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pyarrow.parquet as pq
 import pytest
 from typer.testing import CliRunner
 
+import hoidata.store.fields as fields
 from hoidata.clips import SIDES
 from hoidata.clips.quarantine import Quarantined
+from hoidata.contact.settings import read_contact_settings
 from hoidata.errors import BadInput, MissingResource
+from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, load_embedded_hands, track_joints
+from hoidata.quality.thresholds import left_out_reasons
+from hoidata.store.annotated import load_annotated
 from hoidata.store.distances import DistanceEntries
 from hoidata.store.info import generated_info
+from hoidata.store.mapped import map_npz
 from hoidata.store.store import open_store, write_store
 from hoidata.store_check.check import check_store
+from hoidata.store_check.describe import readme
 from pipelines.cli import app
 from pipelines.commands.store_facts import fact_rows, group_rows, left_out_rows
 from tests.builders.stores import write_clips
@@ -289,3 +303,166 @@ def test_the_command_prints_them_and_all_on_request(tmp_path, clips, monkeypatch
 def test_an_empty_store_is_described_too(tmp_path):
     write_store(tmp_path / "clips", [], generated_info("test"))
     assert dict(fact_rows(open_store(tmp_path / "clips")))["gravity of the clips"] == "no clips"
+
+
+README = Path(fields.__file__).with_name("README.md")
+
+
+def test_the_readme_is_the_one_the_table_gives():
+    assert README.read_text() == readme(), "run: python -m hoidata.store_check.describe > hoidata/store/README.md"
+
+
+def test_places_and_angles_have_a_unit_and_a_frame():
+    for file in (fields.FRAMES, fields.BODY, fields.OBJECT_ARRAYS, fields.TEMPLATES):
+        for field in file.fields:
+            coordinates = field.shape[-1] in (3, 9, 45, 63) and field.dtype.startswith("float")
+            assert bool(field.frame and field.unit) == (coordinates or field.name.endswith("hinge_rad")), field.name
+    for file in fields.STORE_FILES:
+        for field in file.fields:
+            if field.name.endswith("_m"):
+                assert field.unit == "metre", field.name
+
+
+def test_written_files_hold_what_the_table_says(folder):
+    for file in (fields.FRAMES, fields.BODY, fields.SOURCE_CONTACT):
+        with np.load(folder / file.path.replace("*", "00000")) as archive:
+            assert archive.files == [field.name for field in file.fields]
+            for field in file.fields:
+                assert archive[field.name].dtype == field.dtype
+                assert archive[field.name].shape[1:] == field.row_shape
+    for file in fields.TABLES.values():
+        assert pq.read_schema(folder / file.path).names == [field.name for field in file.fields]
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    for field in fields.INFO.fields:
+        fields.value_at(info, field.name)
+    assert info["axes"]["<side>_hand_pose"] == ["frame", "joint x axis-angle"]
+
+
+REASON = "grab is not present in the profile own"
+
+
+def empty(folder: Path) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "empty.json").write_text(json.dumps({"reason": REASON}))
+    return folder
+
+
+@pytest.fixture
+def dataset(tmp_path: Path) -> Path:
+    """The folders of a dataset that is not there: a store without clips, and notes in place of all else."""
+    write_store(tmp_path / "clips", [], generated_info("grab"))
+    for name in ("clips", "annotation", "contact", "splits", "quality"):
+        empty(tmp_path / name)
+    return tmp_path
+
+
+READERS: list[Callable[[Path], object]] = [
+    load_annotated,
+    lambda root: left_out_reasons(root / "quality"),
+    lambda root: read_contact_settings(root / "contact"),
+]
+
+
+@pytest.mark.parametrize("read", READERS)
+def test_the_reason_is_told(dataset, read):
+    with pytest.raises(MissingResource, match=f"is empty: {REASON}"):
+        read(dataset)
+
+
+@pytest.mark.parametrize("name", ["annotation", "contact", "splits"])
+def test_the_reason_of_a_later_stage_is_told_too(dataset, name):
+    (dataset / "clips/empty.json").unlink()
+    for other in {"annotation", "contact", "splits"} - {name}:
+        (dataset / other / "empty.json").unlink()
+        (dataset / other / "info.json").write_text("{}")
+    with pytest.raises(MissingResource, match=f"{name} is empty: {REASON}"):
+        load_annotated(dataset)
+
+
+def test_a_family_without_motions_tells_why_where_its_clips_would_be(tmp_path):
+    with pytest.raises(MissingResource, match=f"text2hoi is empty: {REASON}"):
+        open_store(empty(tmp_path / "text2hoi") / "clips")
+
+
+def test_a_stage_that_has_not_run_is_named(tmp_path):
+    write_store(tmp_path / "clips", [], generated_info("grab"))
+    with pytest.raises(MissingResource, match="annotation is not there: run the stage 'annotate'"):
+        load_annotated(tmp_path)
+
+
+ARRAYS = {
+    "a/points": np.arange(12.0, dtype=np.float32).reshape(4, 3),
+    "flags": np.array([True, False, True]),
+    "empty": np.zeros((0, 45), np.float32),
+    "scalar": np.array(7),
+    "fortran": np.asfortranarray(np.arange(6).reshape(2, 3)),
+}
+
+
+def test_mapped_arrays_equal_those_numpy_loads(tmp_path: Path):
+    write_npz(tmp_path / "a.npz", ARRAYS)
+    np.savez(tmp_path / "b.npz", **ARRAYS)
+    for path in (tmp_path / "a.npz", tmp_path / "b.npz"):
+        mapped = map_npz(path)
+        with np.load(path) as loaded:
+            assert sorted(mapped) == sorted(loaded.files)
+            for name in loaded.files:
+                np.testing.assert_array_equal(mapped[name], loaded[name])
+                assert mapped[name].dtype == loaded[name].dtype
+
+
+def test_mapped_arrays_cannot_be_changed(tmp_path: Path):
+    write_npz(tmp_path / "a.npz", ARRAYS)
+    with pytest.raises(ValueError, match="read-only"):
+        map_npz(tmp_path / "a.npz")["a/points"][0] = 1
+
+
+def test_files_that_cannot_be_mapped_are_named(tmp_path: Path):
+    np.savez_compressed(tmp_path / "small.npz", a=np.zeros(100))
+    np.savez(tmp_path / "objects.npz", a=np.array([{}], dtype=object))
+    (tmp_path / "text.npz").write_text("hello")
+    for name, got in (("small", "compressed"), ("objects", "Python objects"), ("text", "zip"), ("none", "nothing")):
+        with pytest.raises(BadInput, match=got):
+            map_npz(tmp_path / f"{name}.npz")
+
+
+def test_a_header_that_promises_more_than_the_member_holds_is_refused(tmp_path: Path):
+    """Otherwise the rows of the next member would be read as this one's."""
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in (("a", np.zeros((4, 3), np.float32)), ("b", np.ones((400, 3), np.float32))):
+            stream = io.BytesIO()
+            np.save(stream, array)
+            archive.writestr(f"{name}.npy", stream.getvalue().replace(b"'shape': (4, 3)", b"'shape': (9, 3)"))
+    with pytest.raises(BadInput, match="shorter than its shape"):
+        map_npz(path)
+
+
+def test_one_changed_byte_anywhere_in_an_array_is_told(tmp_path: Path):
+    write_npz(tmp_path / "a.npz", {name: array for name, array in ARRAYS.items() if array.size})
+    whole = (tmp_path / "a.npz").read_bytes()
+    expected = {name: array.copy() for name, array in map_npz(tmp_path / "a.npz").items()}
+    told = 0
+    for place in range(0, len(whole), 7):
+        changed = bytearray(whole)
+        changed[place] ^= 1 << place % 8
+        (tmp_path / f"{place}.npz").write_bytes(changed)
+        try:
+            found = map_npz(tmp_path / f"{place}.npz")
+        except BadInput:
+            told += 1
+            continue
+        # Bytes of the archive's own that nobody reads: times, versions, the lengths' second copies.
+        assert {name: array.tolist() for name, array in found.items()} == {
+            name: array.tolist() for name, array in expected.items()
+        } or set(found) != set(expected)
+    assert told > 0.6 * len(whole) / 7
+
+
+def test_a_file_cut_anywhere_gives_the_named_error_only(tmp_path: Path):
+    write_npz(tmp_path / "a.npz", ARRAYS)
+    whole = (tmp_path / "a.npz").read_bytes()
+    for length in range(0, len(whole), 37):
+        (tmp_path / "cut.npz").write_bytes(whole[:length])
+        with pytest.raises(BadInput, match=r"cut\.npz"):
+            map_npz(tmp_path / "cut.npz")

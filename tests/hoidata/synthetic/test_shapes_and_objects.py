@@ -6,7 +6,7 @@ from hoidata.datasets.grab.words import OBJECTS as GRAB_WORDS
 from hoidata.datasets.h2o.adapter import ACTIONS
 from hoidata.objects.distance import signed_distance
 from hoidata.objects.mesh import mass_properties
-from hoidata.splits.published import published
+from hoidata.splits.definitions import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
 from hoidata.synthetic.closing import gradient, grid_field, mirrored
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from hoidata.errors import BadInput
-from hoidata.files.digest import canonical_json, sha256_file
+from hoidata.files.atomic import canonical_json, sha256_file
 from hoidata.files.sealed import payload_digest
 from pipelines.lineage.check import check
 from pipelines.lineage.locks import dvc_digest

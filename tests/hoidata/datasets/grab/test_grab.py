@@ -1,12 +1,14 @@
-"""GRAB: one NPZ and its meshes written by hand, and what their numbers must mean."""
+"""GRAB: one NPZ and its meshes written by hand, what their numbers must mean, and table, body and contact labels."""
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hoidata.datasets.grab import words as grab_words
-from hoidata.datasets.grab.adapter import GrabAdapter
+from hoidata.datasets.grab.adapter import GrabAdapter, read_contact
 from hoidata.datasets.grab.words import object_words
+from hoidata.errors import BadInput
 from tests.builders import grab as recording
 
 
@@ -110,3 +112,115 @@ def test_29_intents_and_51_objects_have_words_and_no_two_objects_the_same():
     assert (len(grab_words.INTENTS), len(grab_words.OBJECTS)) == (29, 51)
     assert len({object_words(name) for name in grab_words.OBJECTS}) == 51
     assert len({*grab_words.OBJECTS, *grab_words.OTHER_MESHES, "body"}) == 57  # the meshes of GRAB's folder
+
+
+def test_the_table_is_a_further_object_where_there_is_one(root, load_all):
+    recording.write_sequence(root, recording.with_table())
+    recording.write_table(root)
+    (clip,) = load_all(GrabAdapter(margin_frames=1), root)
+    (table,) = clip.other_objects
+    assert (table.model.name, table.n_frames, table.hinge_rad) == ("table", clip.n_frames, None)
+    assert clip.object.model.name == "cubelarge"
+    assert "tools/object_meshes/contact_meshes/table.ply" in {source.path for source in clip.sources}
+
+
+@pytest.mark.parametrize("data", [recording.sequence(), recording.with_table()])
+def test_without_a_table_or_its_mesh_there_is_none_and_nothing_is_wrong(root, load_all, data):
+    recording.write_sequence(root, data)
+    (clip,) = load_all(GrabAdapter(), root)
+    assert clip.other_objects == ()
+
+
+def test_the_body_is_left_out_until_it_is_asked_for(root, load_all):
+    recording.write_sequence(root, recording.with_body())
+    assert load_all(GrabAdapter(), root)[0].body is None
+    (clip,) = load_all(GrabAdapter(body=True), root)
+    frames = clip.source_frames
+    body, params = clip.body, recording.with_body()["body"]["params"]
+    np.testing.assert_array_equal(body.transl_m, params["transl"][frames])
+    np.testing.assert_array_equal(body.global_orient, params["global_orient"][frames])
+    np.testing.assert_array_equal(body.body_pose, params["body_pose"][frames])
+    face = np.concatenate([params[name][frames] for name in ("jaw_pose", "leye_pose", "reye_pose")], axis=1)
+    np.testing.assert_array_equal(body.face_pose, face)
+    np.testing.assert_array_equal(body.expression, params["expression"][frames])
+
+
+def test_a_file_without_a_body_converts_when_none_is_asked_for_and_is_named_when_it_is(root, load_all):
+    assert load_all(GrabAdapter(), root)[0].body is None
+    with pytest.raises(BadInput) as caught:
+        load_all(GrabAdapter(body=True), root)
+    assert "body" in caught.value.got
+    data = recording.with_body()
+    del data["body"]["params"]["expression"]
+    recording.write_sequence(root, data)
+    with pytest.raises(BadInput) as caught:
+        load_all(GrabAdapter(body=True), root)
+    assert "expression" in caught.value.expected
+
+
+def labelled(dtype=np.int8, order: str = "C") -> dict:
+    data = recording.sequence()
+    contact = data["contact"]["object"]
+    contact[30, 5], contact[32, 7], contact[32, 1], contact[33, 2] = 55, 21, 40, 22
+    data["contact"]["object"] = np.array(contact, dtype=dtype, order=order)
+    return data
+
+
+# Frames 12 to 44 hold label 22 on vertex 3; frame 30 is no strided one, 32 is the clip's fifth and holds three.
+ENTRIES = sorted([*((frame, 3, 22) for frame in range(9)), (5, 7, 21), (5, 1, 40)])
+
+
+def entries(contact) -> list[tuple[int, int, int]]:
+    return list(zip(contact.frame.tolist(), contact.vertex.tolist(), contact.label.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("dtype", ["int8", "uint8", "<i4", "<i8", ">i2", "<f4", "<f8"])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_contact_labels_are_kept_whatever_their_type_and_order(root, load_all, dtype, order):
+    recording.write_sequence(root, labelled(dtype, order))
+    (clip,) = load_all(GrabAdapter(), root)
+    assert entries(clip.source_contact) == ENTRIES
+
+
+def test_contact_labels_count_frames_of_the_clip_with_its_margin(root, load_all):
+    recording.write_sequence(root, labelled())
+    (clip,) = load_all(GrabAdapter(margin_frames=2), root)
+    assert entries(clip.source_contact) == [(frame + 2, vertex, label) for frame, vertex, label in ENTRIES]
+    (clip,) = load_all(GrabAdapter(margin_frames=50), root)
+    assert clip.source_frames[[0, -1]].tolist() == [0, 60]
+    assert entries(clip.source_contact)[0] == (3, 3, 22)
+
+
+def test_contact_labels_can_be_left_out(root, load_all):
+    (clip,) = load_all(GrabAdapter(contact=False), root)
+    assert clip.source_contact is None
+    assert clip.source_frames[[0, -1]].tolist() == [12, 44]
+
+
+def test_labels_below_zero_mean_no_contact(root, load_all):
+    data = recording.sequence()
+    contact = data["contact"]["object"]
+    contact[contact == 0] = -1
+    recording.write_sequence(root, data)
+    (clip,) = load_all(GrabAdapter(), root)
+    assert set(clip.source_contact.label) == {22}
+    assert clip.n_frames == 9
+
+
+def test_labels_longer_than_one_piece_are_those_read_at_once(root):
+    """1,201 frames of 8,800 vertices take 85 MB as 64-bit numbers, read in pieces of 59 frames: within a step of 4."""
+    rng = np.random.default_rng(0)
+    contact = np.zeros((1201, 8800), np.int64)
+    frame, vertex = rng.integers(0, 1201, 5000), rng.integers(0, 8800, 5000)
+    contact[frame, vertex] = rng.integers(1, 56, 5000)
+    path = recording.write_sequence(root, {"contact": {"object": contact}})
+    labels = read_contact(path, "here", 1201, 8800, 4, with_labels=True)
+    strided = contact[::4]
+    np.testing.assert_array_equal(labels.touched, strided.any(axis=1))
+    expected_frame, expected_vertex = np.nonzero(strided)
+    np.testing.assert_array_equal(labels.labels.frame, expected_frame)
+    np.testing.assert_array_equal(labels.labels.vertex, expected_vertex)
+    np.testing.assert_array_equal(labels.labels.label, strided[expected_frame, expected_vertex])
+    part = labels.cut(100, 200)
+    assert (part.frame.min(), part.frame.max()) == (0, 99)
+    assert len(part.frame) == ((expected_frame >= 100) & (expected_frame < 200)).sum()

@@ -16,7 +16,7 @@ from hoidata.conversion.convert import convert_dataset
 from hoidata.dataset_folders import BUILT_IN, facts_beside
 from hoidata.datasets import Quarantined, RawTree, SequenceKey
 from hoidata.datasets.hot3d.adapter import Hot3dAdapter
-from hoidata.datasets.hot3d.words import NOUNS, object_words
+from hoidata.datasets.hot3d.files import NOUNS, object_words
 from hoidata.errors import BadInput
 from hoidata.hands import track_joints
 from hoidata.store.store import open_store

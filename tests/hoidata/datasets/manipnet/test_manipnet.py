@@ -3,16 +3,30 @@
 Every expected joint is worked out in the files' own left-handed world, link by link, and only then seen in the mirror.
 """
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hoidata.clips.clip import Clip
+from hoidata.clips.clip import SIDES, Clip
+from hoidata.conversion.convert import convert_dataset
 from hoidata.datasets import Quarantined, RawTree
-from hoidata.datasets.manipnet.adapter import ManipNetAdapter, object_words, read_recording, thirty_fps_frames
+from hoidata.datasets.manipnet.adapter import (
+    HAND_JOINTS,
+    ManipNetAdapter,
+    object_words,
+    read_hand_recording,
+    read_recording,
+    thirty_fps_frames,
+)
+from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands, track_joints
-from tests.builders.manipnet import KEY, MIRROR, lift_rows, write_tree
+from hoidata.store.store import Store, open_store
+from hoidata.store_check.check import check_store
+from tests.builders.manipnet import KEY, MIRROR, POSE, lift_rows, write_skin, write_tree
 
 HANDS = load_embedded_hands()
 
@@ -157,3 +171,159 @@ def test_clips_say_that_their_hands_were_fitted_to_keypoints_and_how_well(carrie
     ]
     assert clip.hands_from == "keypoints"
     assert clip.fit_error_m == pytest.approx(np.mean(error_m), abs=1e-6)
+
+
+ANGLES = [0.0, 0.0, 0.0, *POSE[6:]]  # a wrist that does not turn holds the object
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("own")
+    left, right, thing = lift_rows(300)
+    write_tree(folder, *([[*row[:3], *ANGLES] for row in rows] for rows in (left, right)), thing)
+    write_skin(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def stored(root, tmp_path_factory) -> Store:
+    out = tmp_path_factory.mktemp("stored") / "clips"
+    convert_dataset(ManipNetAdapter(), root, load_embedded_hands(), out, progress=False)
+    return open_store(out)
+
+
+def left_handed(root: Path, side: str) -> np.ndarray:
+    """(17, 4, 4) poses of the joints in frame 7, decimetres: link by link, as the files have them."""
+    arm = {"left": 1.0, "right": -1.0}[side]
+    offsets = [(0.2, 0.12, -0.05), (0.18, 0.16, -0.1), (0.28, 0.2, -0.06), (0.3, 0.22, -0.04)]
+    offsets += [(1.05, 0.25, 0.01), (0.41, 0.02, 0.0), (0.26, 0.01, 0.0), (1.04, 0.02, 0.03), (0.46, 0.0, 0.02)]
+    offsets += [(0.3, 0.0, 0.0), (0.97, -0.19, 0.0), (0.42, -0.01, 0.02), (0.28, -0.02, 0.0)]
+    offsets += [(0.86, -0.38, -0.07), (0.33, -0.02, 0.01), (0.22, -0.03, 0.0)]
+    parents = [-1, 0, 1, 2, 3, 0, 5, 6, 0, 8, 9, 0, 11, 12, 0, 14, 15]
+    turns = Rotation.from_euler("YXZ", np.reshape(ANGLES, (17, 3)), degrees=True).as_matrix()
+    poses = np.tile(np.eye(4), (17, 1, 1))
+    poses[:, :3, :3] = turns
+    poses[0, :3, 3] = lift_rows(300)[SIDES.index(side)][7][:3]
+    poses[1:, :3, 3] = np.array(offsets) * [arm, 1, 1]
+    for joint, parent in enumerate(parents[1:], start=1):
+        poses[joint] = poses[parent] @ poses[joint]
+    return poses
+
+
+def test_joints_tips_capsules_and_sensors_of_the_stored_recording_lie_where_the_files_put_them(root, stored):
+    recording, skin = stored.recording(KEY.name), dict(np.load(root / "hand/right_hand_skin.npz"))
+    reference = json.loads((root / "hand/hand_reference.json").read_text())
+    assert (recording.n_frames, recording.hand.joint_names) == (300, HAND_JOINTS)
+    for side in SIDES:
+        poses, seven = left_handed(root, side), np.array([7])
+        found = recording.state(side, seven).placed(recording.world_from_wrist(side)[seven])
+        np.testing.assert_allclose(found.joint_m[0], poses[:, :3, 3] * MIRROR / 10, atol=1e-6)
+        arm = np.ones(3) if side == "right" else MIRROR
+        ends = [
+            poses[HAND_JOINTS.index(row["joint"])] @ [*(arm * row["end_local"]), 1] for row in reference["capsules"]
+        ]
+        np.testing.assert_allclose(found.capsule_end_m[0], np.array(ends)[:, :3] * MIRROR / 10, atol=1e-6)
+        np.testing.assert_allclose(found.tip_m[0], found.capsule_end_m[0][[6, 9, 12, 15, 18]], atol=1e-9)
+        mirror = np.diag([*arm, 1.0])
+        bones = [0, 0, *range(2, 17)]
+        skinned = poses[bones] @ mirror @ skin["bind_poses"] @ mirror
+        for sensor, vertex in enumerate(reference["proximity_vertices"]):
+            bone, weight = skin["bone_indices"][vertex], skin["bone_weights"][vertex]
+            rest, normal = arm * skin["vertices"][vertex], arm * skin["normals"][vertex]
+            place = np.einsum("k,kij,j->i", weight, skinned[bone], [*rest, 1])[:3]
+            way = np.einsum("k,kij,j->i", weight, skinned[bone][:, :3, :3], normal)
+            np.testing.assert_allclose(found.sensor_m[0, sensor], place * MIRROR / 10, atol=1e-6)
+            np.testing.assert_allclose(found.sensor_normal[0, sensor], way / np.linalg.norm(way) * MIRROR, atol=1e-5)
+
+
+def test_the_store_gives_back_the_recording_it_was_given_and_is_sound(root, stored):
+    recording, given = stored.recording(KEY.name), read_hand_recording(RawTree(root), KEY)
+    assert stored.recordings == [KEY.name]
+    for side in SIDES:
+        np.testing.assert_array_equal(recording.hands[side].rotvec, given.hands[side].rotvec)
+        np.testing.assert_array_equal(recording.hands[side].wrist_m, given.hands[side].wrist_m)
+    for name in ("rotvec", "translation_m"):
+        np.testing.assert_array_equal(getattr(recording.object, name), getattr(given.object, name))
+    np.testing.assert_array_equal(recording.usable, given.usable)
+    np.testing.assert_array_equal(recording.state("left").sensor_m, given.state("left").sensor_m)
+    np.testing.assert_array_equal(recording.hand.limit_rad, given.hand.limit_rad)
+    assert {source.path for source in recording.sources} == {source.path for source in given.sources}
+    assert check_store(stored.folder) == []
+
+
+def test_every_second_frame_of_a_recording_is_a_recording(stored):
+    recording = stored.recording(KEY.name)
+    few = recording.take(slice(None, None, 2))
+    assert few.n_frames == 150
+    np.testing.assert_array_equal(few.state("left").tip_m, recording.state("left").tip_m[::2])
+
+
+def test_without_the_skin_file_there_are_clips_and_no_recordings(root, tmp_path):
+    shutil.copytree(root, tmp_path / "raw")
+    (tmp_path / "raw/hand/right_hand_skin.npz").unlink()
+    convert_dataset(ManipNetAdapter(), tmp_path / "raw", load_embedded_hands(), tmp_path / "clips", progress=False)
+    store = open_store(tmp_path / "clips")
+    assert (len(store), store.recordings) == (1, [])
+    assert "recordings" not in store.info
+    assert not (tmp_path / "clips/arrays/recordings.npz").exists()
+    with pytest.raises(KeyError, match="there are: "):
+        store.recording(KEY.name)
+
+
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [
+        ("arrays/recordings.npz", lambda arrays: {name: array[:-1] for name, array in arrays.items()}),
+        ("arrays/recordings.npz", lambda arrays: dict(list(arrays.items())[1:])),
+        ("arrays/source_hands.npz", lambda arrays: {name: array.astype(np.float32) for name, array in arrays.items()}),
+        ("arrays/source_hands.npz", lambda arrays: {name: array * np.nan for name, array in arrays.items()}),
+    ],
+)
+def test_a_damaged_recording_is_found_and_named(stored, tmp_path, place, change):
+    shutil.copytree(stored.folder, tmp_path / "clips")
+    with np.load(tmp_path / "clips" / place) as archive:
+        arrays = dict(archive)
+    np.savez(tmp_path / "clips" / place, **change(arrays))
+    problems = check_store(tmp_path / "clips")
+    assert problems
+    assert all(problem.where.startswith(place) for problem in problems)
+
+
+@pytest.mark.parametrize(("key", "value"), [("hand", "none"), ("object", "cup"), ("source_files", [99]), ("fps", ...)])
+def test_wrong_facts_of_a_recording_are_found(stored, tmp_path, key, value):
+    shutil.copytree(stored.folder, tmp_path / "clips")
+    path = tmp_path / "clips/meta/info.json"
+    info = json.loads(path.read_text())
+    facts = info["recordings"][KEY.name]
+    facts.pop(key) if value is ... else facts.update({key: value})
+    path.write_text(json.dumps(info))
+    assert any(KEY.name in problem.where for problem in check_store(tmp_path / "clips"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda arrays: arrays | {"vertices": arrays["vertices"][:-1]},
+        lambda arrays: arrays | {"normals": arrays["normals"] * np.nan},
+        lambda arrays: arrays | {"bone_weights": arrays["bone_weights"] * 2},
+        lambda arrays: arrays | {"bone_indices": arrays["bone_indices"] + 1},
+        lambda arrays: {name: array for name, array in arrays.items() if name != "bind_poses"},
+    ],
+)
+def test_a_skin_that_is_not_the_released_one_is_refused_by_name(root, tmp_path, change):
+    shutil.copytree(root, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "hand/right_hand_skin.npz"
+    with np.load(path) as archive:
+        arrays = dict(archive)
+    np.savez(path, **change(arrays))
+    with pytest.raises(BadInput, match=r"right_hand_skin\.npz"):
+        read_hand_recording(RawTree(tmp_path), KEY)
+
+
+@pytest.mark.parametrize("sensors", [[0] * 103, [788] * 104, [-1] * 104, "many", None])
+def test_a_reference_without_104_vertices_of_the_skin_is_refused(root, tmp_path, sensors):
+    shutil.copytree(root, tmp_path, dirs_exist_ok=True)
+    path = tmp_path / "hand/hand_reference.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"proximity_vertices": sensors}))
+    with pytest.raises(BadInput, match=r"hand_reference\.json"):
+        read_hand_recording(RawTree(tmp_path), KEY)

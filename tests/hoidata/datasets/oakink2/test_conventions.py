@@ -12,8 +12,7 @@ from hoidata.clips.clip import SIDES, Clip
 from hoidata.clips.hand_parameters import hands_for
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.oakink2.adapter import Oakink2Adapter
-from hoidata.datasets.oakink2.files import read_program
-from hoidata.datasets.oakink2.words import verb_of
+from hoidata.datasets.oakink2.files import read_program, verb_of
 from hoidata.hands import load_embedded_hands
 from tests.builders.formulas import EXACT_M, WRONG_M, agrees, chain, joints_as_stored, off_m, rest_points
 from tests.builders.oakink2 import PREFIX, dump, quaternions, tensor, write_json

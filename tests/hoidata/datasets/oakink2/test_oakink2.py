@@ -16,8 +16,7 @@ from hoidata.clips.validation import check_clip
 from hoidata.datasets import RawTree
 from hoidata.datasets.hinge import find_hinge, hinge_between
 from hoidata.datasets.oakink2.adapter import Oakink2Adapter
-from hoidata.datasets.oakink2.files import read_names, read_program, read_roots
-from hoidata.datasets.oakink2.words import _VERBS
+from hoidata.datasets.oakink2.files import _VERBS, read_names, read_program, read_roots
 from hoidata.errors import BadInput
 from tests.builders.hoi4d import transforms
 from tests.builders.oakink2 import (
