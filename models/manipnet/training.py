@@ -15,11 +15,11 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.objects.surface_index import surface_index
 from models.common.family import Losses, Network, Setup
+from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.examples import LEARNT, Examples, hand_examples, other_poses, prepared, step_loss
 from models.manipnet.features import FeatureSettings
 from models.manipnet.lookups import as_right
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,7 @@ from models.baselines.lookups import NEAREST_CLIP, Lookup, Prompt, by_sentence, 
 from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.registry import load_family
-from models.text2hoi.controls import OtherContact, OwnContact, other_contact_maps
-from models.text2hoi.held_lookup import HeldLookup
+from models.text2hoi.controls import HeldLookup, OtherContact, OwnContact, other_contact_maps
 from models.text2hoi.sampler import Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
 from tests.models.toy import FAST
@@ -122,7 +121,7 @@ def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, mo
         left = [float(own) for own in beyond]
         monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
         monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers, left=left: left.pop(0))
-        monkeypatch.setattr("models.text2hoi.held_lookup.carried_share", lambda *told: 1.0)
+        monkeypatch.setattr("models.text2hoi.controls.carried_share", lambda *told: 1.0)
         found = family.sample(several)
         assert left == []
         for one, number in zip(found, taken, strict=True):
@@ -132,7 +131,7 @@ def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, mo
     monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers: 0.0)
     monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
     shares = [1.0, 0.0, 1.0]
-    monkeypatch.setattr("models.text2hoi.held_lookup.carried_share", lambda *told: shares.pop(0))
+    monkeypatch.setattr("models.text2hoi.controls.carried_share", lambda *told: shares.pop(0))
     nowhere = replace(several[0], motion_id="nowhere")
     lookup = SimpleNamespace(
         sample=lambda asked: [

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from hoidata.errors import BadInput, MissingResource
-from models.common.device import chosen_device
+from models.common.repeatable import chosen_device
 
 
 @pytest.mark.parametrize("present", [True, False])

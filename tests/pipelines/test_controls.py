@@ -92,13 +92,13 @@ def test_every_row_gets_motions_and_figures_and_rows_no_longer_asked_for_go(proj
 
 def test_rows_of_an_optional_family_are_sampled_by_its_own_stage(project, monkeypatch):
     """It alone waits for the networks of that family."""
-    settings = {"profile": "embedded", "sample": {}, "controls": {"families": ["static", "bimart-no-map"]}}
+    settings = {"profile": "embedded", "sample": {}, "controls": {"families": ["static", "bimart-zero-map"]}}
     Path("params.yaml").write_text(yaml.safe_dump(settings))
     sampled = []
     monkeypatch.setattr(controls, "sample", lambda paths, params, name: sampled.append((paths.family, name)))
     for family in ("", "bimart"):
         controls.run(replace(PATHS, family=family))
-    assert sampled == [("controls/static", "static"), ("controls-bimart/bimart-no-map", "bimart-no-map")]
+    assert sampled == [("controls/static", "static"), ("controls-bimart/bimart-zero-map", "bimart-zero-map")]
 
 
 def test_a_clip_left_out_of_a_row_stands_in_its_metrics_with_the_reason_of_the_row(project):

@@ -24,6 +24,7 @@ from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.manipnet.animate import Gap, new_fingers
+from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.examples import sized
 from models.manipnet.family import Fingers
 from models.manipnet.features import FeatureSettings, outputs, pose_features
@@ -32,7 +33,6 @@ from models.manipnet.lookups import as_right
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Follower, Nearest, Predictor, Situation, Task, our_targets, paper_targets, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
-from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.training import MANIPNET
 
 HANDS = load_embedded_hands()
