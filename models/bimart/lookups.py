@@ -1,6 +1,5 @@
 """Rivals that learn nothing: the training window whose object and motion are nearest, the mean pose at the object."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -20,7 +19,7 @@ from models.baselines.families import NO_MEAN
 from models.bimart.family import clip_without_hands, training_clips, world_from_canonical
 from models.bimart.sampler import IDLE_M
 from models.bimart.scene import FeatureConfig, Recorded, Scene, recorded_clip
-from models.common.family import Family, LeftOut, Sources, motion_clip
+from models.common.family import EachAlone, Family, LeftOut, Sources, motion_clip
 from models.common.features import proper_hands
 
 BASIS = BasisSettings(64, nearest="vertex", frame="base")
@@ -52,7 +51,7 @@ def told(scene: Scene) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class NearestWindow:
+class NearestWindow(EachAlone):
     """For every window of a request the hands of the training window most like it, of the same hands.
 
     clips: by hands that take part, what is told (frame, number), normalised, hands (2, frame, 99) canonical, the clip.
@@ -82,10 +81,7 @@ class NearestWindow:
             clips.setdefault(hands_of(sample), []).append(((row - every.mean(axis=0)) / spread, hands, sample))
         return cls(clips, every.mean(axis=0), spread, any(sample.synthetic for sample in samples))
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [self._answer(request) for request in requests]
-
-    def _answer(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | LeftOut:
         if request.trajectories is None or hands_of(request) not in self.clips:
             return LeftOut(request.motion_id, NO_WINDOW)
         thing = request.trajectories.object[: request.n_frames]
@@ -113,7 +109,7 @@ class NearestWindow:
 
 
 @dataclass(frozen=True)
-class MeanPose:
+class MeanPose(EachAlone):
     """The mean hand at the object, canonical frame. hands: (2, 99). seen: (2,) bool, that act in a training clip."""
 
     hands: np.ndarray
@@ -132,10 +128,7 @@ class MeanPose:
         hands = proper_hands(torch.from_numpy(total / count.clip(1))).numpy()
         return cls(hands, any(sample.synthetic for sample in samples), count[:, 0] > 0)
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [self._answer(request) for request in requests]
-
-    def _answer(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | LeftOut:
         if request.trajectories is None:
             return LeftOut(request.motion_id, "no motion of an object")
         if (request.active_hands & ~self.seen).any():
@@ -153,7 +146,7 @@ def hands_of(one: Request | ClipSample) -> tuple[bool, bool]:
 
 
 @dataclass(frozen=True)
-class RefinedWindow:
+class RefinedWindow(EachAlone):
     """Hands of the nearest training window, refined as ours are: the rival that has everything but the networks."""
 
     nearest: NearestWindow
@@ -164,10 +157,7 @@ class RefinedWindow:
     def load(cls, sources: Sources) -> "RefinedWindow":
         return cls(NearestWindow.load(sources), sources.hands)
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [self._answer(request) for request in requests]
-
-    def _answer(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | LeftOut:
         if request.trajectories is None or hands_of(request) not in self.nearest.clips:
             return LeftOut(request.motion_id, NO_WINDOW)
         hands, ids = self._hands(request), hand_keypoints(self.pair.right, FEATURES.keypoints)

@@ -22,8 +22,7 @@ from hoidata.clips.features import (
     OBJECT_ROTATION_6D,
     WRIST,
 )
-from hoidata.clips.recording import HandRecording
-from hoidata.geometry.rotations import rot6d_to_rotmat
+from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
 from hoidata.hands import HandPair
 from hoidata.hands.tracked_hand import TrackedHand
@@ -89,19 +88,13 @@ class Control:
         return np.interp(time_s, self.thing.time_s, self.hinge_rad)
 
 
-def recording_control(recording: HandRecording) -> Control:
-    """What a recording with its source's own hands gives the network, at its own rate, time 0 in its first frame."""
-    thing, time_s = recording.object, recording.time_s
-    wrists: dict[Side, Motion] = {}
-    for side in SIDES:
-        pose = recording.world_from_wrist(side)
-        wrists[side] = Motion(time_s, pose.rotation, pose.translation)
-    body = thing.world_from_object
-    hinge = None if thing.hinge_rad is None else thing.hinge_rad.astype(np.float64)
-    return Control(wrists, Motion(time_s, body.rotation, body.translation), thing.model, hinge)
-
-
 UNSEEN_M = 1.0  # how far away a wrist is taken to be that is never tracked
+
+
+def between(start: np.ndarray, stop: np.ndarray, share: np.ndarray) -> np.ndarray:
+    """Rotations (frame, joint, 3, 3) a share (frame,) of the way from the first to the second."""
+    way = rotmat_to_rotvec(start.swapaxes(-1, -2) @ stop)
+    return start @ rotvec_to_rotmat(share[:, None, None] * way)
 
 
 def control_of(given: Trajectories, model: ObjectModel) -> Control:

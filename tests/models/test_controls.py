@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -26,7 +25,6 @@ from models.registry import load_family
 from models.text2hoi.controls import HeldLookup, OtherContact, OwnContact, other_contact_maps
 from models.text2hoi.sampler import Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
-from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
 SPOILT = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
@@ -35,11 +33,6 @@ LOOKUPS = (
     *("swapped-hands", "other-hands", "nearest-clip"),
 )
 MODELS = ("one-call", "other-contact", "other-prompt-own-contact")
-
-
-@pytest.fixture(scope="module")
-def sources(annotated: AnnotatedStore, trained: Path) -> Sources:
-    return Sources(annotated, trained, HANDS, torch.device("cpu"), FAST)
 
 
 @pytest.fixture(scope="module")

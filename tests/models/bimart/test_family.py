@@ -59,13 +59,6 @@ def sources(annotated: AnnotatedStore, checkpoints: Path) -> Sources:
     return Sources(annotated, checkpoints, HANDS, torch.device("cpu"), SETTINGS)
 
 
-@pytest.fixture(scope="module")
-def samples(annotated: AnnotatedStore) -> list[ClipSample]:
-    """A folder opened by both hands, a box lifted by the left one."""
-    every = [sample for split in ("train", "test") for sample in HoiDataset(annotated, split, crop="start")]
-    return [next(one for one in every if one.hand_type == hand) for hand in ("both", "left")]
-
-
 def interrupted(network: Network, at: int) -> Network:
     """The network with an objective that stops everything at its ``at``-th step."""
 
