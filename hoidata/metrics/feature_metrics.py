@@ -6,7 +6,7 @@ To add one: a function in ``feature_measures.py`` and a row in ``FEATURE_METRICS
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 from hoidata.metrics.encoded import Asked, EncodedSet, Encoder, encode_sets, recorded, stored_motion
 from hoidata.metrics.feature_measures import (
@@ -37,13 +37,12 @@ from hoidata.metrics.feature_measures import (
 from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureFigure, fid_frechet, kid
 from hoidata.metrics.pair import acting_sides
 from hoidata.metrics.paths import PathEncoder
+from hoidata.metrics.registry import Direction
 from hoidata.metrics.unmeasured import Unmeasured
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
 
 DIGITS = 6
-
-Direction = Literal["higher", "lower", "nearer the truth"]
 
 
 @dataclass(frozen=True)
