@@ -25,14 +25,12 @@ from pipelines.cli import app
 from pipelines.promises import CONFUSED, PROMISES, TRUTH, Promise, datasets_below, kept, read_rows, taken_for_reverse
 from pipelines.stages import controls, evaluate
 from pipelines.stages.base import StagePaths, empty_reason
-from pipelines.stages.sample import sample
 from tests.builders.annotated import write_annotated_dataset
 from tests.builders.stores import write_annotated
 from tests.builders.study import study_clips, study_rule
 
 PROJECT = Path(__file__).parents[2]
 PATHS = StagePaths("embedded", "grab")
-COUNTS = {"clips": 0}
 SAMPLES, METRICS_OF = Path("samples/embedded/grab/controls"), Path("metrics/embedded/grab/controls")
 
 
@@ -54,14 +52,6 @@ def run_with(**settings) -> None:
 
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
-
-
-@pytest.mark.parametrize(("section", "name"), [({"encoder": "hash"}, "hash"), ({}, None), (None, None)])
-def test_motions_are_asked_for_with_the_encoder_that_the_settings_name(project, monkeypatch, section, name):
-    found = {}
-    monkeypatch.setattr("models.common.predicting.sample_family", lambda *given, **named: found.update(named) or COUNTS)
-    sample(PATHS, {"profile": "embedded", "annotate": section, "sample": {"samples": 1}}, "text2hoi")
-    assert found["encoder"] == name
 
 
 def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
