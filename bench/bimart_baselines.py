@@ -36,8 +36,8 @@ from hoidata.sensors.part_bps import BasisSettings
 from models.bimart.family import clip_without_hands, world_from_canonical
 from models.bimart.learning import Moments
 from models.bimart.lookups import canonical_hands, moved_hands, told
+from models.bimart.network import layout_of
 from models.bimart.scene import Scene, hand_vertices_m
-from models.bimart.windows import layout_of
 from models.common.checkpoints import load_checkpoint
 from models.common.family import Family, LeftOut, Losses, Network, Setup, Sources, motion_clip, refuse_not_finite
 from models.common.features import proper_hands

@@ -24,9 +24,9 @@ from hoidata.metrics.asked_metrics import with_lists
 from hoidata.metrics.evaluate import evaluate_store
 from hoidata.settings import build_config
 from models.common.checkpoints import FILE_NAME
-from models.common.device import chosen_device
 from models.common.family import Family, Network
 from models.common.predicting import sample_family
+from models.common.repeatable import chosen_device
 from models.common.training import train_network
 from models.registry import load_family
 from pipelines.params import read_params

@@ -27,17 +27,16 @@ FAMILIES = {
     "bimart": "models.bimart.family:BIMART",
     "bimart-unrefined": "models.bimart.family:UNREFINED",
     "nearest-window": "models.bimart.lookups:NEAREST_WINDOW",
-    "nearest-window-refined": "models.bimart.refined_lookup:NEAREST_REFINED",
+    "nearest-window-refined": "models.bimart.lookups:NEAREST_REFINED",
     "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
-    "random-window": "models.bimart.lookups:RANDOM_WINDOW",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
     "other-prompt-own-contact": "models.text2hoi.controls:OTHER_PROMPT_OWN_CONTACT",
     "prompt-lookup": "models.baselines.lookups:PROMPT_LOOKUP",
-    "prompt-lookup-held": "models.text2hoi.held_lookup:PROMPT_LOOKUP_HELD",
+    "prompt-lookup-held": "models.text2hoi.controls:PROMPT_LOOKUP_HELD",
     "verb-lookup": "models.baselines.lookups:VERB_LOOKUP",
-    "verb-lookup-held": "models.text2hoi.held_lookup:VERB_LOOKUP_HELD",
+    "verb-lookup-held": "models.text2hoi.controls:VERB_LOOKUP_HELD",
     "random-clip": "models.baselines.lookups:RANDOM_CLIP",
     "other-verb": "models.baselines.lookups:OTHER_VERB",
     "swapped-hands": "models.baselines.lookups:SWAPPED_HANDS",
@@ -53,7 +52,6 @@ FAMILIES = {
     "noise": "models.baselines.controls:NOISE",
     "bimart-other-path": "models.bimart.family:OTHER_PATH",
     "bimart-other-object": "models.bimart.family:OTHER_OBJECT",
-    "bimart-no-map": "models.bimart.family:NO_MAP",
     "bimart-zero-map": "models.bimart.family:ZERO_MAP",
 }
 # Each in a module of its own, so that a change of one trains no other again.

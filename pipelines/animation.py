@@ -30,9 +30,9 @@ from models.manipnet.animate import (
     straight_fingers,
     with_fingers,
 )
+from models.manipnet.control import hands_of
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
-from models.manipnet.tracks import hands_of
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
 from pipelines.objects import MeshWish, stored_object

@@ -89,7 +89,7 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
     asked = asked_motion(wish, profile, datasets, hands)
     paths, sampler = chosen_networks(wish.model, profile, datasets, hands)
     motions = hands_for(sampler, asked.thing, asked.wish)
-    used = [paths.checkpoints / name / FILE_NAME for name in sampler.used]
+    used = [paths.checkpoints / name / FILE_NAME for name in BIMART.uses]
     made_from = {str(path): sha256_file(path) for path in used}
     learned = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
     facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} (learnt from {learned})")]

@@ -30,8 +30,8 @@ class Encoding(NamedTuple):
 class Encoder(Protocol):
     """Something learnt that turns motions into features.
 
-    name: as it stands in the names of figures. digest: SHA-256 of its weights and configuration. labels: what its
-    logits stand for, in their order. label_kind: "verb", "verb_object", or "" without labels.
+    name: as it stands in the names of figures. digest: SHA-256 of its weights and configuration. labels: the
+    verbs that its logits stand for, in their order; none of an encoder that tells no labels apart.
     """
 
     @property
@@ -40,8 +40,6 @@ class Encoder(Protocol):
     def digest(self) -> str: ...
     @property
     def labels(self) -> tuple[str, ...]: ...
-    @property
-    def label_kind(self) -> str: ...
 
     def encode(self, motions: Sequence[Motion], sides: Sequence[tuple[Side, ...]]) -> Encoding:
         """Features and logits of motions of which only the hands ``sides`` act; others' numbers count nothing."""
@@ -130,8 +128,7 @@ def _encoded(
     known = annotated.store.sequences.loc[list(ids)]
     verbs, hands = [verb_of(annotated, clip_id) for clip_id in ids], [annotated.hand_type(clip_id) for clip_id in ids]
     prompt = [" | ".join(map(str, row)) for row in zip(verbs, known["object_words"], hands, strict=True)]
-    words = label_words(encoder.label_kind, verbs, known["object_words"])
-    label = [encoder.labels.index(word) if word in encoder.labels else UNKNOWN for word in words]
+    label = [encoder.labels.index(verb) if verb in encoder.labels else UNKNOWN for verb in verbs]
     text = encoder.encode_text(np.stack([annotated.text_embedding(clip_id)[0] for clip_id in ids]))
     return EncodedSet(
         encoder.name,
@@ -147,12 +144,6 @@ def _encoded(
         known["sequence"].to_numpy(str)[clip],
         None if text is None else text[clip],
     )
-
-
-def label_words(kind: str, verbs: Iterable[str | None], objects: Iterable[str]) -> list[str | None]:
-    """The label of each clip in words: its verb, or with kind "verb_object" verb and object; None without a verb."""
-    pairs = zip(verbs, objects, strict=True)
-    return [None if not verb else f"{verb} {noun}" if kind == "verb_object" else str(verb) for verb, noun in pairs]
 
 
 def recorded(annotated: AnnotatedStore, ids: Sequence[str]) -> Iterator[Asked]:

@@ -24,7 +24,7 @@ from hoidata.contact.proximity import ProximityIndex
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
 from hoidata.metrics.asked import AskedDistances, read_asked, read_asked_distances
-from hoidata.metrics.encoded import Encoder
+from hoidata.metrics.encoded import Encoder, stored_motion
 from hoidata.metrics.feature_metrics import encoder_summary
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.pair import Motion, Pair, TrueContact, acting_sides
@@ -252,7 +252,7 @@ class _Bench:
 
     def _pair(self, reference: _Reference, sample: str) -> Pair | str:
         """A prediction beside its reference, or why it cannot be compared."""
-        predicted = _motion(self.store, sample)
+        predicted = stored_motion(self.store, sample)
         asked, distances = self.asked.get(sample), self.asked_distances.get(sample)
         check = own_window_of if self.own_length else window_of
         window = check(predicted.clip, reference.motion.clip, reference.sides)
@@ -268,7 +268,7 @@ class _Bench:
         return Pair(predicted, own, reference.sides, contact, reference.table_m, *given)
 
     def _reference(self, clip_id: str) -> _Reference:
-        annotated, motion = self.annotated, _motion(self.annotated.store, clip_id)
+        annotated, motion = self.annotated, stored_motion(self.annotated.store, clip_id)
         name = annotated.object_key(clip_id)
         points = annotated.points(name)
         if name not in self.indices:
@@ -298,11 +298,6 @@ def _no_map_of(distances: AskedDistances, clip: Clip) -> str:
 def _number(sample: str, clip_id: str) -> int:
     """Of a predicted clip: k of ``<reference id>~<k>``, 0 for the bare id."""
     return int(sample.removeprefix(clip_id).lstrip("~") or 0)
-
-
-def _motion(store: Store, clip_id: str) -> Motion:
-    joints: dict[Side, np.ndarray] = {side: store.joints(clip_id, side) for side in SIDES}
-    return Motion(store.clip(clip_id, motion_only=True), joints, store.hand_pair())
 
 
 def own_window_of(predicted: Clip, reference: Clip, sides: tuple[Side, ...]) -> tuple[int, int] | str:

@@ -11,18 +11,23 @@ from typing import NamedTuple
 import numpy as np
 
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
-from hoidata.metrics.feature_distances import (
+from hoidata.metrics.feature_sets import (
     TOO_SMALL,
+    Comparison,
+    FeatureFigure,
     cubic_kernel,
     enough_rows,
     euclidean,
     fid_paired,
     frechet_distance,
     gaussian,
+    mean_figure,
+    mean_matrix,
     mean_of_pairs,
     mean_with_itself,
+    rows_of,
+    set_figure,
 )
-from hoidata.metrics.feature_sets import Comparison, FeatureFigure, mean_figure, mean_matrix, rows_of, set_figure
 from hoidata.metrics.intervals import bootstrap_interval, t_interval
 from hoidata.metrics.unmeasured import Unmeasured
 

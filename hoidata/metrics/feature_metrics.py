@@ -1,15 +1,14 @@
 """The one list of figures of features, as ``registry.METRICS`` is for geometry: tables and docs are made from it; and
 what encoders say of a predicted store, in the form ``evaluate_store`` gives.
 
-To add one: a function in ``feature_measures.py`` and a row in ``_ROWS``.
+To add one: a function in ``feature_measures.py`` and a row in ``FEATURE_METRICS``.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any
 
 from hoidata.metrics.encoded import Asked, EncodedSet, Encoder, encode_sets, recorded, stored_motion
-from hoidata.metrics.feature_distances import TOO_SMALL, fid_frechet, kid
 from hoidata.metrics.feature_measures import (
     FRECHET_DRAWS,
     GROUP,
@@ -35,16 +34,15 @@ from hoidata.metrics.feature_measures import (
     r_precision,
     r_precision_chance,
 )
-from hoidata.metrics.feature_sets import Comparison, FeatureFigure
+from hoidata.metrics.feature_sets import TOO_SMALL, Comparison, FeatureFigure, fid_frechet, kid
 from hoidata.metrics.pair import acting_sides
 from hoidata.metrics.paths import PathEncoder
+from hoidata.metrics.registry import Direction
 from hoidata.metrics.unmeasured import Unmeasured
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.store.store import Store
 
 DIGITS = 6
-
-Direction = Literal["higher", "lower", "nearer the truth"]
 
 
 @dataclass(frozen=True)
@@ -87,19 +85,14 @@ def feature_findings(
     return {metric.name: metric.measure(comparison) for metric in own}
 
 
-class _Row(NamedTuple):
-    """A metric before it is told of an encoder; fields as in ``FeatureMetric``."""
-
-    name: str
-    title: str
-    direction: Direction
-    measure: Measure
-    encoders: tuple[str, ...]
-    reduction: str
-    source: str
-    thresholds: str = ""
-    floor_of: str = ""
-    note: str = ""
+def _of_each(
+    name: str, title: str, direction: Direction, measure: Measure, encoders: tuple[str, ...], *told: str, **more: str
+) -> Iterator[FeatureMetric]:
+    """A metric for each of some encoders. told: reduction, source and what follows; fields as in ``FeatureMetric``."""
+    for encoder in encoders:
+        suffix = encoder.replace("-", "_")
+        own = FeatureMetric(f"{name}_{suffix}", f"{title}, {encoder}", "", direction, encoder, measure, *told, **more)
+        yield replace(own, floor_of=f"{own.floor_of}_{suffix}" if own.floor_of else "")
 
 
 BOTH, PAPER, PAIRS, PATHS = ("paper", "corrected"), ("paper",), ("text-motion",), ("path",)
@@ -109,80 +102,71 @@ T2M = "T2M (Guo et al. 2022), Sec. 5"
 ROWS_NEEDED = f"at least 4 clips per feature, else {TOO_SMALL!r}"
 DRAWN = f"over clips: {FRECHET_DRAWS} draws of one repetition, their middle moved to the figure"
 WIDE, HARD = f"groups of {GROUP} distinct sentences", "sentences about the same object"
-_ROWS = (
-    _Row("accuracy_top1", "top-1 accuracy", "higher", accuracy(1), BOTH, MEAN, IMOS),
-    _Row("accuracy_top3", "top-3 accuracy", "higher", accuracy(3), BOTH, MEAN, "Text2HOI (Cha et al. 2024), Sec. 4.3"),
-    _Row(
+FEATURE_METRICS = (
+    *_of_each("accuracy_top1", "top-1 accuracy", "higher", accuracy(1), BOTH, MEAN, IMOS),
+    *_of_each(
+        "accuracy_top3", "top-3 accuracy", "higher", accuracy(3), BOTH, MEAN, "Text2HOI (Cha et al. 2024), Sec. 4.3"
+    ),
+    *_of_each(
         "fid_paired", "paired feature distance", "lower", paired, BOTH, MEAN, f"{IMOS}, called FID there",
         note="needs pairs; punishes diversity",
     ),
-    _Row("fid_frechet", "Frechet distance", "lower", frechet, BOTH, SETS, "Heusel et al. 2017", ROWS_NEEDED, "", DRAWN),
-    _Row(
+    *_of_each(
+        "fid_frechet", "Frechet distance", "lower", frechet, BOTH, SETS, "Heusel et al. 2017", ROWS_NEEDED, note=DRAWN
+    ),
+    *_of_each(
         "fid_frechet_floor", "Frechet distance, half of the truth against half", "lower", floor(fid_frechet), BOTH,
         f"mean of {HALVES} divisions", "this project", ROWS_NEEDED, "fid_frechet",
     ),
-    _Row(
+    *_of_each(
         "fid_frechet_train", "Frechet distance from the training clips", "lower", frechet_train, BOTH, SETS,
         "Heusel et al. 2017", ROWS_NEEDED, note=DRAWN,
     ),
-    _Row(
+    *_of_each(
         "kid", "kernel distance", "lower", kernel_distance, BOTH, SETS,
         "Binkowski et al. 2018, cubic kernel, unbiased",
     ),
-    _Row(
+    *_of_each(
         "kid_floor", "kernel distance, half of the truth against half", "lower", floor(kid), BOTH,
         f"mean of {HALVES} divisions", "this project", "", "kid",
     ),
-    _Row("diversity", "diversity", "nearer the truth", diversity, BOTH, SETS, "all pairs of clips"),
-    _Row(
+    *_of_each("diversity", "diversity", "nearer the truth", diversity, BOTH, SETS, "all pairs of clips"),
+    *_of_each(
         "diversity_released", "diversity, as released", "nearer the truth", diversity_released, PAPER, SETS,
         f"{IMOS}: {RELEASED_PAIRS} pairs with replacement",
     ),
-    _Row(
+    *_of_each(
         "multimodality_by_label", "multimodality by label", "nearer the truth", multimodality_by_label, BOTH, SETS,
         "all pairs within a true label", "labels of two clips or more",
     ),
-    _Row(
+    *_of_each(
         "multimodality_released", "multimodality, as released", "higher", multimodality_released, PAPER, SETS,
         f"{IMOS}: {RELEASED_PAIRS_OF_LABEL} pairs per predicted label",
     ),
-    _Row(
+    *_of_each(
         "multimodality_by_prompt", "multimodality by prompt", "higher", multimodality_by_prompt, BOTH,
         "mean over clips", f"{T2M}: all pairs of the motions made for one prompt",
     ),
     *(
-        _Row(
+        metric for hard in (False, True) for k in (1, 2, 3) for metric in _of_each(
             f"r_precision_{'hard_' * hard}top{k}", f"R-precision top-{k}{', same object' * hard}", "higher",
             r_precision(k, hard), PAIRS, MEAN, T2M, HARD if hard else WIDE,
         )
-        for hard in (False, True) for k in (1, 2, 3)
     ),
     *(
-        _Row(
+        metric for hard in (False, True) for k in (1, 2, 3) for metric in _of_each(
             f"r_precision_{'hard_' * hard}top{k}_floor", f"R-precision top-{k}{', same object' * hard}, by guessing",
             "nearer the truth", r_precision_chance(k, hard), PAIRS, MEAN, "this project", HARD if hard else WIDE,
             f"r_precision_{'hard_' * hard}top{k}",
         )
-        for hard in (False, True) for k in (1, 2, 3)
     ),
-    _Row("matching_distance", "distance from the own sentence", "lower", matching_distance, PAIRS, MEAN, T2M),
-    _Row(
+    *_of_each("matching_distance", "distance from the own sentence", "lower", matching_distance, PAIRS, MEAN, T2M),
+    *_of_each(
         "memorised_share", "share of motions near a training clip", "lower", memorised, PATHS, MEAN,
         "this project: root mean square over joints and object, 15 frames",
         f"nearer than {MEMORISED_BELOW:g} of what the recorded clip is from its own nearest",
     ),
 )  # fmt: skip
-
-
-def _with_encoder(row: _Row, encoder: str) -> FeatureMetric:
-    suffix = encoder.replace("-", "_")
-    return FeatureMetric(
-        f"{row.name}_{suffix}", f"{row.title}, {encoder}", "", row.direction, encoder, row.measure, row.reduction,
-        row.source, row.thresholds, f"{row.floor_of}_{suffix}" if row.floor_of else "", row.note,
-    )  # fmt: skip
-
-
-FEATURE_METRICS = tuple(_with_encoder(row, encoder) for row in _ROWS for encoder in row.encoders)
 
 
 # --- a predicted store beside an annotated one

@@ -1,6 +1,8 @@
-"""How far joints are from the truth, how smoothly they move, what the object does, how long it all takes.
+"""How far joints are from the truth, how smoothly they move, what the object does, how long it all takes; and
+ManipNet's physical measures: can the contacts carry the object?
 
-Each function gives the values of one motion.
+Each function gives the values of one motion, or why there are none. Of the physical ones there are none without known
+gravity, or where the object is never lifted.
 """
 
 from functools import lru_cache
@@ -13,7 +15,8 @@ from hoidata.metrics.pair import Pair
 from hoidata.metrics.touch import made_entries
 from hoidata.metrics.unmeasured import NO_GRAVITY, Unmeasured, Values
 from hoidata.physics.mano_capsules import world_rotmats
-from hoidata.physics.realism import has_acceleration, smoothness_m_s2
+from hoidata.physics.realism import VARIANTS, Realism, has_acceleration, score, smoothness_m_s2
+from hoidata.physics.scene import Scene
 
 NO_VERB = Unmeasured("the clip has no verb")
 
@@ -109,3 +112,68 @@ def _seen(pair: Pair, side: Side) -> np.ndarray:
 
 def _joined(each: list[np.ndarray]) -> np.ndarray:
     return np.concatenate([np.zeros(0), *each])
+
+
+def realism_si(pair: Pair, every: int) -> Values:
+    """(scored frame,) 1 where friction forces at the contacts give the object's motion, in SI units."""
+    return _passed(pair, "SI", every)
+
+
+def realism_as_released(pair: Pair, every: int) -> Values:
+    """(scored frame,) the same with the units of ManipNet's released sources."""
+    return _passed(pair, "as released", every)
+
+
+def floor_si(pair: Pair, every: int) -> Values:
+    """(lifted frame,) the same in SI units with no hands: 1 only in free fall."""
+    return _floor(pair, "SI", every)
+
+
+def floor_as_released(pair: Pair, every: int) -> Values:
+    """(lifted frame,) the same as released with no hands."""
+    return _floor(pair, "as released", every)
+
+
+def capsule_depth_mm(pair: Pair, every: int) -> Values:
+    """(1,) mean depth over the hand capsules that overlap the object, in lifted frames, millimetres; none without."""
+    found = _score(pair, "SI", every)
+    if isinstance(found, Unmeasured):
+        return found
+    if np.isnan(found.colliding_m):
+        return Unmeasured("no hand capsule overlaps the object in a lifted frame")
+    return np.array([1000 * found.colliding_m])
+
+
+def _passed(pair: Pair, variant: str, every: int) -> Values:
+    found = _score(pair, variant, every)
+    return found if isinstance(found, Unmeasured) else found.passed.astype(np.float64)
+
+
+def _floor(pair: Pair, variant: str, every: int) -> Values:
+    bare = _without_hands(pair)
+    if isinstance(bare, Unmeasured):
+        return bare
+    return score(bare, VARIANTS[variant], _looked_at(bare.lifted, every)).passed.astype(np.float64)
+
+
+@lru_cache(maxsize=1)
+def _without_hands(pair: Pair) -> Scene | Unmeasured:
+    scene = pair.scene
+    return (
+        scene if isinstance(scene, Unmeasured) else scene.with_capsules(scene.capsules.taken(slice(None), slice(0, 0)))
+    )
+
+
+@lru_cache(maxsize=2)
+def _score(pair: Pair, variant: str, every: int) -> Realism | Unmeasured:
+    scene = pair.scene
+    if isinstance(scene, Unmeasured):
+        return scene
+    return score(scene, VARIANTS[variant], _looked_at(scene.lifted, every))
+
+
+def _looked_at(lifted: np.ndarray, every: int) -> np.ndarray:
+    """Every n-th lifted frame, as (frame,) bool. Derivatives are taken over all frames before any is left out."""
+    chosen = np.zeros_like(lifted)
+    chosen[np.flatnonzero(lifted)[::every]] = True
+    return chosen

@@ -41,7 +41,6 @@ class PathEncoder:
     name = "path"
     digest = sha256_bytes(b"path 1")
     labels: tuple[str, ...] = ()
-    label_kind = ""
 
     def encode(self, motions: Sequence[Motion], sides: Sequence[tuple[Side, ...]]) -> Encoding:
         paths = [_path(motion, own) for motion, own in zip(motions, sides, strict=True)]

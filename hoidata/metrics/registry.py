@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple, Protocol
 import numpy as np
 
 from hoidata.clips.slip import MOVING_CM_S
-from hoidata.metrics import forces, motion, touch
+from hoidata.metrics import motion, touch
 from hoidata.metrics.unmeasured import Unmeasured, Values, counted
 from hoidata.physics.realism import LARGEST_PENETRATION_M
 from hoidata.physics.scene import LIFTED_M
@@ -139,26 +139,26 @@ METRICS: tuple[Metric, ...] = (
         thresholds=f"{CONTACT}; moving: {MOVING_CM_S:g} cm/s",
     ),
     Metric(
-        "Physics", "realism_si", "physical realism, SI", "", "higher", forces.realism_si, "mean over frames", SCORED,
+        "Physics", "realism_si", "physical realism, SI", "", "higher", motion.realism_si, "mean over frames", SCORED,
         f"{MANIPNET} and Appendix A, in SI units", samples=1, thresholds=FORCES,
     ),
     Metric(
-        "Physics", "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", forces.floor_si,
+        "Physics", "realism_si_floor", "physical realism, SI, without hands", "", "nearer the truth", motion.floor_si,
         "mean over frames", LIFTED, "this project: what the metric gives for nothing", samples=1, thresholds=FORCES,
         floor_of="realism_si",
     ),
     Metric(
-        "Physics", "realism_released", "physical realism, as released", "", "higher", forces.realism_as_released,
+        "Physics", "realism_released", "physical realism, as released", "", "higher", motion.realism_as_released,
         "mean over frames", SCORED, f"{MANIPNET} and Appendix A, units of the released sources", samples=1,
         thresholds=FORCES,
     ),
     Metric(
         "Physics", "realism_released_floor", "physical realism, as released, without hands", "", "nearer the truth",
-        forces.floor_as_released, "mean over frames", LIFTED, "this project: what the metric gives for nothing",
+        motion.floor_as_released, "mean over frames", LIFTED, "this project: what the metric gives for nothing",
         samples=1, thresholds=FORCES, floor_of="realism_released",
     ),
     Metric(
-        "Physics", "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", forces.capsule_depth_mm,
+        "Physics", "capsule_depth_mm", "penetration of overlapping capsules", "mm", "lower", motion.capsule_depth_mm,
         "mean over motions", LIFTED, f"{MANIPNET}, penetration depth", samples=1,
     ),
     Metric(

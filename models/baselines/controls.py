@@ -11,7 +11,7 @@ from hoidata.objects.model import articulate
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.families import GroundTruth
 from models.baselines.lookups import Lookup, lookup_clips, of_the_hand
-from models.common.family import Family, LeftOut
+from models.common.family import EachAlone, Family, LeftOut
 
 OBJECT_MOVED_M = 0.10
 # From a joint to a sampled point: 2 cm of air, and the finger around the joint.
@@ -151,16 +151,13 @@ def noisy(clip: Clip, known: Recording) -> Clip:
 
 
 @dataclass(frozen=True)
-class OtherHands:
+class OtherHands(EachAlone):
     """The object as recorded, with the hands of a training clip."""
 
     truth: GroundTruth
     lookup: Lookup
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [self._motion(request) for request in requests]
-
-    def _motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | LeftOut:
         found = self.lookup.motion(request)
         return found if isinstance(found, LeftOut) else replace(found, object=self.truth.recorded(request).object)
 

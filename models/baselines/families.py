@@ -12,7 +12,7 @@ from hoidata.clips.clip import Clip
 from hoidata.clips.features import HAND_FEATURES, OBJECT_FEATURES
 from hoidata.store.annotated import AnnotatedStore
 from models.baselines.lookups import matched_rows, train_clips
-from models.common.family import Family, LeftOut, motion_clip
+from models.common.family import EachAlone, Family, LeftOut, motion_clip
 from models.common.features import proper_hands, proper_object
 
 TIME_BINS = 50
@@ -48,7 +48,7 @@ class GroundTruth:
 
 
 @dataclass(frozen=True)
-class MeanMotion:
+class MeanMotion(EachAlone):
     """The mean of the training clips, over equal intervals of each clip's own time.
 
     hands (2, bin, 99), objects (bin, 10): features in the model frame; one bin is the mean pose. seen: (2,) bool, the
@@ -78,10 +78,7 @@ class MeanMotion:
         synthetic = any(sample.synthetic for sample in train)
         return cls(_means(hands, n_hands), _means(objects, n_objects), synthetic, n_hands[:, :, 0].sum(axis=1) > 0)
 
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [self._motion(request) for request in requests]
-
-    def _motion(self, request: Request) -> Clip | LeftOut:
+    def motion(self, request: Request) -> Clip | LeftOut:
         if (request.active_hands & ~self.seen).any():
             return LeftOut(request.motion_id, NO_MEAN)
         rows = matched_rows(request.n_frames, len(self.objects))

@@ -11,13 +11,13 @@ from hoidata.batches.dataset import ClipSample, HoiDataset
 from hoidata.batches.requests import Request
 from hoidata.clips.clip import Clip
 from hoidata.store.annotated import AnnotatedStore
-from models.common.family import Family, LeftOut, Sources, motion_clip
+from models.common.family import EachAlone, Family, LeftOut, Sources, motion_clip
 
 Train = Sequence[ClipSample]
 
 
 @dataclass(frozen=True)
-class Lookup:
+class Lookup(EachAlone):
     """Training clips in the order a ranking gives: its first for the first motion, its second for the second.
 
     The clip's motion is stretched to the length asked for and carried over to the object asked for. rank: from the
@@ -29,9 +29,6 @@ class Lookup:
     rank: Callable[[Train, Request], Sequence[int] | np.ndarray]
     kind: str = ""
     as_found: bool = False
-
-    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
-        return [self.motion(request) for request in requests]
 
     def motion(self, request: Request) -> Clip | LeftOut:
         """The motion of the clip that is found, or that there is none."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from itertools import groupby
 from typing import Any, Literal
 
@@ -21,7 +22,6 @@ from hoidata.sensors.part_bps import distance_map
 from hoidata.settings import build_config
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.learning import CONTACT, MOTION
-from models.bimart.lookups import training_clips
 from models.bimart.network import MotionModel
 from models.bimart.sampler import BimArt, Made, Path, preset_of, sampling_of
 from models.bimart.scene import FeatureConfig, Recorded, Scene, recorded_clip
@@ -32,7 +32,7 @@ NO_OBJECT_MOTION = "it makes hands for the motion of an object, and none was giv
 NO_OTHER = {"other path": "no training clip of its object", "other object": "all training clips are of its object"}
 DIAGNOSED_SAMPLES, DIAGNOSED_CLIPS = 10, 32
 AT_ONCE = 16  # motions of one length that share a batch
-Change = Literal["none", "other path", "other object", "zero map", "no map"]
+Change = Literal["none", "other path", "other object", "zero map"]
 
 
 @dataclass(frozen=True)
@@ -66,17 +66,11 @@ class HandsForPaths:
         assert isinstance(motion.network, MotionModel)
         preset = config.preset or preset_of(motion.network.config)
         sampling = sampling_of(preset, config.sampling, "params.yaml: sample.bimart.sampling")
-        sampling = replace(sampling, with_map=sampling.with_map and change != "no map")
         contact = load_checkpoint(sources.checkpoints / CONTACT.name, CONTACT, sources.device)
         model = BimArt.of(contact, motion, sampling, sources.device)
         synthetic = bool(motion.facts["synthetic"])
         config = replace(config, refined=config.refined and refined)
         return cls(model, sources.hands, config, synthetic, change, sources.annotated)
-
-    @property
-    def used(self) -> tuple[str, ...]:
-        """Names of the networks that make its motions: without contact maps the contact network has no part in them."""
-        return (CONTACT.name, MOTION.name) if self.model.config.with_map else (MOTION.name,)
 
     def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
         return self.sample_asked(requests)[0]
@@ -93,7 +87,7 @@ class HandsForPaths:
             self.clip(request, found[row]) if row in found else LeftOut(request.motion_id, self._why_not(request))
             for row, request in enumerate(requests)
         ]
-        told = self.model.config.with_map and self.change in ("none", "zero map")  # other places are not of this object
+        told = self.change in ("none", "zero map")  # other places are not of this object
         maps = [
             self.asked(request, found[row]) if told and row in found else None for row, request in enumerate(requests)
         ]
@@ -130,7 +124,7 @@ class HandsForPaths:
     def _scene(self, request: Request) -> Scene:
         """The motion of a request, or what a control takes for it."""
         basis, thing = self.model.motion.config.features.basis, _path(request)
-        if self.change in ("none", "zero map", "no map"):
+        if self.change in ("none", "zero map"):
             return self._true_scene(request)
         others = self._others(request)
         other = others[request.seed % len(others)]
@@ -179,6 +173,13 @@ class HandsForPaths:
 def _path(request: Request) -> np.ndarray:
     assert request.trajectories is not None
     return request.trajectories.object[: request.n_frames]
+
+
+@lru_cache(maxsize=2)
+def training_clips(annotated: AnnotatedStore) -> tuple[ClipSample, ...]:
+    """All training clips of a dataset, whole."""
+    split = HoiDataset(annotated, "train")
+    return tuple(split.whole(own) for own in split.ids)
 
 
 def world_from_canonical(request: Request, scene: Scene) -> RigidTransform:
@@ -266,5 +267,4 @@ BIMART = _family("bimart", "BimArt: hands for the object's motion")
 UNREFINED = _family("bimart-unrefined", "BimArt before refinement", refined=False)
 OTHER_PATH = _family("bimart-other-path", "BimArt told another motion of the object", change="other path")
 OTHER_OBJECT = _family("bimart-other-object", "BimArt told another object", change="other object")
-NO_MAP = _family("bimart-no-map", "BimArt told no contact map", change="no map")
 ZERO_MAP = _family("bimart-zero-map", "BimArt told a contact map of zeros", change="zero map")

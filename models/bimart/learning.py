@@ -13,9 +13,17 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotation_angle
 from hoidata.hands import HandPair
 from hoidata.sensors.keypoints import hand_keypoints
-from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Windows, contact_channels
+from models.bimart.network import (
+    Asked,
+    ContactModel,
+    Denoiser,
+    DenoiserConfig,
+    MotionModel,
+    Windows,
+    contact_channels,
+    windows_of,
+)
 from models.bimart.scene import Recorded, recorded_clip
-from models.bimart.windows import Asked, windows_of
 from models.common.family import Losses, Network, Setup
 from models.common.losses import masked_mean
 from models.common.sampling import TRAIN_STEPS, add_noise

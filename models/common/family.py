@@ -122,6 +122,17 @@ class Sampler(Protocol):
         ...
 
 
+class EachAlone:
+    """A sampler that answers every request by itself."""
+
+    def sample(self, requests: Sequence[Request]) -> list[Clip | LeftOut]:
+        return [self.motion(request) for request in requests]
+
+    def motion(self, request: Request) -> Clip | LeftOut:
+        """The answer to one request."""
+        raise NotImplementedError
+
+
 @dataclass(frozen=True)
 class Family:
     """A model family. title: in words, for tables. networks: what it trains itself.

@@ -7,6 +7,8 @@ from contextlib import contextmanager
 import numpy as np
 import torch
 
+from hoidata.errors import BadInput, MissingResource
+
 
 def make_repeatable(threads: int) -> None:
     """Fix, for the whole process, what could change bytes from run to run: threads and algorithms.
@@ -36,3 +38,18 @@ def seed_draws(*words: int) -> torch.Generator:
     seed = int(np.random.SeedSequence(words).generate_state(1, np.uint64)[0] >> np.uint64(1))
     torch.manual_seed(seed)
     return torch.Generator().manual_seed(seed)
+
+
+DEVICES = ("auto", "cpu", "cuda")
+
+
+def chosen_device(setting: str) -> str:
+    """``cuda`` or ``cpu``: auto takes a GPU where torch finds one.
+
+    Raises BadInput for another word, and MissingResource where cuda is asked for and there is none.
+    """
+    if setting not in DEVICES:
+        raise BadInput("params.yaml: device", " or ".join(DEVICES), repr(setting), "correct it")
+    if setting == "cuda" and not torch.cuda.is_available():
+        raise MissingResource("params.yaml: device is cuda, and torch finds no GPU; set it to auto or cpu")
+    return "cuda" if setting != "cpu" and torch.cuda.is_available() else "cpu"

@@ -16,8 +16,7 @@ from hoidata.metrics.paths import even_frames, joints_and_presence
 from hoidata.settings import plain_config
 from models.common.checkpoints import FILE_NAME, load_checkpoint
 from models.common.family import StoredNetwork
-from models.evaluator.examples import padded
-from models.evaluator.inputs import corrected_input, paper_input
+from models.evaluator.inputs import corrected_input, padded, paper_input
 from models.evaluator.networks import EncoderConfig, MotionEncoder
 
 
@@ -28,7 +27,6 @@ class MotionEvaluator:
     name: str
     network: MotionEncoder
     labels: tuple[str, ...]
-    label_kind: str
     digest: str
 
     @torch.no_grad()
@@ -57,9 +55,8 @@ def load_evaluator(folder: Path) -> MotionEvaluator:
     """The network in ``folder``. Raises BadInput as ``load_checkpoint`` does."""
     checkpoint = load_checkpoint(folder, stored_network(folder.name))
     assert isinstance(checkpoint.network, MotionEncoder)
-    facts = checkpoint.facts
     return MotionEvaluator(
-        folder.name, checkpoint.network, tuple(facts["labels"]), facts["label_kind"], weights_digest(checkpoint.network)
+        folder.name, checkpoint.network, tuple(checkpoint.facts["labels"]), weights_digest(checkpoint.network)
     )
 
 

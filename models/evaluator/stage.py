@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +17,13 @@ from hoidata.files import atomic_folder, canonical_json, sha256_bytes, write_who
 from hoidata.files.sealed import METADATA_KEY
 from hoidata.hands import HandPair
 from hoidata.metrics.encoded import UNKNOWN
-from hoidata.metrics.majority import majority_rows
 from hoidata.settings import plain_config
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from hoidata.workers import in_workers
 from models.common.checkpoints import save_checkpoint
 from models.common.repeatable import make_repeatable, own_draws
 from models.evaluator.encoders import stored_network, weights_digest
-from models.evaluator.examples import Examples
+from models.evaluator.inputs import Examples
 from models.evaluator.networks import EncoderConfig, MotionEncoder
 from models.evaluator.settings import EvaluatorSettings, NetworkName
 from models.evaluator.training import RECIPES, Classification, Pairing, Task, fit, held_out_loss, logits_of
@@ -33,6 +33,13 @@ PAPER_FEATURES, SHARED = 128, 64
 FEATURES, FEATURES_OF_FEW, FEW_CLIPS = 32, 16, 256
 DIGITS = 4
 Figures = dict[str, Any]
+Row = tuple[str, str, str]  # label, object, hand of one clip
+INPUTS: dict[str, Callable[[Row], tuple[str, ...]]] = {
+    "nothing": lambda row: (),
+    "object": lambda row: row[1:2],
+    "hand": lambda row: row[2:],
+    "object and hand": lambda row: row[1:],
+}
 
 
 class Trained(NamedTuple):
@@ -104,13 +111,12 @@ def train_evaluators(
     """
     annotated = load_annotated(annotated_root, hands)
     parts = {split: Examples.of(annotated, split) for split in SPLITS}
-    if reason := _why_not(parts["train"], settings):
-        return reason
+    if (labels := len(parts["train"].known_verbs)) < 2:
+        return f"training clips: {len(parts['train'])}, labels among them: {labels}; nothing to tell apart"
     info: dict[str, Any] = {
-        "label_kind": settings.labels,
-        "labels": list(Classification.of(parts["train"], settings.labels, "softmax").labels),
+        "labels": list(parts["train"].known_verbs),
         "clips": {split: len(examples) for split, examples in parts.items()},
-        "majority": majority_rows(*(_known(parts[split], settings.labels) for split in ("train", "test"))),
+        "majority": majority_rows(*(_known(parts[split]) for split in ("train", "test"))),
         "evaluators": {},
     }
     wanted = [(name, seed) for name in settings.networks for seed in settings.seeds]
@@ -124,9 +130,9 @@ def train_evaluators(
             trainings = [found[name, seed] for seed in settings.seeds]
             kept = _chosen(trainings)
             by_seed = {str(one.seed): one.figures for one in trainings}
-            facts = _facts(name, kept, parts, settings, annotated, info["labels"])
+            facts = _facts(name, kept, parts, annotated, info["labels"])
             stored = {"facts": facts, "results": kept.figures, "provenance": provenance(facts) if provenance else {}}
-            network = _network(name, kept, parts["train"], settings)
+            network = _network(name, kept, parts["train"])
             save_checkpoint(partial / name, stored_network(name).name, network, None, stored)
             info["evaluators"][name] = {
                 "digest": weights_digest(network),
@@ -141,15 +147,6 @@ def train_evaluators(
     return info
 
 
-def _why_not(train: Examples, settings: EvaluatorSettings) -> str | None:
-    labels = {word for word in train.label_words(settings.labels) if word}
-    return (
-        None
-        if len(labels) > 1
-        else f"training clips: {len(train)}, labels among them: {len(labels)}; nothing to tell apart"
-    )
-
-
 def _chosen(trainings: Sequence[Trained]) -> Trained:
     """The training in the middle by validation; without validation clips the first."""
     ranks = [(own.chosen_by, -own.seed, own) for own in trainings if own.chosen_by is not None]
@@ -160,7 +157,7 @@ def _trained(name: NetworkName, seed: int, parts: dict[str, Examples], settings:
     train = parts["train"]
     with own_draws():
         torch.manual_seed(seed)
-        task, network = _task(name, train, settings), MotionEncoder(config_of(name, train, settings.labels))
+        task, network = _task(name, train), MotionEncoder(config_of(name, train))
         known = {split: examples for split, examples in parts.items() if task.can_weigh(examples)}
         held_out = known.get("validation")
         fit(network, task, train, held_out, RECIPES[name], seed, settings.most_steps)
@@ -173,28 +170,28 @@ def _trained(name: NetworkName, seed: int, parts: dict[str, Examples], settings:
     return Trained(seed, weights, -losses["validation"] if held_out else None, {"loss": rounded})
 
 
-def _network(name: NetworkName, trained: Trained, train: Examples, settings: EvaluatorSettings) -> MotionEncoder:
+def _network(name: NetworkName, trained: Trained, train: Examples) -> MotionEncoder:
     with own_draws():
-        network = MotionEncoder(config_of(name, train, settings.labels))
+        network = MotionEncoder(config_of(name, train))
     network.load_state_dict(load(trained.weights))
     return network.eval()
 
 
-def config_of(name: str, train: Examples, label_kind: str) -> EncoderConfig:
+def config_of(name: str, train: Examples) -> EncoderConfig:
     """Sizes of a network for these clips: fewer features where there are few clips."""
     features = FEATURES_OF_FEW if len(train) < FEW_CLIPS else FEATURES
     if name == "text-motion":
         return EncoderConfig("recurrent", SHARED, features, text=train.text.shape[-1])
-    labels = len({word for word in train.label_words(label_kind) if word})
+    labels = len(train.known_verbs)
     if name == "paper":
         return EncoderConfig("planar", labels, PAPER_FEATURES)
     return EncoderConfig("recurrent", labels, features)
 
 
-def _task(name: str, train: Examples, settings: EvaluatorSettings) -> Task:
+def _task(name: str, train: Examples) -> Task:
     if name == "text-motion":
         return Pairing()
-    return Classification.of(train, settings.labels, settings.paper_loss if name == "paper" else "softmax")
+    return Classification.of(train, "sigmoid" if name == "paper" else "softmax")
 
 
 @torch.no_grad()
@@ -207,9 +204,9 @@ def _accuracies(network: MotionEncoder, task: Classification, examples: Examples
     return {f"top{k}": round(float((rank < k).double().mean()), DIGITS) for k in (1, 3)}
 
 
-def _known(examples: Examples, label_kind: str) -> list[tuple[str, str, str]]:
+def _known(examples: Examples) -> list[Row]:
     """Label, object and hand of each clip that has a label."""
-    rows = zip(examples.label_words(label_kind), examples.objects, examples.hands, strict=True)
+    rows = zip(examples.verbs, examples.objects, examples.hands, strict=True)
     return [(label, noun, hand) for label, noun, hand in rows if label]
 
 
@@ -217,7 +214,6 @@ def _facts(
     name: str,
     kept: Trained,
     parts: dict[str, Examples],
-    settings: EvaluatorSettings,
     annotated: AnnotatedStore,
     labels: Sequence[str],
 ) -> dict[str, Any]:
@@ -225,9 +221,34 @@ def _facts(
     return {
         "model": stored_network(name).name,
         "seed": kept.seed,
-        "label_kind": "" if name == "text-motion" else settings.labels,
         "labels": [] if name == "text-motion" else list(labels),
         "clips": {split: parts[split].ids for split in ("train", "validation")},
         "synthetic": bool(annotated.info["synthetic"]),
         "encoder": annotated.encoder_identity,
     }
+
+
+def majority_rows(train: Sequence[Row], test: Sequence[Row]) -> dict[str, dict[str, float]]:
+    """What the inputs alone give away: per input, how often a test clip's label is the most common in training (top1)
+    or among the three most common.
+
+    Of equally common labels the first by name comes first; an input that was never met is answered with all clips'.
+    """
+    return {name: _majority_accuracy(train, test, key) for name, key in INPUTS.items()} if train and test else {}
+
+
+def ranked_labels(train: Sequence[Row], key: Callable[[Row], tuple[str, ...]]) -> dict[tuple[str, ...], list[str]]:
+    """By input, the labels of training clips from the most common on."""
+    counts: defaultdict[tuple[str, ...], Counter[str]] = defaultdict(Counter)
+    for row in train:
+        counts[key(row)][row[0]] += 1
+    return {given: sorted(found, key=lambda label: (-found[label], label)) for given, found in counts.items()}
+
+
+def _majority_accuracy(
+    train: Sequence[Row], test: Sequence[Row], key: Callable[[Row], tuple[str, ...]]
+) -> dict[str, float]:
+    known, usual = ranked_labels(train, key), ranked_labels(train, INPUTS["nothing"])[()]
+    guesses = [known.get(key(row), usual) for row in test]
+    hits = {k: sum(row[0] in guess[:k] for row, guess in zip(test, guesses, strict=True)) for k in (1, 3)}
+    return {f"top{k}": round(count / len(test), 4) for k, count in hits.items()}

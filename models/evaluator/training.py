@@ -6,14 +6,13 @@ The common loop is not used: it moves a generator's ``ClipBatch``; here an epoch
 import copy
 import math
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
 from torch import Tensor, nn
 
 from hoidata.errors import BadInput
 from hoidata.metrics.encoded import UNKNOWN
-from models.evaluator.examples import Examples
+from models.evaluator.inputs import Examples
 from models.evaluator.networks import MotionEncoder, turned
 
 LABEL_SMOOTHING = 0.05
@@ -46,24 +45,6 @@ RECIPES = {
 }
 
 
-class Task(Protocol):
-    """What a network is trained for."""
-
-    def targets(self, examples: Examples) -> tuple[Tensor, ...]:
-        """What is asked of each clip; tensors whose first axis counts clips."""
-        ...
-
-    def can_weigh(self, examples: Examples) -> bool:
-        """Whether there is a clip among them of which something is asked."""
-        ...
-
-    def loss(
-        self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None
-    ) -> Tensor:
-        """The loss of a batch; without a generator always the same."""
-        ...
-
-
 @dataclass(frozen=True)
 class Classification:
     """Labels from motions. kind: "sigmoid" of each label, as IMoS released it, or "softmax" with smoothed labels.
@@ -71,19 +52,19 @@ class Classification:
     weights: (label,) of each in the loss, so that rare ones count as much.
     """
 
-    label_kind: str
     labels: tuple[str, ...]
     weights: Tensor
     kind: str
 
     @classmethod
-    def of(cls, train: Examples, label_kind: str, kind: str) -> "Classification":
-        labels = tuple(sorted({word for word in train.label_words(label_kind) if word}))
-        counts = torch.bincount(train.labels(label_kind, labels), minlength=len(labels))
-        return cls(label_kind, labels, len(train) / (len(labels) * counts), kind)
+    def of(cls, train: Examples, kind: str) -> "Classification":
+        labels = train.known_verbs
+        counts = torch.bincount(train.labels(labels), minlength=len(labels))
+        return cls(labels, len(train) / (len(labels) * counts), kind)
 
     def targets(self, examples: Examples) -> tuple[Tensor, ...]:
-        return (examples.labels(self.label_kind, self.labels),)
+        """What is asked of each clip; the first axis counts clips."""
+        return (examples.labels(self.labels),)
 
     def can_weigh(self, examples: Examples) -> bool:
         """Whether one of them has a label of the training clips."""
@@ -92,6 +73,7 @@ class Classification:
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None
     ) -> Tensor:
+        """The loss of a batch; nothing of it is drawn."""
         known = targets[0] != UNKNOWN
         logits, wanted = logits[known], targets[0][known]
         if self.kind == "sigmoid":
@@ -112,6 +94,7 @@ class Pairing:
     def loss(
         self, network: MotionEncoder, logits: Tensor, targets: tuple[Tensor, ...], generator: torch.Generator | None
     ) -> Tensor:
+        """The loss of a batch; without a generator always that of the first sentences."""
         text, prompts = targets
         rows = torch.arange(len(text))
         forms = torch.randint(text.shape[1], (len(text),), generator=generator) if generator else 0 * rows
@@ -121,6 +104,9 @@ class Pairing:
         same = (prompts[:, None] == prompts) & ~torch.eye(len(rows), dtype=torch.bool)
         alike = alike.masked_fill(same, -math.inf)
         return (nn.functional.cross_entropy(alike, rows) + nn.functional.cross_entropy(alike.T, rows)) / 2
+
+
+Task = Classification | Pairing
 
 
 def fit(

@@ -13,9 +13,8 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.hands.tracks import track_rotmats
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
-from models.manipnet.control import Control, Motion
-from models.manipnet.examples import between
-from models.manipnet.plausible import UNSEEN_M, plausible_reading
+from models.manipnet.control import UNSEEN_M, Control, Motion, between
+from models.manipnet.plausible import plausible_reading
 from models.manipnet.rollout import Predictor, Task, roll_out
 from models.manipnet.trajectory_files import MOST_FRAMES, TrajectoryFile
 

@@ -20,12 +20,11 @@ from hoidata.objects.surface_index import surface_index
 from hoidata.settings import build_config
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.family import Family, Figures, LeftOut, Sources, motion_clip
-from models.manipnet.control import Control
+from models.manipnet.control import Control, control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.features import FeatureSettings
 from models.manipnet.lookups import Lookup, as_right, control_inputs, joint_errors_m, mean_rotmats
 from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule, Task, roll_out
-from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.training import MANIPNET
 
 NEAREST = 10

@@ -19,7 +19,7 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.user_mesh import UNITS_M
-from models.manipnet.control import Control, Motion
+from models.manipnet.control import UNSEEN_M, Control, Motion
 from models.manipnet.trajectory_files import Body, TrajectoryFile
 
 NEAR_M = 0.12  # from the middle of the palm to the object: a hand that never comes nearer handles nothing
@@ -28,7 +28,6 @@ REACH_M = NEAR_M + PALM_M  # from the wrist, whatever way the palm lies
 SWALLOWED_M = 0.03  # so deep in an object no palm is
 WRIST_OFF_M = 0.015  # a wrist nearer to the object's hull has no room for a hand; recorded ones stay 1.9 cm off
 MOST = 0.5  # of the frames in which a hand is near
-UNSEEN_M = 1.0
 FACING = np.array([0.8, 0.0, -0.6])  # canonical: where a hand that holds something looks to
 PER_PALM_M, PER_SPREAD_M, PER_TURN_RAD = 10.0, 5.0, 0.5  # what a fit loses, beside two cosines
 NO_FIT, CLEARLY = -2.0, 0.3  # of scores, 2 at best

@@ -21,8 +21,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
-from models.manipnet.control import Control
-from models.manipnet.examples import between
+from models.manipnet.control import Control, between
 from models.manipnet.features import (
     FeatureSettings,
     joint_rotmats_of,

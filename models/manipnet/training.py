@@ -1,25 +1,110 @@
-"""Training of ManipNet on annotated clips: the shared loop draws clips, from each of which steps are drawn."""
+"""Training of ManipNet on annotated clips: the shared loop draws clips, from each of which steps are drawn.
+
+A step is the recorded pose of a frame and that of the next (Sec. 6.4), of hands of any source.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from hoidata.batches.dataset import ClipBatch, ClipSample
-from hoidata.clips.clip import FPS, SIDES
+from hoidata.clips.clip import FPS, SIDES, Side
 from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.hands import HandPair
-from hoidata.objects.surface_index import surface_index
+from hoidata.hands.tracked_hand import TrackedHand
+from hoidata.objects.surface_index import SurfaceIndex, surface_index
+from hoidata.sensors import sensor_size
 from models.common.family import Losses, Network, Setup
-from models.manipnet.examples import LEARNT, Examples, hand_examples, other_poses, prepared, step_loss
-from models.manipnet.features import FeatureSettings
+from models.manipnet.control import Control, between, control_of, finger_rotmats_of, hands_of, trajectories_of
+from models.manipnet.features import FeatureSettings, floors, hand_inputs, outputs, sizes
+from models.manipnet.inverse_kinematics import turns_from_rest
 from models.manipnet.lookups import as_right
 from models.manipnet.network import ManipNet, NetworkConfig
-from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
+
+LEARNT = ("inputs", "outputs")
+MARGIN_RAD = 0.1  # joints may turn by so much more than in any training clip
+
+
+class Examples(NamedTuple):
+    """Steps of a hand, from one frame to the next. frame: (step,) it starts in. inputs: (step, 2350), float32.
+
+    outputs: (step, 214), float32. turns_rad: (step, joint - 1, 3) from the neutral pose, as a right hand's.
+    """
+
+    frame: np.ndarray
+    inputs: np.ndarray
+    outputs: np.ndarray
+    turns_rad: np.ndarray
+
+
+def hand_examples(
+    control: Control,
+    side: Side,
+    hand: TrackedHand,
+    finger_rotmats: np.ndarray,
+    time_s: np.ndarray,
+    usable: np.ndarray,
+    surface: SurfaceIndex,
+    settings: FeatureSettings,
+    given: np.ndarray | None = None,
+) -> Examples:
+    """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart.
+
+    given: (frame, joint - 1, 3, 3) other poses to start the steps from, which lead to the recorded ones all the same:
+    the paper trains from recorded poses alone, and a network may then keep any pose it is given.
+    """
+    first = np.flatnonzero(usable[:-1] & usable[1:])
+    start = finger_rotmats[first] if given is None else given[first]
+    seen = hand_inputs(control, side, hand, hand.state(start), time_s[first], surface, settings)
+    placed = control.thing.at(time_s[first + 1]).inverse() @ control.wrists[side].at(time_s[first + 1])
+    hinge = control.hinge_at(time_s[first + 1])
+    after = hand.state(finger_rotmats[first + 1])
+    distance_m = surface.nearest(placed @ after.point_m, hinge).distance_m
+    made = outputs(hand, after, distance_m, settings)
+    rows = np.concatenate(seen, axis=1, dtype=np.float32)
+    return Examples(first, rows, made.astype(np.float32), turns_from_rest(hand, finger_rotmats[first]))
+
+
+def other_poses(fingers: np.ndarray, pool: np.ndarray, seed: int) -> np.ndarray:
+    """(frame, joint - 1, 3, 3) for each pose one that lies between it and another of the pool, anywhere on the way."""
+    draws = np.random.default_rng(seed)
+    return between(fingers, pool[draws.integers(len(pool), size=len(fingers))], draws.uniform(0, 1, len(fingers)))
+
+
+def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
+    """The configuration with the numbers that this hand has."""
+    count = sizes(hand, config.features)
+    return replace(
+        config,
+        pose=count["pose"],
+        trajectory=count["trajectory"],
+        sensors=sensor_size(hand, config.features.sensors),
+        output=count["pose"] + hand.n_points,
+        joints=hand.n_joints,
+    )
+
+
+def prepared(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
+    """A network that knows its normalisation and the limits of the joints from training examples."""
+    network = ManipNet(sized(config, hand))
+    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in LEARNT)
+    least = [torch.from_numpy(values).float() for values in floors(hand, config.features)]
+    network.learn_normalisation(inputs, made, (least[0], least[1]))
+    turns = torch.from_numpy(np.concatenate([one.turns_rad for one in examples]))
+    network.low_rad.copy_(turns.amin(0) - MARGIN_RAD)
+    network.high_rad.copy_(turns.amax(0) + MARGIN_RAD)
+    return network
+
+
+def step_loss(network: ManipNet, inputs: Tensor, made: Tensor) -> Tensor:
+    """Mean squared error of normalised outputs."""
+    return (network.normalised(inputs) - (made - network.output_mean) / network.output_scale).square().mean()
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,8 @@ def run(paths: StagePaths) -> None:
 
 def sample(paths: StagePaths, params: dict, family: str) -> None:
     """Motions of a family into ``paths.samples``; params: all of params.yaml."""
-    from models.common.device import chosen_device
     from models.common.predicting import sample_family
-    from models.common.repeatable import make_repeatable
+    from models.common.repeatable import chosen_device, make_repeatable
     from models.registry import load_family
 
     section = dict(params.get("sample") or {})

@@ -90,8 +90,7 @@ def train_into(made: Path, paths: StagePaths, params: Mapping[str, Any], progres
 
     code: the file with the digests of what runs.
     """
-    from models.common.device import chosen_device
-    from models.common.repeatable import make_repeatable
+    from models.common.repeatable import chosen_device, make_repeatable
     from models.common.team import Team
     from models.common.training import train_network
 

@@ -8,8 +8,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hoidata.clips.clip import SIDES, Side
+from hoidata.clips.recording import HandRecording
 from hoidata.datasets import RawTree, SequenceKey
 from hoidata.datasets.manipnet.adapter import HAND_JOINTS
+from models.manipnet.control import Control, Motion
 
 # A right hand in the files' axes: fingers to -x, thumb side +y, palm to -z. "~" is "-" on the right, "" on the left.
 HAND = """HIERARCHY
@@ -157,3 +160,15 @@ def write_skin(root: Path, seed: int = 0) -> dict[str, np.ndarray]:
         json.dumps({"capsules": capsules, "proximity_vertices": sensors})
     )
     return arrays
+
+
+def recording_control(recording: HandRecording) -> Control:
+    """What a recording with its source's own hands gives the network, at its own rate, time 0 in its first frame."""
+    thing, time_s = recording.object, recording.time_s
+    wrists: dict[Side, Motion] = {}
+    for side in SIDES:
+        pose = recording.world_from_wrist(side)
+        wrists[side] = Motion(time_s, pose.rotation, pose.translation)
+    body = thing.world_from_object
+    hinge = None if thing.hinge_rad is None else thing.hinge_rad.astype(np.float64)
+    return Control(wrists, Motion(time_s, body.rotation, body.translation), thing.model, hinge)

@@ -6,9 +6,8 @@ import numpy as np
 
 from hoidata.clips import SIDES, Clip
 from hoidata.hands import load_embedded_hands
-from hoidata.synthetic.study import PoolTask, find_grasps, people_of
+from hoidata.synthetic.study import PoolTask, Scenario, draw_hold, find_grasps, make_study_sequence, people_of
 from hoidata.synthetic.study_objects import STUDY_OBJECTS
-from hoidata.synthetic.study_sequences import Scenario, draw_hold, make_study_sequence
 from tests.builders.clips import clip_of
 
 # Clips of each verb and hand by each subject of the small corpora: to train on, to validate, to test.

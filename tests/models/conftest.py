@@ -5,15 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-from hoidata.batches.dataset import ClipBatch, HoiDataset, collate
+from hoidata.batches.dataset import ClipBatch, ClipSample, HoiDataset, collate
 from hoidata.clips.clip import Clip, ObjectTrack
+from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
 from hoidata.store.annotated import AnnotatedStore, load_annotated
+from models.common.family import Sources
 from tests.builders.clips import clip_of, flat_hand
 from tests.builders.objects import box_model, notebook
 from tests.builders.stores import write_annotated
-from tests.models.toy import PARAMS, train
+from tests.models.toy import FAST, PARAMS, train
 
 GRASP_HEIGHT_M = 0.01
 
@@ -98,3 +101,15 @@ def trained(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) -> P
     for name in PARAMS:
         train(name, annotated_root, out)
     return out
+
+
+@pytest.fixture(scope="session")
+def sources(annotated: AnnotatedStore, trained: Path) -> Sources:
+    return Sources(annotated, trained, load_embedded_hands(), torch.device("cpu"), FAST)
+
+
+@pytest.fixture(scope="session")
+def samples(annotated: AnnotatedStore) -> list[ClipSample]:
+    """A folder opened by both hands, a box lifted by the left one."""
+    every = [sample for split in ("train", "test") for sample in HoiDataset(annotated, split, crop="start")]
+    return [next(one for one in every if one.hand_type == hand) for hand in ("both", "left")]

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,11 +22,9 @@ from models.baselines.lookups import NEAREST_CLIP, Lookup, Prompt, by_sentence, 
 from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for, sample_family
 from models.registry import load_family
-from models.text2hoi.controls import OtherContact, OwnContact, other_contact_maps
-from models.text2hoi.held_lookup import HeldLookup
+from models.text2hoi.controls import HeldLookup, OtherContact, OwnContact, other_contact_maps
 from models.text2hoi.sampler import Text2Hoi
 from models.text2hoi.verb_check import VerbCheck
-from tests.models.toy import FAST
 
 HANDS = load_embedded_hands()
 SPOILT = ("static", "reversed", "object-moved", "hands-away", "pressed", "noise")
@@ -36,11 +33,6 @@ LOOKUPS = (
     *("swapped-hands", "other-hands", "nearest-clip"),
 )
 MODELS = ("one-call", "other-contact", "other-prompt-own-contact")
-
-
-@pytest.fixture(scope="module")
-def sources(annotated: AnnotatedStore, trained: Path) -> Sources:
-    return Sources(annotated, trained, HANDS, torch.device("cpu"), FAST)
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +114,7 @@ def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, mo
         left = [float(own) for own in beyond]
         monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
         monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers, left=left: left.pop(0))
-        monkeypatch.setattr("models.text2hoi.held_lookup.carried_share", lambda *told: 1.0)
+        monkeypatch.setattr("models.text2hoi.controls.carried_share", lambda *told: 1.0)
         found = family.sample(several)
         assert left == []
         for one, number in zip(found, taken, strict=True):
@@ -132,7 +124,7 @@ def test_a_held_lookup_is_looked_up_again_by_the_rules_of_ours(sources, test, mo
     monkeypatch.setattr(VerbCheck, "beyond", lambda self, asked, numbers: 0.0)
     monkeypatch.setattr(VerbCheck, "fails", lambda self, asked, moved_as: False)
     shares = [1.0, 0.0, 1.0]
-    monkeypatch.setattr("models.text2hoi.held_lookup.carried_share", lambda *told: shares.pop(0))
+    monkeypatch.setattr("models.text2hoi.controls.carried_share", lambda *told: shares.pop(0))
     nowhere = replace(several[0], motion_id="nowhere")
     lookup = SimpleNamespace(
         sample=lambda asked: [

@@ -21,7 +21,7 @@ from models.common.checkpoints import load_checkpoint, save_checkpoint
 from models.common.family import Network, Setup
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
-from models.evaluator.examples import Examples
+from models.evaluator.inputs import Examples
 from models.evaluator.settings import EvaluatorSettings
 from models.evaluator.stage import train_evaluators
 from models.registry import load_network

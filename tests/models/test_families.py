@@ -34,11 +34,6 @@ from tests.models.toy import FAST
 HANDS = load_embedded_hands()
 
 
-@pytest.fixture(scope="module")
-def sources(annotated: AnnotatedStore, trained: Path) -> Sources:
-    return Sources(annotated, trained, HANDS, torch.device("cpu"), FAST)
-
-
 def samples_of(annotated: AnnotatedStore, split: str) -> list[ClipSample]:
     return list(HoiDataset(annotated, split, crop="start"))
 

@@ -10,7 +10,7 @@ from hoidata.batches.requests import ObjectPoints
 from hoidata.clips.clip import SIDES, Clip, HandTrack
 from hoidata.hands import load_embedded_hands, track_vertices
 from hoidata.objects.sampling import sample_points
-from models.text2hoi.faults import visible_faults
+from models.text2hoi.generation import visible_faults
 from models.text2hoi.verb_check import VerbCheck
 from tests.builders.clips import DOWN, clip_of, flat_hand, still_object
 from tests.builders.objects import box_model

@@ -321,8 +321,8 @@ def test_a_person_is_told_of_differences_that_can_be_seen_and_the_page_has_the_o
     models = Models(trained, load_embedded_hands(), load_encoder("hash"))
     asked = Asked("Lift a box with the left hand.", tmp_path / "box.stl", models=models, wish=Wish(frames=8))
     monkeypatch.setattr(Text2Hoi, "refined_by", "hold")
-    monkeypatch.setattr("models.text2hoi.faults._contact_faults", lambda *_: [])
-    monkeypatch.setattr("models.text2hoi.faults._is_still", lambda *_: False)
+    monkeypatch.setattr("models.text2hoi.generation._contact_faults", lambda *_: [])
+    monkeypatch.setattr("models.text2hoi.generation._is_still", lambda *_: False)
     monkeypatch.setattr(VerbCheck, "unusual", lambda self, asked, numbers: ("rise_m 9 (usual: 0 to 1)", "path_m 8"))
     notes = {}
     for verb in ("lift", "open"):

@@ -25,14 +25,12 @@ from pipelines.cli import app
 from pipelines.promises import CONFUSED, PROMISES, TRUTH, Promise, datasets_below, kept, read_rows, taken_for_reverse
 from pipelines.stages import controls, evaluate
 from pipelines.stages.base import StagePaths, empty_reason
-from pipelines.stages.sample import sample
 from tests.builders.annotated import write_annotated_dataset
 from tests.builders.stores import write_annotated
 from tests.builders.study import study_clips, study_rule
 
 PROJECT = Path(__file__).parents[2]
 PATHS = StagePaths("embedded", "grab")
-COUNTS = {"clips": 0}
 SAMPLES, METRICS_OF = Path("samples/embedded/grab/controls"), Path("metrics/embedded/grab/controls")
 
 
@@ -54,14 +52,6 @@ def run_with(**settings) -> None:
 
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
-
-
-@pytest.mark.parametrize(("section", "name"), [({"encoder": "hash"}, "hash"), ({}, None), (None, None)])
-def test_motions_are_asked_for_with_the_encoder_that_the_settings_name(project, monkeypatch, section, name):
-    found = {}
-    monkeypatch.setattr("models.common.predicting.sample_family", lambda *given, **named: found.update(named) or COUNTS)
-    sample(PATHS, {"profile": "embedded", "annotate": section, "sample": {"samples": 1}}, "text2hoi")
-    assert found["encoder"] == name
 
 
 def test_without_rows_the_stage_says_so_and_imports_no_torch(project):
@@ -92,13 +82,13 @@ def test_every_row_gets_motions_and_figures_and_rows_no_longer_asked_for_go(proj
 
 def test_rows_of_an_optional_family_are_sampled_by_its_own_stage(project, monkeypatch):
     """It alone waits for the networks of that family."""
-    settings = {"profile": "embedded", "sample": {}, "controls": {"families": ["static", "bimart-no-map"]}}
+    settings = {"profile": "embedded", "sample": {}, "controls": {"families": ["static", "bimart-zero-map"]}}
     Path("params.yaml").write_text(yaml.safe_dump(settings))
     sampled = []
     monkeypatch.setattr(controls, "sample", lambda paths, params, name: sampled.append((paths.family, name)))
     for family in ("", "bimart"):
         controls.run(replace(PATHS, family=family))
-    assert sampled == [("controls/static", "static"), ("controls-bimart/bimart-no-map", "bimart-no-map")]
+    assert sampled == [("controls/static", "static"), ("controls-bimart/bimart-zero-map", "bimart-zero-map")]
 
 
 def test_a_clip_left_out_of_a_row_stands_in_its_metrics_with_the_reason_of_the_row(project):

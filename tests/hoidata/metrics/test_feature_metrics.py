@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from hoidata.metrics.encoded import UNKNOWN, EncodedSet
-from hoidata.metrics.feature_distances import TOO_SMALL, fid_frechet, fid_paired, frechet_distance, kid
 from hoidata.metrics.feature_measures import ranks
 from hoidata.metrics.feature_metrics import FEATURE_METRICS, feature_findings
-from hoidata.metrics.feature_sets import FeatureFigure
-from hoidata.metrics.majority import majority_rows
+from hoidata.metrics.feature_sets import TOO_SMALL, FeatureFigure, fid_frechet, fid_paired, frechet_distance, kid
 from hoidata.metrics.unmeasured import Unmeasured
 
 CLIPS, LABELS = 60, ("close", "lift", "open")
@@ -251,15 +249,6 @@ def test_every_figure_is_registered_once_and_floors_have_their_metric():
     names = [item.name for item in FEATURE_METRICS]
     assert len(set(names)) == len(names) == len({item.title for item in FEATURE_METRICS})
     assert {item.floor_of for item in FEATURE_METRICS if item.floor_of} <= set(names)
-
-
-def test_what_the_inputs_give_away_is_the_majority_of_the_training_clips():
-    train = [("lift", "cup", "left")] * 3 + [("pour", "cup", "right")] * 2 + [("open", "box", "right")]
-    test = [("pour", "cup", "right"), ("lift", "cup", "right"), ("open", "box", "left"), ("lift", "jar", "left")]
-    found = majority_rows(train, test)
-    assert found["nothing"] == {"top1": 0.5, "top3": 1.0}
-    assert found["object"] == {"top1": 0.75, "top3": 1.0}
-    assert found["object and hand"] == {"top1": 0.5, "top3": 0.75}
 
 
 def test_figures_of_features_that_could_not_be_measured_have_a_reason():

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from hoidata.actions.action import action_numbers, learn_actions
 from hoidata.clips.clip import FPS, HandTrack, ObjectTrack
 from hoidata.hands import load_embedded_hands, track_vertices
-from hoidata.metrics import forces, motion, touch
+from hoidata.metrics import motion, touch
 from hoidata.metrics.registry import METRICS
 from hoidata.metrics.unmeasured import NO_GRAVITY, NO_INSIDE, Unmeasured
 from hoidata.objects.model import ObjectModel
@@ -149,7 +149,7 @@ def test_an_object_without_an_inside_has_no_penetration(make_clip, pair_of):
     open_box = replace(clip.object.model, faces=clip.object.model.faces[:1], name="one triangle")
     clip = replace(clip, object=replace(clip.object, model=open_box))
     assert touch.penetration_mm(pair_of(clip, clip), 1) == NO_INSIDE
-    assert forces.realism_si(pair_of(clip, clip, table_m=-1.0), 1) == NO_INSIDE
+    assert motion.realism_si(pair_of(clip, clip, table_m=-1.0), 1) == NO_INSIDE
 
 
 def test_contact_distance_is_that_of_joints_that_touch_in_the_truth(make_clip, moved, pair_of):
@@ -219,21 +219,21 @@ def on_a_hand(make_clip, fall_m_s2=0.0, hand_below_m=0.0):
 
 def test_a_plate_at_rest_on_a_hand_is_realistic_and_one_in_the_air_is_not(make_clip, pair_of):
     held, floating = on_a_hand(make_clip), on_a_hand(make_clip, hand_below_m=0.5)
-    for measure in (forces.realism_si, forces.realism_as_released):
+    for measure in (motion.realism_si, motion.realism_as_released):
         assert measure(pair_of(held, floating, table_m=-1.0), 1).tolist() == [1.0] * 12
         assert measure(pair_of(floating, held, table_m=-1.0), 1).tolist() == [0.0] * 12
-    for floor in (forces.floor_si, forces.floor_as_released):
+    for floor in (motion.floor_si, motion.floor_as_released):
         assert floor(pair_of(held, held, table_m=-1.0), 1).tolist() == [0.0] * 12
 
 
 def test_the_floor_is_what_falls_by_itself(make_clip, pair_of):
     """As released, gravity is ten times too small: an object that falls that slowly needs no hand."""
     free, slow = on_a_hand(make_clip, 9.81, 0.5), on_a_hand(make_clip, 0.98, 0.5)
-    assert forces.floor_si(pair_of(free, free, table_m=-1.0), 1).all()
-    assert not forces.floor_as_released(pair_of(free, free, table_m=-1.0), 1).any()
-    assert not forces.floor_si(pair_of(slow, slow, table_m=-1.0), 1).any()
+    assert motion.floor_si(pair_of(free, free, table_m=-1.0), 1).all()
+    assert not motion.floor_as_released(pair_of(free, free, table_m=-1.0), 1).any()
+    assert not motion.floor_si(pair_of(slow, slow, table_m=-1.0), 1).any()
     # Its forward differences have nothing after the last two frames.
-    assert forces.floor_as_released(pair_of(slow, slow, table_m=-1.0), 1)[:-2].all()
+    assert motion.floor_as_released(pair_of(slow, slow, table_m=-1.0), 1)[:-2].all()
 
 
 def test_every_name_in_the_registry_gives_the_figure_it_names(make_clip, pair_of):
@@ -269,10 +269,10 @@ def test_every_name_in_the_registry_gives_the_figure_it_names(make_clip, pair_of
 
 def test_forces_are_asked_about_above_the_table_of_the_truth_only(make_clip, pair_of):
     held = on_a_hand(make_clip)
-    assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M), 1)) == 0
-    assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 1)) == 12
-    assert len(forces.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 3)) == 4
-    assert forces.realism_si(pair_of(held, held, table_m=None), 1) == NO_GRAVITY
+    assert len(motion.realism_si(pair_of(held, held, table_m=-BOTTOM_M), 1)) == 0
+    assert len(motion.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 1)) == 12
+    assert len(motion.realism_si(pair_of(held, held, table_m=-BOTTOM_M - 0.02), 3)) == 4
+    assert motion.realism_si(pair_of(held, held, table_m=None), 1) == NO_GRAVITY
 
 
 def test_capsule_depth_is_how_far_capsules_reach_over_a_plane(make_clip, pair_of):
@@ -281,9 +281,9 @@ def test_capsule_depth_is_how_far_capsules_reach_over_a_plane(make_clip, pair_of
     depth = np.maximum(capsules.start_m, capsules.end_m)[0, :, 2] + capsules.radius_m + BOTTOM_M
     expected = 1000 * depth[depth > 0].mean()
     assert (depth > 0).sum() > 3
-    assert forces.capsule_depth_mm(pair_of(held, held, table_m=-1.0), 1) == pytest.approx([expected], abs=1e-3)
+    assert motion.capsule_depth_mm(pair_of(held, held, table_m=-1.0), 1) == pytest.approx([expected], abs=1e-3)
     floating = on_a_hand(make_clip, hand_below_m=0.5)
-    assert len(forces.capsule_depth_mm(pair_of(floating, held, table_m=-1.0), 1)) == 0
+    assert len(motion.capsule_depth_mm(pair_of(floating, held, table_m=-1.0), 1)) == 0
 
 
 def test_a_motion_is_judged_by_the_verb_of_its_reference(make_clip, pair_of):

@@ -17,8 +17,8 @@ from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.objects.triangle_tree import TriangleTree
 from hoidata.sensors import Sensed, sense
-from models.manipnet.control import recording_control
 from models.manipnet.features import FeatureSettings, object_from_wrist
+from tests.builders.manipnet import recording_control
 from tests.hoidata.sensors import slow
 from tests.hoidata.sensors.test_sensors import cells_in_object
 

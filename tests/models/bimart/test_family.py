@@ -15,11 +15,10 @@ from hoidata.hands import load_embedded_hands
 from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.store.annotated import AnnotatedStore
-from models.bimart.family import BIMART, NO_MAP, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, HandsForPaths
+from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, HandsForPaths
 from models.bimart.learning import CONTACT, MOTION, LossConfig, learn_statistics, targets_of, window_losses
-from models.bimart.lookups import NEAREST_WINDOW, OBJECT_MEAN_POSE
+from models.bimart.lookups import NEAREST_REFINED, NEAREST_WINDOW, OBJECT_MEAN_POSE
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
-from models.bimart.refined_lookup import NEAREST_REFINED
 from models.bimart.sampler import BimArt
 from models.bimart.sampler import Path as ObjectPath
 from models.bimart.scene import FeatureConfig, Scene, recorded_clip
@@ -58,13 +57,6 @@ def checkpoints(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.fixture(scope="module")
 def sources(annotated: AnnotatedStore, checkpoints: Path) -> Sources:
     return Sources(annotated, checkpoints, HANDS, torch.device("cpu"), SETTINGS)
-
-
-@pytest.fixture(scope="module")
-def samples(annotated: AnnotatedStore) -> list[ClipSample]:
-    """A folder opened by both hands, a box lifted by the left one."""
-    every = [sample for split in ("train", "test") for sample in HoiDataset(annotated, split, crop="start")]
-    return [next(one for one in every if one.hand_type == hand) for hand in ("both", "left")]
 
 
 def interrupted(network: Network, at: int) -> Network:
@@ -171,7 +163,7 @@ def test_refinement_and_controls_change_the_hands_and_never_the_object(
     asked = requests_for(samples[1], PredictionConfig(samples=1))
     plain = UNREFINED.load(sources).sample(asked)[0]
     assert isinstance(plain, Clip)
-    for family in (BIMART, ZERO_MAP, NO_MAP, OTHER_OBJECT, OTHER_PATH):
+    for family in (BIMART, ZERO_MAP, OTHER_OBJECT, OTHER_PATH):
         made = family.load(sources).sample(asked)[0]
         assert isinstance(made, Clip)
         assert not same(plain, made)
@@ -218,8 +210,7 @@ def test_lookups_place_training_hands_at_the_object(sources: Sources, annotated:
 def test_no_window_is_copied_in_which_a_hand_is_not_tracked(family, sources: Sources, annotated, monkeypatch) -> None:
     train = list(HoiDataset(annotated, "train"))
     gaps = [replace(one, valid=one.valid & (np.arange(one.length) != 3)) for one in train]
-    for module in ("lookups", "refined_lookup"):
-        monkeypatch.setattr(f"models.bimart.{module}.training_clips", lambda _: gaps)
+    monkeypatch.setattr("models.bimart.lookups.training_clips", lambda _: gaps)
     (found,) = family.load(sources).sample(requests_for(train[0], PredictionConfig(samples=1)))
     assert isinstance(found, LeftOut)
 

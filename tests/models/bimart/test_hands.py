@@ -129,10 +129,3 @@ def test_files_and_page_are_written_repeat_and_explain_every_array(made, path, t
     assert "keyframes 2 to 3" in page
     assert "a &lt;script&gt;" in page
     assert "http" not in page.split("<main")[1].split("<script")[0]
-
-
-def test_a_motion_made_without_a_contact_map_names_no_contact_network(sampler) -> None:
-    """Which it then may have loaded, and does not ask."""
-    without = replace(sampler, model=replace(sampler.model, config=replace(sampler.model.config, with_map=False)))
-    assert sampler.used == ("bimart-contact", "bimart-motion")
-    assert without.used == ("bimart-motion",)

@@ -10,20 +10,23 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rot6d_to_rotmat, rotmat_to_rot6d, rotmat_to_rotvec, rotvec_to_rotmat
 from hoidata.sensors.part_bps import BasisSettings
 from hoidata.settings import build_config
-from models.bimart.guidance import Map, combined, discrepancy, metre_step, paper_step
 from models.bimart.learning import middle_start, window_starts
-from models.bimart.network import ContactModel, DenoiserConfig, MotionModel
+from models.bimart.network import Asked, ContactModel, DenoiserConfig, Layout, MotionModel, layout_of, windows_of
 from models.bimart.sampler import (
     OURS,
     PAPER,
     BimArt,
+    Map,
     Path,
     SamplingConfig,
     WalkConfig,
+    combined,
+    discrepancy,
+    metre_step,
+    paper_step,
     sampling_of,
 )
 from models.bimart.scene import FeatureConfig, Recorded, Scene
-from models.bimart.windows import Asked, Layout, layout_of, windows_of
 from models.common.transformer import TransformerConfig
 from tests.builders.objects import hinged_box
 

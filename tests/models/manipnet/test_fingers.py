@@ -9,7 +9,7 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from hoidata.batches.dataset import ClipSample, HoiDataset
+from hoidata.batches.dataset import ClipSample
 from hoidata.clips.clip import FPS, SIDES, Clip
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.geometry.transform import RigidTransform
@@ -24,7 +24,7 @@ from models.common.family import LeftOut, Sources
 from models.common.predicting import PredictionConfig, requests_for
 from models.common.training import train_network
 from models.manipnet.animate import Gap, new_fingers
-from models.manipnet.examples import sized
+from models.manipnet.control import control_of, finger_rotmats_of, hands_of, trajectories_of
 from models.manipnet.family import Fingers
 from models.manipnet.features import FeatureSettings, outputs, pose_features
 from models.manipnet.inverse_kinematics import Limits, reach, target_points
@@ -32,8 +32,7 @@ from models.manipnet.lookups import as_right
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Follower, Nearest, Predictor, Situation, Task, our_targets, paper_targets, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
-from models.manipnet.tracks import control_of, finger_rotmats_of, hands_of, trajectories_of
-from models.manipnet.training import MANIPNET
+from models.manipnet.training import MANIPNET, sized
 
 HANDS = load_embedded_hands()
 PARAMS = {
@@ -57,13 +56,6 @@ def checkpoints(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) 
 @pytest.fixture(scope="module")
 def fingers(annotated: AnnotatedStore, checkpoints: Path) -> Fingers:
     return Fingers.load(Sources(annotated, checkpoints, HANDS, torch.device("cpu")))
-
-
-@pytest.fixture(scope="module")
-def samples(annotated: AnnotatedStore) -> list[ClipSample]:
-    """A folder opened by both hands, a box lifted by the left one."""
-    every = [sample for split in ("train", "test") for sample in HoiDataset(annotated, split, crop="start")]
-    return [next(one for one in every if one.hand_type == hand) for hand in ("both", "left")]
 
 
 def right_hand() -> TrackedHand:

@@ -16,13 +16,14 @@ from hoidata.hands import load_embedded_hands
 from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
-from models.common.training import TrainingConfig
-from models.manipnet.control import Control, Motion, recording_control
-from models.manipnet.examples import Examples, fit_examples, hand_examples, other_poses, prepared
+from models.common.training import TrainingConfig, learning_rate_factor
+from models.manipnet.control import Control, Motion
 from models.manipnet.features import FeatureSettings
 from models.manipnet.lookups import as_right, joint_errors_m
 from models.manipnet.network import ManipNet, NetworkConfig
 from models.manipnet.rollout import Predictor, Task, roll_out
+from models.manipnet.training import LEARNT, Examples, hand_examples, other_poses, prepared, step_loss
+from tests.builders.manipnet import recording_control
 from tests.builders.objects import box_model
 
 ROOT = os.environ.get("HOIDATA_MANIPNET", "")
@@ -86,6 +87,28 @@ def steps_of(stretches: list[Stretch]) -> list[Examples]:
             own = (one.control, one.side, one.hand, one.fingers, one.time_s, usable, surface, SETTINGS, given)
             examples.append(hand_examples(*own))
     return examples
+
+
+def fit_examples(network: ManipNet, examples: list[Examples], config: TrainingConfig, seed: int) -> list[float]:
+    """Train on steps of any source in an order drawn anew for every epoch; the losses. Adam, as the paper's."""
+    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in LEARNT)
+    generator = torch.Generator().manual_seed(seed)
+    optimiser = torch.optim.AdamW(network.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+    network.train()
+    losses, order = [], torch.zeros(0, dtype=torch.long)
+    for step in range(1, config.steps + 1):
+        if len(order) < config.batch:  # the last batch that is not full is left out
+            order = torch.randperm(len(inputs), generator=generator)
+        rows, order = order[: config.batch], order[config.batch :]
+        for group in optimiser.param_groups:
+            group["lr"] = config.learning_rate * learning_rate_factor(step, config)
+        loss = step_loss(network, inputs[rows], made[rows])
+        optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        optimiser.step()
+        losses.append(float(loss.detach()))
+    network.eval()
+    return losses
 
 
 def learnt(stretches: list[Stretch]) -> ManipNet:

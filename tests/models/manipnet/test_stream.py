@@ -12,11 +12,11 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import surface_index
 from hoidata.sensors.mano_hand import mano_hand
 from models.manipnet.control import Control, Motion
-from models.manipnet.examples import hand_examples, prepared
 from models.manipnet.features import FeatureSettings
 from models.manipnet.network import NetworkConfig
 from models.manipnet.rollout import Predictor, Task, roll_out
 from models.manipnet.stream import Stream, TrackedFrame
+from models.manipnet.training import hand_examples, prepared
 from tests.builders.objects import box_model
 
 HANDS: dict[Side, TrackedHand] = {side: mano_hand(load_embedded_hands(), side) for side in SIDES}
