@@ -19,7 +19,6 @@ from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import clip_joints_m, drawn, mesh_arrays, motion_arrays
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
-from pipelines.pages.view import touched_side
 
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
 ARRAYS = {
@@ -96,10 +95,7 @@ def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> _Shown:
     clip, coarse = (drawn(shown) for shown in (motion.clip, motion.coarse))
     title = f"{caption}: {text}"
     paints = {"asked for": _paint(motion, motion.contact), "reached": _paint(motion, reached)}
-    asked, got = (
-        contact_player(clip, paint, f"{title}, {name}", name, touched_side(clip, paint), name)
-        for name, paint in paints.items()
-    )
+    asked, got = (contact_player(clip, paint, f"{title}, {name}", name, name) for name, paint in paints.items())
     player = motion_player(clip, hands, title, caption, paints["reached"], "contact reached")
     before = motion_player(coarse, hands, f"{title}, before refinement", caption)
     return _Shown(caption, player, before, asked, got, _agreement(motion.contact, reached))

@@ -18,7 +18,6 @@ from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import clip_joints_m, drawn, mesh_arrays, motion_arrays
 from pipelines.pages.player import Player, contact_player, css_colour, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
-from pipelines.pages.view import touched_side
 
 FACES_OF_STILLS = 8_000
 FADES_M = 0.02  # where paint ends
@@ -140,9 +139,8 @@ def _map(motion: MadeHands, side: Side, title: str) -> tuple[str, Player, Player
     asked, reached = motion.asked_m[row], motion.reached_m[row].min(axis=0)
     still = drawn(motion.clip, FACES_OF_STILLS)
     paints = {"asked for": _paint(motion, asked), "reached": _paint(motion, reached)}
-    look = touched_side(still, paints["reached"])
     first, second = (
-        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", look, name)
+        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", name, paints["reached"])
         for name, paint in paints.items()
     )
     near = asked < FADES_M

@@ -7,8 +7,7 @@ import pytest
 
 from hoidata.clips.clip import ObjectTrack
 from hoidata.objects.model import ObjectModel
-from pipelines.pages.player import motion_player, three_javascript
-from pipelines.pages.view import view_of
+from pipelines.pages.player import motion_player, three_javascript, view_of
 
 
 def test_three_comes_with_its_licence_notice_and_the_loader():
