@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -60,8 +61,7 @@ class Example:
     link: str
 
 
-@dataclass(frozen=True)
-class ObjectContact:
+class ObjectContact(NamedTuple):
     """One object, or all of them, over its clips, as texts; "not measured" where nothing can be inside.
 
     touching: share of frames in which a joint is within the threshold of a sampled point. deep: share of the frames
