@@ -17,6 +17,7 @@ from pipelines.lineage.provenance import build_provenance, read_provenance
 from pipelines.lineage.targets import find_target
 from pipelines.lineage.tree import Node, overall_status, target_tree, tree_as_json
 from pipelines.stages.code import write_code
+from tests.builders.folders import write_text
 
 GRAPH = """
 stages:
@@ -58,7 +59,7 @@ FACTS = {"model": "contact", "seed": 0, "clips": {"train": ["grab/s1/a", "grab/s
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("written")
-    for name, text in {
+    files = {
         "dvc.yaml": GRAPH,
         "models/text2hoi/dvc.yaml": FAMILY,
         "params.yaml": PARAMS,
@@ -69,10 +70,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "pipelines/stages/convert.py": "import hoidata.datasets.registry",
         "pipelines/stages/train.py": "from models.text2hoi import contact",
         "data/grab/clips.npz": "clips",
-    }.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+    }
+    write_text(folder, files)
     Repo.init(str(folder), no_scm=True).close()
     write_code(folder)
     return folder
