@@ -11,7 +11,6 @@ import torch
 
 from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, Side
 from hoidata.errors import BadInput, MissingResource
-from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import read_user_object
@@ -36,20 +35,15 @@ from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
 from pipelines.objects import MeshWish, stored_object
-from pipelines.pages.glb import write_glb
 from pipelines.pages.motion_files import ARRAYS as SHARED
-from pipelines.pages.motion_files import drawn, motion_arrays
-from pipelines.pages.player import motion_player, write_page
+from pipelines.pages.motion_files import MotionFiles, drawn, hand_shapes, motion_arrays, write_motions
+from pipelines.pages.player import motion_player
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, load_hands
 from pipelines.trained import trained_on, trained_run
 
 Way = Literal["auto", "network", "interpolate"]
 ARRAYS = SHARED | {"made": "(S, F) whether the fingers were made here"}
-FILE_WORDS = {
-    "motion.npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
-    "motion.glb": "an animated model for any glTF 2.0 viewer",
-}
 UPS = {"": None, "x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 
 
@@ -130,31 +124,21 @@ class Animated:
 
 def animate_files(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...], out: Path) -> list[Path]:
     """Animate a stored clip (its id) or a file of trajectories (its path) into ``out``."""
-    return _write(out, animate(what, wish, profile, datasets))
-
-
-def _write(folder: Path, animated: Animated) -> list[Path]:
-    """Write motion.npz, motion.glb and index.html; gives their paths. The same motion gives the same bytes."""
-    clip, hands = animated.clip, animated.hands
-    folder.mkdir(parents=True, exist_ok=True)
-    arrays = motion_arrays(clip, hands) | {"made": animated.made}
-    write_npz(folder / "motion.npz", arrays)
-    write_glb(folder / "motion.glb", clip, hands, ghosts=animated.ghosts)
+    animated = animate(what, wish, profile, datasets)
+    clip, hands, ghosts = animated.clip, animated.hands, animated.ghosts
     length = ("length", f"{clip.n_frames} frames, {clip.n_frames / FPS:.2f} s")
-    write_page(
-        folder / "index.html",
+    return write_motions(
+        out,
         "animation.html",
+        [MotionFiles(clip, motion_arrays(clip, hands) | {"made": animated.made}, ghosts=ghosts)],
+        hands,
+        ARRAYS,
         title=clip.clip_id,
-        synthetic=clip.synthetic,
-        ghost=bool(animated.ghosts),
+        ghost=bool(ghosts),
         notes=animated.notes,
-        player=motion_player(drawn(clip), hands, clip.clip_id, ghosts=animated.ghosts),
+        player=motion_player(drawn(clip), hands, clip.clip_id, ghosts=ghosts),
         facts=[*animated.facts, length, ("hand model", hands.name)],
-        files=list(FILE_WORDS.items()),
-        arrays=[(name, ARRAYS[name]) for name in arrays],
-        has_players=True,
     )
-    return [folder / name for name in (*FILE_WORDS, "index.html")]
 
 
 def animate(what: str, wish: AnimateWish, profile: str, datasets: tuple[str, ...]) -> Animated:
@@ -177,7 +161,7 @@ def _from_clip(clip_id: str, wish: AnimateWish, profile: str, datasets: tuple[st
     gaps: dict[Side, Gap] = {side: gap_of(clip.hands[side], frames) for side in sides}
     straight = [side for side in sides if _is_straight(gaps[side], wish.way)]
     network = None if straight == sides else chosen_network(wish, profile, (paths.dataset, *datasets), hands)
-    control, own, tracks = clip_control(clip), hands_of(hands, *_shape(clip)), dict(clip.hands)
+    control, own, tracks = clip_control(clip), hands_of(hands, *hand_shapes(clip)), dict(clip.hands)
     made = np.zeros((2, clip.n_frames), bool)
     for side, gap in gaps.items():
         if network is None or side in straight:
@@ -282,14 +266,6 @@ def chosen_network(wish: AnimateWish, profile: str, datasets: tuple[str, ...], h
     assert isinstance(checkpoint.network, ManipNet)
     rows = [("network", str(paths)), ("trained on", trained_on(facts)), ("post-processing", wish.rule)]
     return Network(Predictor(checkpoint.network, wish.rule), rows, facts)
-
-
-def _shape(clip: Clip) -> tuple[np.ndarray, np.ndarray | None]:
-    """(2, 10) shapes and (2, 778, 3) personal meshes, as samples have them."""
-    tracks = [clip.hands[side] for side in SIDES]
-    templates = [track.template_m for track in tracks if track.template_m is not None]
-    betas = np.stack([track.mean_betas for track in tracks]).astype(np.float32)
-    return betas, np.stack(templates).astype(np.float32) if len(templates) == 2 else None
 
 
 def _frames(text: str, n_frames: int) -> slice:

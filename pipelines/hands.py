@@ -10,7 +10,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, Slerp
 
-from hoidata.clips.clip import FPS, SIDES, HandType, ObjectTrack
+from hoidata.clips.clip import FPS, HandType, ObjectTrack
 from hoidata.clips.features import upright
 from hoidata.errors import BadInput
 from hoidata.files import sha256_file
@@ -30,6 +30,7 @@ from models.common.family import Sources
 from models.common.repeatable import make_repeatable
 from pipelines.objects import MeshWish, mesh_notes, nearest_name
 from pipelines.pages.hands_page import write_hands
+from pipelines.pages.motion_files import hand_shapes
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 from pipelines.trained import check_dataset, trained_on, trained_run
@@ -217,17 +218,10 @@ def _of_clip(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: Ha
         raise BadInput("object", "none beside --clip, which has its own", wish.object, "leave it out")
     paths = find_clip(wish.clip, profile, list(datasets))
     clip = open_store(paths.clips, hands).clip(wish.clip)
-    tracks = [clip.hands[side] for side in SIDES]
-    templates = [track.template_m for track in tracks if track.template_m is not None]
+    betas, template_m = hand_shapes(clip)
     notes = [] if clip.gravity is not None else ["up: z, assumed: the gravity of this clip is not known"]
     gravity = own.gravity if clip.gravity is None else np.asarray(clip.gravity, np.float64)
-    own = replace(
-        own,
-        words=clip.object_words,
-        gravity=gravity,
-        betas=np.stack([track.mean_betas for track in tracks]).astype(np.float32),
-        template_m=np.stack(templates) if len(templates) == 2 else None,
-    )
+    own = replace(own, words=clip.object_words, gravity=gravity, betas=betas, template_m=template_m)
     return Asked(clip.object, own, (), f"clip {wish.clip}", notes)
 
 

@@ -45,12 +45,7 @@ def load_yaml(text: bytes) -> Any:
     deep = text.count(b"[") + text.count(b"{") > MOST_NESTED or re.search(rb"[ ?-]{%d}" % MOST_NESTED, text)
     try:
         return YAML(typ="safe", pure=bool(deep)).load(text)
-    except (
-        YAMLError,
-        LookupError,
-        TypeError,
-        AttributeError,
-    ) as error:  # the latter of a tag that does not fit its text
+    except (YAMLError, LookupError, TypeError, AttributeError) as error:  # of a tag that does not fit its text
         raise ValueError(str(error)) from error
 
 

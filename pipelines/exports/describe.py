@@ -3,6 +3,7 @@
 All of it comes from the store's facts; there is no date in it, so equal stores give equal bytes.
 """
 
+import re
 from collections import Counter
 from dataclasses import dataclass
 from fnmatch import fnmatch
@@ -21,8 +22,8 @@ from hoidata.store.info import stand_in_note
 from hoidata.store.store import Store
 from pipelines.exports.licences import OWN_USE, ArrayLicence, licences_of
 from pipelines.exports.motion import Column
-from pipelines.markdown import markdown_text
 
+_MARKUP = re.compile(r"[\\`*_\[\]|~$]")
 CROISSANT = "http://mlcommons.org/croissant/1.1"
 RESPONSIBLE = "http://mlcommons.org/croissant/RAI/1.0"
 HOMEPAGE = "https://schema.org/Dataset"  # where a dataset names no page of its own
@@ -285,3 +286,8 @@ def _field(record: str, file: str, column: pa.Field, meaning: str) -> dict[str, 
     if meaning:
         described["description"] = meaning
     return described | ({"isArray": True, "arrayShape": ",".join(lengths)} if lengths else {})
+
+
+def markdown_text(text: Any) -> str:
+    """Text of a file as text in Markdown: on one line, and nothing in it is markup, HTML or the border of a table."""
+    return _MARKUP.sub(r"\\\g<0>", " ".join(str(text).split())).replace("&", "&amp;").replace("<", "&lt;")

@@ -31,23 +31,16 @@ VALID, NEXT_VALID = "observation.hand_valid", "next.hand_valid"
 _OBJECT_NAMES = [*(f"object.{axis}" for axis in "xyz"), *(f"object.q{axis}" for axis in "xyzw"), "object.hinge"]
 _HAND_NAMES = [name for side in SIDES for name in state_names(side)]
 _NAMES = {STATE: _HAND_NAMES, ACTION: _HAND_NAMES, OBJECT: _OBJECT_NAMES, VALID: list(SIDES), NEXT_VALID: list(SIDES)}
+_POSE = "origin of the object frame, quaternion xyzw of world_from_object, hinge angle from the mesh as stored"
+_TRACKED = (
+    "whether left and right hand are tracked; where not, the last tracked pose is repeated, before the first one "
+    "the first; zeros if a hand is never tracked in the clip"
+)
 COLUMNS = (
     Column(STATE, "float32", (126,), "21 joints of the left, then of the right hand; world frame, metre"),
     Column(ACTION, "float32", (126,), "the same of the next frame; the last frame repeats its own"),
-    Column(
-        OBJECT,
-        "float32",
-        (8,),
-        "origin of the object frame, quaternion xyzw of world_from_object, hinge angle from the mesh as stored "
-        "(0 for a rigid object); world frame, metre, radian",
-    ),
-    Column(
-        VALID,
-        "bool",
-        (2,),
-        "whether left and right hand are tracked; where not, the last tracked pose is repeated, before the first one "
-        "the first; zeros if a hand is never tracked in the clip",
-    ),
+    Column(OBJECT, "float32", (8,), f"{_POSE} (0 for a rigid object); world frame, metre, radian"),
+    Column(VALID, "bool", (2,), _TRACKED),
     Column(NEXT_VALID, "bool", (2,), f"the same of the next frame, so of {ACTION}; False in the last frame"),
     Column("timestamp", "float32", (), "since the clip's first frame, second"),
     Column("frame_index", "int64", (), "frame of the episode, from 0"),

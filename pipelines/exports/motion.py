@@ -36,35 +36,22 @@ class Column(NamedTuple):
     meaning: str
 
 
+_JOINTS = "joints: wrist, three each of index, middle, pinky, ring and thumb, then their tips; world frame, metre"
+_REPEATED = "where not, its last tracked pose is repeated, before the first one the first"
+_POSE = "axis-angles of 15 finger joints relative to their parents; zero is the hand model's flat hand"
+_BETAS = "shape coefficients on the hand model's template; NaN where {}_template_m alone is the shape"
+_TEMPLATE = "778 vertices of the person's own {} rest mesh, in the place of the hand model's template, metre; "
+
+
 def _hand_columns(side: Side) -> tuple[Column, ...]:
+    """What is told of one hand in each frame."""
+    valid = f"whether the hand is tracked; {_REPEATED}; zeros if it is never tracked in the clip"
     return (
-        Column(
-            f"{side}_joints_m",
-            "float32",
-            (21, 3),
-            "joints: wrist, three each of index, middle, pinky, ring and thumb, then their tips; world frame, metre",
-        ),
-        Column(
-            f"{side}_valid",
-            "bool",
-            (),
-            "whether the hand is tracked; where not, its last tracked pose is repeated, "
-            "before the first one the first; zeros if it is never tracked in the clip",
-        ),
+        Column(f"{side}_joints_m", "float32", (21, 3), _JOINTS),
+        Column(f"{side}_valid", "bool", (), valid),
         Column(f"{side}_global_orient", "float32", (3,), "axis-angle of the wrist joint; world frame, radian"),
-        Column(
-            f"{side}_hand_pose",
-            "float32",
-            (45,),
-            "axis-angles of 15 finger joints relative to their parents; zero is the hand model's flat hand, "
-            "not its mean pose; radian",
-        ),
-        Column(
-            f"{side}_betas",
-            "float32",
-            (10,),
-            f"shape coefficients on the hand model's template; NaN where {side}_template_m alone is the shape",
-        ),
+        Column(f"{side}_hand_pose", "float32", (45,), f"{_POSE}, not its mean pose; radian"),
+        Column(f"{side}_betas", "float32", (10,), _BETAS.format(side)),
     )
 
 
@@ -79,13 +66,7 @@ COLUMNS = (
 CLIP_COLUMNS = (
     Column("gravity", "float32", (3,), "unit vector in which things fall; world frame; NaN where it is not known"),
     *(
-        Column(
-            f"{side}_template_m",
-            "float32",
-            (-1, 3),
-            f"778 vertices of the person's own {side} rest mesh, in the place of the hand model's template, metre; "
-            "empty where the person has none",
-        )
+        Column(f"{side}_template_m", "float32", (-1, 3), f"{_TEMPLATE.format(side)}empty where the person has none")
         for side in SIDES
     ),
 )

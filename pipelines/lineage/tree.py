@@ -67,12 +67,6 @@ def tree_as_json(tree: Node) -> dict[str, Any]:
     return {**values, "children": [tree_as_json(child) for child in tree.children]}
 
 
-def lineage_tree(root: Path, checkpoint: Path) -> tuple[Node, dict[str, Any]]:
-    """The tree behind ``checkpoint``, compared with the working tree at ``root``, and the provenance it came from."""
-    target = find_target(root, str(checkpoint))
-    return target_tree(root, target), target.record
-
-
 def target_tree(root: Path | None, target: Target) -> Node:
     """The tree behind a target, compared with the project at ``root``; nothing is compared where there is none."""
     if target.kind == "motion":

@@ -26,7 +26,6 @@ from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_c
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, contact_player, motion_player, write_page
 from pipelines.pages.surface import ContactPaint
-from pipelines.pages.view import touched_side
 
 # Near to far, as BimArt draws its maps (figure 9): red where the hand is close, blue where it is 20 cm away.
 DISTANCE_COLOURS = ("#b5241c", "#efb35b", "#f3efdd", "#7fb0d0", "#2a5f96")
@@ -119,5 +118,5 @@ def _still_maps(clip: Clip, series: ClipSeries, points: SampledPoints) -> list[P
         paint = ContactPaint(points.points_m, points.part, share)
         caption = f"{side} hand, {int((share > 0).sum()):,} points, in contact in {touching} of {clip.n_frames} frames"
         label = "share of these frames, 0 to 1"
-        players.append(contact_player(clip, paint, caption, caption, touched_side(clip, paint), label))
+        players.append(contact_player(clip, paint, caption, caption, label))
     return players

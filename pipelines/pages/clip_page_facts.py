@@ -21,30 +21,18 @@ NOTHING = "none"
 
 
 @dataclass(frozen=True)
-class HandFacts:
-    """One hand in the hand test: each a text; active: whether the hand takes part. surface_*: against the surface."""
-
-    side: str
-    valid: str
-    nearest: str
-    where: str
-    within: str
-    active: bool
-    surface_nearest: str
-    surface_within: str
-    surface_acts: bool
-
-
-@dataclass(frozen=True)
 class HandDecision:
-    """The hand type, in words how it was found, what the exact surface says, and the row of each hand."""
+    """The hand type, in words how it was found, and what the exact surface says.
+
+    hands: of each hand side, valid frames, then whether it acts and how near it comes, by points and by the surface.
+    """
 
     hand_type: str
     rule: str
     agreement: str
     surface: str
     points: int
-    hands: list[HandFacts]
+    hands: Rows
 
 
 @dataclass(frozen=True)
@@ -101,25 +89,23 @@ def _surface_words(series: ClipSeries) -> str:
     return f"With the object's exact surface in place of the points the hand type is {verdict}."
 
 
-def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side: Side) -> HandFacts:
+def _hand_facts(annotated: AnnotatedStore, clip: Clip, series: ClipSeries, side: Side) -> tuple[str, ...]:
     points, surface = series.evidence, series.surface_evidence
     valid, distance = clip.hands[side].valid, points.distance_m[side]
     count = f"{int(valid.sum())} of {clip.n_frames}"
     if not valid.any():
-        return HandFacts(side, count, "never seen", "", "", False, "", "", False)
+        return side, count, "no", "never seen", *[""] * 5
     frame = int(distance.argmin())
     within, exact = int(points.near(side).sum()), int(surface.near(side).sum())
-    return HandFacts(
-        side=side,
-        valid=count,
-        nearest=f"{distance[frame] * 100:.2f} cm",
-        where=f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}",
-        within=f"{within} of {clip.n_frames}",
-        active=within > 0,
-        surface_nearest=f"{surface.closest_m(side) * 100:.2f} cm",
-        surface_within=f"{exact} of {clip.n_frames}",
-        surface_acts=exact > 0,
+    where = f"frame {frame}{_joint(annotated, clip.clip_id, side, frame)}"
+    return (
+        *(side, count, _yes(within), f"{distance[frame] * 100:.2f} cm", where, f"{within} of {clip.n_frames}"),
+        *(_yes(exact), f"{surface.closest_m(side) * 100:.2f} cm", f"{exact} of {clip.n_frames}"),
     )
+
+
+def _yes(frames: int) -> str:
+    return "yes" if frames else "no"
 
 
 def _joint(annotated: AnnotatedStore, clip_id: str, side: Side, frame: int) -> str:

@@ -1,8 +1,6 @@
 """Curves as inline SVG: equal numbers give equal markup."""
 
-import csv
 import io
-import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,6 +9,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
@@ -91,10 +90,8 @@ def _draw_panel(axes: Axes, panel: Panel, x_label: str) -> None:
 
 def read_log(path: str | Path) -> dict[str, np.ndarray]:
     """The numeric columns of a training log, by name; an empty cell is NaN, a column of words is left out."""
-    with open(path, newline="", encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
-    columns = {name: [_number(row[name]) for row in rows] for name in (rows[0] if rows else {})}
-    return {name: np.array(values) for name, values in columns.items() if not all(math.isnan(v) for v in values)}
+    table = pd.read_csv(path).apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
+    return {str(name): table[name].to_numpy(np.float64) for name in table}
 
 
 def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Curve]:
@@ -107,10 +104,3 @@ def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Cur
         if name != x_name and re.search("loss|train|valid", name) and here.any():
             curves.append(Curve(name.removeprefix("train_").replace("_", " "), columns[x_name][here], values[here]))
     return curves
-
-
-def _number(text: str | None) -> float:
-    try:
-        return float(text or "nan")
-    except ValueError:
-        return math.nan

@@ -4,6 +4,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,11 +14,11 @@ from matplotlib.ticker import MaxNLocator
 
 from hoidata.clips.clip import FPS, SIDES
 from hoidata.errors import MissingResource
+from hoidata.files.written import read_table
 from hoidata.hands import HandPair
 from hoidata.store.annotated import AnnotatedStore, load_annotated
 from pipelines.commands.store_facts import fact_rows
 from pipelines.pages.clip_page import page_name, write_clip_page
-from pipelines.pages.contact_facts import contact_by_object
 from pipelines.pages.curves import COLOURS, figure_svg
 from pipelines.pages.dataset_facts import has_tables, read_dataset
 from pipelines.pages.examples import true_contact
@@ -27,6 +28,7 @@ from pipelines.pages.quality import read_quality
 EXAMPLES = 6
 SHOWN_BARS = 24
 CLIP_FOLDER = "clips"
+NOT_MEASURED = "not measured"
 UNLABELLED = "no label in the source"
 Rows = list[tuple[str, ...]]
 
@@ -57,6 +59,21 @@ class Example:
     sentence: str
     clip_id: str
     link: str
+
+
+class ObjectContact(NamedTuple):
+    """One object, or all of them, over its clips, as texts; "not measured" where nothing can be inside.
+
+    touching: share of frames in which a joint is within the threshold of a sampled point. deep: share of the frames
+    that quality control looked at in which a hand vertex is too deep inside. deepest: depth of the deepest vertex, mm.
+    """
+
+    name: str
+    clips: str
+    frames: str
+    touching: str
+    deep: str
+    deepest: str
 
 
 def write_dataset_page(
@@ -209,3 +226,28 @@ def without_words(annotated: AnnotatedStore) -> Rows:
     named = set(annotated.ids())
     rows = zip(annotated.hand_types["clip_id"].tolist(), annotated.hand_types["reason"].tolist(), strict=True)
     return [(str(clip_id), str(reason)) for clip_id, reason in rows if clip_id not in named]
+
+
+def contact_by_object(annotated: AnnotatedStore) -> list[ObjectContact]:
+    """Every object by name, after all of them together where there are several."""
+    rows = annotated.store.sequences[["clip_id", "object", "n_frames"]].reset_index(drop=True)
+    rows["touching"] = [len(np.unique(annotated.distances(clip_id).frame)) for clip_id in rows["clip_id"]]
+    measures = ["clip_id", "penetration_m", "penetration_share"]
+    depths = read_table(Path(annotated.root) / "quality" / "clips.parquet", measures)
+    rows = rows.merge(depths, on="clip_id", how="left", validate="one_to_one")
+    found = [_contact_row(str(name), group) for name, group in rows.groupby("object")]
+    return [_contact_row("all objects", rows), *found] if len(found) > 1 else found
+
+
+def _contact_row(name: str, rows) -> ObjectContact:
+    measured = rows[rows["penetration_m"].notna()]
+    return ObjectContact(
+        name=name,
+        clips=f"{len(rows):,}",
+        frames=f"{rows['n_frames'].sum():,}",
+        touching=f"{100 * rows['touching'].sum() / rows['n_frames'].sum():.1f} %",
+        deep=f"{100 * np.average(measured['penetration_share'], weights=measured['n_frames']):.1f} %"
+        if len(measured)
+        else NOT_MEASURED,
+        deepest=f"{measured['penetration_m'].max() * 1000:.1f}" if len(measured) else NOT_MEASURED,
+    )

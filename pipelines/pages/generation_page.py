@@ -1,25 +1,22 @@
 """What a generated motion is written as: motion.npz (arrays), motion.glb (animated) and a page that plays it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES
 from hoidata.contact.maps import f1_score
 from hoidata.contact.proximity import ProximityIndex
-from hoidata.files.arrays import write_npz
 from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair, track_joints
 from models.common.checkpoints import FILE_NAME
 from models.text2hoi.generation import GeneratedMotion
-from pipelines.pages.glb import write_glb
 from pipelines.pages.motion_files import ARRAYS as SHARED
-from pipelines.pages.motion_files import clip_joints_m, drawn, mesh_arrays, motion_arrays
-from pipelines.pages.player import Player, contact_player, motion_player, write_page
+from pipelines.pages.motion_files import MotionFiles, clip_joints_m, drawn, mesh_arrays, motion_arrays, write_motions
+from pipelines.pages.player import contact_player, motion_player
 from pipelines.pages.surface import ContactPaint
-from pipelines.pages.view import touched_side
 
 # Every array of motion.npz. Axes: S = 2 sides (left, right), F frames, P object points.
 ARRAYS = {
@@ -34,18 +31,6 @@ ARRAYS = {
 }
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """One motion on the page. agreement: of the contact reached with the contact asked for, in words."""
-
-    caption: str
-    player: Player
-    before: Player
-    asked: Player
-    reached: Player
-    agreement: str
-
-
 def write_generation(
     out_dir: str | Path,
     motions: Sequence[GeneratedMotion],
@@ -58,51 +43,41 @@ def write_generation(
     hands: the model the motions' parameters belong to. checkpoints: the folder they come from, in words. notes: shown
     on top. The same motions give the same bytes.
     """
-    folder = Path(out_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
+    files = []
     for motion in motions:
-        name = f"motion-{number}" if (number := motion.evidence["number"]) else "motion"
         made_from = checkpoint_digests(motion, checkpoints)
-        write_npz(folder / f"{name}.npz", generated_arrays(motion, hands, made_from))
-        paint = _paint(motion, motion.contact)
-        write_glb(folder / f"{name}.glb", motion.clip, hands, paint, extras={"checkpoints": made_from})
-        paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
-    first = motions[0]
-    write_page(
-        folder / "index.html",
+        arrays, paint = generated_arrays(motion, hands, made_from), _paint(motion, motion.contact)
+        files.append(MotionFiles(motion.clip, arrays, paint, {}, made_from, motion.evidence["number"]))
+    return write_motions(
+        Path(out_dir),
         "generation.html",
-        title=str(first.evidence["text"]),
-        synthetic=first.clip.synthetic,
+        files,
+        hands,
+        ARRAYS,
+        "the contact asked for",
+        title=str(motions[0].evidence["text"]),
         notes=list(notes),
         motions=[_shown(motion, hands, f"sample {motion.evidence['number'] + 1}") for motion in motions],
         facts=[*generation_facts(motions, checkpoints), ("hand model", hands.name)],
-        files=[(path.name, _FILE_WORDS[path.suffix]) for path in paths],
-        arrays=[(name, ARRAYS[name]) for name in generated_arrays(first, hands, {})],
-        has_players=True,
     )
-    return [*paths, folder / "index.html"]
 
 
-_FILE_WORDS = {
-    ".glb": "an animated model for any glTF 2.0 viewer; painted: the contact asked for",
-    ".npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
-}
+def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> dict[str, Any]:
+    """What the page shows of one motion; large meshes are thinned, the files keep them whole.
 
-
-def _shown(motion: GeneratedMotion, hands: HandPair, caption: str) -> _Shown:
-    """What the page shows of one motion; large meshes are thinned, the files keep them whole."""
+    agreement: of the contact reached with the contact asked for, in words.
+    """
     text, reached = str(motion.evidence["text"]), reached_contact(motion, hands)
     clip, coarse = (drawn(shown) for shown in (motion.clip, motion.coarse))
     title = f"{caption}: {text}"
     paints = {"asked for": _paint(motion, motion.contact), "reached": _paint(motion, reached)}
-    asked, got = (
-        contact_player(clip, paint, f"{title}, {name}", name, touched_side(clip, paint), name)
-        for name, paint in paints.items()
-    )
-    player = motion_player(clip, hands, title, caption, paints["reached"], "contact reached")
-    before = motion_player(coarse, hands, f"{title}, before refinement", caption)
-    return _Shown(caption, player, before, asked, got, _agreement(motion.contact, reached))
+    return {
+        "caption": caption,
+        "player": motion_player(clip, hands, title, caption, paints["reached"], "contact reached"),
+        "before": motion_player(coarse, hands, f"{title}, before refinement", caption),
+        "maps": [contact_player(clip, paint, f"{title}, {name}", name, name) for name, paint in paints.items()],
+        "agreement": _agreement(motion.contact, reached),
+    }
 
 
 def _agreement(asked: np.ndarray, reached: np.ndarray) -> str:

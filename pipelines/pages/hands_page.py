@@ -3,22 +3,21 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hoidata.clips.clip import FPS, SIDES, Side
-from hoidata.files.arrays import write_npz
 from hoidata.files.atomic import canonical_json
 from hoidata.hands import HandPair
 from hoidata.metrics.unmeasured import NO_INSIDE
 from hoidata.object_paths.path import PathStep
 from models.bimart.hands import TOUCH_M, MadeHands, Standing
-from pipelines.pages.glb import HAND_COLOURS, write_glb
+from pipelines.pages.glb import HAND_COLOURS
 from pipelines.pages.motion_files import ARRAYS as SHARED
-from pipelines.pages.motion_files import clip_joints_m, drawn, mesh_arrays, motion_arrays
-from pipelines.pages.player import Player, contact_player, css_colour, motion_player, write_page
+from pipelines.pages.motion_files import MotionFiles, clip_joints_m, drawn, mesh_arrays, motion_arrays, write_motions
+from pipelines.pages.player import Player, contact_player, css_colour, motion_player
 from pipelines.pages.surface import ContactPaint
-from pipelines.pages.view import touched_side
 
 FACES_OF_STILLS = 8_000
 FADES_M = 0.02  # where paint ends
@@ -34,10 +33,6 @@ ARRAYS = SHARED | {
     "contact_distance_m": "(S, F, P) float16 distance of each point to the nearest vertex of the hand",
     "asked_distance_m": "(S, P) the least of them over all frames, as the contact model asked; infinite: not looked at",
 }
-_FILE_WORDS = {
-    ".glb": "an animated model for any glTF 2.0 viewer; painted: how near the hands come",
-    ".npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
-}
 
 
 @dataclass(frozen=True)
@@ -47,18 +42,6 @@ class Strip:
     name: str
     colour: str
     bars: list[tuple[float, float, str]]
-
-
-@dataclass(frozen=True)
-class _Shown:
-    """One motion on the page. maps: by hand, the contact map asked for and the one reached, and how far they agree."""
-
-    caption: str
-    player: Player
-    before: Player
-    strips: list[Strip]
-    maps: list[tuple[str, Player, Player, str]]
-    figures: list[tuple[str, ...]]
 
 
 def write_hands(
@@ -72,35 +55,28 @@ def write_hands(
 ) -> list[Path]:
     """Write motion.npz, motion.glb (for further motions motion-1.npz, ...) and index.html; gives their paths.
 
-    steps: what the object does when. made_from: digests of the networks by their files. The same motions give the same
-    bytes.
+    steps: what the object does when. made_from: digests of the networks by their files.
     """
-    folder = Path(out_dir)
-    folder.mkdir(parents=True, exist_ok=True)
-    paths, first = [], motions[0]
+    first, files = motions[0], []
     for motion in motions:
-        name = f"motion-{motion.number}" if motion.number else "motion"
-        write_npz(folder / f"{name}.npz", hands_arrays(motion, hands, made_from))
-        paint = _paint(motion, motion.reached_m.min(axis=(0, 1)))
-        write_glb(folder / f"{name}.glb", motion.clip, hands, paint, extras={"checkpoints": dict(made_from)})
-        paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
+        arrays, paint = hands_arrays(motion, hands, made_from), _paint(motion, motion.reached_m.min(axis=(0, 1)))
+        files.append(MotionFiles(motion.clip, arrays, paint, {}, made_from, motion.number))
     length = f"{first.clip.n_frames} frames, {first.clip.n_frames / FPS:.2f} s at {FPS} fps"
     digests = ", ".join(f"{Path(path).parent.name} {digest[:12]}" for path, digest in made_from.items())
-    write_page(
-        folder / "index.html",
+    return write_motions(
+        Path(out_dir),
         "hands.html",
+        files,
+        hands,
+        ARRAYS,
+        "how near the hands come",
         title=f"Hands for {first.clip.object_words}",
-        synthetic=first.clip.synthetic,
         notes=list(notes),
         touch_mm=round(1000 * TOUCH_M),
         fades_cm=round(100 * FADES_M),
         motions=[_shown(motion, hands, steps) for motion in motions],
         facts=[*facts, ("length", length), ("hand model", hands.name), ("sha256", digests)],
-        files=[(path.name, _FILE_WORDS[path.suffix]) for path in paths],
-        arrays=[(name, ARRAYS[name]) for name in hands_arrays(first, hands, {})],
-        has_players=True,
     )
-    return [*paths, folder / "index.html"]
 
 
 def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str]) -> dict[str, np.ndarray]:
@@ -121,18 +97,19 @@ def hands_arrays(motion: MadeHands, hands: HandPair, made_from: Mapping[str, str
     }
 
 
-def _shown(motion: MadeHands, hands: HandPair, steps: Sequence[PathStep]) -> _Shown:
+def _shown(motion: MadeHands, hands: HandPair, steps: Sequence[PathStep]) -> dict[str, Any]:
+    """One motion on the page. maps: by hand, the contact map asked for and the one reached, and how far they agree."""
     caption = f"sample {motion.number + 1}"
     title = f"{caption}: hands for {motion.clip.object_words}"
-    paint = _paint(motion, motion.reached_m.min(axis=(0, 1)))
-    return _Shown(
-        caption,
-        motion_player(drawn(motion.clip), hands, title, caption, paint, f"a hand comes within {100 * FADES_M:.0f} cm"),
-        motion_player(drawn(motion.before), hands, f"{title}, before refinement", caption),
-        _strips(motion, steps),
-        [_map(motion, side, title) for side in motion.standing.touching],
-        _figures(motion.standing_before, motion.standing),
-    )
+    paint, words = _paint(motion, motion.reached_m.min(axis=(0, 1))), f"a hand comes within {100 * FADES_M:.0f} cm"
+    return {
+        "caption": caption,
+        "player": motion_player(drawn(motion.clip), hands, title, caption, paint, words),
+        "before": motion_player(drawn(motion.before), hands, f"{title}, before refinement", caption),
+        "strips": _strips(motion, steps),
+        "maps": [_map(motion, side, title) for side in motion.standing.touching],
+        "figures": _figures(motion.standing_before, motion.standing),
+    }
 
 
 def _map(motion: MadeHands, side: Side, title: str) -> tuple[str, Player, Player, str]:
@@ -140,9 +117,8 @@ def _map(motion: MadeHands, side: Side, title: str) -> tuple[str, Player, Player
     asked, reached = motion.asked_m[row], motion.reached_m[row].min(axis=0)
     still = drawn(motion.clip, FACES_OF_STILLS)
     paints = {"asked for": _paint(motion, asked), "reached": _paint(motion, reached)}
-    look = touched_side(still, paints["reached"])
     first, second = (
-        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", look, name)
+        contact_player(still, paint, f"{title}, {side} hand, {name}", f"{side} hand, {name}", name, paints["reached"])
         for name, paint in paints.items()
     )
     near = asked < FADES_M

@@ -1,13 +1,19 @@
-"""The arrays every made motion is written with: hands, the object's motion, its mesh and hinge."""
+"""What a made motion is written as: motion.npz (hands, object, mesh and hinge), motion.glb and a page that plays it."""
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
-from hoidata.clips.clip import FPS, SIDES, Clip
+from hoidata.clips.clip import FPS, SIDES, Clip, HandTrack, Side
+from hoidata.files.arrays import write_npz
 from hoidata.hands import HandPair, track_joints
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.user_mesh import thinned
+from pipelines.pages.glb import write_glb
+from pipelines.pages.player import write_page
+from pipelines.pages.surface import ContactPaint
 
 MOST_FACES_DRAWN = 30_000
 
@@ -33,6 +39,49 @@ ARRAYS = {
 }
 
 
+@dataclass(frozen=True, eq=False)
+class MotionFiles:
+    """One motion: arrays of its .npz; clip, paint and ghosts of its .glb. checkpoints: digests of its networks."""
+
+    clip: Clip
+    arrays: Mapping[str, np.ndarray]
+    paint: ContactPaint | None = None
+    ghosts: Mapping[Side, HandTrack] = field(default_factory=dict)
+    checkpoints: Mapping[str, str] | None = None
+    number: int = 0
+
+
+def write_motions(
+    folder: Path,
+    template: str,
+    made: Sequence[MotionFiles],
+    hands: HandPair,
+    meanings: Mapping[str, str],
+    painted: str = "",
+    **page: object,
+) -> list[Path]:
+    """Write motion.npz, motion.glb (for further motions motion-1.npz, ...) and index.html; gives their paths.
+
+    meanings: of all arrays. painted: what the colours of the .glb mean. page: values of the template. The same motions
+    give the same bytes.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for motion in made:
+        name = f"motion-{motion.number}" if motion.number else "motion"
+        extras = None if motion.checkpoints is None else {"checkpoints": dict(motion.checkpoints)}
+        write_npz(folder / f"{name}.npz", motion.arrays)
+        write_glb(folder / f"{name}.glb", motion.clip, hands, motion.paint, motion.ghosts, extras)
+        paths += [folder / f"{name}.npz", folder / f"{name}.glb"]
+    words = {
+        ".glb": "; painted: ".join(filter(None, ("an animated model for any glTF 2.0 viewer", painted))),
+        ".npz": "plain arrays, metres and radians: numpy.load('motion.npz')",
+    }
+    page |= {"files": [(path.name, words[path.suffix]) for path in paths], "synthetic": made[0].clip.synthetic}
+    page |= {"arrays": [(name, meanings[name]) for name in made[0].arrays], "has_players": True}
+    return [*paths, write_page(folder / "index.html", template, **page)]
+
+
 def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
     """Of both hands and the object's motion: metres, radians, 30 fps, world frame.
 
@@ -40,7 +89,7 @@ def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
     """
     tracks = [clip.hands[side] for side in SIDES]
     valid = np.stack([track.valid for track in tracks])
-    values = {"joints_m": clip_joints_m(clip, hands)}
+    values, (_, templates_m) = {"joints_m": clip_joints_m(clip, hands)}, hand_shapes(clip)
     for name in ("wrist_m", "global_orient", "hand_pose"):
         values[name] = _where_valid([getattr(track, name) for track in tracks], valid)
     arrays = {
@@ -49,7 +98,7 @@ def motion_arrays(clip: Clip, hands: HandPair) -> dict[str, np.ndarray]:
         "valid": valid,
         **values,
         "betas": np.stack(np.broadcast_arrays(*(track.betas for track in tracks))).astype(np.float32),
-        "template_m": _templates_m(clip),
+        "template_m": np.zeros(0, np.float32) if templates_m is None else templates_m,
         "object_rotvec": clip.object.rotvec.astype(np.float32),
         "object_translation_m": clip.object.translation_m.astype(np.float32),
     }
@@ -82,11 +131,12 @@ def drawn(clip: Clip, most_faces: int = MOST_FACES_DRAWN) -> Clip:
     return replace(clip, object=replace(clip.object, model=thinned(clip.object.model, most_faces)))
 
 
-def _templates_m(clip: Clip) -> np.ndarray:
-    """(2, 778, 3) personal rest meshes of both hands, (0,) where the person has none."""
-    templates_m = [clip.hands[side].template_m for side in SIDES]
-    own = [template_m for template_m in templates_m if template_m is not None]
-    return np.stack(own).astype(np.float32) if len(own) == len(SIDES) else np.zeros(0, np.float32)
+def hand_shapes(clip: Clip) -> tuple[np.ndarray, np.ndarray | None]:
+    """(2, 10) mean betas and (2, 778, 3) personal rest meshes, metres, of both hands; None where one has no mesh."""
+    tracks = [clip.hands[side] for side in SIDES]
+    templates = [track.template_m for track in tracks if track.template_m is not None]
+    betas = np.stack([track.mean_betas for track in tracks]).astype(np.float32)
+    return betas, np.stack(templates).astype(np.float32) if len(templates) == len(SIDES) else None
 
 
 def _where_valid(values: list[np.ndarray], valid: np.ndarray) -> np.ndarray:

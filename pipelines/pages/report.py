@@ -20,7 +20,6 @@ from pipelines.pages.metrics_table import CONTROLS, LOOKUPS, MetricsTable, metri
 from pipelines.pages.player import Player, contact_player, motion_player, render_page
 from pipelines.pages.quality import QualityFacts, read_quality
 from pipelines.pages.surface import ContactPaint
-from pipelines.pages.view import touched_side
 
 CONTACT_EXAMPLES = 3
 
@@ -188,9 +187,7 @@ def _contact_pairs(facts: DatasetFacts, hands: HandPair, samples: Path) -> list[
         truth = true_contact(annotated, clip_id)
         paints = {"ground truth": truth, "generated": motion_contact(annotated, clip_id, motion, hands)}
         players = [
-            contact_player(
-                clip, paint, f"{caption}: {sentence}", caption, touched_side(clip, truth), touch_words(annotated)
-            )
+            contact_player(clip, paint, f"{caption}: {sentence}", caption, touch_words(annotated), truth)
             for caption, paint in paints.items()
         ]
         pairs.append((sentence, players))

@@ -1,8 +1,12 @@
-"""The evaluator as a stage: off it costs nothing, on it stands in the figures of every family."""
+"""The evaluator as a stage: off it costs nothing, on it stands in the figures of every family; killed trainings."""
 
 import json
+import multiprocessing
+import os
+import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +15,7 @@ import yaml
 
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
-from pipelines.stages import evaluate, evaluator
+from pipelines.stages import evaluate, evaluator, train
 from pipelines.stages.base import StagePaths, empty_reason
 from pipelines.stages.code import write_code
 from tests.builders.clips import build_clip
@@ -76,3 +80,57 @@ def test_on_its_figures_and_digests_stand_in_the_metrics_of_a_family(project):
     }
     assert found["figures"]["accuracy_top1_corrected"] == info["evaluators"]["corrected"]["accuracy"]["test"]["top1"]
     assert found["notes"]["fid_frechet_corrected"] == "N too small"
+
+
+def end(*_: object, **__: object) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+@pytest.fixture
+def stopped_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project whose trainings are killed as soon as they have begun."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("dvc.yaml", "params.yaml"):
+        text = (PROJECT / name).read_text()
+        (tmp_path / name).write_text(text.replace("evaluator: {}", "evaluator: {networks: [paper]}"))
+    for name in ("models", "pipelines", "manifests"):
+        (tmp_path / name).symlink_to(PROJECT / name)
+    monkeypatch.setattr("models.common.training.train_network", end)
+    monkeypatch.setattr("models.evaluator.stage.train_evaluators", end)
+    return tmp_path
+
+
+def killed(run: Callable[[StagePaths], None], paths: StagePaths) -> None:
+    process = multiprocessing.get_context("fork").Process(target=run, args=(paths,))
+    process.start()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+
+
+@pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
+@pytest.mark.parametrize(
+    ("run", "paths", "out"),
+    [
+        (train.run, StagePaths("embedded", "grab", "length"), "checkpoints"),
+        (evaluator.run, StagePaths("embedded", "grab"), "evaluators"),
+    ],
+    ids=["train", "evaluator"],
+)
+def test_a_killed_training_leaves_nothing_beside_its_output(
+    stopped_project: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    run: Callable[[StagePaths], None],
+    paths: StagePaths,
+    out: str,
+) -> None:
+    monkeypatch.setattr("pipelines.stages.train.producers", lambda graph: _AnyStage())
+    monkeypatch.setattr("pipelines.stages.evaluator.producers", lambda graph: _AnyStage())
+    killed(run, paths)
+    assert [path for path in (stopped_project / out).rglob("*") if path.is_file() or path.name.startswith(".")] == []
+
+
+class _AnyStage(dict):
+    def __missing__(self, path: str) -> "_AnyStage":
+        return self
+
+    name = "train"

@@ -4,8 +4,8 @@ import pytest
 from markdown_it import MarkdownIt
 
 from pipelines.commands.lineage import _print_tree
+from pipelines.exports.describe import markdown_text
 from pipelines.lineage.tree import Node
-from pipelines.markdown import markdown_text
 
 EVIL = "a | <b>b</b> [c](javascript:d) ![e](f) `g` *h* \\ &lt;"
 

@@ -13,7 +13,23 @@ import pandas as pd
 import pygltflib
 from scipy.spatial.transform import Rotation
 
+from hoidata.store.store import Store
+from pipelines.exports.export import FORMATS, export_store
+
 Read = dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]
+
+
+def export_all(store: Store, root: Path) -> dict[str, Path]:
+    """Every format, written once."""
+    for name in FORMATS:
+        export_store(store, name, root / name, progress=False)
+    return {name: root / name for name in FORMATS}
+
+
+def read(name: str, folder: Path, cache: Path) -> Read:
+    """The export of a format by its reader."""
+    reader = globals()[name]
+    return reader(folder, cache) if name == "huggingface" else reader(folder)
 
 
 def transforms(places: Any, quaternions_xyzw: Any) -> np.ndarray:

@@ -59,10 +59,7 @@ def store(tmp_path_factory) -> Store:
 
 @pytest.fixture(scope="module")
 def exported(store, tmp_path_factory) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("exported")
-    for name in FORMATS:
-        export_store(store, name, root / name, progress=False)
-    return {name: root / name for name in FORMATS}
+    return readers.export_all(store, tmp_path_factory.mktemp("exported"))
 
 
 def rows_of(folder: Path) -> dict[str, dict[str, Any]]:
@@ -162,10 +159,9 @@ def test_bvh_is_upright_where_an_importer_takes_y_for_up(store, exported):
 
 @pytest.mark.parametrize("name", ["lerobot", "huggingface", "webdataset", "glb", "usd"])
 def test_a_hand_holds_its_last_tracked_pose_in_every_format(name, store, exported, tmp_path):
-    reader = getattr(readers, name)
     only = tmp_path / "one"
     export_store(store, name, only, clip_ids=("toy/s2/open",), progress=False)
-    left, right, _ = (reader(only, tmp_path / "cache") if name == "huggingface" else reader(only))["toy/s2/open"]
+    left, right, _ = readers.read(name, only, tmp_path / "cache")["toy/s2/open"]
     assert np.abs(left - store.joints("toy/s2/open", "left")[[2, 2, 2, 2, 4]]).max() < 1e-4
     assert np.abs(right - store.joints("toy/s2/open", "right")).max() < 1e-4
 

@@ -48,21 +48,12 @@ def store(tmp_path_factory) -> Store:
 
 @pytest.fixture(scope="module")
 def exported(store, tmp_path_factory) -> dict[str, Path]:
-    """Every format, written once."""
-    root = tmp_path_factory.mktemp("exported")
-    for name in FORMATS:
-        export_store(store, name, root / name, progress=False)
-    return {name: root / name for name in FORMATS}
-
-
-def read(name: str, folder: Path, cache: Path) -> readers.Read:
-    reader = getattr(readers, name)
-    return reader(folder, cache) if name == "huggingface" else reader(folder)
+    return readers.export_all(store, tmp_path_factory.mktemp("exported"))
 
 
 @pytest.mark.parametrize("name", READ_BACK)
 def test_joints_and_object_come_back_from_every_format(name, store, exported, tmp_path):
-    found = read(name, exported[name], tmp_path)
+    found = readers.read(name, exported[name], tmp_path)
     assert set(found) == set(store.ids)
     for clip_id, (left, right, world_from_object) in found.items():
         for side, joints in zip(SIDES, (left, right), strict=True):

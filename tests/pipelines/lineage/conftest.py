@@ -25,6 +25,7 @@ from pipelines.lineage.provenance import build_provenance
 from pipelines.params import read_params
 from pipelines.stages.code import write_code
 from tests.builders.clips import clip_of, still_object
+from tests.builders.folders import write_text
 from tests.builders.objects import box_model
 
 RAW, CLIPS, SPLITS = (f"data/embedded/grab/{name}" for name in ("raw.json", "clips", "splits"))
@@ -91,12 +92,6 @@ CODE = {
 }
 SEEN = {"contact": ("grab/s1/mug_lift", "grab/s1/cup_pour"), "length": ("grab/s2/mug_pass",)}
 ALL_CLIPS = (*SEEN["contact"], *SEEN["length"], "grab/s3/box_lift")
-
-
-def write_text(root: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
 
 
 def recorded_clip(clip_id: str):

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipelines.lineage.closure import KNOWN_IMPORTS, Choice, SourceTree
+from tests.builders.folders import write_text
 
 STAGE = """import numpy
 
@@ -58,14 +59,7 @@ SPLITS = Choice(package="hoidata.datasets.grab", files=("*.json",))
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    write(tmp_path, FILES)
-    return tmp_path
-
-
-def write(root: Path, files: dict[str, str]) -> None:
-    for name, text in files.items():
-        (root / name).parent.mkdir(parents=True, exist_ok=True)
-        (root / name).write_text(text)
+    return write_text(tmp_path, FILES)
 
 
 def test_lazy_relative_and_package_imports_count_and_so_does_data_beside_them(root):
@@ -104,7 +98,7 @@ def test_files_that_a_module_reads_by_name_count_for_it_and_not_for_the_package_
 
 def test_a_package_whose_folder_lies_elsewhere_is_named_as_it_is_imported(root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("outside") / "kitchen"
-    write(folder, {"adapter.py": "from hoidata.datasets.kitchen import words", "words.py": "", "facts.toml": ""})
+    write_text(folder, {"adapter.py": "from hoidata.datasets.kitchen import words", "words.py": "", "facts.toml": ""})
     tree = SourceTree(root, {"hoidata.datasets.kitchen": folder})
     modules = tree.modules_below("hoidata.datasets.kitchen")
     assert modules == ["hoidata.datasets.kitchen.adapter", "hoidata.datasets.kitchen.words"]
@@ -114,7 +108,7 @@ def test_a_package_whose_folder_lies_elsewhere_is_named_as_it_is_imported(root, 
 
 def test_a_package_that_registers_an_adapter_counts_with_its_files_and_version(root, tmp_path_factory, monkeypatch):
     site = tmp_path_factory.mktemp("site")
-    write(
+    write_text(
         site,
         {
             "toy_hoi/__init__.py": "",
@@ -152,9 +146,9 @@ def test_kept_imports_change_no_answer_and_damaged_ones_are_parsed_again(root, d
 def test_kept_imports_give_the_digests_of_a_fresh_look_whatever_was_edited(edits):
     with TemporaryDirectory() as folder:
         root = Path(folder)
-        write(root, {".hoidata/x": "", **FILES})
+        write_text(root, {".hoidata/x": "", **FILES})
         for name, text in edits:
-            write(root, {name: text})
+            write_text(root, {name: text})
             tree = SourceTree(root)
             with_kept = tree.closure(["hoidata.stage"], {})
             tree.keep_imports()

@@ -14,8 +14,10 @@ from hoidata.files import canonical_json
 from pipelines.lineage.digests import path_digest
 from pipelines.lineage.graph import look_up, read_graph, written_graph
 from pipelines.lineage.provenance import build_provenance, read_provenance
-from pipelines.lineage.tree import lineage_tree, overall_status, tree_as_json
+from pipelines.lineage.targets import find_target
+from pipelines.lineage.tree import Node, overall_status, target_tree, tree_as_json
 from pipelines.stages.code import write_code
+from tests.builders.folders import write_text
 
 GRAPH = """
 stages:
@@ -57,7 +59,7 @@ FACTS = {"model": "contact", "seed": 0, "clips": {"train": ["grab/s1/a", "grab/s
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("written")
-    for name, text in {
+    files = {
         "dvc.yaml": GRAPH,
         "models/text2hoi/dvc.yaml": FAMILY,
         "params.yaml": PARAMS,
@@ -68,10 +70,8 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "pipelines/stages/convert.py": "import hoidata.datasets.registry",
         "pipelines/stages/train.py": "from models.text2hoi import contact",
         "data/grab/clips.npz": "clips",
-    }.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+    }
+    write_text(folder, files)
     Repo.init(str(folder), no_scm=True).close()
     write_code(folder)
     return folder
@@ -92,8 +92,12 @@ def checkpoint(root: Path) -> Path:
     return path
 
 
+def tree_of(root: Path, checkpoint: Path) -> Node:
+    return target_tree(root, find_target(root, str(checkpoint)))
+
+
 def status_of(root: Path, checkpoint: Path) -> dict[str, str]:
-    return {f"{node.kind} {node.name}": node.status for node in lineage_tree(root, checkpoint)[0].walk()}
+    return {f"{node.kind} {node.name}": node.status for node in tree_of(root, checkpoint).walk()}
 
 
 def test_graph_holds_the_stages_of_all_families_with_their_addresses(root):
@@ -170,19 +174,19 @@ def test_tree_names_every_stage_param_code_and_manifest_behind_a_checkpoint(root
 def test_a_change_of_any_input_is_found(root, checkpoint, path, text, node):
     (root / path).write_text(text)
     assert status_of(root, checkpoint)[node] == "changed"
-    assert overall_status(lineage_tree(root, checkpoint)[0]) == "changed"
+    assert overall_status(tree_of(root, checkpoint)) == "changed"
 
 
 def test_a_changed_param_says_what_it_was_and_is(root, checkpoint):
     (root / "params.yaml").write_text(PARAMS.replace("lr: 0.1", "lr: 0.5"))
-    nodes = lineage_tree(root, checkpoint)[0].walk()
+    nodes = tree_of(root, checkpoint).walk()
     assert next(node.detail for node in nodes if node.name == "train.demo.contact") == "lr: 0.1 -> 0.5"
 
 
 def test_what_is_gone_is_missing(root, checkpoint):
     (root / "manifests/grab.json").unlink()
     assert status_of(root, checkpoint)["manifest manifests/grab.json"] == "missing"
-    assert overall_status(lineage_tree(root, checkpoint)[0]) == "missing"
+    assert overall_status(tree_of(root, checkpoint)) == "missing"
 
 
 def test_unrelated_changes_are_not_reported(root, checkpoint):
@@ -190,7 +194,7 @@ def test_unrelated_changes_are_not_reported(root, checkpoint):
     (root / "models" / "__pycache__").mkdir()
     (root / "models" / "__pycache__" / "contact.pyc").write_text("compiled")
     (root / "models" / "text2hoi" / "length.py").write_text("nobody imports it")
-    assert overall_status(lineage_tree(root, checkpoint)[0]) == "same"
+    assert overall_status(tree_of(root, checkpoint)) == "same"
 
 
 def test_provenance_depends_on_content_alone(root):
@@ -201,7 +205,7 @@ def test_provenance_depends_on_content_alone(root):
 
 
 def test_tree_is_plain_json(root, checkpoint):
-    tree = lineage_tree(root, checkpoint)[0]
+    tree = tree_of(root, checkpoint)
     assert json.loads(json.dumps(tree_as_json(tree)))["children"][0]["name"] == TRAIN
 
 

@@ -17,13 +17,13 @@ from pipelines.lineage.manifests import (
     verify_files,
     write_manifest,
 )
+from tests.builders.folders import write_text
 
 
 @pytest.fixture
 def raw(tmp_path: Path) -> Path:
     """Two files, a folder of per-frame files, and things no adapter reads."""
-    root = tmp_path / "raw"
-    for name, text in {
+    files = {
         "s1/mug.npz": "abc",
         "tools/table.json": "{}",
         "cam4/hand_pose/000000.txt": "1 2",
@@ -31,11 +31,8 @@ def raw(tmp_path: Path) -> Path:
         "cam4/rgb/000000.png": "pixels",
         "s1.tar.gz": "archive",
         ".cache/state": "x",
-    }.items():
-        path = root / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
-    return root
+    }
+    return write_text(tmp_path / "raw", files)
 
 
 def manifest_of(root: Path) -> Manifest:

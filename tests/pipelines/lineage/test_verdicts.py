@@ -16,6 +16,7 @@ from pipelines.lineage.locks import dvc_digest
 from pipelines.lineage.raw import raw_sources
 from pipelines.lineage.targets import find_target
 from pipelines.lineage.tree import overall_status, target_tree
+from tests.builders.folders import write_text
 
 pytestmark = pytest.mark.slow
 
@@ -186,14 +187,13 @@ def test_the_users_own_raw_files_that_are_gone_are_licensed_data_one_needs(ran, 
 def test_an_adapter_of_another_package_counts_like_our_own(project_builder, tmp_path, monkeypatch):
     site, root = tmp_path / "site", tmp_path / "project"
     entry = "[hoidata.adapters]\ngrab = toy_reader.adapter:Toy\n"
-    for name, text in {
+    files = {
         "toy_reader/__init__.py": "",
         "toy_reader/adapter.py": "SCALE = 1",
         "toy_reader-1.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: toy-reader\nVersion: 1.0\n",
         "toy_reader-1.0.dist-info/entry_points.txt": entry,
-    }.items():
-        (site / name).parent.mkdir(parents=True, exist_ok=True)
-        (site / name).write_text(text)
+    }
+    write_text(site, files)
     root.mkdir()
     monkeypatch.syspath_prepend(str(site))
     project_builder.build(root, {name: text for name, text in project_builder.code.items() if name != ADAPTER})

@@ -1,5 +1,6 @@
 """What the pages' tests share: a made-up clip (hands beside a carried box), an independent glTF reader."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -123,3 +124,13 @@ def page_clip():
 @pytest.fixture
 def read_glb():
     return GltfFile
+
+
+@pytest.fixture
+def chromium() -> list[str]:
+    """The browser and what makes it open a page without a window."""
+    found = shutil.which("chromium") or shutil.which("google-chrome")
+    if found is None:
+        pytest.skip("no chromium on PATH: the page was not opened")
+    drawing = ("--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader")
+    return [found, "--headless", "--no-sandbox", *drawing, "--no-first-run"]

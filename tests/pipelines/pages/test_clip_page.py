@@ -327,18 +327,13 @@ def test_page_names_are_safe_file_names():
 
 
 @pytest.mark.slow
-def test_curves_and_contact_follow_the_player_in_chromium(dataset, page, hands, tmp_path):
-    chromium = shutil.which("chromium") or shutil.which("google-chrome")
-    if chromium is None:
-        pytest.skip("no chromium on PATH: the page was not opened")
+def test_curves_and_contact_follow_the_player_in_chromium(chromium, dataset, page, hands, tmp_path):
     page = page("test/s1/lid")
-    switches = [
-        "--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--use-angle=swiftshader",
-        "--no-first-run", f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=6000", "--dump-dom",
-    ]  # fmt: skip
+    profile = f"--user-data-dir={tmp_path / 'profile'}"
+    chromium += [profile, "--virtual-time-budget=6000", "--dump-dom"]
     series = measure_clip(dataset, dataset.clip("test/s1/lid"), hands)
     for part, frame in ((0.0, 0), (1.0, 23)):
-        command = [chromium, *switches, f"{page.as_uri()}#t={part}"]
+        command = [*chromium, f"{page.as_uri()}#t={part}"]
         dom = subprocess.run(command, check=True, capture_output=True, text=True, timeout=180).stdout
         shown = re.findall(r'<div class="readout".*?</div>', dom, re.S)[0]
         counts = [int(number) for number in re.findall(r"<b>(\d+)</b>", shown)]
@@ -347,7 +342,7 @@ def test_curves_and_contact_follow_the_player_in_chromium(dataset, page, hands, 
     painted = tmp_path / "painted.html"
     text = page.read_text().replace('value="frame" checked', 'value="frame"')
     painted.write_text(text.replace('value="left">', 'value="left" checked>'))
-    command = [chromium, *switches, f"{painted.as_uri()}#t=0.5"]
+    command = [*chromium, f"{painted.as_uri()}#t=0.5"]
     dom = subprocess.run(command, check=True, capture_output=True, text=True, timeout=180).stdout
     # The legends change places after the object has been painted.
     assert '<span class="legend" data-for="distance">' in dom

@@ -12,11 +12,17 @@ from hoidata.clips.quarantine import Quarantined
 from hoidata.errors import BadInput, MissingResource
 from hoidata.files.written import read_table
 from hoidata.store.annotated import load_annotated
-from pipelines.pages.contact_facts import contact_by_object
 from pipelines.pages.dataset_facts import majority_verb, read_dataset
-from pipelines.pages.dataset_page import can_be_shown, count_bars, example_ids, still_of, write_dataset_page
+from pipelines.pages.dataset_page import (
+    can_be_shown,
+    contact_by_object,
+    count_bars,
+    example_ids,
+    still_of,
+    write_dataset_page,
+)
+from pipelines.pages.player import view_of
 from pipelines.pages.report import ReportFolders, write_report
-from pipelines.pages.view import view_of
 from pipelines.showing import closest_ids, find_clip, write_shown
 from tests.builders.stores import write_annotated, write_clips
 

@@ -50,6 +50,13 @@ def table_of(folder):
     return metrics_tables(folder, FAMILIES)
 
 
+def page_of(folder):
+    """The section of a page, as its template has it."""
+    environment = jinja2.Environment(loader=jinja2.PackageLoader("pipelines.pages", ""), autoescape=True)
+    section = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}')
+    return section.render(table=table_of(folder))
+
+
 def cells_of(table, family):
     """The cells of one row by the titles of their columns."""
     number = [row.family for row in table.rows].index(family)
@@ -129,11 +136,7 @@ def test_a_chart_has_a_bar_for_every_row_with_its_intervals_on_one_scale(folder)
 
 
 def test_the_page_says_it_and_escapes_what_it_is_given(folder):
-    loader = jinja2.PackageLoader("pipelines.pages", "")
-    environment = jinja2.Environment(loader=loader, autoescape=True)
-    text = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}').render(
-        table=table_of(folder)
-    )
+    text = page_of(folder)
     assert "<b>ours</b> loses to nearest-clip in 2 of 4 figures." in text
     assert f"to nearest-clip: {title('contact_f1')}" in text
     assert '<td class="number good">30.0</td>' in text
@@ -200,11 +203,7 @@ def test_a_metric_that_no_row_has_stands_below_its_topic_with_the_reason(partly)
     topic = next(topic for topic in table_of(partly).topics if topic.unmeasured)
     titles = f"{title(LENGTH)}; {title(LENGTH_SHARE)}"
     assert topic.unmeasured == [(titles, "the length was given: 10 clips")]
-    loader = jinja2.PackageLoader("pipelines.pages", "")
-    environment = jinja2.Environment(loader=loader, autoescape=True)
-    text = environment.from_string('{% import "metrics.html" as m %}{{ m.section(table) }}').render(
-        table=table_of(partly)
-    )
+    text = page_of(partly)
     assert f"Not measured: {titles} (the length was given: 10 clips)." in text
     assert f'title="{NO_INSIDE}: 10 clips">not measured</td>' in text
     assert "3 of 10 clips</span>" in text

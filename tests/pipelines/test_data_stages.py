@@ -1,0 +1,310 @@
+"""The data stages as dvc.yaml runs them: every setting of params.yaml reaches the library."""
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import orjson
+import pandas as pd
+import pytest
+import yaml
+from typer.testing import CliRunner
+
+from hoidata.annotation.sentences import reference_sentences
+from hoidata.annotation.stage import annotate_store
+from hoidata.clips.clip import SourceFile
+from hoidata.datasets import RawTree, get_adapter
+from hoidata.datasets.grab.adapter import GrabAdapter
+from hoidata.errors import BadInput, MissingResource
+from hoidata.quality.thresholds import DEFAULT_LIMITS
+from hoidata.splits.definitions import choose
+from hoidata.store.info import generated_info
+from hoidata.store.store import write_store
+from pipelines.commands.adapters import app
+from pipelines.lineage.closure import SourceTree
+from pipelines.lineage.graph import producers, read_graph
+from pipelines.lineage.manifests import Manifest, read_manifest, scan_files, write_manifest
+from pipelines.params import read_file
+from pipelines.stages import annotate, contact, quality, split
+from pipelines.stages.adapters import ConvertSettings, ensure_manifests, raw_files
+from pipelines.stages.base import StagePaths, empty_reason, load_settings, write_empty
+from pipelines.stages.code import closures, own_settings
+from tests.builders import hoi4d
+from tests.builders.clips import jumping
+
+PROJECT = Path(__file__).parents[2]
+
+
+def params_of(folder: Path, text: str) -> ConvertSettings:
+    path = folder / "params.yaml"
+    path.write_text(text)
+    return load_settings(ConvertSettings, "convert", path)
+
+
+def test_the_committed_settings_are_every_adapters_defaults():
+    params = load_settings(ConvertSettings, "convert", PROJECT / "params.yaml")
+    assert params.adapter("grab") == GrabAdapter()
+
+
+def test_a_dataset_may_have_a_margin_of_its_own(tmp_path):
+    params = params_of(tmp_path, "convert: {margin_frames: 5, adapters: {arctic: {margin_frames: 2}, h2o: null}}")
+    margins = {name: getattr(params.adapter(name), "margin_frames", None) for name in ("grab", "arctic", "h2o")}
+    assert margins == {"grab": 5, "arctic": 2, "h2o": 5}
+
+
+def test_a_variant_has_the_adapter_and_raw_files_of_its_source_and_settings_of_its_own(tmp_path, monkeypatch):
+    params = params_of(tmp_path, "convert: {adapters: {arctic-whole: {clips: whole}}}")
+    assert (params.adapter("arctic").clips, params.adapter("arctic-whole").clips) == ("described", "whole")
+    with pytest.raises(MissingResource, match="no adapter 'kitchen'"):
+        params.adapter("kitchen-whole")
+    monkeypatch.chdir(tmp_path)
+    scanned = Manifest("arctic", True, "files", "some", files=(SourceFile("raw_seqs/s01/box.mano.npy", 9, "ab" * 32),))
+    write_manifest(StagePaths("own", "arctic").manifest, scanned)
+    ensure_manifests("own", ["arctic", "arctic-whole"])
+    assert read_manifest(StagePaths("own", "arctic-whole").manifest) == scanned
+    (tmp_path / "files").mkdir()
+    monkeypatch.setenv("HOIDATA_ARCTIC", str(tmp_path / "files"))
+    assert raw_files(StagePaths("own", "arctic-whole")) == raw_files(StagePaths("own", "arctic")) == tmp_path / "files"
+    # A generated corpus is each variant's own: its manifest may hold another recipe.
+    with pytest.raises(MissingResource, match=r"\.hoidata/raw/embedded/arctic-whole"):
+        raw_files(StagePaths("embedded", "arctic-whole"))
+
+
+def test_a_folder_with_a_file_per_frame_is_one_entry_of_a_manifest(tmp_path):
+    """HOI4D has 2,971 recordings of 900 such files."""
+    adapter, root = get_adapter("hoi4d"), hoi4d.write_two(tmp_path)
+    listed = {entry.path: entry for entry in scan_files(root, adapter.parts)}
+    assert f"HOI4D_annotations/{hoi4d.SAFE}/objpose" in listed
+    assert len(listed) < 30
+    assert adapter.load(RawTree(root, listed), hoi4d.key_of(hoi4d.SAFE), hoi4d.HANDS)
+    (root / f"HOI4D_annotations/{hoi4d.SAFE}/objpose/7.json").write_text("{}")
+    with pytest.raises(BadInput, match="SHA-256"):
+        adapter.load(RawTree(root, listed), hoi4d.key_of(hoi4d.SAFE), hoi4d.HANDS)
+
+
+def test_the_code_of_a_variant_is_that_of_its_source_and_its_settings_concern_it_alone():
+    plain = read_file(PROJECT / "params.yaml")
+    params = plain | {
+        "datasets": ["arctic", "arctic-whole"],
+        "convert": {"adapters": {"arctic-whole": {"clips": "whole"}}},
+    }
+    starts = closures(params, SourceTree(PROJECT))
+    for stage in ("raw", "convert", "split"):
+        assert starts[f"{stage}/arctic"] == starts[f"{stage}/arctic-whole"]
+    assert own_settings(params, "convert/arctic") == {"params.yaml convert.adapters.arctic": "null"}
+    assert "whole" in own_settings(params, "convert/arctic-whole")["params.yaml convert.adapters.arctic-whole"]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("convert: {margin: 5}", "keys among: margin_frames, adapters, got margin"),
+        ("convert: {margin_frames: -1}", "margin_frames"),
+        ("convert: {adapters: {grab: {margin: 1}}}", "settings of the adapter grab.*margin_frames.*got margin"),
+    ],
+)
+def test_a_wrong_setting_is_named_with_the_known_ones(tmp_path, text, problem):
+    with pytest.raises(BadInput, match=problem):
+        params_of(tmp_path, text).adapter("grab")
+
+
+PATHS = StagePaths("embedded", "grab")
+
+
+def test_clip_that_fails_is_listed_with_its_reason_and_not_annotated(stage_folder, make_clip):
+    clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
+    clips[1] = jumping(clips[1], 20, 0.5)
+    write_store(PATHS.clips, clips, generated_info("grab"))
+    quality.run(PATHS)
+    contact.run(PATHS)
+    annotate.run(PATHS)
+    words = pd.read_parquet(PATHS.annotation / "text.parquet")
+    hands = pd.read_parquet(PATHS.annotation / "hand_type.parquet").set_index("clip_id")
+    assert set(words["clip_id"]) == {"test/s1/0"}
+    assert hands.at["test/s1/1", "reason"].startswith("left out by quality control: largest sudden step of a corner")
+
+
+def test_params_decide_what_is_left_out(stage_folder, make_clip):
+    write_store(PATHS.clips, [make_clip(40, seed=3)], generated_info("grab"))
+    stage_folder(quality={"limits": {"size_m": {"leave_out": 0.05}}})
+    quality.run(PATHS)
+    rows = pd.read_parquet(PATHS.quality / "clips.parquet")
+    limits = orjson.loads((PATHS.quality / "info.json").read_bytes())["thresholds"]["limits"]
+    assert limits["size_m"] == {"warn": 1.0, "leave_out": 0.05}
+    assert limits["hand_jump_m"] == asdict(DEFAULT_LIMITS["hand_jump_m"])
+    assert rows["reasons"].tolist() == ["object box: longest side of the bounding box: 0.1 m, above 0.05 m"]
+
+
+def test_empty_dataset_passes_through(stage_folder):
+    write_empty(PATHS.clips, "grab is not present")
+    quality.run(PATHS)
+    assert empty_reason(PATHS.quality) == "grab is not present"
+    annotate.run(PATHS)
+    assert empty_reason(PATHS.annotation) == "grab is not present"
+
+
+def test_unknown_setting_and_unknown_measure_are_named(stage_folder, make_clip):
+    write_store(PATHS.clips, [make_clip(40)], generated_info("grab"))
+    stage_folder(quality={"too_deep_mm": 10})
+    with pytest.raises(BadInput, match="too_deep_mm"):
+        quality.run(PATHS)
+    stage_folder(quality={"limits": {"jerk": {"warn": 1, "leave_out": 2}}})
+    with pytest.raises(BadInput, match="jerk"):
+        quality.run(PATHS)
+
+
+@pytest.fixture
+def clips(stage_folder, make_clip):
+    """A clip with a verb and one without in the current folder."""
+    clips = [make_clip(40, seed=3, clip_id=f"test/s1/{number}") for number in range(2)]
+    write_store(PATHS.clips, [clips[0], replace(clips[1], verb=None)], generated_info("grab"))
+    quality.run(PATHS)
+    return clips
+
+
+@pytest.fixture
+def annotated_with(clips, stage_folder):
+    """Call it with settings: hand types and sentences by clip, and the facts, of a run with them."""
+
+    def run(of_contact: dict | None = None, **settings) -> tuple[pd.DataFrame, pd.DataFrame, dict]:
+        stage_folder(annotate={"encoder": "hash", **settings}, contact=of_contact or {})
+        contact.run(PATHS)
+        annotate.run(PATHS)
+        hands, text = (pd.read_parquet(PATHS.annotation / f"{name}.parquet") for name in ("hand_type", "text"))
+        return hands.set_index("clip_id"), text, orjson.loads((PATHS.annotation / "info.json").read_bytes())
+
+    return run
+
+
+def test_threshold_and_points_of_the_contact_stage_decide_which_hand_acts(annotated_with) -> None:
+    hands, _, info = annotated_with({"threshold_m": 1e-6, "points": 64})
+    assert (info["threshold_m"], info["points"]) == (1e-6, 64)
+    assert hands["hand_type"].isna().all()
+
+
+def test_hand_types_may_have_a_threshold_of_their_own(annotated_with) -> None:
+    hands, _, info = annotated_with({"threshold_m": 1e-6}, threshold_m=0.02)
+    assert info["threshold_m"] == 0.02
+    assert hands["hand_type"].notna().all()
+
+
+def test_the_contact_stage_has_to_run_first(clips) -> None:
+    with pytest.raises(MissingResource, match="run the stage 'contact'"):
+        annotate.run(PATHS)
+
+
+def test_forms_are_those_asked_for(clips, annotated_with) -> None:
+    hands, text, info = annotated_with(forms="reference")
+    clip = clips[0]
+    found = text[text["clip_id"] == clip.clip_id]["sentence"].tolist()
+    assert found == list(reference_sentences(clip.verb, clip.object_words, hands.at[clip.clip_id, "hand_type"]))
+    assert info["forms"] == "reference"
+    with pytest.raises(BadInput, match="forms"):
+        annotated_with(forms="poem")
+
+
+def test_whose_word_counts_for_the_hand_is_written_down_where_it_is_not_the_distances(annotated_with) -> None:
+    rule = "annotated-else-proximity"
+    assert [annotated_with(**chosen)[2].get("hand") for chosen in ({}, {"hand": rule})] == [None, rule]
+    with pytest.raises(BadInput, match="hand"):
+        annotated_with(hand="nearest")
+
+
+def test_verbs_from_motion_can_be_turned_off(annotated_with) -> None:
+    with_them, _, _ = annotated_with()
+    assert with_them["verb_source"].tolist() == ["source", "derived"]
+    without, plain, info = annotated_with(derive_verbs=False)
+    assert without["verb_source"].isna().tolist() == [False, True]
+    assert plain[plain["clip_id"] == "test/s1/1"]["sentence"].iloc[0].startswith("Move ")
+    assert info["counts"]["derived_verbs"] == 0
+
+
+def test_the_sentences_of_a_dataset_are_printed_by_a_command() -> None:
+    def printed(*arguments: str) -> str:
+        return CliRunner().invoke(app, ["sentences", *arguments], catch_exceptions=False).output
+
+    whole = printed().splitlines()
+    assert len(whole) == 3 + 202 + 36 + 91
+    assert whole[0] == "grab: 202 pairs of verb and object"
+    assert "  see, binoculars: Look through a pair of binoculars in both hands. " in printed("grab", "--hand", "both")
+    with pytest.raises(BadInput, match="grab or h2o or arctic"):
+        printed("taco")
+
+
+@pytest.fixture
+def folder(make_clip, tmp_path, monkeypatch):
+    """A project folder with four annotated clips of PATHS, one per subject; the current folder."""
+    monkeypatch.chdir(tmp_path)
+    names = ("s1", "s2", "s9", "s10")
+    clips = [
+        replace(make_clip(seed=seed, clip_id=f"grab/{name}/box_lift_1", subject=name), sequence=f"{name}/box_lift_1")
+        for seed, name in enumerate(names)
+    ]
+    write_store(PATHS.clips, clips, generated_info("grab"))
+    annotate_store(PATHS.clips, PATHS.annotation, encoder="hash")
+    return tmp_path
+
+
+def choose_split(folder, value) -> None:
+    (folder / "params.yaml").write_text(yaml.safe_dump({"split": {"grab": value}}))
+
+
+def test_a_name_or_a_rule_of_the_users_own_decides(folder):
+    choose_split(folder, "text2hoi")
+    split.run(PATHS)
+    assert pd.read_parquet(PATHS.splits / "splits.parquet")["split"].tolist() == [
+        "train",
+        "train",
+        "validation",
+        "test",
+    ]
+    (folder / "params.yaml").write_text("split: {}")  # then the dataset's own: text2hoi
+    split.run(PATHS)
+    assert json.loads((PATHS.splits / "info.json").read_text())["chosen"]["name"] == "text2hoi"
+    choose_split(folder, {"by": "subject", "train": ["s2"], "validation": ["s1"], "test": ["s9"]})
+    split.run(PATHS)
+    parts = pd.read_parquet(PATHS.splits / "splits.parquet")["split"]
+    assert parts.tolist()[:3] == ["validation", "train", "test"]
+    assert pd.isna(parts[3])
+    assert json.loads((PATHS.splits / "info.json").read_text())["chosen"]["name"] == "params.yaml"
+
+
+def test_parts_without_clips_are_said_with_the_setting(folder, capsys):
+    choose_split(folder, {"by": "subject", "train": "rest", "validation": ["s7"], "test": ["s10"]})
+    split.run(PATHS)
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 1
+    assert said[0].startswith("embedded-grab: no validation clips: ")
+    assert "split.grab of params.yaml" in said[0]
+
+
+def test_a_name_that_is_not_there_lists_those_that_are(folder):
+    choose_split(folder, "text2hio")
+    with pytest.raises(BadInput, match=r"params.yaml: split.grab: expected one of: composition, .*official, text2hoi"):
+        split.run(PATHS)
+    assert not PATHS.splits.exists()
+
+
+def test_a_dataset_without_clips_passes_its_reason_on(folder):
+    choose_split(folder, "text2hoi")
+    empty = StagePaths("embedded", "h2o")
+    empty.annotation.mkdir(parents=True)
+    (empty.annotation / "empty.json").write_text('{"reason": "h2o is not present"}')
+    split.run(empty)
+    assert json.loads((empty.splits / "empty.json").read_text()) == {"reason": "h2o is not present"}
+
+
+def test_whatever_opens_the_annotated_store_depends_on_its_split(pytestconfig):
+    graph = read_graph(pytestconfig.rootpath)
+    made = producers(graph)
+    for name in ("h2o", "grab", "arctic", "manipnet"):
+        out = f"data/embedded/{name}/splits"
+        assert made[out].name == f"split@embedded-{name}"
+        readers = {stage.name.rpartition(":")[2].split("@")[0] for stage in graph.values() if out in stage.deps}
+        assert readers == {"train", "train-diffusion", "train-refiner", "sample", "evaluate", "evaluator", "controls"}
+
+
+def test_the_project_chooses_a_split_each_dataset_has(pytestconfig):
+    params = yaml.safe_load((pytestconfig.rootpath / "params.yaml").read_text())
+    for dataset in params["datasets"]:
+        assert choose(dataset, params["split"][dataset]).rule
