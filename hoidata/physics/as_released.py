@@ -12,9 +12,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hoidata.physics.capsules import CapsuleContacts
-from hoidata.physics.nnls import wrench_residuals
 from hoidata.physics.scene import Scene
-from hoidata.physics.standard_units import force_columns
+from hoidata.physics.standard_units import force_columns, wrench_residuals
 
 UNITS_PER_METRE = 10.0
 GRAVITY_PER_S = 9.8

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
+from scipy.optimize import nnls
 
 from hoidata.physics.capsules import CapsuleContacts
 from hoidata.physics.contact_forces import FRICTION, RESIDUAL_LIMIT, cone_edges
-from hoidata.physics.nnls import wrench_residuals
 from hoidata.physics.scene import Scene
 
 SUPPORT_M = 0.002
 _SUPPORT_DIRECTIONS = 16
+MOST_STEPS = 300
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,33 @@ def force_columns(
     edges = edges[order]
     columns = np.concatenate([edges, np.cross(arms[order, None], edges)], axis=2).reshape(-1, 6).T
     return columns, np.r_[0, np.cumsum(np.bincount(frame, minlength=n_frames) * edges.shape[1])]
+
+
+def wrench_residuals(
+    columns: np.ndarray, offsets: np.ndarray, wrenches: np.ndarray, most_steps: int = MOST_STEPS
+) -> np.ndarray:
+    """(frame, 6) what is left of each wrench: ``wrench - columns @ x`` at the non-negative ``x`` that leaves least.
+
+    columns: (6, column) of all frames one after another; frame i owns ``columns[:, offsets[i] : offsets[i + 1]]``,
+    maybe none. offsets: (frame + 1,). wrenches: (frame, 6). Rows may have any units; the norm mixes them as they come.
+    A frame that needs more than ``most_steps`` exchanges of columns keeps its wrench, whose norm is an upper bound: it
+    may be called infeasible wrongly, never feasible.
+    """
+    if columns.ndim != 2 or len(columns) != 6 or wrenches.ndim != 2 or wrenches.shape[1] != 6:
+        raise ValueError(f"columns (6, n) and wrenches (frame, 6) expected, got {columns.shape} and {wrenches.shape}")
+    rising = len(offsets) == len(wrenches) + 1 and offsets[0] == 0 and (np.diff(offsets) >= 0).all()
+    if not rising or offsets[-1] != columns.shape[1]:
+        raise ValueError("offsets must rise from 0 to the number of columns, one more than there are frames")
+    if not (np.isfinite(columns).all() and np.isfinite(wrenches).all()):
+        raise ValueError("finite columns and wrenches expected")
+    left = np.array(wrenches, dtype=np.float64)
+    for frame in np.flatnonzero(np.diff(offsets)):
+        own = columns[:, offsets[frame] : offsets[frame + 1]]
+        try:
+            left[frame] -= own @ nnls(own, wrenches[frame], maxiter=most_steps)[0]
+        except RuntimeError:  # no convergence
+            continue
+    return left
 
 
 def table_contacts(scene: Scene, table_m: float) -> tuple[np.ndarray, np.ndarray]:
