@@ -15,8 +15,8 @@ from torch import Tensor
 
 from hoidata.devices import send
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import surface_index
 
 MARGIN_M = 0.03
 FAR_M = 10.0
@@ -110,12 +110,12 @@ def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.nda
         values = np.zeros((resolution**3, 4), np.float32)
         values[:, 0] = FAR_M
         return values, np.full(3, -1.0), np.full(3, 1.0)
-    vertices_m, faces = model.filled_part(part)
-    corners = vertices_m[faces].reshape(-1, 3)
-    low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
+    surface = surface_index(model).filled[part]
+    box = surface.tree.box[0]
+    low, high = box[:3] - MARGIN_M, box[3:] + MARGIN_M
     axes = [np.linspace(low[axis], high[axis], resolution) for axis in range(3)]
     nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    found = signed_distance(vertices_m, faces, nodes)
+    found = surface.nearest(nodes)
     values = np.column_stack((found.distance_m, found.closest_m - nodes))
     return values.astype(np.float32), low, high
 
