@@ -1,7 +1,6 @@
-"""Exact distances from points to a triangle mesh, signed: negative inside.
+"""Nearest points of a triangle mesh by libigl, and what a mesh is made of: merged vertices, edges, normals, volume.
 
-Exact nearest-triangle search is libigl's. The sign is the angle-weighted pseudonormal's (Baerentzen and Aanaes 2005)
-where the surface is closed, and the winding number's (Jacobson et al. 2013) where it has holes.
+Signed distances are ``hoidata.objects.surface_index``'s.
 """
 
 from typing import NamedTuple
@@ -23,10 +22,7 @@ class ClosestPoints(NamedTuple):
 
 
 class SignedDistance(NamedTuple):
-    """distance_m: (point,) negative inside; closest_m: (point, 3); normal: (point, 3) unit, outward.
-
-    ``normal`` belongs to the closest point: the triangle's there, whatever the side the query came from.
-    """
+    """distance_m: (point,) negative inside; closest_m: (point, 3); normal: (point, 3) the distance's gradient."""
 
     distance_m: np.ndarray
     closest_m: np.ndarray
@@ -49,25 +45,6 @@ def closest_points(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarr
     parts = [igl.point_mesh_squared_distance(chunk, *surface)[::2] for chunk in _chunks(points_m)]
     square, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
     return ClosestPoints(np.sqrt(square), closest.reshape(-1, 3))
-
-
-def signed_distance(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> SignedDistance:
-    """Signed distance from ``points_m (point, 3)`` to the mesh ``(vertex, 3)``, ``(face, 3)``; metres, one frame.
-
-    Vertices that coincide (a mesh split along texture seams) count as one, so seams do not open the surface. A mesh
-    turned inside out is turned back.
-    Raises BadInput as :func:`closest_points` does.
-    """
-    surface = merged_surface(vertices_m, faces)
-    closed = is_closed(surface.faces)
-    if _is_inside_out(surface, closed):
-        surface = surface._replace(faces=np.ascontiguousarray(surface.faces[:, ::-1]))
-    kinds = igl.SignedDistanceType
-    kind = kinds.SIGNED_DISTANCE_TYPE_PSEUDONORMAL if closed else kinds.SIGNED_DISTANCE_TYPE_WINDING_NUMBER
-    parts = [igl.signed_distance(chunk, *surface, kind)[:3] for chunk in _chunks(points_m)]
-    distance, face, closest = (np.concatenate(column) for column in zip(*parts, strict=True))
-    normals = face_normals(surface.vertices_m, surface.faces)
-    return SignedDistance(distance, closest.reshape(-1, 3), normals[face])
 
 
 def face_normals(vertices_m: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -111,13 +88,6 @@ def is_closed(faces: np.ndarray) -> bool:
     forward = np.sort(edges[:, 0] * size + edges[:, 1])
     backward = np.sort(edges[:, 1] * size + edges[:, 0])
     return bool(np.array_equal(forward, backward))
-
-
-def _is_inside_out(surface: MergedSurface, closed: bool) -> bool:
-    """Negative volume: more than rounding of it (two opposite shells enclose nothing), or where the surface is open
-    and its volume vague, more than 1 % of the bounding box.
-    """
-    return bool(volume_m3(*surface) < -(1e-6 if closed else 0.01) * np.ptp(surface.vertices_m, axis=0).prod())
 
 
 def volume_m3(vertices_m: np.ndarray, faces: np.ndarray) -> float:

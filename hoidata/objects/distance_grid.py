@@ -94,6 +94,25 @@ def _between(low_m, cell_m, value, x, y, z):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
+def interpolated(grid, places_m):  # pragma: no cover (compiled)
+    """(place,) signed distances at ``places_m (place, 3)`` between the nodes of a grid; off the grid lower bounds.
+
+    The surface lies inside of the grid, so the way to it is at least the hypotenuse of the way to the grid and on.
+    """
+    low_m, cell_m, value = grid[0], grid[1], grid[2]
+    distance = np.empty(len(places_m))
+    for place in range(len(places_m)):
+        beyond, on_grid = 0.0, np.empty(3)
+        for axis in range(3):
+            high_m = low_m[axis] + cell_m * (value.shape[2 - axis] - 1)
+            on_grid[axis] = min(max(places_m[place, axis], low_m[axis]), high_m)
+            beyond += (places_m[place, axis] - on_grid[axis]) ** 2
+        near = _between(low_m, cell_m, value, on_grid[0], on_grid[1], on_grid[2])[0]
+        distance[place] = np.sqrt(beyond + near * near) if beyond > 0.0 else near
+    return distance
+
+
+@njit(cache=True)
 def mark_within(tree, grid, places_m, threshold_m, within):  # pragma: no cover (compiled)
     """Set ``within (place,)`` where the distance of ``places_m (place, 3)`` is less than the threshold.
 

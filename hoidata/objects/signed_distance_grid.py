@@ -1,18 +1,13 @@
-"""Signed distances interpolated in grids: made once per surface from exact ones, asked in NumPy or in torch.
+"""Signed distances interpolated in grids, in torch: made once per surface from exact ones, for losses.
 
-Where thousands of points are asked at every step, exact answers would cost seconds. One grid, two ways to read it:
-:class:`SignedDistanceGrid` by itself is NumPy, of one surface, for the grasp search of the embedded corpora;
-:class:`DistanceFields` is torch, of both parts of many objects in one stack, also with the offset to the nearest
-surface point, for losses: gradients flow to the points asked about and never into the grid. They differ beyond the
-grid: the search takes a lower bound, a loss needs a distance that goes on without a jump.
+Both parts of many objects in one stack, with the offset to the nearest surface point: gradients flow to the points
+asked about and never into the grid. Beyond the grid the distance goes on without a jump.
 
-Whoever needs exact answers asks ``hoidata.objects.surface_index``, whose ``distance_grid`` only decides which triangles
-need not be looked at, from bounds on what lies between its nodes. The hold reads that grid as it is
-(``hoidata.refinement.object_field``).
+Whoever needs exact answers asks ``hoidata.objects.surface_index``. Its grid (``hoidata.objects.distance_grid``) serves
+the hold (``hoidata.refinement.object_field``) and the grasp search of the embedded corpora.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -20,57 +15,11 @@ from torch import Tensor
 
 from hoidata.devices import send
 from hoidata.geometry.rotations import rotvec_to_rotmat
-from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import surface_index
 
 MARGIN_M = 0.03
 FAR_M = 10.0
-
-
-@dataclass(frozen=True)
-class SignedDistanceGrid:
-    """axes_m: places of the nodes along x, y and z, evenly spaced. distance_m: (x, y, z) signed, negative inside.
-
-    offset_m: (x, y, z, 3) from each node to the nearest surface point.
-    """
-
-    axes_m: tuple[np.ndarray, np.ndarray, np.ndarray]
-    distance_m: np.ndarray
-    offset_m: np.ndarray
-
-    @classmethod
-    def build(
-        cls, vertices_m: np.ndarray, faces: np.ndarray, axes_m: tuple[np.ndarray, np.ndarray, np.ndarray]
-    ) -> "SignedDistanceGrid":
-        """Exact values of the mesh (vertex, 3), (face, 3) at every node. Raises as ``signed_distance`` does."""
-        nodes = np.stack(np.meshgrid(*axes_m, indexing="ij"), axis=-1)
-        found = signed_distance(vertices_m, faces, nodes.reshape(-1, 3))
-        offset = found.closest_m.reshape(nodes.shape) - nodes
-        return cls(axes_m, found.distance_m.reshape(nodes.shape[:3]), offset)
-
-    def distances_m(self, points_m: np.ndarray, spacing_m: float, margin_m: float) -> np.ndarray:
-        """(...,) interpolated distances of points (..., 3); beyond the grid a lower bound.
-
-        spacing_m: step of the grid, the same along all axes. margin_m: how far the surface keeps from the grid's faces.
-        The order of operations is part of the embedded corpora: their bytes rest on it.
-        """
-        shape = np.array(self.distance_m.shape)
-        low_m = np.array([axis[0] for axis in self.axes_m])
-        cell = (points_m - low_m) / spacing_m
-        clipped = np.clip(cell, 0, shape - 1.000001)
-        beyond = np.sqrt(((cell - clipped) ** 2).sum(-1)) * spacing_m
-        low = clipped.astype(np.int64)
-        x, y, z = np.moveaxis(clipped - low, -1, 0)
-        step_x, step_y = shape[1] * shape[2], shape[2]
-        flat = low[..., 0] * step_x + low[..., 1] * step_y + low[..., 2]
-        values = self.distance_m.reshape(-1)
-        rows = []
-        for offset in (0, step_y, step_x, step_x + step_y):
-            start = values[flat + offset]
-            rows.append(start + z * (values[flat + offset + 1] - start))
-        near = rows[0] + y * (rows[1] - rows[0])
-        far = rows[2] + y * (rows[3] - rows[2])
-        return np.where(beyond > 0, beyond + margin_m, near + x * (far - near))
 
 
 class DistanceFields:
@@ -161,13 +110,14 @@ def _part_values(model: ObjectModel, part: int, resolution: int) -> tuple[np.nda
         values = np.zeros((resolution**3, 4), np.float32)
         values[:, 0] = FAR_M
         return values, np.full(3, -1.0), np.full(3, 1.0)
-    vertices_m, faces = model.filled_part(part)
-    corners = vertices_m[faces].reshape(-1, 3)
-    low, high = corners.min(axis=0) - MARGIN_M, corners.max(axis=0) + MARGIN_M
-    x, y, z = (np.linspace(low[axis], high[axis], resolution) for axis in range(3))
-    grid = SignedDistanceGrid.build(vertices_m, faces, (x, y, z))
-    values = np.concatenate((grid.distance_m[..., None], grid.offset_m), axis=-1)
-    return values.reshape(-1, 4).astype(np.float32), low, high
+    surface = surface_index(model).filled[part]
+    box = surface.tree.box[0]
+    low, high = box[:3] - MARGIN_M, box[3:] + MARGIN_M
+    axes = [np.linspace(low[axis], high[axis], resolution) for axis in range(3)]
+    nodes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    found = surface.nearest(nodes)
+    values = np.column_stack((found.distance_m, found.closest_m - nodes))
+    return values.astype(np.float32), low, high
 
 
 def _tensor(rows: list[np.ndarray]) -> Tensor:

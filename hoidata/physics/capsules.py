@@ -10,13 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from hoidata.geometry.transform import RigidTransform
-from hoidata.objects.distance import signed_distance
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import PartSurface, surface_index
 
 COARSE_SAMPLES = 9
 _REFINEMENTS = 2
-Surface = tuple[np.ndarray, np.ndarray]  # vertices (vertex, 3) in metres, faces (face, 3)
-_ON_SURFACE_M = 1e-6  # nearer than this the direction to the surface is rounding; the triangle's normal is used
 
 
 class Capsules(NamedTuple):
@@ -101,37 +99,37 @@ def capsule_contacts(
 def _part_contacts(
     model: ObjectModel, part: int, world_from_part: RigidTransform, capsules: Capsules, tolerance_m: float
 ) -> CapsuleContacts:
-    surface = model.filled_part(part)
+    surface = surface_index(model).filled[part]
     start, end = (world_from_part.inverse() @ ends for ends in (capsules.start_m, capsules.end_m))
-    frame, capsule = _candidates(surface[0][np.unique(surface[1])], start, end, capsules.radius_m + tolerance_m)
+    frame, capsule = _candidates(surface.tree.box[0], start, end, capsules.radius_m + tolerance_m)
     start, end, radius = start[frame, capsule], end[frame, capsule], capsules.radius_m[capsule]
     half = np.linalg.norm(end - start, axis=1) / 2
-    middle = _distances(surface, (start + end) / 2)
-    near = middle[0] < half + radius + tolerance_m
+    middle = surface.nearest((start + end) / 2)
+    near = middle.distance_m < half + radius + tolerance_m
     frame, capsule, start, end, radius = (column[near] for column in (frame, capsule, start, end, radius))
     along = _deepest(surface, start, end)
-    deepest = _distances(surface, start + along[:, None] * (end - start))
-    hit = deepest[0] < radius + tolerance_m
+    deepest = surface.nearest(start + along[:, None] * (end - start))
+    hit = deepest.distance_m < radius + tolerance_m
     frame, world = frame[hit], world_from_part[frame[hit]]
-    places = deepest[1][hit], deepest[2][hit], middle[1][near][hit], middle[2][near][hit]
+    places = deepest.closest_m[hit], deepest.normal[hit], middle.closest_m[near][hit], middle.normal[near][hit]
     point, normal, middle_point, middle_normal = (
         (world.turn(rows[:, None]) if number % 2 else world @ rows[:, None])[:, 0] for number, rows in enumerate(places)
     )
-    depth = (radius - deepest[0])[hit]
+    depth = (radius - deepest.distance_m)[hit]
     part_of = np.full(len(frame), part)
     return CapsuleContacts(frame, capsule[hit], part_of, depth, point, normal, middle_point, middle_normal)
 
 
 def _candidates(
-    vertices_m: np.ndarray, start: np.ndarray, end: np.ndarray, reach_m: np.ndarray
+    box_m: np.ndarray, start: np.ndarray, end: np.ndarray, reach_m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frame and capsule of those whose bounding box, widened by its reach, meets the part's."""
+    """Frame and capsule of those whose bounding box, widened by its reach, meets the part's, box_m (6,)."""
     low, high = np.minimum(start, end) - reach_m[:, None], np.maximum(start, end) + reach_m[:, None]
-    frame, capsule = np.nonzero(((low < vertices_m.max(axis=0)) & (high > vertices_m.min(axis=0))).all(axis=-1))
+    frame, capsule = np.nonzero(((low < box_m[3:]) & (high > box_m[:3])).all(axis=-1))
     return frame, capsule
 
 
-def _deepest(surface: Surface, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+def _deepest(surface: PartSurface, start: np.ndarray, end: np.ndarray) -> np.ndarray:
     """(segment,) position on each axis, 0 to 1, where the signed distance is least."""
     grid = np.linspace(0, 1, COARSE_SAMPLES)
     along = np.broadcast_to(grid, (len(start), COARSE_SAMPLES))
@@ -143,18 +141,7 @@ def _deepest(surface: Surface, start: np.ndarray, end: np.ndarray) -> np.ndarray
     return _least(surface, start, end, along)
 
 
-def _least(surface: Surface, start: np.ndarray, end: np.ndarray, along: np.ndarray) -> np.ndarray:
+def _least(surface: PartSurface, start: np.ndarray, end: np.ndarray, along: np.ndarray) -> np.ndarray:
     points = start[:, None] + along[:, :, None] * (end - start)[:, None]
-    distance = _distances(surface, points.reshape(-1, 3))[0].reshape(along.shape)
+    distance = surface.signed_m(points.reshape(-1, 3)).reshape(along.shape)
     return along[np.arange(len(along)), distance.argmin(axis=1)]
-
-
-def _distances(surface: Surface, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Signed distance, nearest surface point, and the gradient of the distance, of points in the part's frame."""
-    if not len(points):
-        return np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3))
-    found = signed_distance(*surface, points)
-    away = np.abs(found.distance_m) > _ON_SURFACE_M
-    gradient = found.normal.copy()
-    gradient[away] = (points[away] - found.closest_m[away]) / found.distance_m[away, None]
-    return found.distance_m, found.closest_m, gradient

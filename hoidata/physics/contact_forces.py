@@ -11,9 +11,14 @@ import numpy as np
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
+from hoidata.hands.model import HandModel
+from hoidata.objects.distance import SignedDistance
+from hoidata.objects.model import ObjectModel
+
 FRICTION = 0.35
 GRAVITY_M_S2 = 9.81
 RESIDUAL_LIMIT = 0.01
+CONTACT_TOLERANCE_M = 0.002
 _NNLS_ITERATIONS = 300
 
 
@@ -27,6 +32,36 @@ class BodyMotion(NamedTuple):
     centre_m: np.ndarray
     inertia_kg_m2: np.ndarray
     rotmats: np.ndarray
+
+
+class Contacts(NamedTuple):
+    """points_m, normals: (contact, 3), object frame; normals point out of the object."""
+
+    points_m: np.ndarray
+    normals: np.ndarray
+
+
+def body_motion(
+    model: ObjectModel, rotmats: np.ndarray, translation_m: np.ndarray, hinge_rad: np.ndarray | None
+) -> BodyMotion:
+    """Centre of mass and inertia of 1 kg in the world at each frame; a hinged object is one body at its angle."""
+    n_frames = len(rotmats)
+    parts = model.masses
+    total = sum(part.volume_m3 for part in parts)
+    shares, centres, inertias = [part.volume_m3 / total for part in parts], [], []
+    for index, part in enumerate(parts):
+        object_from_part = model.object_from_part(index, hinge_rad)
+        turn = np.broadcast_to(object_from_part.rotation, (n_frames, 3, 3))
+        centres.append((object_from_part @ np.broadcast_to(part.centre_m, (n_frames, 1, 3)))[:, 0])
+        inertias.append(turn @ part.inertia_kg_m2 @ turn.transpose(0, 2, 1))
+    centre = sum(share * c for share, c in zip(shares, centres, strict=True))
+    inertia = np.zeros((n_frames, 3, 3))
+    for share, part_centre, part_inertia in zip(shares, centres, inertias, strict=True):
+        away = part_centre - centre
+        square = (away**2).sum(-1)[:, None, None] * np.eye(3)
+        inertia += share * (part_inertia + square - away[:, :, None] * away[:, None, :])
+    world_centre = np.einsum("fij,fj->fi", rotmats, np.asarray(centre)) + translation_m
+    return BodyMotion(world_centre, rotmats @ inertia @ rotmats.transpose(0, 2, 1), rotmats)
 
 
 def angular_velocity(rotmats: np.ndarray, fps: float) -> np.ndarray:
@@ -53,6 +88,34 @@ def required_wrench(motion: BodyMotion, fps: float, gravity: np.ndarray) -> np.n
     momentum = np.einsum("fij,fj->fi", motion.inertia_kg_m2, spin)
     torque = np.gradient(momentum, 1 / fps, axis=0)
     return np.concatenate([acceleration - GRAVITY_M_S2 * gravity, torque], axis=1)
+
+
+def hand_patches(model: HandModel) -> np.ndarray:
+    """(778,) which of 21 patches a hand vertex belongs to: 15 finger segments, then 6 regions of the palm.
+
+    As ManipNet's capsules (Appendix A): 4 palm regions towards the fingers, the thumb's ball and the heel.
+    """
+    joint = model.skin_weights.argmax(axis=1)
+    rest = model.joint_regressor @ model.template_m
+    knuckles = rest[[1, 4, 10, 7]]
+    anchors = np.concatenate(
+        [rest[0] + 0.7 * (knuckles - rest[0]), [0.5 * (rest[0] + rest[13])], [rest[0] + 0.25 * (rest[7] - rest[0])]]
+    )
+    region = np.linalg.norm(model.template_m[:, None] - anchors, axis=2).argmin(axis=1)
+    return np.where(joint == 0, 15 + region, joint - 1)
+
+
+def patch_contacts(distances: SignedDistance, patches: np.ndarray, frame: int) -> Contacts:
+    """At most one contact per patch: its deepest vertex, where that is nearer than 2 mm.
+
+    The contact point is the closest surface point. distances: of points (frame, point), object frame, as
+    ``SurfaceIndex.nearest`` gives them. patches: (point,) as from :func:`hand_patches`, any numbering.
+    """
+    order = np.argsort(distances.distance_m[frame], kind="stable")
+    order = order[distances.distance_m[frame][order] < CONTACT_TOLERANCE_M]
+    first = np.unique(patches[order], return_index=True)[1]
+    chosen = order[first]
+    return Contacts(distances.closest_m[frame][chosen], distances.normal[frame][chosen])
 
 
 def cone_edges(normals: np.ndarray, friction: float = FRICTION) -> np.ndarray:

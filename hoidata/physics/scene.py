@@ -10,9 +10,8 @@ from hoidata.errors import BadInput
 from hoidata.hands import HandModel, HandPair
 from hoidata.objects.model import ObjectModel, articulate
 from hoidata.physics.capsules import Capsules, ObjectPoses, joined
-from hoidata.physics.contact_forces import GRAVITY_M_S2, BodyMotion, required_wrench
+from hoidata.physics.contact_forces import GRAVITY_M_S2, BodyMotion, body_motion, required_wrench
 from hoidata.physics.mano_capsules import hand_capsules
-from hoidata.physics.surface import body_motion
 
 LIFTED_M = 0.015
 TABLE_PERCENTILE = 3

@@ -22,8 +22,8 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.model import N_VERTICES, HandModel, HandPair
 from hoidata.objects.surface_index import surface_index
 from hoidata.physics.capsules import CapsuleContacts, Capsules, joined
+from hoidata.physics.realism import StandardUnits
 from hoidata.physics.scene import Scene, capsules_there, object_scene
-from hoidata.physics.standard_units import StandardUnits
 from hoidata.refinement.hold_solver import Draw, HandInTime, SolverSettings
 from hoidata.refinement.kernels import N_UNKNOWNS
 from hoidata.refinement.object_field import ObjectField, world_from_part

@@ -4,12 +4,12 @@ Everything is written for the right hand; for a left hand the caller mirrors the
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
-from hoidata.objects.signed_distance_grid import SignedDistanceGrid
+from hoidata.objects.distance_grid import interpolated
+from hoidata.objects.surface_index import PartSurface
 from hoidata.synthetic.hand_capsules import (
     CURL_RATIO,
     LIMITS_RAD,
@@ -20,7 +20,6 @@ from hoidata.synthetic.hand_capsules import (
     capsule_points,
 )
 
-MARGIN_M = 0.035
 _GRADIENT_STEP_M = 1e-3
 
 
@@ -40,18 +39,10 @@ def gradient(field: Field, points_m: np.ndarray) -> np.ndarray:
     return slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-9)
 
 
-def grid_field(vertices_m: np.ndarray, faces: np.ndarray) -> Field:
-    """The exact signed distance of a closed mesh, sampled on a grid of 3 to 6 mm, finer for smaller objects.
-
-    Beyond the grid, a lower bound: the object keeps MARGIN_M from its faces.
-    """
-    used = vertices_m[np.unique(faces)]
-    low, high = used.min(0) - MARGIN_M, used.max(0) + MARGIN_M
-    spacing = float(np.clip((np.prod(high - low) / 1e5) ** (1 / 3), 0.003, 0.006))
-    counts = np.ceil((high - low) / spacing).astype(int) + 1
-    x, y, z = (low[axis] + spacing * np.arange(counts[axis]) for axis in range(3))
-    grid = SignedDistanceGrid.build(vertices_m, faces, (x, y, z))
-    return partial(grid.distances_m, spacing_m=spacing, margin_m=MARGIN_M)
+def grid_field(surface: PartSurface) -> Field:
+    """The signed distance of a surface, interpolated in its grid; beyond the grid a lower bound."""
+    grid = surface.grid
+    return lambda points_m: interpolated(grid, points_m.reshape(-1, 3)).reshape(points_m.shape[:-1])
 
 
 PRESS_M = 0.0008

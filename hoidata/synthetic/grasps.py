@@ -6,7 +6,7 @@ counts in the end is the hand's mesh against the object's mesh.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +18,8 @@ from hoidata.geometry.rotations import mirror_rotvec_x, rotvec_to_rotmat
 from hoidata.hands import HandPair
 from hoidata.hands.tracks import kinematics_of
 from hoidata.objects.model import ObjectModel
-from hoidata.physics.contact_forces import wrench_columns
-from hoidata.physics.surface import body_motion, hand_patches, patch_contacts, surface_distances
+from hoidata.objects.surface_index import surface_index
+from hoidata.physics.contact_forces import body_motion, hand_patches, patch_contacts, wrench_columns
 from hoidata.synthetic.catalogue import ObjectSpec
 from hoidata.synthetic.closing import Field, Placement, close_fingers, draw_placements, gradient, grid_field, mirrored
 from hoidata.synthetic.hand_capsules import OPEN_RAD, CapsuleHands, capsule_points, hand_pose_rotvec
@@ -32,7 +32,6 @@ STAND_RADIUS_M = 0.02
 _TORQUE_SCALE_M = 0.05
 _CLOSURE_RESIDUAL = 1e-6
 _CAPSULE_CONTACT_M = 0.002
-_NEAR_M = 0.004
 # On the way in and out: (how far the fingers are closed, how far the hand is withdrawn in metres).
 _STAGES = ((0.75, 0.0), (0.4, 0.0), (0.0, 0.0), (0.0, 0.03))
 # Where the elbow may be, seen from the right wrist: towards the person and outwards, not in front.
@@ -109,11 +108,10 @@ class Scene:
 
     @cached_property
     def part_fields(self) -> list[Field]:
-        standing = self.model.vertices_m @ self.upright.T
-        if not self.model.is_articulated:
-            return [grid_field(standing, self.model.faces)]
-        base, lid = (grid_field(standing, self.model.faces[self.model.face_part == part]) for part in (0, 1))
-        return [base, lambda points_m: lid(points_m @ self.turn)]
+        fields = [grid_field(surface) for surface in surface_index(self.model).filled.values()]
+        # Upright points to the rest frame of the part's mesh.
+        turns = [self.upright, self.turn @ self.upright]
+        return [partial(_turned, field, turn) for field, turn in zip(fields, turns, strict=False)]
 
     def field(self, points_m: np.ndarray) -> np.ndarray:
         """Signed distance of the whole object."""
@@ -152,6 +150,10 @@ class Candidates(NamedTuple):
     @property
     def open_rad(self) -> np.ndarray:
         return np.broadcast_to(OPEN_RAD, self.flexion_rad.shape)
+
+
+def _turned(field: Field, upright_from_part: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    return field(points_m @ upright_from_part)
 
 
 def _mirrored(side: Side, field: Field) -> Field:
@@ -296,7 +298,7 @@ def verify(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair) ->
 def _comes_and_goes(scene: Scene, hold: Hold, hands: list[PosedHands], pair: HandPair, angle: float) -> np.ndarray:
     """(row,) whether opening, half-closed and withdrawing hands, too, stay out of the object."""
     follow = follow_lid(scene, angle)
-    clear = np.ones(len(hands[0].wrist_m), dtype=bool)
+    surface, clear = surface_index(scene.model), np.ones(len(hands[0].wrist_m), dtype=bool)
     hinge = np.full(len(clear), angle) if scene.model.is_articulated else None
     for (_, reach), hand in zip(hold.reaches, hands, strict=True):
         turn = scene.upright.T @ (follow if reach.part == 1 else np.eye(3))
@@ -304,8 +306,7 @@ def _comes_and_goes(scene: Scene, hold: Hold, hands: list[PosedHands], pair: Han
             pose = hand.open_pose + closed * (hand.hand_pose - hand.open_pose)
             wrist = hand.wrist_m + away_m * hand.rotmats[:, :, 1]
             vertices = replace(hand, hand_pose=pose, wrist_m=wrist).mesh(pair)[0]
-            distance = surface_distances(scene.model, hinge, vertices @ turn.T, 1e-4).distance_m
-            clear &= distance.min(1) > -LARGEST_PENETRATION_M
+            clear &= surface.depth_m(vertices @ turn.T, hinge).max(1) < LARGEST_PENETRATION_M
     return clear
 
 
@@ -313,11 +314,11 @@ def _verify_at(scene: Scene, hold: Hold, hands, meshes, pair: HandPair, angle: f
     n_rows = len(hands[0].wrist_m)
     hinge = np.full(n_rows, angle) if scene.model.is_articulated else None
     follow = follow_lid(scene, angle)
-    near, touch, patches = [], [], []
+    surface, near, touch, patches = surface_index(scene.model), [], [], []
     for (side, reach), (vertices, joints) in zip(hold.reaches, meshes, strict=True):
         turn = scene.upright.T @ (follow if reach.part == 1 else np.eye(3))
-        near.append(surface_distances(scene.model, hinge, vertices @ turn.T, _NEAR_M))
-        touch.append(surface_distances(scene.model, hinge, joints @ turn.T, LARGEST_JOINT_DISTANCE_M).distance_m.min(1))
+        near.append(surface.nearest(vertices @ turn.T, hinge))
+        touch.append(surface.nearest(joints @ turn.T, hinge).distance_m.min(1))
         patches.append(hand_patches(pair[side]))
     centre = body_motion(scene.model, np.eye(3)[None].repeat(n_rows, 0), np.zeros((n_rows, 3)), hinge).centre_m
     score = np.zeros(n_rows)

@@ -4,7 +4,7 @@ import numpy as np
 
 from hoidata.errors import HoidataError
 from hoidata.hands import HandPair
-from hoidata.physics.surface import body_motion
+from hoidata.physics.contact_forces import body_motion
 from hoidata.synthetic.closing import Placement
 from hoidata.synthetic.grasps import (
     SMALLEST_HAND_GAP_M,

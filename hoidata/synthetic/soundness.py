@@ -9,15 +9,16 @@ from hoidata.clips.clip import FPS, SIDES, ObjectTrack, Side
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandPair, track_joints, track_vertices
 from hoidata.hands.model import TIP_VERTICES
-from hoidata.physics.contact_forces import RESIDUAL_LIMIT, force_residual, required_wrench
-from hoidata.physics.surface import (
+from hoidata.objects.distance import SignedDistance
+from hoidata.objects.surface_index import surface_index
+from hoidata.physics.contact_forces import (
+    RESIDUAL_LIMIT,
     Contacts,
-    SurfaceDistances,
     body_motion,
+    force_residual,
     hand_patches,
     patch_contacts,
-    penetration_depth_m,
-    surface_distances,
+    required_wrench,
 )
 from hoidata.synthetic.truth import GRAVITY, TruthSequence
 
@@ -29,7 +30,7 @@ _IDLE_M = 0.2
 # which a hand counts as acting, acting joints stay above the table, and two hands keep their joints apart.
 _NEAR_IDLE_M, _TABLE_M, _HANDS_APART_M = 0.028, 0.0, 0.012
 _SAME_M = 1e-5
-# Vertices farther away than this are not looked at; a hand that has none nearer counts as away (infinite distance).
+# A hand without a vertex nearer than this counts as away (infinite distance).
 _REACH_M = 0.008
 
 
@@ -68,10 +69,10 @@ def measure(truth: TruthSequence, pair: HandPair, hand_shift_m: np.ndarray | Non
     """
     truth = truth.at_30_fps()
     held = np.flatnonzero(truth.held)
-    near: dict[Side, SurfaceDistances] = {
+    near: dict[Side, SignedDistance] = {
         side: _distances(truth, side, pair, hand_shift_m) for side in truth.acting_sides
     }
-    penetration = np.max([penetration_depth_m(one) for one in near.values()], axis=0)
+    penetration = np.max([-one.distance_m.min(1) for one in near.values()], axis=0).clip(0)
     distances: dict[Side, np.ndarray] = {side: one.distance_m.min(1) for side, one in near.items()}
     joints: dict[Side, np.ndarray] = {
         side: _joint_distance(truth, side, pair, one, hand_shift_m) for side, one in near.items()
@@ -129,9 +130,7 @@ def _wrench(truth: TruthSequence):
     return required_wrench(motion, FPS, GRAVITY), motion
 
 
-def _residuals(
-    truth: TruthSequence, near: dict[Side, SurfaceDistances], pair: HandPair, held: np.ndarray
-) -> np.ndarray:
+def _residuals(truth: TruthSequence, near: dict[Side, SignedDistance], pair: HandPair, held: np.ndarray) -> np.ndarray:
     wrench, motion = _wrench(truth)
     patches = {side: hand_patches(pair[side]) for side in near}
     residual = np.empty(len(held))
@@ -154,7 +153,7 @@ def _object_points(truth: TruthSequence, points_m: np.ndarray, shift_m: np.ndarr
     return truth.object.world_from_object.inverse() @ moved
 
 
-def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.ndarray | None) -> SurfaceDistances:
+def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.ndarray | None) -> SignedDistance:
     """Of the hand's vertices, computed once for frames in which hand and object stand to each other the same way."""
     points = _object_points(truth, track_vertices(truth.hands[side], pair[side]), shift_m)
     hinge = truth.object.hinge_rad
@@ -166,11 +165,12 @@ def _distances(truth: TruthSequence, side: Side, pair: HandPair, shift_m: np.nda
     changed = np.concatenate([[True], (np.abs(np.diff(keys, axis=0)) > 1).any(1)])
     first = np.flatnonzero(changed)
     back = np.cumsum(changed) - 1
-    found = surface_distances(truth.object.model, None if hinge is None else hinge[first], points[first], _REACH_M)
-    return SurfaceDistances(*(array[back] for array in found))
+    found = surface_index(truth.object.model).nearest(points[first], None if hinge is None else hinge[first])
+    found = found._replace(distance_m=np.where(found.distance_m > _REACH_M, np.inf, found.distance_m))
+    return SignedDistance(*(array[back] for array in found))
 
 
-def _joint_distance(truth, side: Side, pair: HandPair, vertices: SurfaceDistances, shift_m) -> np.ndarray:
+def _joint_distance(truth, side: Side, pair: HandPair, vertices: SignedDistance, shift_m) -> np.ndarray:
     """(frame,) of the nearest fingertip vertex, or of any joint where no tip is near."""
     tips = np.abs(vertices.distance_m[:, list(TIP_VERTICES)]).min(1)
     far = np.flatnonzero(tips > _JOINT_TOUCH_M)
@@ -178,7 +178,7 @@ def _joint_distance(truth, side: Side, pair: HandPair, vertices: SurfaceDistance
         track = truth.hands[side]
         joints = _object_points(truth, track_joints(track, pair[side]), shift_m)[far]
         hinge = None if truth.object.hinge_rad is None else truth.object.hinge_rad[far]
-        tips[far] = np.abs(surface_distances(truth.object.model, hinge, joints).distance_m).min(1)
+        tips[far] = surface_index(truth.object.model).distance_m(joints, hinge).min(1)
     return tips
 
 

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import igl
 import numpy as np
 import trimesh
 
+from hoidata.objects.distance import merged_surface
 from hoidata.objects.model import Hinge, ObjectModel
 from hoidata.objects.sampling import SampledPoints
 
@@ -18,6 +20,11 @@ def model_of(mesh: Any, name: str = "object") -> ObjectModel:
 
 def box_model(size_m: Three = (0.10, 0.08, 0.06), name: str = "box", middle_m: Three = (0.0, 0.0, 0.0)) -> ObjectModel:
     return model_of(trimesh.creation.box(size_m).apply_translation(middle_m), name)
+
+
+def igl_signed_m(vertices_m: np.ndarray, faces: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    """(point,) libigl's signed distances to a closed mesh (vertex, 3), (face, 3)."""
+    return igl.signed_distance(points_m, *merged_surface(vertices_m, faces))[0]
 
 
 def two_parts(

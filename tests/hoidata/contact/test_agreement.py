@@ -5,10 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hoidata.contact.agreement import f1_score
 
 from hoidata.clips import Clip
-from hoidata.contact.maps import contact_maps, touched_frames
+from hoidata.contact.maps import contact_maps, f1_score, touched_frames
 from hoidata.contact.proximity import ENTRY
 from hoidata.contact.settings import ContactSettings, read_contact_settings
 from hoidata.contact.stage import contact_store

@@ -1,32 +1,40 @@
-"""One grid of signed distances, read in NumPy and in torch: both against the exact ones."""
+"""Grids of signed distances, the torch one of losses and the one of the grasp search: both against exact ones."""
 
 import numpy as np
 import torch
 
-from hoidata.objects.distance import signed_distance
+from hoidata.objects.distance import closest_points
 from hoidata.objects.model import ObjectModel
 from hoidata.objects.signed_distance_grid import DistanceFields
+from hoidata.objects.surface_index import surface_index
 from hoidata.synthetic.closing import grid_field
 from hoidata.synthetic.shapes import sphere
+from tests.builders.objects import igl_signed_m
 
 
 def test_both_look_ups_give_the_exact_signed_distance_to_a_fraction_of_a_cell():
     vertices, faces = sphere(0.05, 40)
     model = ObjectModel("ball", vertices, faces, np.zeros(len(vertices), np.uint8))
     points = np.random.default_rng(0).uniform(-0.07, 0.07, (400, 3))
-    exact = signed_distance(vertices, faces, points)
-    assert exact.distance_m.min() < -0.03
-    numpy_m = grid_field(vertices, faces)(points)
+    exact_m = igl_signed_m(vertices, faces, points)
+    assert exact_m.min() < -0.03
+    search_m = grid_field(surface_index(model).filled[0])(points)
     fields = DistanceFields([("ball", model)], 40)
     asked = torch.from_numpy(points[None, None].astype(np.float32))
     torch_m, offset_m = fields.query(torch.zeros(1, dtype=torch.long), asked, torch.zeros(1, 1))
-    far = np.abs(exact.distance_m) < 0.03  # the offset jumps in the middle of the ball
-    for found in (numpy_m, torch_m[0, 0].numpy()):
-        np.testing.assert_allclose(found[far], exact.distance_m[far], atol=4e-4)
-    np.testing.assert_allclose(points[far] + offset_m[0, 0].numpy()[far], exact.closest_m[far], atol=3e-3)
+    far = np.abs(exact_m) < 0.03  # the offset jumps in the middle of the ball
+    near = far & (exact_m < 0.01)  # the grid of the search reaches 1 cm, that of losses 3 cm
+    for found, asked_m in ((search_m, near), (torch_m[0, 0].numpy(), far)):
+        np.testing.assert_allclose(found[asked_m], exact_m[asked_m], atol=4e-4)
+    off = exact_m > 0.01  # a lower bound, by at most the root of two
+    assert (search_m[off] < exact_m[off] + 4e-4).all()
+    assert (search_m[off] > exact_m[off] / np.sqrt(2) - 4e-4).all()
+    np.testing.assert_allclose(
+        points[far] + offset_m[0, 0].numpy()[far], closest_points(vertices, faces, points).closest_m[far], atol=3e-3
+    )
 
 
-def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_numpy_one_stays_below():
+def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_search_s_stays_below():
     vertices, faces = sphere(0.05, 40)
     model = ObjectModel("ball", vertices, faces, np.zeros(len(vertices), np.uint8))
     asked = torch.tensor([[[[0.3, 0.0, 0.0]]]])
@@ -35,4 +43,4 @@ def test_beyond_the_grid_the_torch_look_up_goes_on_and_the_numpy_one_stays_below
     )
     np.testing.assert_allclose(distance, [[[0.25]]], atol=1e-3)
     np.testing.assert_allclose(offset, [[[[-0.25, 0, 0]]]], atol=1e-3)
-    assert 0.2 < grid_field(vertices, faces)(np.array([[0.3, 0.0, 0.0]]))[0] <= 0.251
+    assert 0.2 < grid_field(surface_index(model).filled[0])(np.array([[0.3, 0.0, 0.0]]))[0] <= 0.251

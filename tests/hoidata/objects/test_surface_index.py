@@ -285,3 +285,27 @@ def test_the_nearest_place_on_triangles_as_narrow_as_rounding_is_as_far_as_is_sa
     found = PartSurface(vertices, faces, False, 10**9).nearest(positions)
     apart = np.linalg.norm(positions - found.closest_m, axis=1)
     np.testing.assert_allclose(apart, found.distance_m, atol=1e-6 * size)
+
+
+def test_the_signed_distance_inside_a_cube_is_that_to_its_nearest_face():
+    cube = SurfaceIndex(box_model((0.2, 0.2, 0.2)))
+    points = np.array([[[0.0, 0.0, 0.09], [0.0, 0.0, 0.12]], [[0.0, 0.0, 0.11], [0.0, 0.0, 0.3]]])
+    found = cube.nearest(points, None)
+    np.testing.assert_allclose(found.distance_m[0], [-0.01, 0.02], atol=1e-12)
+    np.testing.assert_allclose(cube.depth_m(points, None).max(axis=1), [0.01, 0.0], atol=1e-12)
+    np.testing.assert_allclose(found.closest_m[0, 0], [0, 0, 0.1], atol=1e-12)
+    np.testing.assert_allclose(found.normal[0, 0], [0, 0, 1], atol=1e-12)
+
+
+def test_the_nearest_place_of_a_moved_lid_is_where_the_lid_is():
+    base, lid = (
+        box_model((0.1, 0.1, 0.04), middle_m=(0.05, 0, -0.021)),
+        box_model((0.1, 0.1, 0.02), middle_m=(0.05, 0, 0.011)),
+    )
+    model = two_parts(base, lid, (0, -1, 0))
+    angles = np.array([0.4, 1.1])
+    top = articulate(np.array([[0.05, 0.0, 0.021 + 0.005]]), np.ones(1), model.hinge, angles)
+    found = SurfaceIndex(model).nearest(top, angles)
+    np.testing.assert_allclose(found.distance_m[:, 0], 0.005, atol=1e-9)
+    surface = articulate(np.array([[0.05, 0.0, 0.021]]), np.ones(1), model.hinge, angles)
+    np.testing.assert_allclose(found.closest_m, surface, atol=1e-9)

@@ -2,19 +2,23 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hoidata.hands import load_embedded_hands
 from hoidata.objects.mesh import mass_properties
 from hoidata.objects.model import ObjectModel
+from hoidata.objects.surface_index import SurfaceIndex
 from hoidata.physics.contact_forces import (
     GRAVITY_M_S2,
     RESIDUAL_LIMIT,
     BodyMotion,
     angular_velocity,
+    body_motion,
     cone_edges,
     force_residual,
+    hand_patches,
+    patch_contacts,
     required_wrench,
     wrench_columns,
 )
-from hoidata.physics.surface import body_motion
 from hoidata.synthetic.shapes import sharp_box
 from tests.builders.objects import box_model, two_parts
 
@@ -126,3 +130,17 @@ def test_a_closed_hinged_object_has_the_inertia_of_the_whole_box():
     motion = body_motion(_two_boxes(), np.eye(3)[None], np.zeros((1, 3)), np.zeros(1))
     whole = mass_properties(*sharp_box((0.1, 0.1, 0.06)))
     np.testing.assert_allclose(motion.inertia_kg_m2[0], whole.inertia_kg_m2, atol=1e-12)
+
+
+def test_every_patch_of_a_hand_has_vertices_and_left_mirrors_right():
+    pair = load_embedded_hands()
+    right, left = hand_patches(pair.right), hand_patches(pair.left)
+    assert set(right) == set(range(21))
+    np.testing.assert_array_equal(left, right)
+
+
+def test_one_contact_per_patch_at_its_deepest_vertex():
+    points = np.array([[[0.0, 0.0, 0.1005], [0.01, 0.0, 0.098], [0.05, 0.0, 0.11], [-0.05, 0.0, 0.101]]])
+    found = SurfaceIndex(box_model((0.2, 0.2, 0.2))).nearest(points, None)
+    contacts = patch_contacts(found, np.array([0, 0, 1, 2]), 0)
+    np.testing.assert_allclose(contacts.points_m, [[0.01, 0, 0.1], [-0.05, 0, 0.1]], atol=1e-12)

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.optimize import nnls
 
-from hoidata.physics.standard_units import wrench_residuals
+from hoidata.physics.realism import wrench_residuals
 
 NUMBERS = st.floats(-10, 10).map(lambda value: round(value, 3))
 

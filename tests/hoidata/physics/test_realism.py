@@ -9,12 +9,17 @@ from hoidata.errors import BadInput
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.model import ObjectModel
-from hoidata.physics.as_released import AsReleased, friction_edges
 from hoidata.physics.capsules import Capsules, ObjectPoses, capsule_contacts
 from hoidata.physics.contact_forces import cone_edges
-from hoidata.physics.realism import score, smoothness_m_s2
+from hoidata.physics.realism import (
+    AsReleased,
+    StandardUnits,
+    friction_edges,
+    score,
+    smoothness_m_s2,
+    table_contacts,
+)
 from hoidata.physics.scene import Scene, clip_scene
-from hoidata.physics.standard_units import StandardUnits, table_contacts
 from tests.builders.objects import box_model, two_parts
 
 SIZE = np.array([0.1, 0.08, 0.06])

@@ -7,13 +7,12 @@ import torch
 from hoidata.clips.clip import ObjectTrack
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import HandKinematics, load_embedded_hands
-from hoidata.objects.distance import signed_distance
 from hoidata.refinement.banded import acceleration_equations, second_differences, solve_blocks
 from hoidata.refinement.hold_solver import Draw, SolverSettings, Wishes
 from hoidata.refinement.kernels import N_UNKNOWNS, add_squares
 from hoidata.refinement.object_field import ObjectField
 from hoidata.refinement.skin import HandPose, Skin
-from tests.builders.objects import hinged_box
+from tests.builders.objects import hinged_box, igl_signed_m
 
 FRAMES = 3
 IDS = np.array([0, 5, 100, 317, 445, 556, 673, 745, 760])
@@ -57,7 +56,7 @@ def test_the_field_has_the_distances_of_both_parts_where_they_are_and_their_slop
     distance, slope = ObjectField(thing).distances(places)
     for frame in range(FRAMES):
         vertices = thing.take(slice(frame, frame + 1)).points_in_world(model.vertices_m, model.part)[0]
-        each = [signed_distance(vertices, model.faces_of(part), places[frame]).distance_m for part in (0, 1)]
+        each = [igl_signed_m(vertices, model.faces_of(part), places[frame]) for part in (0, 1)]
         exact = np.min(each, axis=0)
         near = exact < 0.01  # beyond the grid the way to its rim is added
         assert near.sum() > 100

@@ -4,12 +4,13 @@ import trimesh
 
 from hoidata.datasets.grab.words import OBJECTS as GRAB_WORDS
 from hoidata.datasets.h2o.adapter import ACTIONS
-from hoidata.objects.distance import signed_distance
 from hoidata.objects.mesh import mass_properties
+from hoidata.objects.surface_index import PartSurface, surface_index
 from hoidata.splits.definitions import published
 from hoidata.synthetic.catalogue import OBJECTS, object_model, object_spec
 from hoidata.synthetic.closing import gradient, grid_field, mirrored
 from hoidata.synthetic.shapes import cylinder, revolved, rounded_box, sharp_box, sphere, torus, united
+from tests.builders.objects import igl_signed_m
 
 ALL = [(dataset, spec.name) for dataset, specs in OBJECTS.items() for spec in specs]
 
@@ -101,42 +102,42 @@ def test_arctic_objects_turn_about_minus_z_through_their_origin_without_cutting_
     for angle in (0.0, 0.35, 0.95):
         turn = np.array([[np.cos(angle), np.sin(angle), 0], [-np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         moved = model.vertices_m[np.unique(lid)] @ turn.T
-        assert signed_distance(model.vertices_m, base, moved).distance_m.min() > -1e-6
+        assert igl_signed_m(model.vertices_m, base, moved).min() > -1e-6
 
 
 @pytest.mark.parametrize("key", [("grab", "mug"), ("h2o", "book"), ("grab", "toruslarge"), ("h2o", "spray")])
 @pytest.mark.slow
 def test_the_search_field_agrees_with_the_mesh_to_half_a_millimetre_near_its_faces(key):
     model = object_model(*key)
-    field = grid_field(model.vertices_m, model.faces)
+    field = grid_field(surface_index(model).filled[0])
     mesh = trimesh.Trimesh(model.vertices_m, model.faces, process=False)
     on_surface, face = trimesh.sample.sample_surface(mesh, 4000, seed=3)
     rng = np.random.default_rng(0)
     points = np.asarray(on_surface) + rng.uniform(-0.003, 0.01, (4000, 1)) * mesh.face_normals[face]
-    error = np.abs(field(points) - signed_distance(model.vertices_m, model.faces, points).distance_m)
+    error = np.abs(field(points) - igl_signed_m(model.vertices_m, model.faces, points))
     assert np.quantile(error, 0.95) < 0.0005
     assert error.max() < 0.003
 
 
 def test_far_from_the_grid_the_field_never_promises_more_room_than_there_is():
     model = object_model("grab", "mug")
-    field = grid_field(model.vertices_m, model.faces)
+    field = grid_field(surface_index(model).filled[0])
     points = np.random.default_rng(2).uniform(-0.4, 0.4, (500, 3))
-    assert (field(points) <= signed_distance(model.vertices_m, model.faces, points).distance_m + 0.001).all()
+    assert (field(points) <= igl_signed_m(model.vertices_m, model.faces, points) + 0.001).all()
 
 
 def test_a_mirrored_field_is_the_field_of_the_mirrored_object():
     model = object_model("grab", "mug")
-    turned_round = grid_field(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1])
+    turned_round = grid_field(PartSurface(model.vertices_m * [-1, 1, 1], model.faces[:, ::-1], True, 0))
     points = np.random.default_rng(1).uniform(-0.08, 0.1, (600, 3))
-    seen, wanted = mirrored(grid_field(model.vertices_m, model.faces))(points), turned_round(points)
+    seen, wanted = mirrored(grid_field(surface_index(model).filled[0]))(points), turned_round(points)
     near = wanted < 0.025
     assert near.sum() > 40
     assert np.abs(seen - wanted)[near].max() < 0.003
 
 
 def test_the_gradient_of_a_ball_points_away_from_its_middle():
-    field = grid_field(*sphere(0.05, 60))
+    field = grid_field(PartSurface(*sphere(0.05, 60), True, 0))
     directions = np.random.default_rng(5).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     assert np.einsum("pi,pi->p", gradient(field, 0.052 * directions), directions).min() > 0.98

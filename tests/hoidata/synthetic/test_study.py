@@ -12,7 +12,6 @@ from hoidata.clips.clip import SIDES
 from hoidata.files import sha256_file
 from hoidata.geometry.rotations import rotvec_to_rotmat
 from hoidata.hands import load_embedded_hands, track_joints
-from hoidata.objects.distance import signed_distance
 from hoidata.synthetic.catalogue import model_of
 from hoidata.synthetic.check import check_sequences
 from hoidata.synthetic.corpus import write_corpus
@@ -20,6 +19,7 @@ from hoidata.synthetic.paths import follow_path
 from hoidata.synthetic.soundness import measure, vertex_distances_m
 from hoidata.synthetic.study_objects import STUDY_OBJECTS
 from hoidata.synthetic.study_plan import HANDOVER, VERBS, choices, shares, study_plan, verbs_of
+from tests.builders.objects import igl_signed_m
 
 DATASETS = tuple(STUDY_OBJECTS)
 TEST, VALIDATION = {"s10"}, {"s9", "s05"}
@@ -85,7 +85,7 @@ def test_every_object_is_its_own_mirror_image_as_it_stands(dataset, row, region)
     model = model_of(thing.spec)
     for part in model.parts:
         own = model.vertices_m[model.part == part]
-        away = signed_distance(model.vertices_m, model.faces_of(part), own @ symmetry.T).distance_m
+        away = igl_signed_m(model.vertices_m, model.faces_of(part), own @ symmetry.T)
         assert np.abs(away).max() < 5e-4
     if model.hinge is not None:  # a lid opened in the mirror is a lid opened as far
         np.testing.assert_allclose(-symmetry @ model.hinge.axis, model.hinge.axis, atol=1e-9)
