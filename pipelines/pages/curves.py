@@ -91,7 +91,7 @@ def _draw_panel(axes: Axes, panel: Panel, x_label: str) -> None:
 def read_log(path: str | Path) -> dict[str, np.ndarray]:
     """The numeric columns of a training log, by name; an empty cell is NaN, a column of words is left out."""
     table = pd.read_csv(path).apply(pd.to_numeric, errors="coerce").dropna(axis="columns", how="all")
-    return {str(name): table[name].to_numpy(np.float64) for name in table}
+    return {str(name): column.to_numpy(np.float64) for name, column in table.items()}
 
 
 def log_curves(columns: dict[str, np.ndarray], x_name: str = "step") -> list[Curve]:
