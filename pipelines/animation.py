@@ -34,13 +34,12 @@ from models.manipnet.network import ManipNet
 from models.manipnet.rollout import Predictor, Rule
 from models.manipnet.training import MANIPNET
 from models.manipnet.trajectory_files import ENDINGS, Axes, TrajectoryFile, read_trajectories
-from pipelines.objects import MeshWish, stored_object
+from pipelines.command_inputs import MeshWish, stored_object, trained_on, trained_run
 from pipelines.pages.motion_files import ARRAYS as SHARED
 from pipelines.pages.motion_files import MotionFiles, drawn, hand_shapes, motion_arrays, write_motions
 from pipelines.pages.player import motion_player
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, load_hands
-from pipelines.trained import trained_on, trained_run
 
 Way = Literal["auto", "network", "interpolate"]
 ARRAYS = SHARED | {"made": "(S, F) whether the fingers were made here"}

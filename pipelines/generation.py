@@ -25,7 +25,7 @@ from models.text2hoi.generation import GeneratedMotion, Generator, Wish
 from models.text2hoi.sampler import SamplingConfig
 from models.text2hoi.sentences import further_verbs, read_sentence
 from models.text2hoi.wording import Wording, understood_words
-from pipelines.objects import MeshWish, mesh_notes, stored_object
+from pipelines.command_inputs import MeshWish, Written, mesh_notes, stored_object
 from pipelines.pages.generation_page import write_generation
 from pipelines.params import chosen_params, read_file
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
@@ -65,14 +65,6 @@ class Asked:
     mesh: MeshWish = field(default_factory=MeshWish)
     sampler: Mapping[str, Any] = field(default_factory=dict)
     force: bool = False
-
-
-@dataclass(frozen=True)
-class Written:
-    """paths of the files; notes: what was assumed, chosen or never seen in training, for the person who asked."""
-
-    paths: list[Path]
-    notes: list[str]
 
 
 def generate_files(asked: Asked, out: Path) -> Written:

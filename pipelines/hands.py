@@ -28,12 +28,19 @@ from models.bimart.hands import MadeHands, MotionWish, hands_for
 from models.common.checkpoints import FILE_NAME, read_info
 from models.common.family import Sources
 from models.common.repeatable import make_repeatable
-from pipelines.objects import MeshWish, mesh_notes, nearest_name
+from pipelines.command_inputs import (
+    MeshWish,
+    Written,
+    check_dataset,
+    mesh_notes,
+    nearest_name,
+    trained_on,
+    trained_run,
+)
 from pipelines.pages.hands_page import write_hands
 from pipelines.pages.motion_files import hand_shapes
 from pipelines.showing import find_clip
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
-from pipelines.trained import check_dataset, trained_on, trained_run
 
 LEAST_S = 0.3
 MOST_FRAMES = round(MOST_S * FPS) + 1
@@ -73,14 +80,7 @@ class Asked(NamedTuple):
     notes: list[str]
 
 
-class WrittenHands(NamedTuple):
-    """paths of the files; notes: what was assumed, for the person who asked."""
-
-    paths: list[Path]
-    notes: list[str]
-
-
-def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: Path) -> WrittenHands:
+def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: Path) -> Written:
     """Make hands, and write arrays, an animated GLB each and a page that plays them into ``out``.
 
     Raises MissingResource or BadInput that says what is not there or cannot be meant, and what to do.
@@ -95,7 +95,7 @@ def hands_files(wish: HandsWish, profile: str, datasets: tuple[str, ...], out: P
     learned = trained_on(read_info(paths.checkpoints / BIMART.uses[-1] / FILE_NAME)["facts"])
     facts = [("object's motion", asked.source), ("networks", f"{paths.checkpoints} (learnt from {learned})")]
     notes = [*asked.notes, *_notes(motions)]
-    return WrittenHands(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)
+    return Written(write_hands(out, motions, hands, asked.steps, made_from, facts, notes), notes)
 
 
 def asked_motion(wish: HandsWish, profile: str, datasets: tuple[str, ...], hands: HandPair) -> Asked:

@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from hoidata.errors import BadInput, MissingResource
-from pipelines.commands.hands import chosen_hands
+from pipelines.commands.project import chosen_hands
 from pipelines.params import load_yaml
 
 if TYPE_CHECKING:

@@ -11,8 +11,7 @@ import typer
 from rich.console import Console
 
 from hoidata.errors import MissingResource
-from pipelines.commands.hands import hands_of
-from pipelines.commands.project import enter_project
+from pipelines.commands.project import enter_project, hands_of
 
 if TYPE_CHECKING:
     from rich.table import Table

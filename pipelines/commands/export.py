@@ -34,8 +34,7 @@ def export(data: Data, to: To, out: Out, clip: ClipIds = None, for_own_use: OwnU
 
     from hoidata.errors import MissingResource
     from hoidata.store.store import open_store, read_info
-    from pipelines.commands.hands import hands_of
-    from pipelines.commands.project import enter_project
+    from pipelines.commands.project import enter_project, hands_of
     from pipelines.exports.export import export_store
 
     folder = data if (data / "meta").is_dir() else data / "clips"

@@ -66,9 +66,7 @@ def of(
     if raw or page:
         sources = raw_sources(root, found.record) if found.kind != "motion" else _raw_of_motion(root, found.record)
     if page:
-        from pipelines.pages.lineage_page import write_lineage_page
-
-        write_lineage_page(page, tree, found.record, sources)
+        formats.write_lineage_page(page, tree, found.record, sources)
     if mermaid:
         typer.echo(formats.mermaid(tree, found.record), nl=False)
     elif json or prov:

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from pipelines.commands.hands import hands_of
-from pipelines.commands.project import current_profile, enter_project
+from pipelines.commands.project import current_profile, enter_project, hands_of
 
 if TYPE_CHECKING:
-    from pipelines.generation import Models, Written
-    from pipelines.hands import WrittenHands
+    from pipelines.command_inputs import Written
+    from pipelines.generation import Models
 
 Out = Annotated[
     Path, typer.Option(help="Folder for motion.npz, motion.glb and index.html.", resolve_path=True, file_okay=False)
@@ -79,8 +78,8 @@ def generate(
     from hoidata.clips.clip import FPS
     from hoidata.errors import BadInput
     from models.text2hoi.generation import Wish
+    from pipelines.command_inputs import MeshWish
     from pipelines.generation import Asked, generate_files
-    from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
     where: dict[str, Any] = {"models": _given_models(models, encoder)} if models else {}
@@ -167,7 +166,7 @@ def animate(
     project = enter_project()
     from hoidata.clips.clip import SIDES
     from pipelines.animation import AnimateWish, animate_files
-    from pipelines.objects import MeshWish
+    from pipelines.command_inputs import MeshWish
     from pipelines.params import read_params
 
     paths = [str(here / name) if name and isfile(here / name) else name for name in (what, object)]
@@ -205,8 +204,8 @@ def hands(
     """An object's motion -> contact maps, hands, refinement; writes arrays, animated GLBs and a page."""
     here = Path.cwd()
     project = enter_project()
+    from pipelines.command_inputs import MeshWish
     from pipelines.hands import HandsWish, hands_files
-    from pipelines.objects import MeshWish
     from pipelines.params import read_params
 
     wish = HandsWish(
@@ -226,7 +225,7 @@ def hands(
     _tell(written)
 
 
-def _tell(written: "Written | WrittenHands") -> None:
+def _tell(written: "Written") -> None:
     for note in written.notes:
         typer.echo(note, err=True)
     for path in written.paths:

@@ -7,8 +7,7 @@ from typing import Annotated
 import typer
 
 from hoidata.errors import BadInput, MissingResource
-from pipelines.commands.hands import hands_of
-from pipelines.commands.project import current_profile, enter_project
+from pipelines.commands.project import current_profile, enter_project, hands_of
 
 Data = Annotated[
     Path | None,

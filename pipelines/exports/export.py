@@ -1,7 +1,10 @@
 """A store written in another project's form, with croissant.json, README.md and export.json beside what was written."""
 
+import io
+import tarfile
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +16,9 @@ from rich.progress import Progress
 from hoidata.clips.clip import SIDES, Clip, Side
 from hoidata.errors import BadInput
 from hoidata.files import atomic_folder
+from hoidata.files.arrays import write_npz_to
 from hoidata.store.store import Store
-from pipelines.exports import bvh, hugging_face, lerobot, spider, usd, web_dataset
+from pipelines.exports import bvh, hugging_face, lerobot, spider, usd
 from pipelines.exports.describe import Description, write_description
 from pipelines.exports.licences import (
     HANDS,
@@ -31,6 +35,7 @@ from pipelines.exports.licences import (
 from pipelines.exports.motion import CLIP_COLUMNS, COLUMNS, WORLD, Y_UP, Column, ExportedClip, Source
 from pipelines.pages.glb import glb_bytes
 
+CLIPS_PER_SHARD = 500
 _MOTION = (HANDS, OBJECT, WORDS)
 _PARAMETERS = (*_MOTION, PERSON)
 _COLUMNS = (*COLUMNS, *CLIP_COLUMNS)
@@ -75,6 +80,27 @@ def _write_glb(folder: Path, clips: Iterable[ExportedClip]) -> None:
         (folder / f"{item.file_name}.glb").write_bytes(scene)
 
 
+def _write_web_dataset(folder: Path, clips: Iterable[ExportedClip]) -> None:
+    """Write WebDataset shards <subset>-<number>.tar, ``all-`` for clips in no subset, which follow each other.
+
+    ``<number>.npz`` of a clip has the arrays of ``COLUMNS`` and ``CLIP_COLUMNS``, ``<number>.json`` the facts.
+    """
+    for subset, group in groupby(clips, key=lambda item: item.subset):
+        for shard, numbered in groupby(enumerate(group), key=lambda pair: pair[0] // CLIPS_PER_SHARD):
+            with tarfile.open(folder / f"{subset or 'all'}-{shard:06d}.tar", "w", format=tarfile.USTAR_FORMAT) as tar:
+                for number, item in numbered:
+                    _add_to_tar(tar, f"{number:08d}", item)
+
+
+def _add_to_tar(tar: tarfile.TarFile, key: str, item: ExportedClip) -> None:
+    arrays = io.BytesIO()
+    write_npz_to(arrays, item.arrays() | item.clip_arrays())
+    for suffix, content in (("npz", arrays.getvalue()), ("json", orjson.dumps(item.facts))):
+        member = tarfile.TarInfo(f"{key}.{suffix}")  # dated 1970: equal clips, equal bytes
+        member.size = len(content)
+        tar.addfile(member, io.BytesIO(content))
+
+
 FORMATS = {
     "croissant": Format("croissant.json and a dataset card for the store itself, to lie beside its meta/", (), None),
     "lerobot": Format(
@@ -84,7 +110,7 @@ FORMATS = {
         "Parquet with features: datasets.load_dataset(DIR)", _PARAMETERS, hugging_face.write, columns=_COLUMNS
     ),
     "webdataset": Format(
-        "tar shards with .npz and .json of each clip", _PARAMETERS, web_dataset.write, columns=_COLUMNS
+        "tar shards with .npz and .json of each clip", _PARAMETERS, _write_web_dataset, columns=_COLUMNS
     ),
     "glb": Format("an animated scene per clip", _SCENE, _write_glb, world=Y_UP),
     "usd": Format("a stage per clip, meshes with time samples", _SCENE, usd.write, world=Y_UP),

@@ -1,12 +1,16 @@
-"""A lineage in the forms of others: Mermaid and PROV-JSON. Both come from the record alone."""
+"""A lineage as a page, and in the forms of others: Mermaid and PROV-JSON, which come from the record alone."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from pipelines.lineage.digests import value_digest
-from pipelines.lineage.tree import Node
+from pipelines.lineage.raw import RawSource
+from pipelines.lineage.tree import STATUSES, Node, overall_status
 
+QUIET = ("same", "recorded")
 PRODUCER = "urn:hoidata:lineage"
 _STATUS_COLOURS = {"same": "#e5f5e5", "recorded": "#eeeeee", "uncommitted": "#fff4cc", "changed": "#fff4cc"}
 _BAD_COLOUR = "#fadbd8"
@@ -119,3 +123,24 @@ def prov(tree: Node, record: dict[str, Any]) -> dict[str, Any]:
 
 def _qualified(kind: str, name: str) -> str:
     return f"hoi:{kind}/{quote(name, safe='/@')}"
+
+
+def write_lineage_page(path: Path, tree: Node, record: dict[str, Any], sources: Sequence[RawSource]) -> Path:
+    """Write a self-contained page; what is not as recorded stands open, all else is folded."""
+    from pipelines.pages.player import write_page  # imports what draws motions
+
+    status = overall_status(tree)
+    stages = dict.fromkeys(node.name for node in tree.walk() if node.kind == "stage")
+    return write_page(
+        path,
+        "lineage.html",
+        title=f"Lineage of {tree.name}",
+        status=status,
+        meaning=STATUSES[status],
+        tree=tree,
+        loud={node.name for node in tree.walk() if any(below.status not in QUIET for below in node.walk())},
+        anchors={name: f"stage-{number}" for number, name in enumerate(stages)},
+        libraries=record.get("libraries", {}),
+        sources=list(sources),
+        has_players=False,
+    )

@@ -14,14 +14,15 @@ from hoidata.objects.sampling import SampledPoints
 from hoidata.store.annotated import AnnotatedStore
 from hoidata.surface.bimart_maps import REACH_M, STEP_M, packed_map
 from pipelines.pages.clip_page_facts import (
+    ClipSeries,
     clip_facts,
     clip_quality,
     hand_decision,
+    measure_clip,
     sentence_rows,
     source_rows,
     split_rows,
 )
-from pipelines.pages.clip_page_series import ClipSeries, measure_clip
 from pipelines.pages.clip_page_timeline import BOTH_COLOUR, SIDE_COLOURS, clip_charts, draw_timeline
 from pipelines.pages.examples import true_contact
 from pipelines.pages.player import Player, contact_player, motion_player, write_page

@@ -11,7 +11,7 @@ from matplotlib.ticker import MaxNLocator
 
 from hoidata.clips.clip import Side
 from hoidata.surface.contact import TOUCH_M
-from pipelines.pages.clip_page_series import ClipSeries
+from pipelines.pages.clip_page_facts import ClipSeries
 from pipelines.pages.curves import figure_svg
 
 # Stronger than the hands' own colours: lines are thin. clip_page.js paints contact in the same.

@@ -27,7 +27,9 @@ from pipelines.cli import app
 from pipelines.lineage.locks import dvc_digest, written_digest
 from pipelines.side_by_side import log_of
 from pipelines.stages.code import write_code
+from tests.builders.folders import kept
 from tests.pipelines.prefect_up import hoidata_up, wait_until
+from tests.pipelines.test_interrupts import is_at_work, until
 
 IS_CHAOS = "HOIDATA_CHAOS" in os.environ
 TURNS = range(int(os.environ.get("HOIDATA_CHAOS", "1")))
@@ -196,23 +198,14 @@ def test_a_run_that_is_interrupted_or_killed_takes_its_stages_along(built, typed
     process = begun("hoidata", "repro", CONVERT)
     wait_until(lambda: "Running stage" in text_of(log), 60, process, process.told)
     time.sleep(moment(turn, 0, 2))
-    children = [child.pid for child in psutil.Process(process.pid).children(recursive=True)]
+    children = psutil.Process(process.pid).children(recursive=True)
     os.kill(process.pid, sent)
     code = process.wait(60)
     told = process.told.read_text()
     if sent != signal.SIGKILL:
         assert (code, "run it again" in told, "Traceback" in told) == (128 + sent, True, False), told
-    deadline = time.monotonic() + 30
-    while any(is_at_work(pid) for pid in children):
-        assert time.monotonic() < deadline, "stages go on although nobody waits for them"
-        time.sleep(0.1)
+    until(lambda: not any(map(is_at_work, children)), 30)  # else stages go on although nobody waits for them
     completes(typed, CONVERT)
-
-
-def is_at_work(pid: int) -> bool:
-    with contextlib.suppress(psutil.NoSuchProcess):
-        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-    return False
 
 
 @only_in_chaos
@@ -363,13 +356,10 @@ def test_facts_without_an_entry_name_it_and_the_file(built):
     from hoidata.store.store import open_store
 
     path = built / "data/embedded/grab/clips/meta/info.json"
-    whole = path.read_text()
-    path.write_text(json.dumps({key: value for key, value in json.loads(whole).items() if key != "counts"}))
-    try:
+    with kept(path) as whole:
+        path.write_text(json.dumps({key: value for key, value in json.loads(whole).items() if key != "counts"}))
         with pytest.raises(BadInput, match=r"info\.json: counts"):
             open_store(path.parents[1])
-    finally:
-        path.write_text(whole)
 
 
 def test_names_that_are_not_utf_8_are_told_and_not_raised(built, typed, tmp_path):

@@ -16,8 +16,8 @@ from hoidata.object_paths import keyframed_path, parse_keyframes
 from hoidata.store.info import generated_info
 from hoidata.store.store import write_store
 from models.bimart.hands import Standing
+from pipelines.command_inputs import MeshWish, stored_object
 from pipelines.hands import Asked, HandsWish, asked_motion, chosen_networks, hinge_range
-from pipelines.objects import MeshWish, stored_object
 from pipelines.pages.hands_page import _figures
 from pipelines.pages.motion_files import mesh_arrays, motion_arrays
 from tests.builders.clips import clip_of

@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from pathlib import Path
 
 import pytest
@@ -14,8 +13,10 @@ from hoidata.errors import BadInput
 from hoidata.files.sealed import read_metadata
 from pipelines.cli import app
 from pipelines.side_by_side import CODE
+from tests.builders.folders import kept, moved
 
 pytestmark = [pytest.mark.slow, pytest.mark.first]
+RAW = ".hoidata/raw/embedded/grab"
 MODELS = ("contact", "length", "diffusion", "refiner")
 
 
@@ -90,67 +91,49 @@ def test_lineage_rerun_trains_the_same_weights_in_a_clean_clone(built, project_t
 
 
 def test_lineage_says_what_has_changed_since(built, project_tools):
-    params = (built / "params.yaml").read_text()
-    values = yaml.safe_load(params)
-    values["annotate"]["threshold_m"] = 0.03
-    project_tools.write_params(built, values)
-    try:
+    with kept(built / "params.yaml") as params:
+        values = yaml.safe_load(params)
+        values["annotate"]["threshold_m"] = 0.03
+        project_tools.write_params(built, values)
         result = project_tools.run(built, "hoidata", "lineage", "checkpoints/embedded/grab/contact")
         assert result.returncode == 1
         assert "annotate changed threshold_m: None -> 0.03" in result.stdout
-    finally:
-        (built / "params.yaml").write_text(params)
 
 
 def test_removing_the_raw_data_afterwards_neither_deletes_nor_retrains_anything(built, project_tools):
-    raw = built / ".hoidata/raw/embedded/grab"
-    shutil.move(raw, built / "moved")
-    try:
+    with moved(built / RAW, built / "moved"):
         result = project_tools.run(built, "dvc", "repro")
         assert result.returncode == 0, result.stderr
         assert stages_run(result.stdout) == [CODE]
-    finally:
-        shutil.move(built / "moved", raw)
 
 
 def test_a_failing_conversion_leaves_the_clips_in_place(built, project_tools):
     code = built / "pipelines/stages/convert.py"
-    text = code.read_text()
-    shutil.move(built / ".hoidata/raw/embedded/grab", built / "moved")
-    code.write_text(text + "\n# edited\n")
-    try:
+    with moved(built / RAW, built / "moved"), kept(code) as text:
+        code.write_bytes(text + b"\n# edited\n")
         result = project_tools.run(built, "dvc", "repro", "convert@embedded-grab")
         assert result.returncode != 0
         assert "hoidata synth write grab" in result.stdout + result.stderr
         assert (built / "data/embedded/grab/clips/meta/sequences.parquet").is_file()
-    finally:
-        code.write_text(text)
-        shutil.move(built / "moved", built / ".hoidata/raw/embedded/grab")
-        assert project_tools.run(built, "dvc", "repro", CODE).returncode == 0
+    assert project_tools.run(built, "dvc", "repro", CODE).returncode == 0
 
 
 @pytest.mark.long
 def test_going_to_the_other_profile_and_back_runs_nothing_again(built, project_tools):
-    params = (built / "params.yaml").read_text()
-    values = yaml.safe_load(params)
-    project_tools.write_params(built, {**values, "profile": "own"})
-    other = project_tools.run(built, "dvc", "repro", "models/text2hoi/dvc.yaml:train@own-grab-contact")
-    (built / "params.yaml").write_text(params)
+    with kept(built / "params.yaml") as params:
+        project_tools.write_params(built, {**yaml.safe_load(params), "profile": "own"})
+        other = project_tools.run(built, "dvc", "repro", "models/text2hoi/dvc.yaml:train@own-grab-contact")
     assert other.returncode == 0, other.stderr
     assert (built / "checkpoints/own/grab/contact/empty.json").is_file()
     assert stages_run(project_tools.run(built, "dvc", "repro").stdout) == [CODE]
 
 
 def test_a_dataset_that_becomes_present_runs_its_own_stages_only(built, project_tools):
-    manifest = built / "manifests/embedded/arctic.json"
-    text = manifest.read_text()
-    project_tools.set_present(built, {"grab", "arctic"})
-    try:
+    with kept(built / "manifests/embedded/arctic.json"):
+        project_tools.set_present(built, {"grab", "arctic"})
         status = json.loads(project_tools.run(built, "dvc", "status", "--json").stdout)
         assert "raw@embedded-arctic" in status
         assert not [stage for stage in status if "grab" in stage]
-    finally:
-        manifest.write_text(text)
 
 
 @pytest.mark.long

@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -13,6 +12,7 @@ import pytest
 from hoidata import processor
 from hoidata.processor import processor_name, same_kernels
 from pipelines.warm import KILLED, SOCKET, WarmProcess, run_warm
+from tests.pipelines.test_interrupts import until
 
 ACT = """
 import os, signal, sys, time
@@ -49,17 +49,10 @@ def warm(tmp_path: Path):
         env={**os.environ, "PYTHONPATH": paths},
         start_new_session=True,
     )
-    until(path.exists)
+    until(path.exists, 20)
     yield {**os.environ, "PYTHONPATH": paths, "WORD": "given", SOCKET: str(path)}
     server.communicate(timeout=10)
     assert server.returncode == 0
-
-
-def until(true) -> None:
-    end = time.monotonic() + 20
-    while not true():
-        assert time.monotonic() < end
-        time.sleep(0.02)
 
 
 def ask(warm: dict[str, str], folder: Path, what: str) -> subprocess.Popen:
@@ -81,7 +74,7 @@ def test_a_stage_says_and_answers_what_it_would_by_itself(warm, tmp_path: Path, 
 
 def test_a_signal_for_the_one_that_asks_is_for_the_stage(warm, tmp_path: Path) -> None:
     asking = ask(warm, tmp_path, "wait")
-    until((tmp_path / "began").exists)
+    until((tmp_path / "began").exists, 20)
     asking.send_signal(signal.SIGTERM)
     assert asking.wait(20) == 7
     assert (tmp_path / "stopped").exists()
@@ -89,12 +82,12 @@ def test_a_signal_for_the_one_that_asks_is_for_the_stage(warm, tmp_path: Path) -
 
 def test_a_stage_ends_with_the_one_that_asked(warm, tmp_path: Path) -> None:
     asking = ask(warm, tmp_path, "wait")
-    until((tmp_path / "began").exists)
+    until((tmp_path / "began").exists, 20)
     fork = [int(entry.name) for entry in Path("/proc").iterdir() if entry.name.isdigit() and socket_of(entry, warm)]
     assert len(fork) == 1
     asking.kill()
     asking.wait()
-    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in fork))
+    until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in fork), 20)
 
 
 def test_a_stage_ends_with_one_that_was_killed_before_it_read_all() -> None:

@@ -48,7 +48,7 @@ def test_init_makes_the_graph_of_the_clone_with_the_stages_of_the_installation(t
 def test_init_leaves_a_project_alone_and_adds_to_what_git_ignores(tmp_path):
     (tmp_path / ".gitignore").write_text("mine\n")
     typed("init", tmp_path)
-    assert (tmp_path / ".gitignore").read_text().startswith("mine\n/.venv/\n")
+    assert (tmp_path / ".gitignore").read_text() == f"mine\n{(PROJECT / '.gitignore').read_text()}"
     with pytest.raises(BadInput, match=r"a folder without a project, got params\.yaml"):
         typed("init", tmp_path)
 

@@ -20,8 +20,7 @@ from hoidata.errors import MissingResource
 from hoidata.hands import track_joints, track_vertices
 from hoidata.store.annotated import load_annotated
 from pipelines.pages.clip_page import page_name, paint_values, write_clip_page
-from pipelines.pages.clip_page_facts import clip_facts
-from pipelines.pages.clip_page_series import measure_clip
+from pipelines.pages.clip_page_facts import clip_facts, measure_clip
 from pipelines.pages.clip_page_timeline import Chart, Line, clip_charts, draw_timeline
 from pipelines.pages.glb import write_glb
 from pipelines.pages.player import three_javascript
