@@ -50,6 +50,12 @@ _SHORTER = {
         "lifted frames"
     ),
     "the contact stage's distance and points (its info.json)": "the contact stage's threshold",
+    "of all clips of a repetition, mean over repetitions": "over all clips",
+    "BimArt (Zhang et al. 2025), this project: corrected": "BimArt, corrected",
+    "BimArt (Zhang et al. 2025)": "BimArt",
+    "ManipNet (Zhang et al. 2021)": "ManipNet",
+    "this project: ": "",
+    "this project": "hoidata",
 }
 
 
@@ -68,7 +74,7 @@ def _cells(metric: Metric) -> tuple[str, ...]:
     samples = f"first {metric.samples} sample(s)" if metric.samples else ""
     frames = "" if metric.frames == "all" else metric.frames
     parts = (metric.title, frames, metric.thresholds, reduction, every, samples)
-    return f"`{metric.name}`", metric.unit, _direction(metric), _joined(parts), metric.source
+    return f"`{metric.name}`", metric.unit, _direction(metric), _joined(parts), _shorter(metric.source)
 
 
 def _feature_rows() -> list[tuple[str, ...]]:
@@ -88,11 +94,14 @@ def _feature_rows() -> list[tuple[str, ...]]:
 def _feature_cells(metric: FeatureMetric) -> tuple[str, ...]:
     reduction = "" if metric.reduction == "mean over motions" else metric.reduction
     definition = _joined((metric.title.removesuffix(", paper"), metric.thresholds, reduction, metric.note))
-    return f"`{metric.name}`", metric.unit, _direction(metric), definition, metric.source
+    return f"`{metric.name}`", metric.unit, _direction(metric), definition, _shorter(metric.source)
 
 
 def _joined(parts: tuple[str, ...]) -> str:
-    text = "; ".join(filter(None, parts))
+    return _shorter("; ".join(filter(None, parts)))
+
+
+def _shorter(text: str) -> str:
     for long, short in _SHORTER.items():
         text = text.replace(long, short)
     return text
