@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import nn
-from torch._subclasses.fake_tensor import FakeTensorMode
+from torch._subclasses.fake_tensor import FakeTensorMode, unset_fake_temporarily
 from torch.utils.backend_registration import _setup_privateuseone_for_python_backend
 
 from hoidata.batches.dataset import collate
@@ -25,6 +25,7 @@ from hoidata.batches.sight import Sight
 from hoidata.hands import load_embedded_hands
 from hoidata.settings import build_config
 from hoidata.store.annotated import load_annotated
+from hoidata.store.store import Store
 from models.common.checkpoints import Checkpoint, load_checkpoint
 from models.common.corpus import Corpus
 from models.common.family import Network, Setup
@@ -49,6 +50,16 @@ PAPER: dict[str, dict[str, Any]] = {
     "diffusion": {"transformer": TRANSFORMER},
     "refiner": {"transformer": TRANSFORMER},
 }
+
+
+def on_host(function: Callable) -> Callable:
+    """The function with tensors that hold data: clips are read on the host, and their joints are computed there."""
+
+    def call(*arguments: Any) -> Any:
+        with unset_fake_temporarily():
+            return function(*arguments)
+
+    return call
 
 
 def moved(module: nn.Module, device: Any) -> nn.Module:
@@ -181,6 +192,7 @@ def lengths(stored: dict[str, Checkpoint], requests: list[Request]) -> None:
 def main() -> None:
     setattr(nn.Module, "to", moved)  # noqa: B010 (pyright knows it as a method)
     setattr(torch.Tensor, "to", sent)  # noqa: B010
+    setattr(Store, "joints", on_host(Store.joints))  # noqa: B010
     # Read from the clips' values, on the host, once before the first step.
     setattr(Normaliser, "of", lambda clips: Normaliser.nothing(clips[0][1].shape[-1]))  # noqa: B010
     every = [("a value that is waited for", lambda: float(torch.zeros((), device=DEVICE))),
