@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from hoidata.hands import HandPair
 
 app = typer.Typer(no_args_is_help=True)
-# Datasets whose sentences come from a list of verbs and objects.
-TEMPLATED = ("grab", "h2o", "arctic")
+# Datasets whose sentences come from a list of verbs and objects, and the module with that list.
+TEMPLATED = {"grab": "words", "h2o": "files", "arctic": "files"}
 COLOURS = {"pass": "green", "warn": "yellow", "fail": "bold red", "skip": "dim"}
 Name = Annotated[str, typer.Argument(help="A name that `hoidata adapters list` shows.")]
 Root = Annotated[Path, typer.Option(help="A raw folder it can read.", exists=True, file_okay=False, resolve_path=True)]
@@ -64,7 +64,7 @@ def sentences(
     for name in names or TEMPLATED:
         if name not in TEMPLATED:
             raise BadInput("hoidata adapters sentences", " or ".join(TEMPLATED), name, "choose one of them")
-        pairs = import_module(f"hoidata.datasets.{name}.words").PAIRS
+        pairs = import_module(f"hoidata.datasets.{name}.{TEMPLATED[name]}").PAIRS
         typer.echo(f"{name}: {len(pairs)} pairs of verb and object")
         for verb, words in pairs:
             typer.echo(f"  {verb}, {words}: {' '.join(four_sentences(verb, words, hand))}")

@@ -5,7 +5,6 @@ Also the tables made of all datasets: conventions from their facts, problems of 
 
 import importlib
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -94,26 +93,8 @@ CONTRACTS: tuple[type[AdapterContract], ...] = (OfH2O, Grab, Arctic, ManipNet, T
 ROOM = Path(hoidata.datasets.__file__).parent
 
 
-def as_markdown(contracts: Iterable[type[AdapterContract]]) -> str:
-    """One line per problem, one column per dataset: the words of the error, or a dash where it cannot occur."""
-    names, cells = [kind.name for kind in contracts], {}
-    for kind in contracts:
-        for row in kind.rows():
-            cells.setdefault(row.problem, {})[kind.name] = f"{Path(row.where).name}: {row.says}"
-    lines = [f"| problem | {' | '.join(names)} |", f"|---|{'---|' * len(names)}"]
-    lines += [
-        f"| {problem} | {' | '.join(found.get(name, '-') for name in names)} |" for problem, found in cells.items()
-    ]
-    return "\n".join(lines)
-
-
 def test_every_built_in_dataset_is_under_contract() -> None:
     assert sorted(kind.name for kind in CONTRACTS) == built_in_names()
-
-
-@pytest.mark.slow
-def test_the_readme_of_files_prints_the_problems_of_all_contracts() -> None:
-    assert as_markdown(CONTRACTS) in Path(hoidata.files.__file__).with_name("README.md").read_text()
 
 
 def test_the_committed_table_of_conventions_is_made_of_the_facts() -> None:
@@ -127,7 +108,3 @@ def test_no_dataset_imports_another_and_the_shared_code_imports_none() -> None:
         owner = path.parent.name if path.parent.parent == ROOM else ""
         named = set(re.findall(r"hoidata\.datasets\.(\w+)", path.read_text())) & set(built_in_names())
         assert named <= {owner}, path
-
-
-if __name__ == "__main__":
-    print(as_markdown(CONTRACTS))
