@@ -47,6 +47,13 @@ def test_maps_are_bytes_that_are_one_where_any_frame_touches():
     assert touched_frames(entries["left"], 5).dtype == np.uint16
 
 
+def test_one_point_and_any_length_above_zero_are_settings_and_nothing_less_is():
+    assert ContactSettings(points=1, threshold_m=1e-6).points == 1
+    for values in ({"points": 0}, {"threshold_m": 0.0}, {"threshold_m": -0.01}, {"threshold_m": float("nan")}):
+        with pytest.raises(BadInput, match=r"contact\."):
+            ContactSettings(**values)
+
+
 def test_the_store_keeps_entries_below_its_threshold_and_says_which_that_was(tmp_path):
     """Of the two clips that no hand touches, each counts."""
     acting = build_clip(n_frames=6, clip_id="test/s1/box_lift_1")
@@ -65,6 +72,15 @@ def test_the_store_keeps_entries_below_its_threshold_and_says_which_that_was(tmp
         assert 0 < distances.max() < threshold_m
         found[threshold_m] = distances
     assert len(found[0.01]) == (found[0.02] < 0.01).sum()
+
+
+def test_entries_are_counted_over_all_shards(tmp_path, monkeypatch):
+    monkeypatch.setattr("hoidata.contact.stage.ENTRIES_PER_SHARD", 1)
+    clips = [build_clip(n_frames=6, clip_id=f"test/s1/box_lift_{number}") for number in range(3)]
+    counts = contact_store(write_clips(tmp_path / "clips", clips), tmp_path / "out", ContactSettings(points=512))
+    shards = [len(read_npz(path)["distance_m"]) for path in sorted((tmp_path / "out").glob("distances-*.npz"))]
+    assert len(shards) == 3
+    assert counts["entries"] == sum(shards) > max(shards)
 
 
 def still(clip: Clip) -> Clip:
