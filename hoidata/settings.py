@@ -13,6 +13,8 @@ from hoidata.errors import BadInput
 
 Config = TypeVar("Config")
 NONE = type(None)
+# Old names of keys in params.yaml and their present names: a file with an old one is refused, the new one is named.
+RENAMED_KEYS: dict[str, str] = {}
 
 
 class Section(dict[str, Any]):
@@ -89,7 +91,10 @@ def refuse_unknown(values: Mapping[str, Any], known: Sequence[str], where: str) 
     """Raise BadInput that names the keys that are not known and lists those that are."""
     if unknown := [str(name) for name in values if name not in known]:
         section = key_in_file(values, unknown[0], where).removesuffix(f".{unknown[0]}")
-        raise BadInput(section, f"keys among: {', '.join(known)}", ", ".join(unknown), "correct it")
+        new_names = [f"{name} is now {RENAMED_KEYS[name]}" for name in unknown if RENAMED_KEYS.get(name) in known]
+        raise BadInput(
+            section, f"keys among: {', '.join(known)}", ", ".join(unknown), "; ".join(new_names) or "correct it"
+        )
 
 
 def plain_config(config: Any) -> dict[str, Any]:

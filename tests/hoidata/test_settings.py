@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import pytest
 
+from hoidata import settings
 from hoidata.errors import BadInput
 from hoidata.settings import at_least, build_config, plain_config
 
@@ -89,3 +90,11 @@ def test_less_than_a_setting_may_be_is_named():
     at_least("here", Example(), "count", 3)
     with pytest.raises(BadInput, match=r"here\.count: expected 4 or more, got 3"):
         at_least("here", Example(), "count", 4)
+
+
+def test_a_renamed_key_is_refused_with_its_new_name(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setitem(settings.RENAMED_KEYS, "cuont", "count")
+    with pytest.raises(BadInput, match="got cuont; cuont is now count"):
+        built(cuont=1)
+    with pytest.raises(BadInput, match="got cuont; correct it"):
+        build_config(Inner, {"cuont": 1}, "here")
