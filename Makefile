@@ -56,6 +56,7 @@ mutation: install-dev
 lint: install-dev
 	ruff check .
 	ruff format --check .
+	python -m docs.make.plain_words
 
 types: install-dev
 	pyright

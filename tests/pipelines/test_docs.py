@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.main import get_command
@@ -22,6 +23,19 @@ BLOCK = re.compile(r"(?:<!-- not run: (?P<why>[^>]+) -->\n)?```(?P<kind>\w*)\n(?
 LINK = re.compile(r"\]\((?!https?:|#)([^)#\s]+)")
 RUN = {"python", "console"}
 SHOWN = {"yaml"}  # printed by docs/make/reference.py, and compared below
+
+
+def docs_tool(name: str) -> Any:
+    """The module docs/make/NAME.py, which is in no package."""
+    spec = spec_from_file_location(name, PROJECT / f"docs/make/{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+plain_words = docs_tool("plain_words")
 
 
 @dataclass(frozen=True)
@@ -75,11 +89,7 @@ def test_the_readme_is_read_in_a_minute_and_no_link_leads_nowhere():
 
 
 def test_reference_pages_are_printed_from_the_tables():
-    spec = spec_from_file_location("reference", PROJECT / "docs/make/reference.py")
-    assert spec is not None
-    assert spec.loader is not None
-    reference = module_from_spec(spec)
-    spec.loader.exec_module(reference)
+    reference = docs_tool("reference")
     for name, text in reference.PAGES.items():
         assert (reference.FOLDER / name).read_text() == text(), "run: python -m docs.make.reference"
 
@@ -100,3 +110,20 @@ def test_the_blocks_of_a_page_run_one_after_the_other(page, built, monkeypatch):
                 done.output
             )  # 1: the data is not what a lineage or check wants, and says so
             assert done.output
+
+
+def test_plain_words_counts_names_comments_docstrings_and_markdown_outside_of_code():
+    source = '"""Lies beside it."""\nfound = 1  # left out\n\n\ndef f(row):\n    """A map."""\n    return row\n'
+    assert [(hit.line, hit.word) for hit in plain_words.hits("a.py", source)] == [
+        (2, "left out"),
+        (1, "beside"),
+        (2, "name found"),
+        (5, "name row"),
+    ]
+    assert [hit.word for hit in plain_words.hits("a.md", "```\nanew\n```\nthings\n")] == ["things"]
+    assert [hit.line for hit in plain_words.hits("a.js", "let told\n// told\n")] == [2]
+
+
+def test_the_words_allowed_by_the_word_count_are_in_the_glossary():
+    glossary = (PROJECT / "ARCHITECTURE.md").read_text().partition("## Glossary")[2].lower()
+    assert {word for word in plain_words.ALLOWED if f"| {word}" not in glossary} == set()
