@@ -1,8 +1,8 @@
 """Counts words of house dialect in comments, docstrings, Markdown and names.
 
-`python -m docs.make.plain_words` fails if the count is above CEILING; with files as arguments it lists their hits. Lower
-CEILING whenever the count falls. A hit is a sentence to read again, not always a fault. The words in ALLOWED are defined
-in the glossary of ARCHITECTURE.md and do not count.
+`python -m docs.make.plain_words` fails if the count is above CEILING; with files as arguments it lists their hits.
+Lower CEILING whenever the count falls. A hit is a sentence to read again, not always a fault. The words in ALLOWED are
+defined in the glossary of ARCHITECTURE.md and do not count.
 """
 
 import ast
