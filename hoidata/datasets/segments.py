@@ -1,0 +1,174 @@
+"""Cuts a long recording into clips of one action each, from contact, object motion and hinge angle.
+
+A recording needs no words for it. The verb of each segment follows later (``hoidata.annotation.derived``).
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import pairwise
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy.ndimage import maximum_filter1d, minimum_filter1d, uniform_filter1d
+
+from hoidata.annotation.derived import turning_points
+from hoidata.clips.clip import FPS, SIDES, Clip, Side
+from hoidata.contact.maps import acting_hands
+from hoidata.contact.proximity import ProximityIndex
+from hoidata.contact.settings import ContactSettings
+from hoidata.geometry.intervals import Interval, bridged, runs
+from hoidata.geometry.rotations import rotation_angle, rotvec_to_rotmat
+from hoidata.hands import HandPair, track_joints
+from hoidata.objects.sampling import sample_points
+from hoidata.store.hand_evidence import HandEvidence
+
+LONGEST_FRAMES = 5 * FPS  # Text2HOI's models see 150 frames
+SHORTEST_FRAMES = FPS  # a shorter event belongs to the segment before or after it
+MARGIN_FRAMES = FPS // 2  # of approach before the first contact, and of release after the last
+LOST_FRAMES = FPS // 3  # a contact that is lost for at most this long continues
+# Motion is the range within half a second: tracker noise of about 0.5 mm per frame is not motion.
+WINDOW_FRAMES = FPS // 2
+CARRIED_M, CARRIED_RAD = 0.012, np.deg2rad(8)
+ARTICULATED_RAD = np.deg2rad(6)
+REVERSED_RAD = np.deg2rad(15)  # a hinge that reverses by this much was opened and is now closed
+LIFTED_M = 0.08  # an object that rises and sinks by this much is lifted and then placed
+
+Event = Literal["approach", "articulation", "hand change", "carrying", "top of a lift", "slow frame", "release"]
+
+
+class Cut(NamedTuple):
+    """The first frame of a segment, and the event that begins there."""
+
+    frame: int
+    event: Event
+
+
+class Segment(NamedTuple):
+    """Frames ``start`` to ``stop`` (half-open) of a recording, and the events at both ends."""
+
+    start: int
+    stop: int
+    begins_with: Event
+    ends_with: Event
+
+
+class ObjectSignals(NamedTuple):
+    """The motion of an object, frame by frame."""
+
+    is_carried: np.ndarray  # (frame,) bool: the whole object moves
+    is_articulated: np.ndarray  # (frame,) bool: the hinge moves
+    speed_m: np.ndarray  # (frame,) metres per frame, smoothed; of a hinge the speed of the moving part's rim
+    height_m: np.ndarray | None  # (frame,) above the first frame; None if gravity is unknown
+    hinge_rad: np.ndarray | None  # (frame,); None for a rigid object
+
+
+def segment_clips(recording: Clip, hands: HandPair) -> list[Clip]:
+    """The segments of a recording as clips. Ids get the frames, counted from 1 and including the last.
+
+    A recording of at most 150 frames, or without contact, is not cut.
+    """
+    if recording.n_frames <= LONGEST_FRAMES:
+        return [recording]
+    points = sample_points(recording.object.model, ContactSettings().points)
+    joints_m: dict[Side, np.ndarray] = {side: track_joints(recording.hands[side], hands[side]) for side in SIDES}
+    evidence = acting_hands(recording, joints_m, ProximityIndex(points), ContactSettings().threshold_m)
+    return [_taken(recording, segment) for segment in find_segments(recording, evidence)] or [recording]
+
+
+def _taken(recording: Clip, segment: Segment) -> Clip:
+    clip = recording.take(slice(segment.start, segment.stop))
+    first, last = int(clip.source_frames[0]) + 1, int(clip.source_frames[-1]) + 1
+    return replace(clip, clip_id=f"{recording.clip_id}/{first:04d}-{last:04d}")
+
+
+def find_segments(recording: Clip, evidence: HandEvidence) -> list[Segment]:
+    """The segments of a recording, disjoint and in order: at most 150 frames each, with contact in each.
+
+    Every contact of a hand with the object lies in segments, with up to half a second of approach and release. A
+    contact is cut where the hinge starts, stops or reverses, a hand arrives or leaves, the object is picked up or put
+    down, or is highest; at the frame of slowest motion if a segment is still too long. Cuts are at least a second
+    apart; if they are closer, the earlier kind in this list is chosen.
+    """
+    signals = object_signals(recording)
+    near: dict[Side, np.ndarray] = {side: bridged(evidence.near(side), LOST_FRAMES) for side in SIDES}
+    contacts = runs(bridged(near["left"] | near["right"], LOST_FRAMES))
+    next_starts = [*(contact.start for contact in contacts[1:]), recording.n_frames]
+    segments: list[Segment] = []
+    for contact, next_start in zip(contacts, next_starts, strict=False):
+        start = max(contact.start - MARGIN_FRAMES, segments[-1].stop if segments else 0)
+        stop = min(contact.stop + MARGIN_FRAMES, next_start)
+        cuts = chosen_cuts(contact, _candidates(signals, near))
+        cuts = _divided([Cut(start, "approach"), *cuts, Cut(stop, "release")], signals.speed_m)
+        segments += [Segment(cut.frame, after.frame, cut.event, after.event) for cut, after in pairwise(cuts)]
+    return segments
+
+
+def _candidates(signals: ObjectSignals, near: Mapping[Side, np.ndarray]) -> Iterator[Cut]:
+    """Possible cuts, the most important kind first."""
+    for interval in runs(signals.is_articulated):
+        yield from (Cut(frame, "articulation") for frame in interval)
+        if signals.hinge_rad is not None:
+            reversals = turning_points(signals.hinge_rad[slice(*interval)], REVERSED_RAD)
+            yield from (Cut(interval.start + frame, "articulation") for frame in reversals)
+    for flags in near.values():
+        yield from (Cut(frame, "hand change") for interval in runs(flags) for frame in interval)
+    for interval in runs(signals.is_carried):
+        yield from (Cut(frame, "carrying") for frame in interval)
+        if signals.height_m is not None:
+            tops = turning_points(signals.height_m[slice(*interval)], LIFTED_M)
+            yield from (Cut(interval.start + frame, "top of a lift") for frame in tops)
+
+
+def chosen_cuts(contact: Interval, candidates: Iterator[Cut]) -> list[Cut]:
+    """The candidates at least a second from both ends of the contact and from each other; the first ones win."""
+    chosen: list[Cut] = []
+    for cut in candidates:
+        boundaries = [*contact, *(other.frame for other in chosen)]
+        is_inside = contact.start < cut.frame < contact.stop
+        if is_inside and min(abs(cut.frame - frame) for frame in boundaries) >= SHORTEST_FRAMES:
+            chosen.append(cut)
+    return sorted(chosen)
+
+
+def _divided(cuts: list[Cut], speed_m: np.ndarray) -> list[Cut]:
+    """The cuts, with further ones at slow frames, so that no segment is longer than 150 frames."""
+    divided = cuts[:1]
+    for cut in cuts[1:]:
+        while (left := cut.frame - divided[-1].frame) > LONGEST_FRAMES:
+            latest = divided[-1].frame + min(LONGEST_FRAMES, left - SHORTEST_FRAMES)
+            earliest = max(divided[-1].frame + SHORTEST_FRAMES, latest - LONGEST_FRAMES // 2)
+            divided.append(Cut(earliest + int(np.argmin(speed_m[earliest : latest + 1])), "slow frame"))
+        divided.append(cut)
+    return divided
+
+
+def object_signals(recording: Clip) -> ObjectSignals:
+    """What the object does in each frame: the middle of its bounding box at hinge angle zero, and its hinge."""
+    track, vertices_m = recording.object, recording.object.model.vertices_m
+    corners_m = np.stack([vertices_m.min(axis=0), vertices_m.max(axis=0)])
+    rotation = rotvec_to_rotmat(track.rotvec.astype(np.float64))
+    centre_m = rotation @ corners_m.mean(axis=0) + track.translation_m.astype(np.float64)
+    hinge_rad = None if track.hinge_rad is None else track.hinge_rad.astype(np.float64)
+    step_m = np.linalg.norm(np.diff(centre_m, axis=0, prepend=centre_m[:1]), axis=1)
+    if hinge_rad is not None:
+        step_m += np.linalg.norm(np.ptp(corners_m, axis=0)) / 2 * np.abs(np.diff(hinge_rad, prepend=hinge_rad[0]))
+    frames, half = np.arange(recording.n_frames), WINDOW_FRAMES // 2
+    before, after = np.maximum(frames - half, 0), np.minimum(frames + half, recording.n_frames - 1)
+    turned_rad = rotation_angle(rotation[before].transpose(0, 2, 1) @ rotation[after])
+    moved_m = np.linalg.norm(_range_in_window(centre_m), axis=1)
+    down = recording.gravity
+    return ObjectSignals(
+        is_carried=(moved_m > CARRIED_M) | (turned_rad > CARRIED_RAD),
+        is_articulated=np.zeros(len(frames), bool)
+        if hinge_rad is None
+        else _range_in_window(hinge_rad) > ARTICULATED_RAD,
+        speed_m=uniform_filter1d(step_m, WINDOW_FRAMES),
+        height_m=None if down is None else -(centre_m - centre_m[0]) @ np.asarray(down, np.float64),
+        hinge_rad=hinge_rad,
+    )
+
+
+def _range_in_window(signal: np.ndarray) -> np.ndarray:
+    """Largest minus smallest value of (frame, ...) within half a second about each frame."""
+    highest = maximum_filter1d(signal, WINDOW_FRAMES, axis=0, mode="nearest")
+    return highest - minimum_filter1d(signal, WINDOW_FRAMES, axis=0, mode="nearest")
