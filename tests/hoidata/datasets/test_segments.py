@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hoidata.clips import Clip
+from hoidata.clips import SIDES, Clip, Side
 from hoidata.datasets.segments import (
     LONGEST_FRAMES,
     MARGIN_FRAMES,
@@ -34,8 +34,8 @@ def recording(frames: int, height_m: np.ndarray | None = None, hinge_rad: np.nda
 
 def evidence(frames: int, left: slice | None = None, right: slice | None = None) -> HandEvidence:
     """Hands at 1 cm in these frames and 10 cm away in the others."""
-    distance_m = {"left": np.full(frames, 0.1), "right": np.full(frames, 0.1)}
-    for side, touched in (("left", left), ("right", right)):
+    distance_m: dict[Side, np.ndarray] = {"left": np.full(frames, 0.1), "right": np.full(frames, 0.1)}
+    for side, touched in zip(SIDES, (left, right), strict=True):
         distance_m[side][touched or slice(0, 0)] = 0.01
     return HandEvidence(None, distance_m, 0.02).at_threshold(0.02)
 
@@ -49,8 +49,8 @@ def test_a_recording_without_contact_has_no_segment():
 
 
 def test_a_contact_gets_half_a_second_of_approach_and_release():
-    found = find_segments(recording(300), evidence(300, right=slice(100, 180)))
-    assert found == [Segment(100 - MARGIN_FRAMES, 180 + MARGIN_FRAMES, "approach", "release")]
+    segments = find_segments(recording(300), evidence(300, right=slice(100, 180)))
+    assert segments == [Segment(100 - MARGIN_FRAMES, 180 + MARGIN_FRAMES, "approach", "release")]
     at_the_ends = find_segments(recording(120), evidence(120, right=slice(5, 110)))
     assert ends(at_the_ends) == [(0, 120)]
 
@@ -65,8 +65,8 @@ def test_a_contact_lost_for_a_third_of_a_second_continues_and_one_lost_for_longe
 
 def test_opening_and_closing_a_hinge_are_two_segments():
     angle = np.concatenate([np.zeros(60), RAMP, np.ones(40), RAMP[::-1], np.zeros(60)])
-    found = find_segments(recording(len(angle), hinge_rad=angle), evidence(len(angle), left=slice(20, 220)))
-    inner = [segment for segment in found if "articulation" in (segment.begins_with, segment.ends_with)]
+    segments = find_segments(recording(len(angle), hinge_rad=angle), evidence(len(angle), left=slice(20, 220)))
+    inner = [segment for segment in segments if "articulation" in (segment.begins_with, segment.ends_with)]
     opening, closing = (next(s for s in inner if s.start <= frame < s.stop) for frame in (80, 160))
     assert opening.stop <= closing.start
     assert angle[opening.stop - 1] - angle[opening.start] > 0.9
@@ -75,40 +75,40 @@ def test_opening_and_closing_a_hinge_are_two_segments():
 
 def test_a_hinge_that_reverses_is_cut_where_it_reverses():
     angle = np.concatenate([np.zeros(50), RAMP, RAMP[::-1], np.zeros(50)])
-    found = find_segments(recording(len(angle), hinge_rad=angle), evidence(len(angle), left=slice(0, len(angle))))
-    assert min(abs(segment.start - 90) for segment in found) <= 1
+    segments = find_segments(recording(len(angle), hinge_rad=angle), evidence(len(angle), left=slice(0, len(angle))))
+    assert min(abs(segment.start - 90) for segment in segments) <= 1
 
 
 @pytest.mark.parametrize(("rise_m", "is_cut"), [(0.2, True), (0.05, False)])
 def test_a_lift_is_cut_at_its_top_if_it_is_high_enough(rise_m, is_cut):
     height_m = rise_m * np.concatenate([np.zeros(5), RAMP, RAMP[::-1], np.zeros(5)])
-    found = find_segments(recording(len(height_m), height_m), evidence(len(height_m), right=slice(0, 90)))
-    assert ("top of a lift" in [segment.begins_with for segment in found]) == is_cut
+    segments = find_segments(recording(len(height_m), height_m), evidence(len(height_m), right=slice(0, 90)))
+    assert ("top of a lift" in [segment.begins_with for segment in segments]) == is_cut
 
 
 def test_a_second_hand_that_arrives_begins_a_segment():
-    found = find_segments(recording(140), evidence(140, left=slice(10, 130), right=slice(70, 130)))
-    assert ends(found) == [(0, 70), (70, 140)]
-    assert found[1].begins_with == "hand change"
+    segments = find_segments(recording(140), evidence(140, left=slice(10, 130), right=slice(70, 130)))
+    assert ends(segments) == [(0, 70), (70, 140)]
+    assert segments[1].begins_with == "hand change"
 
 
 def test_no_segment_is_longer_than_the_models_see_or_shorter_than_a_second_of_contact():
     rng = np.random.default_rng(0)
     for frames in (151, 400, 1000, 1733):
         height_m = np.cumsum(rng.normal(0, 0.004, frames))
-        found = find_segments(recording(frames, height_m), evidence(frames, right=slice(20, frames - 20)))
-        lengths = [segment.stop - segment.start for segment in found]
+        segments = find_segments(recording(frames, height_m), evidence(frames, right=slice(20, frames - 20)))
+        lengths = [segment.stop - segment.start for segment in segments]
         assert max(lengths) <= LONGEST_FRAMES
         assert min(lengths) >= SHORTEST_FRAMES
-        assert found[0].start == 5
-        assert [segment.stop for segment in found[:-1]] == [segment.start for segment in found[1:]]
+        assert segments[0].start == 5
+        assert [segment.stop for segment in segments[:-1]] == [segment.start for segment in segments[1:]]
 
 
 def test_a_long_contact_is_divided_at_slow_frames():
     speed = np.full(300, 0.01)
     speed[95:105] = 0
-    found = find_segments(recording(300, np.cumsum(speed)), evidence(300, right=slice(0, 300)))
-    assert 95 <= found[0].stop <= 105
+    segments = find_segments(recording(300, np.cumsum(speed)), evidence(300, right=slice(0, 300)))
+    assert 95 <= segments[0].stop <= 105
 
 
 def test_noise_of_a_tracker_is_no_motion_and_the_signals_do_not_depend_on_the_world():
