@@ -14,6 +14,7 @@ from pipelines.pages.clip_page import page_name, write_clip_page
 from pipelines.pages.clip_page_facts import source_frames_text
 from pipelines.pages.dataset_page import write_dataset_page
 from pipelines.pages.player import motion_player, write_page
+from pipelines.pages.sequence_page import write_sequence_page
 from pipelines.params import read_params
 from pipelines.stages.base import StagePaths, empty_reason, load_hands
 
@@ -29,6 +30,9 @@ def write_shown(what: str, profile: str, out: Path) -> Path:
     if what in datasets:
         paths = StagePaths(profile, what)
         return write_dataset_page(out, paths.data, what, load_hands(profile), dataset_title(what))
+    if (paths := _find_sequence(what, profile)) is not None:
+        annotated = load_annotated(paths.data, load_hands(profile))
+        return write_sequence_page(out / page_name(what), annotated, what.partition("/")[2])
     paths = find_clip(what, profile, datasets)
     hands = load_hands(profile)
     return write_clip_page(out / page_name(what), load_annotated(paths.data, hands), what, hands)
@@ -40,6 +44,9 @@ def write_shown_of(folder: Path, clip_id: str, hands: HandPair, out: Path) -> Pa
     """
     is_store = (folder / "meta").is_dir()
     store = open_store(folder if is_store else folder / "clips", hands)
+    if not is_store and _is_sequence(store, clip_id):
+        annotated = load_annotated(folder, hands)
+        return write_sequence_page(out / page_name(clip_id), annotated, clip_id.partition("/")[2])
     if clip_id and clip_id not in store.sequences.index:
         raise _unknown(clip_id, str(folder), {str(store.info["dataset"]): store})
     if is_store:
@@ -69,6 +76,22 @@ def write_stored_clip(out: Path, store: Store, clip_id: str, hands: HandPair) ->
     player = motion_player(clip, hands, title)
     values = {"title": title, "synthetic": clip.synthetic, "player": player, "facts": facts, "has_players": True}
     return write_page(out / page_name(clip_id), "store_clip.html", **values)
+
+
+def _find_sequence(name: str, profile: str) -> StagePaths | None:
+    """The dataset with clips of the sequence ``name``, such as ``arctic/s01/box_use_01``; None without."""
+    for paths in (StagePaths(profile, str(key)) for key in read_params(Path())["datasets"]):
+        store = _store(paths)
+        if store is not None and _is_sequence(store, name):
+            return paths
+    return None
+
+
+def _is_sequence(store: Store, name: str) -> bool:
+    """Whether clips of the store, none with this id, are from the sequence of this name."""
+    dataset, _, sequence = name.partition("/")
+    is_there = dataset == store.info["dataset"] and bool((store.sequences["sequence"] == sequence).any())
+    return is_there and name not in store.sequences.index
 
 
 def find_clip(clip_id: str, profile: str, datasets: list[str]) -> StagePaths:
