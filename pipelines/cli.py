@@ -9,6 +9,7 @@ import typer
 from hoidata.errors import HoidataError, told_in_words
 from pipelines.commands import (
     adapters,
+    compare,
     evaluate,
     export,
     graph,
@@ -46,6 +47,7 @@ app.command("profile")(raw.profile)
 app.command("settings")(settings.settings)
 app.command("share")(share.share)
 app.command("evaluate")(evaluate.evaluate)
+app.command("compare")(compare.compare)
 app.command("controls")(evaluate.controls)
 app.command("table")(evaluate.table)
 app.command("generate")(motions.generate)
