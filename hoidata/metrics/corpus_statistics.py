@@ -57,7 +57,7 @@ def compare_corpora(statistics: Mapping[str, np.ndarray], reference: Mapping[str
         values, others = statistics[name], reference[name]
         is_known = len(values) > 0 and len(others) > 0
         ratio = float(values.mean() / others.mean()) if is_known and others.mean() else float("nan")
-        distance = float(ks_2samp(values, others)[0]) if is_known else float("nan")
+        distance = float(np.asarray(ks_2samp(values, others))[0]) if is_known else float("nan")
         rows.append(Comparison(name, unit, values, others, ratio, distance))
     return rows
 
