@@ -1,8 +1,8 @@
-"""Adapters beside naive readers: frames per second to joints and object poses, H2O's text.
+"""Adapters compared with naive readers: frames per second to joints and object poses, and H2O's text files.
 
-``python -m bench adapters``. Both sides read the same sequences and give world joints of both hands and object
-poses of every frame of the clips; the values are compared. The adapters also digest every file, and read the frames
-around the clips.
+``python -m bench adapters``. Both read the same sequences and return world joints of both hands and object poses
+for each frame of the clips. The results are compared. The adapters also compute the SHA-256 of each file, and read the
+frames around the clips.
 """
 
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ TEXT_COLUMNS = {"cam_pose": 16, "hand_pose_mano": 124, "obj_pose_rt": 17, "actio
 
 @dataclass(frozen=True)
 class Sample:
-    """The first sequences of one dataset, and the source frames of each one's clips."""
+    """The first sequences of one dataset, with the source frames of their clips."""
 
     adapter: Adapter
     root: Path
@@ -42,8 +42,8 @@ def sample(name: str, root: Path) -> Sample:
     adapter = get_adapter(name)
     hands = hands_for(adapter.hand_convention, load_embedded_hands())
     keys = adapter.sequences(root)[: SEQUENCES[name]]
-    found = {key: _clips(adapter, root, hands, key) for key in keys}
-    frames = {key: np.concatenate([clip.source_frames for clip in clips]) for key, clips in found.items()}
+    clips_by_sequence = {key: _clips(adapter, root, hands, key) for key in keys}
+    frames = {key: np.concatenate([clip.source_frames for clip in clips]) for key, clips in clips_by_sequence.items()}
     return Sample(adapter, root, hands, frames)
 
 
@@ -52,7 +52,7 @@ def _clips(adapter: Adapter, root: Path, hands: HandPair, key: SequenceKey) -> l
 
 
 def read_ours(chosen: Sample) -> Poses:
-    """Clips by the adapter, their joints and poses clip by clip."""
+    """Joints and object poses of the clips, read with the adapter."""
     clips = [clip for key in chosen.frames for clip in _clips(chosen.adapter, chosen.root, chosen.hands, key)]
     joints = [
         np.stack([track_joints(clip.hands[side], chosen.hands[side]) for side in SIDES], axis=1) for clip in clips
@@ -70,7 +70,7 @@ def read_naive(chosen: Sample, naive: NaiveHands) -> Poses:
 
 
 def largest_difference_m(ours: Poses, naive: Poses, valid: np.ndarray) -> float:
-    """Of joints of valid hands, and of points 10 cm from the object's origin."""
+    """The largest difference of joints of valid hands, and of points 10 cm from the object's origin."""
     points = np.concatenate([np.zeros((1, 3)), 0.1 * np.eye(3)])
     moved = [points @ pose[:, :3, :3].transpose(0, 2, 1) + pose[:, None, :3, 3] for pose in (ours[1], naive[1])]
     joints = np.abs(ours.joints_m - naive.joints_m).max(axis=(2, 3))
@@ -108,24 +108,24 @@ def compare_readers(corpora: Path) -> None:
 
 
 def compare_text(corpora: Path) -> None:
-    """H2O's four files of every frame of one sequence: np.loadtxt per file, and ``parse_rows`` per folder."""
-    place = sorted(corpora.glob("h2o/subject*/*/*/cam4"))[0]
-    names = sorted(path.name for path in (place / "cam_pose").iterdir())
-    inside = {kind: (place / kind).relative_to(corpora / "h2o").as_posix() for kind in TEXT_COLUMNS}
+    """Read H2O's four files per frame of one sequence: np.loadtxt per file, or ``parse_rows`` per folder."""
+    camera_folder = sorted(corpora.glob("h2o/subject*/*/*/cam4"))[0]
+    names = sorted(path.name for path in (camera_folder / "cam_pose").iterdir())
+    relative_folders = {kind: (camera_folder / kind).relative_to(corpora / "h2o").as_posix() for kind in TEXT_COLUMNS}
 
     def loadtxt() -> list[np.ndarray]:
-        return [np.array([np.loadtxt(place / kind / name, ndmin=1) for name in names]) for kind in TEXT_COLUMNS]
+        return [np.array([np.loadtxt(camera_folder / kind / name, ndmin=1) for name in names]) for kind in TEXT_COLUMNS]
 
-    def ours() -> list[np.ndarray]:
+    def read_folders() -> list[np.ndarray]:
         tree = RawTree(corpora / "h2o")
         return [
-            parse_rows(tree.read_folder(inside[kind], names), columns, inside[kind], names)
+            parse_rows(tree.read_folder(relative_folders[kind], names), columns, relative_folders[kind], names)
             for kind, columns in TEXT_COLUMNS.items()
         ]
 
-    if [rows.tobytes() for rows in loadtxt()] != [rows.tobytes() for rows in ours()]:
+    if [rows.tobytes() for rows in loadtxt()] != [rows.tobytes() for rows in read_folders()]:
         raise AssertionError("parse_rows and np.loadtxt differ")
-    times = medians({"np.loadtxt, four calls per frame": loadtxt, "read_folder with SHA-256, parse_rows": ours})
+    times = medians({"np.loadtxt, four calls per frame": loadtxt, "read_folder with SHA-256, parse_rows": read_folders})
     base = times["np.loadtxt, four calls per frame"]
     rows = [(kind, f"{len(names) / time.median:,.0f}", *ratios(base, time)) for kind, time in times.items()]
     columns = ("reader", "frames/s", "ratio", "ratio, processor")

@@ -2,12 +2,12 @@
 
 ``python -m bench bimart-tables`` in a project. HOIDATA_BENCH_DATA: a folder with clips, annotation, contact and splits
 (data/embedded/arctic); HOIDATA_BENCH_SIZE: small or full, as in params.yaml; HOIDATA_BENCH_SAMPLES: motions per clip
-(4); HOIDATA_BENCH_CLIPS: test clips, 0 for all (16); HOIDATA_BENCH_SEED: of everything that is drawn (0);
-HOIDATA_BENCH_METHODS: some methods alone, names with commas. Networks and motions are kept in HOIDATA_BENCH_OUT
-(.hoidata/bimart-tables); networks that are there already are not trained again.
+(4); HOIDATA_BENCH_CLIPS: test clips, 0 for all (16); HOIDATA_BENCH_SEED: of all random numbers (0);
+HOIDATA_BENCH_METHODS: names of methods with commas (all). Networks and motions are stored in HOIDATA_BENCH_OUT
+(.hoidata/bimart-tables); existing networks are not trained again.
 
-The nearest training window, refined as ours, is the retrieval baseline. Only CAMS-B is given recorded hands: those of
-the first frame, and when each hand touches which part.
+The nearest training window, refined as ours, is the retrieval baseline. Only CAMS-B is conditioned on recorded hands:
+those of the first frame, and when each hand touches which part.
 """
 
 import os
@@ -53,12 +53,12 @@ COLUMNS = {
 
 @dataclass(frozen=True)
 class Method:
-    """A row of the table. preset: of BimArt's networks and sampling. samples: motions per clip; None: the run's."""
+    """A method of the table."""
 
     title: str
     load: Callable[[], Family]
-    preset: str = ""
-    samples: int | None = None
+    preset: str = ""  # of BimArt's networks and sampling
+    samples: int | None = None  # motions per clip; None: those of the run
 
 
 def _of_registry(name: str) -> Callable[[], Family]:
@@ -81,33 +81,31 @@ METHODS = {
 
 @dataclass(frozen=True)
 class Run:
-    """data: an annotated dataset. out: for networks and motions. train: the section ``train`` of params.yaml.
+    """One run of the comparison."""
 
-    baselines: section ``training`` of the baselines' networks. settings: ``sample.bimart`` of every method.
-    """
-
-    data: Path
-    out: Path
+    data: Path  # an annotated dataset
+    out: Path  # folder of networks and motions
     hands: HandPair
-    train: TrainParams
-    baselines: Mapping[str, Any]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    samples: int = 4
-    clips: int = 16
+    train: TrainParams  # section ``train`` of params.yaml
+    baselines: Mapping[str, Any]  # section ``training`` of the baselines' networks
+    settings: Mapping[str, Any] = field(default_factory=dict)  # section ``sample.bimart``
+    samples: int = 4  # motions per clip
+    clips: int = 16  # test clips; 0: all
     seed: int = 0
     device: str = "cpu"
 
-    def figures(self, name: str) -> dict[str, Any]:
-        """What ``evaluate_store`` finds for a method, or the reason for no motions under ``empty``."""
+    def evaluate(self, name: str) -> dict[str, Any]:
+        """Train and sample a method; the result of ``evaluate_store``, or the reason under ``empty`` if none."""
         method, folder = METHODS[name], self.out / "motions" / name
         family = replace(method.load(), name=name, diagnose=lambda sources: {})
         networks = self.out / "networks" / (method.preset or "baselines")
-        for network in family.networks or [own for own in load_family("bimart").networks if own.name in family.uses]:
+        bimart_networks = [network for network in load_family("bimart").networks if network.name in family.uses]
+        for network in family.networks or bimart_networks:
             self._train(network, networks, method.preset)
-        asked = {"samples": method.samples or self.samples, "seed": self.seed, "clips": self.clips}
+        options = {"samples": method.samples or self.samples, "seed": self.seed, "clips": self.clips}
         settings = {"bimart": self.settings}
         counts = sample_family(
-            family, self.data, networks, folder, asked, self.hands, settings=settings, device=self.device
+            family, self.data, networks, folder, options, self.hands, settings=settings, device=self.device
         )
         if not counts["clips"]:
             return read_json(folder / "empty.json")
@@ -122,14 +120,14 @@ class Run:
 
 
 def rows(run: Run, names: Sequence[str]) -> list[list[str]]:
-    """A row of the table per method: title, motions, and a cell per column."""
-    found = []
+    """The table: per method its title, number of motions, and a cell per column."""
+    table = []
     for name in names:
-        figures = run.figures(name)
-        values = figures.get("figures", {})
-        cells = [" / ".join(_cell(values.get(metric)) for metric in metrics) for metrics in COLUMNS.values()]
-        found.append([METHODS[name].title, str(figures.get("motions", figures.get("empty"))), *cells])
-    return found
+        result = run.evaluate(name)
+        metrics = result.get("figures", {})
+        cells = [" / ".join(_cell(metrics.get(metric)) for metric in column) for column in COLUMNS.values()]
+        table.append([METHODS[name].title, str(result.get("motions", result.get("empty"))), *cells])
+    return table
 
 
 def _cell(value: float | None) -> str:
@@ -137,18 +135,18 @@ def _cell(value: float | None) -> str:
 
 
 def main() -> None:
-    told = {name: os.environ.get(f"HOIDATA_BENCH_{name}", "") for name in ("DATA", "OUT", "SIZE", "METHODS")}
+    variables = {name: os.environ.get(f"HOIDATA_BENCH_{name}", "") for name in ("DATA", "OUT", "SIZE", "METHODS")}
     numbers = {name: os.environ.get(f"HOIDATA_BENCH_{name.upper()}") for name in ("samples", "clips", "seed")}
-    data, params = Path(told["DATA"] or "data/embedded/arctic"), read_params(Path())
-    size = told["SIZE"] or params["train"]["size"]
+    data, params = Path(variables["DATA"] or "data/embedded/arctic"), read_params(Path())
+    size = variables["SIZE"] or params["train"]["size"]
     run = Run(
-        data,
-        Path(told["OUT"] or ".hoidata/bimart-tables"),
-        load_hands(data.parent.name),
-        build_config(TrainParams, {**params["train"], "size": size}, "params.yaml: train"),
-        BASELINE_TRAINING[size],
+        data=data,
+        out=Path(variables["OUT"] or ".hoidata/bimart-tables"),
+        hands=load_hands(data.parent.name),
+        train=build_config(TrainParams, {**params["train"], "size": size}, "params.yaml: train"),
+        baselines=BASELINE_TRAINING[size],
         device=chosen_device(params.get("device", "auto")),
         **{name: int(value) for name, value in numbers.items() if value},
     )
-    names = told["METHODS"].split(",") if told["METHODS"] else list(METHODS)
+    names = variables["METHODS"].split(",") if variables["METHODS"] else list(METHODS)
     show(f"{data}: {size} networks, as released / corrected", ("method", "motions", *COLUMNS), rows(run, names))

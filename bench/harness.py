@@ -1,4 +1,4 @@
-"""What the benchmarks share: the embedded corpora, alternating runs with medians, a table."""
+"""Shared by the benchmarks: the embedded corpora, alternating runs with medians, and a table."""
 
 import os
 import statistics
@@ -18,16 +18,15 @@ CORPORA = ("h2o", "grab", "arctic")
 
 
 class Times(NamedTuple):
-    """Seconds. processor: of this process, steadier on a busy machine. first: the call that compiles and warms up, by
-    the clock; it does not count in the two medians."""
+    """Durations of one variant, seconds."""
 
-    median: float
-    processor: float
-    first: float
+    median: float  # wall clock, without the first call
+    processor: float  # median processor time of this process; it varies less on a busy machine
+    first: float  # wall clock of the first call, which compiles and warms up
 
 
 def medians(variants: Mapping[str, Callable[[], object]], runs: int = RUNS) -> dict[str, Times]:
-    """Times of each variant; they take turns."""
+    """Measure each variant; their runs alternate."""
     times: dict[str, list[tuple[float, float]]] = {name: [] for name in variants}
     for _ in range(runs + 1):
         for name, work in variants.items():
@@ -45,18 +44,18 @@ def show(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> N
     table = Table(title=title, title_justify="left")
     for number, name in enumerate(columns):
         table.add_column(name, justify="right" if number else "left")
-    for row in rows:
-        table.add_row(*row)
+    for cells in rows:
+        table.add_row(*cells)
     console = Console()
     (console if console.is_terminal else Console(width=WIDTH)).print(table)
 
 
 def embedded_root() -> Path:
-    """The embedded corpora: of HOIDATA_BENCH_CORPORA, else those ``make demo`` wrote, else generated here once."""
-    given = os.environ.get("HOIDATA_BENCH_CORPORA")
-    made = Path(".hoidata", "raw", "embedded")
-    if given or all((made / name).is_dir() for name in CORPORA):
-        return Path(given or made).resolve()
+    """The embedded corpora: HOIDATA_BENCH_CORPORA, or those of ``make demo``, or generated once."""
+    configured = os.environ.get("HOIDATA_BENCH_CORPORA")
+    demo_folder = Path(".hoidata", "raw", "embedded")
+    if configured or all((demo_folder / name).is_dir() for name in CORPORA):
+        return Path(configured or demo_folder).resolve()
     folder = Path(".hoidata", "bench", "embedded").resolve()
     for name in CORPORA:
         if not (folder / name).is_dir():

@@ -1,8 +1,8 @@
-"""Distance maps, joints and farthest points beside the plain way of each, in one run.
+"""Distance maps, joints and farthest points compared with straightforward implementations.
 
-``python -m bench kernels``. One thread. A turn of a variant is a batch of clips, as a corpus comes; variants take
-turns, and results are medians of the processor's time. The first call is shown apart: it compiles, unless numba's cache
-has the code. Errors are against float64 brute force.
+``python -m bench kernels``. One thread. A run of a variant is a batch of clips. Variants alternate, and times are
+medians of processor time. The first call, which compiles without numba's cache, has a separate column. Errors are
+differences to float64 brute force.
 """
 
 from collections.abc import Callable, Mapping
@@ -26,18 +26,18 @@ RUNS, CLIPS, FRAMES, JOINTS = 7, 40, 150, 21
 
 @dataclass(frozen=True)
 class Scene:
-    """One object and the motion of it and of one hand's joints in several clips; the hand is near in most frames."""
+    """An object with its motion and one hand's joints in several clips; the hand is near in most frames."""
 
     points: SampledPoints
     clips: list[tuple[np.ndarray, ObjectTrack]]
 
 
 def scene(articulated: bool) -> Scene:
-    """A torus of 4,000 vertices, 14 cm wide, whose right half a hinge turns; joints scattered about it."""
+    """A torus of 4,000 vertices, 14 cm wide, whose right half moves on a hinge; joints are scattered around it."""
     torus = trimesh.creation.torus(0.05, 0.02, major_sections=80, minor_sections=50)
     part = ((torus.vertices[:, 0] > 0) & articulated).astype(np.uint8)
     hinge = Hinge(np.array([0.0, 0.0, -1.0]), np.zeros(3)) if articulated else None
-    model = ObjectModel("torus", torus.vertices, torus.faces, part, hinge)
+    model = ObjectModel(name="torus", vertices_m=torus.vertices, faces=torus.faces, part=part, hinge=hinge)
     return Scene(sample_points(model), [moving(model, seed) for seed in range(CLIPS)])
 
 
@@ -51,15 +51,15 @@ def moving(model: ObjectModel, seed: int) -> tuple[np.ndarray, ObjectTrack]:
 
 
 def dense_in_world(points: SampledPoints, joints: np.ndarray, track: ObjectTrack) -> np.ndarray:
-    """The plain way: all points to the world, all distances by torch.cdist, those below the threshold; float32."""
+    """The baseline: all points in the world, all distances by torch.cdist, those below the threshold; float32."""
     local = torch.as_tensor(points.points_m)[None]
     if track.hinge_rad is not None and track.model.hinge is not None:
-        # As the field does it: the whole mesh is articulated frame by frame, then its sampled points are picked.
+        # As in published code: the whole mesh is articulated frame by frame, then its sampled points are picked.
         hinge, vertices = track.model.hinge, torch.as_tensor(track.model.vertices_m, dtype=torch.float32)
-        turn = torch.as_tensor(rotvec_to_rotmat((hinge.axis * track.hinge_rad[:, None]).astype(np.float32)))
+        rotmats = torch.as_tensor(rotvec_to_rotmat((hinge.axis * track.hinge_rad[:, None]).astype(np.float32)))
         origin, moves = torch.as_tensor(hinge.origin_m, dtype=torch.float32), torch.as_tensor(track.model.part) == 1
-        turned = (vertices - origin) @ turn.transpose(1, 2) + origin
-        mesh = torch.where(moves[None, :, None], turned, vertices[None])
+        rotated = (vertices - origin) @ rotmats.transpose(1, 2) + origin
+        mesh = torch.where(moves[None, :, None], rotated, vertices[None])
         corner = points.barycentric.argmax(axis=1)
         local = mesh[:, torch.as_tensor(track.model.faces[points.face, corner])]
     rotation = torch.as_tensor(rotvec_to_rotmat(track.rotvec))
@@ -81,32 +81,32 @@ def brute_force(points: SampledPoints, joints: np.ndarray, track: ObjectTrack) -
 
 
 def distance_rows(articulated: bool) -> list[list[str]]:
-    made = scene(articulated)
-    index, valid = ProximityIndex(made.points), np.ones(FRAMES, bool)
+    batch = scene(articulated)
+    index, valid = ProximityIndex(batch.points), np.ones(FRAMES, bool)
     variants: dict[str, Callable[[], object]] = {
-        "torch.cdist in the world, dense": lambda: [dense_in_world(made.points, *clip) for clip in made.clips],
-        "cell grid, sparse": lambda: [index.entries(joints, valid, track) for joints, track in made.clips],
+        "torch.cdist in the world, dense": lambda: [dense_in_world(batch.points, *clip) for clip in batch.clips],
+        "cell grid, sparse": lambda: [index.entries(joints, valid, track) for joints, track in batch.clips],
     }
     times = medians(variants, RUNS)
-    joints, track = made.clips[0]
-    truth, found = brute_force(made.points, joints, track), index.entries(joints, valid, track)
-    plain = dense_in_world(made.points, joints, track)
+    joints, track = batch.clips[0]
+    truth, entries = brute_force(batch.points, joints, track), index.entries(joints, valid, track)
+    plain = dense_in_world(batch.points, joints, track)
     errors = [
         entry_errors(truth, plain[:3].astype(int), plain[3]),
-        entry_errors(truth, np.stack([found[name] for name in ("frame", "point", "joint")]), found["distance_m"]),
+        entry_errors(truth, np.stack([entries[name] for name in ("frame", "point", "joint")]), entries["distance_m"]),
     ]
     name = "articulated" if articulated else "rigid"
     return rows_of(f"distance map, {name}: ", times, CLIPS, errors)
 
 
-def entry_errors(truth: np.ndarray, places: np.ndarray, distances: np.ndarray) -> str:
+def entry_errors(truth: np.ndarray, indices: np.ndarray, distances: np.ndarray) -> str:
     """Entries missing and in excess more than 1 um off the threshold, and the largest error of a distance."""
     listed = np.zeros(truth.shape, bool)
-    listed[tuple(places)] = True
+    listed[tuple(indices)] = True
     clear = np.abs(truth - CONTACT_THRESHOLD_M) > 1e-6
     missing = ((truth < CONTACT_THRESHOLD_M) & ~listed & clear).sum()
     extra = ((truth >= CONTACT_THRESHOLD_M) & listed & clear).sum()
-    error_m = np.abs(truth[tuple(places)] - distances).max()
+    error_m = np.abs(truth[tuple(indices)] - distances).max()
     return f"{missing} / {extra} of {listed.sum():,}; {error_m * 1e6:.3f} um"
 
 
@@ -114,8 +114,8 @@ def joints_rows() -> list[list[str]]:
     model, tracks = load_embedded_hands().right, [random_track(seed) for seed in range(CLIPS)]
     layer, inputs = HandKinematics(model), [torch_inputs(track) for track in tracks]
     forwards: dict[str, Callable[[], list[np.ndarray]]] = {
-        "all vertices in torch, float32": lambda: [layer(*own)[1].numpy() for own in inputs],
-        "joints and tips in torch, float64": lambda: [track_joints(own, model) for own in tracks],
+        "all vertices in torch, float32": lambda: [layer(*item)[1].numpy() for item in inputs],
+        "joints and tips in torch, float64": lambda: [track_joints(item, model) for item in tracks],
     }
     with torch.no_grad():
         times = medians(forwards, RUNS)
@@ -131,7 +131,7 @@ def random_track(seed: int) -> HandTrack:
         random.normal(0, 0.4, (FRAMES, 45)).astype(np.float32),
         random.normal(0, 1, (1, 10)).astype(np.float32),
     )
-    return HandTrack(wrist_m, orient, pose, betas, np.ones(FRAMES, bool))
+    return HandTrack(wrist_m=wrist_m, global_orient=orient, hand_pose=pose, betas=betas, valid=np.ones(FRAMES, bool))
 
 
 def torch_inputs(track: HandTrack, dtype: torch.dtype = torch.float32) -> list[torch.Tensor]:
@@ -145,8 +145,8 @@ def farthest_rows(n_points: int) -> list[list[str]]:
         "torch loop": lambda: torch_farthest(torch.as_tensor(points), 1024).numpy(),
         "compiled": lambda: farthest_points(points, 1024),
     }
-    plain, found = (work() for work in variants.values())
-    errors = ["", f"{(plain == found).sum()} of 1,024 indices equal"]
+    plain, compiled = (work() for work in variants.values())
+    errors = ["", f"{(plain == compiled).sum()} of 1,024 indices equal"]
     return rows_of(f"1,024 farthest of {n_points:,}: ", medians(variants, RUNS), 1, errors)
 
 
@@ -162,17 +162,17 @@ def torch_farthest(points: torch.Tensor, count: int) -> torch.Tensor:
 
 
 def rows_of(title: str, times: Mapping[str, Times], size: int, errors: list[str]) -> list[list[str]]:
-    """The first variant is the baseline. size: clips of a turn."""
+    """Rows of the table; the first variant is the baseline. size: clips per run."""
     base = next(iter(times.values()))
     return [
         [
             title + name,
-            f"{own.processor / size * 1e3:.3f} / {own.median / size * 1e3:.3f}",
-            f"{base.processor / own.processor:.1f}",
+            f"{timing.processor / size * 1e3:.3f} / {timing.median / size * 1e3:.3f}",
+            f"{base.processor / timing.processor:.1f}",
             error,
-            f"{own.first:.2f} s",
+            f"{timing.first:.2f} s",
         ]
-        for (name, own), error in zip(times.items(), errors, strict=True)
+        for (name, timing), error in zip(times.items(), errors, strict=True)
     ]
 
 
@@ -182,4 +182,4 @@ def main() -> None:
     rows = [*distance_rows(False), *distance_rows(True), *joints_rows(), *farthest_rows(4000), *farthest_rows(30000)]
     torch.set_num_threads(threads)
     columns = ["", "ms processor / clock", "x", "missing / extra; largest error", "first call"]
-    show(f"Kernels: {FRAMES} frames, one hand, medians of {RUNS} turns of {CLIPS} clips", columns, rows)
+    show(f"Kernels: {FRAMES} frames, one hand, medians of {RUNS} runs of {CLIPS} clips", columns, rows)

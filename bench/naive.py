@@ -1,7 +1,7 @@
-"""How the field reads these datasets: one file, one frame, one call of the hand model at a time (the baseline).
+"""Naive readers as in published code: one file, one frame, one call of the hand model at a time (the baseline).
 
-Each reader gives, for chosen frames of one sequence, the world joints of both hands and the object's pose, from its own
-formulas: nothing of the adapters is used but the hand model and the safe opening of pickled files.
+Each reader returns the world joints of both hands and the object's pose for chosen frames of one sequence. The readers
+share only the hand model and restricted unpickling with the adapters.
 """
 
 from pathlib import Path
@@ -18,14 +18,14 @@ from hoidata.objects.mesh import load_mesh
 
 
 class Poses(NamedTuple):
-    """joints_m: (frame, hand, 21, 3), left before right; object_pose: (frame, 4, 4) world_from_object."""
+    """Joints of both hands and the object's pose."""
 
-    joints_m: np.ndarray
-    object_pose: np.ndarray
+    joints_m: np.ndarray  # (frame, hand, 21, 3) world, left before right
+    object_pose: np.ndarray  # (frame, 4, 4) world_from_object
 
 
 class NaiveHands:
-    """The hand model called for one frame of one hand, with MANO's own translation."""
+    """The hand model, called for one frame of one hand, with MANO's ``transl``."""
 
     def __init__(self, hands: HandPair) -> None:
         self.models = (hands.left, hands.right)
@@ -54,8 +54,8 @@ def read_h2o(root: Path, sequence: str, frames: np.ndarray, naive: NaiveHands) -
         pose = np.loadtxt(folder / "obj_pose_rt" / f"{frame:06d}.txt")[1:].reshape(4, 4)
         np.loadtxt(folder / "action_label" / f"{frame:06d}.txt")
         both = []
-        for side, row in enumerate(numbers):
-            points = naive.joints(side, row[4:7], row[7:52], row[1:4], row[52:62])
+        for side, parameters in enumerate(numbers):
+            points = naive.joints(side, parameters[4:7], parameters[7:52], parameters[1:4], parameters[52:62])
             both.append(points @ camera[:3, :3].T + camera[:3, 3])
         joints.append(both)
         objects.append(camera @ pose)
@@ -83,7 +83,7 @@ def read_grab(root: Path, sequence: str, frames: np.ndarray, naive: NaiveHands) 
 
 def read_arctic(root: Path, sequence: str, frames: np.ndarray, naive: NaiveHands) -> Poses:
     mano = load_npy_object(root / "raw_seqs" / f"{sequence}.mano.npy")
-    rows = load_npy_object(root / "raw_seqs" / f"{sequence}.object.npy")
+    object_rows = load_npy_object(root / "raw_seqs" / f"{sequence}.object.npy")
     load_mesh(root / "meta" / "object_vtemplates" / sequence.split("/")[1].split("_")[0] / "mesh.obj")
     joints, objects = [], []
     for frame in frames:
@@ -93,8 +93,8 @@ def read_arctic(root: Path, sequence: str, frames: np.ndarray, naive: NaiveHands
             fingers = hand["pose"][frame] + naive.models[side].mean_pose
             both.append(naive.joints(side, hand["rot"][frame], fingers, hand["trans"][frame], hand["shape"]))
         joints.append(both)
-        row = np.asarray(rows[frame], dtype=np.float64)
-        objects.append(pose_matrix(Rotation.from_rotvec(row[1:4]).as_matrix(), row[4:7] / 1000))
+        object_row = np.asarray(object_rows[frame], dtype=np.float64)
+        objects.append(pose_matrix(Rotation.from_rotvec(object_row[1:4]).as_matrix(), object_row[4:7] / 1000))
     return Poses(np.array(joints), np.array(objects))
 
 

@@ -1,7 +1,7 @@
-"""What a motion of Text2HOI's size costs: strided samplers, tokens that are cut, guidance in one call; on the CPU.
+"""CPU time of one Text2HOI motion: strided samplers, tokens without padding, guidance in one call.
 
-``python -m bench samplers``. The baseline is a stock ``nn.TransformerEncoder`` of the same size over all 451 tokens
-with a mask, called 1,000 times: it is timed on a few calls and scaled. Weights are random; both compute the same sizes.
+``python -m bench samplers``. The baseline is ``nn.TransformerEncoder`` of the same size over all 451 tokens with a
+mask. Its 1,000 calls are extrapolated from a few. Weights are random.
 """
 
 import copy
@@ -33,44 +33,60 @@ def main() -> None:
     }
     with torch.no_grad():
         times = medians(calls, RUNS)
-        whole = times["both hands, 150 frames"].processor
-        rows = [[name, f"{own.processor * 1e3:.0f}", f"{own.processor / whole:.2f}"] for name, own in times.items()]
-        show("One call of the denoiser, one motion", ["call", "processor ms", "of the first"], rows)
+        full_s = times["both hands, 150 frames"].processor
+        rows = [
+            [name, f"{timing.processor * 1e3:.0f}", f"{timing.processor / full_s:.2f}"]
+            for name, timing in times.items()
+        ]
+        show("One call of the denoiser, one motion", ["call", "processor ms", "relative to the first"], rows)
         stock_s = times["stock encoder, 451 tokens masked"].processor * STOCK_STEPS
         rows = [["stock encoder, 1,000 masked steps (scaled)", f"{stock_s:.1f}", "1"]]
         for kind, steps in (("ddim", 50), ("dpm++", 20)):
             seconds = motion_s(model, SamplerConfig(kind, steps))
             rows.append([f"{kind}, {steps} steps", f"{seconds:.1f}", f"{stock_s / seconds:.0f}"])
-        show("One motion of 150 frames and both hands", ["way", "processor s", "times faster"], rows)
+        show("One motion of 150 frames and both hands", ["sampler", "processor s", "speed-up"], rows)
         exact = run(model, SamplerConfig("dpm++", 10))
         for precision in get_args(SamplingPrecision)[1:]:
             lower = copy.deepcopy(model)
             compute_in(lower, precision)
-            apart = (run(lower, SamplerConfig("dpm++", 10)) - exact)[..., :3].abs().max()
-            print(
-                f"{precision} in the Transformer moves wrists by up to {float(apart) * 1e3:.2f} (thousandths of a unit)"
-            )
+            difference = (run(lower, SamplerConfig("dpm++", 10)) - exact)[..., :3].abs().max()
+            moved = 1e3 * float(difference)
+            print(f"{precision} in the Transformer moves wrists by up to {moved:.2f} (thousandths of a unit)")
 
 
 def stock_encoder(size: TransformerConfig) -> nn.TransformerEncoder:
-    layer = nn.TransformerEncoderLayer(size.width, size.heads, size.feed_forward, 0.0, "gelu", batch_first=True)
+    layer = nn.TransformerEncoderLayer(
+        d_model=size.width,
+        nhead=size.heads,
+        dim_feedforward=size.feed_forward,
+        dropout=0.0,
+        activation="gelu",
+        batch_first=True,
+    )
     return nn.TransformerEncoder(layer, size.layers, enable_nested_tensor=False).eval()
 
 
-def stock_call(stock: nn.TransformerEncoder, size: TransformerConfig, there: int) -> Callable[[], object]:
-    """All tokens of 150 frames and three agents, of which a motion of ``there`` frames and one hand uses some."""
+def stock_call(stock: nn.TransformerEncoder, size: TransformerConfig, n_frames: int) -> Callable[[], object]:
+    """All tokens of 150 frames and three agents; those that a motion of one hand does not use are masked."""
     tokens, mask = torch.randn(1, 1 + 3 * FRAMES, size.width), torch.zeros(1, 1 + 3 * FRAMES, dtype=torch.bool)
-    mask[:, 1 + 3 * there :] = True
+    mask[:, 1 + 3 * n_frames :] = True
     return lambda: stock(tokens, src_key_padding_mask=mask)
 
 
 def condition(active: tuple[bool, bool], frames: int) -> Condition:
     points = torch.randn(1, 1024, 3) * 0.05
     return Condition(
-        torch.randn(1, 512), torch.randn(1, 1024), points, torch.randn(1, 1024, 3),
-        torch.zeros(1, 1024, dtype=torch.long), torch.zeros(1, 2, 1024, dtype=torch.bool),
-        torch.tensor([active]), torch.tensor([frames]), (frames,), active,
-    )  # fmt: skip
+        text=torch.randn(1, 512),
+        object=torch.randn(1, 1024),
+        points_m=points,
+        normals=torch.randn(1, 1024, 3),
+        part=torch.zeros(1, 1024, dtype=torch.long),
+        contact=torch.zeros(1, 2, 1024, dtype=torch.bool),
+        active_hands=torch.tensor([active]),
+        lengths=torch.tensor([frames]),
+        counts=(frames,),
+        sides=active,
+    )
 
 
 def one_call(
@@ -82,11 +98,11 @@ def one_call(
 
 
 def run(model: DiffusionModel, config: SamplerConfig) -> Tensor:
-    """Hands of one motion, always from the same noise."""
-    draws = torch.Generator().manual_seed(0)
+    """Sample the hands of one motion from fixed noise."""
+    generator = torch.Generator().manual_seed(0)
     torch.manual_seed(1)
-    noise = torch.randn(1, 2, FRAMES, 99, generator=draws), torch.randn(1, FRAMES, 10, generator=draws)
-    return sample_motion(guided(model, condition((True, True), FRAMES), 1.0), noise, config, draws)[0]
+    noise = torch.randn(1, 2, FRAMES, 99, generator=generator), torch.randn(1, FRAMES, 10, generator=generator)
+    return sample_motion(guided(model, condition((True, True), FRAMES), 1.0), noise, config, generator)[0]
 
 
 def motion_s(model: DiffusionModel, config: SamplerConfig) -> float:

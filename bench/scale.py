@@ -1,9 +1,9 @@
-"""How conversion, annotation and contact grow: time, memory and bytes per clip, compared with a small corpus.
+"""Time, memory and bytes per clip of conversion, annotation and contact, for corpora of several sizes.
 
 ``python -m bench scale``. The raw files are hard links to those of the embedded corpora under the names of further
-subjects; HOIDATA_BENCH_COPIES: how many copies of the corpora (1,4,16; 26 give as many clips as Text2HOI counts). Each
-stage runs in a process of its own, conversion on HOIDATA_BENCH_JOBS workers (2). Memory is the peak of the largest
-process. A cost that grows in a straight line has the same value per further clip at every size.
+subjects. HOIDATA_BENCH_COPIES: numbers of copies of the corpora (1,4,16; 26 copies have as many clips as Text2HOI
+reports). Each stage runs in a separate process, conversion on HOIDATA_BENCH_JOBS workers (2). Memory is the peak of the
+largest process. A linear cost has the same value per further clip at all sizes.
 """
 
 import json
@@ -53,16 +53,16 @@ OUTPUTS = {"convert": "clips", "annotate": "annotation", "contact": "contact"}
 
 
 class Cost(NamedTuple):
-    """Of one stage over all datasets. processor_s: of all its processes; peak_bytes: of the largest one."""
+    """The cost of one stage."""
 
     wall_s: float
-    processor_s: float
-    peak_bytes: int
+    processor_s: float  # of all its processes
+    peak_bytes: int  # of its largest process
     output_bytes: int
 
 
 def replicate(source: Path, target: Path, copies: int) -> None:
-    """Link a raw folder. Files below the folder of a subject appear ``copies`` times, each under another subject."""
+    """Link the files of a raw folder; files of a subject appear ``copies`` times, each under another subject."""
     for path in sorted(source.rglob("*")):
         if path.is_dir():
             continue
@@ -76,14 +76,14 @@ def replicate(source: Path, target: Path, copies: int) -> None:
 
 
 def _renamed(copy: int, name: re.Match[str]) -> str:
-    """A folder ``s05`` is ``s25`` in the first further copy; other names that contain a number stay."""
+    """The folder name of a subject in a copy: ``s05`` becomes ``s25`` in the first; other names stay."""
     if name.group() != name.string:
         return name.group()
     return f"{name[1]}{int(name[2]) + SUBJECTS_APART * copy:0{len(name[2])}d}"
 
 
 def measured(stage: str, raw: Path, out: Path) -> Cost:
-    """Run one stage of one dataset in a process of its own."""
+    """Run one stage of one dataset in a separate process."""
     command = [sys.executable, "-m", "bench.scale", stage, str(raw), str(out)]
     environment, end = {**os.environ, "OMP_NUM_THREADS": "1"}, partial(end_with_parent, os.getpid())
     start = time.perf_counter()
@@ -97,34 +97,37 @@ def measured(stage: str, raw: Path, out: Path) -> Cost:
 
 
 def total(parts: list[Cost]) -> Cost:
-    """Datasets run one after another: times and bytes add up, peaks do not."""
+    """The cost of datasets run one after another: times and bytes add up, the memory peak is the largest."""
     wall_s, processor_s, peaks, sizes = zip(*parts, strict=True)
     return Cost(sum(wall_s), sum(processor_s), max(peaks), sum(sizes))
 
 
 def run_size(source: Path, folder: Path, copies: int) -> tuple[int, int, dict[str, Cost]]:
-    """Clips, frames, and the cost of each stage, of so many copies of the corpora."""
-    found: dict[str, list[Cost]] = {stage: [] for stage in STAGES}
+    """Run all stages on copies of the corpora; returns clips, frames, and the cost of each stage."""
+    costs_by_stage: dict[str, list[Cost]] = {stage: [] for stage in STAGES}
     clips = frames = 0
     for name in CORPORA:
         raw, out = folder / "raw" / name, folder / "out" / name
         replicate(source / name, raw, copies)
-        for stage, costs in found.items():
+        for stage, costs in costs_by_stage.items():
             costs.append(measured(stage, raw, out))
         store = open_store(out / "clips")
         clips, frames = clips + len(store), frames + int(store.sequences["n_frames"].sum())
-    return clips, frames, {stage: total(costs) for stage, costs in found.items()}
+    return clips, frames, {stage: total(costs) for stage, costs in costs_by_stage.items()}
 
 
 def rows(sizes: list[tuple[int, int, dict[str, Cost]]]) -> list[list[str]]:
-    """Of each stage and size: costs, and processor time and bytes per clip beyond the size before it."""
-    found = []
+    """The table by stage and size: costs, and processor time and bytes per clip beyond the previous size."""
+    table = []
     for stage in STAGES:
-        before, known = 0, Cost(0, 0, 0, 0)
+        previous_clips, previous = 0, Cost(0, 0, 0, 0)
         for clips, frames, costs in sizes:
-            cost, more = costs[stage], max(clips - before, 1)
-            further = (cost.processor_s - known.processor_s) / more, (cost.output_bytes - known.output_bytes) / more
-            found.append(
+            cost, further_clips = costs[stage], max(clips - previous_clips, 1)
+            further = (
+                (cost.processor_s - previous.processor_s) / further_clips,
+                (cost.output_bytes - previous.output_bytes) / further_clips,
+            )
+            table.append(
                 [
                     f"{stage}, {clips:,} clips",
                     f"{cost.wall_s:.1f}",
@@ -135,14 +138,14 @@ def rows(sizes: list[tuple[int, int, dict[str, Cost]]]) -> list[list[str]]:
                     f"{further[1] / 1024:.1f}",
                 ]
             )
-            before, known = clips, cost
-    return found
+            previous_clips, previous = clips, cost
+    return table
 
 
 def main() -> None:
     corpora = embedded_root()
     copies = [int(number) for number in os.environ.get("HOIDATA_BENCH_COPIES", "1,4,16").split(",")]
-    # Beside the corpora: hard links do not leave a file system.
+    # Next to the corpora, because hard links need the same file system.
     with tempfile.TemporaryDirectory(prefix="bench-scale-", dir=corpora.parent) as folder:
         sizes = [run_size(corpora, Path(folder) / f"{number}", number) for number in copies]
     columns = ["", "s", "processor s", "frames/s", "peak MiB", "processor ms per further clip", "KiB per further clip"]

@@ -1,4 +1,4 @@
-"""A raw folder to a store, no project: python examples/convert_a_folder.py grab /data/GRAB grab-store [MANO FOLDER]"""
+"""Convert a raw folder to a store: python examples/convert_a_folder.py grab /data/GRAB grab-store [MANO FOLDER]"""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""A network of your own on stored clips: wrists from the object, in 30 lines.
+"""Train a custom network on stored clips in 30 lines: it predicts wrist positions from the object's pose.
 
 python examples/train_on_batches.py data/embedded/grab
 """
@@ -20,8 +20,8 @@ for epoch in range(5):
     losses = []
     for batch in DataLoader(dataset, batch_size=8, shuffle=True, collate_fn=collate):
         wrists = batch.joints_m[:, :, :, 0].transpose(1, 2)  # (clip, frame, side, 3) metres
-        seen = batch.present.transpose(1, 2)
-        error = (network(batch.object).unflatten(-1, (2, 3)) - wrists).norm(dim=-1)[seen]
+        present = batch.present.transpose(1, 2)
+        error = (network(batch.object).unflatten(-1, (2, 3)) - wrists).norm(dim=-1)[present]
         adam.zero_grad()
         error.mean().backward()
         adam.step()

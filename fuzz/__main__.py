@@ -33,7 +33,7 @@ def main() -> int:
 
 
 def _fuzzed(name: str, arguments: argparse.Namespace, log: Path | None = None) -> None:
-    """libFuzzer ends this process. log: what it prints goes there."""
+    """Fuzz one parser in this process, which libFuzzer ends; log: file for its output."""
     if log:
         descriptor = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
         os.dup2(descriptor, 1)
@@ -44,14 +44,14 @@ def _fuzzed(name: str, arguments: argparse.Namespace, log: Path | None = None) -
 
 def _in_a_process(name: str, arguments: argparse.Namespace) -> int:
     log = arguments.folder / f"{name}.log"
-    # Forked: what all parsers import is imported once.
+    # Forked, so that the parsers' modules are imported once.
     process = multiprocessing.get_context("fork").Process(target=_fuzzed, args=(name, arguments, log))
     process.start()
     process.join()
     text = log.read_text(errors="replace")
     runs = re.search(r"^stat::number_of_executed_units: +(\d+)$", text, re.MULTILINE)
-    said = "no fault" if not process.exitcode else f"FAILED, see {log}:\n{text[-3000:]}"
-    print(f"{name:24} {int(runs[1]) if runs else 0:9,} runs  {said}", flush=True)
+    result = "no fault" if not process.exitcode else f"FAILED, see {log}:\n{text[-3000:]}"
+    print(f"{name:24} {int(runs[1]) if runs else 0:9,} runs  {result}", flush=True)
     return int(process.exitcode != 0)
 
 

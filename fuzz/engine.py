@@ -1,8 +1,8 @@
 """Fuzzing of one parser by atheris (libFuzzer), in this process, which libFuzzer ends.
 
-A fault is any exception but BadInput and MissingResource, any warning, a call over one second of processor time, no end
-within 30 s, or memory refused by the limit of 1 GiB above what the process had at its start. The first fault ends the
-run, and libFuzzer saves its input.
+A fault is an exception other than BadInput and MissingResource, or a warning. A call over one second of processor time,
+a timeout of 30 s, and an allocation over 1 GiB above the initial memory are faults too. The first fault ends the run,
+and libFuzzer saves its input.
 """
 
 import contextlib
@@ -24,10 +24,10 @@ import atheris
 
 from hoidata.errors import BadInput, MissingResource
 
-SLOWEST_S = 1.0
+MAX_CALL_S = 1.0
 HANG_S = 30
 MEMORY_BYTES = 1 << 30
-LONGEST = 1 << 14
+MAX_INPUT_BYTES = 1 << 14
 OPCODES = (
     *(opcode.code.encode("latin1") for opcode in pickletools.opcodes if opcode.arg is None),
     *(b"cnumpy\nndarray\n", b"cnumpy\ndtype\n", b"cnumpy.core.multiarray\n_reconstruct\n", b"cos\nsystem\n"),
@@ -62,56 +62,52 @@ WORDS = (
 
 @dataclass(frozen=True)
 class Target:
-    """One parser.
+    """One parser to fuzz."""
 
-    seeds: gives small valid files. run: parses bytes; it may write into the folder it is given.
-    modules: their branches guide the search.
-    container: "zip" or "pickle", whose members or opcodes are changed one by one, so that lengths and checksums fit.
-    """
-
-    seeds: Callable[[], Sequence[bytes]]
-    run: Callable[[bytes, Path], Any]
-    modules: Sequence[ModuleType] = ()
+    seeds: Callable[[], Sequence[bytes]]  # returns small valid files
+    run: Callable[[bytes, Path], Any]  # parses bytes; may write into the folder
+    modules: Sequence[ModuleType] = ()  # whose branches guide the search
+    # "zip" or "pickle": members or opcodes are mutated one by one, so that lengths and checksums stay valid.
     container: str = ""
 
 
 def fuzz(name: str, target: Target, seed: int, executions: int, seconds: int, folder: Path) -> None:
-    """Run one target until either limit. folder: gets the corpus and an input that failed."""
-    own = folder.resolve() / name
-    shutil.rmtree(own, ignore_errors=True)
+    """Run one target until either limit; the corpus and a failing input are written into ``folder``."""
+    target_folder = folder.resolve() / name
+    shutil.rmtree(target_folder, ignore_errors=True)
     for part in ("corpus", "scratch"):
-        (own / part).mkdir(parents=True)
+        (target_folder / part).mkdir(parents=True)
     seeds = target.seeds()
     for number, data in enumerate(seeds):
-        (own / "corpus" / f"seed-{number:03d}").write_bytes(data)
+        (target_folder / "corpus" / f"seed-{number:03d}").write_bytes(data)
     words = ("".join(f"\\x{byte:02x}" for byte in word) for word in (*WORDS, *OPCODES))
-    (own / "words").write_text("".join(f'"{word}"\n' for word in words))
+    (target_folder / "words").write_text("".join(f'"{word}"\n' for word in words))
     for module in target.modules:
         _instrument(module, module.__name__)
     options = {
         "runs": executions, "max_total_time": seconds, "seed": seed + 1, "timeout": HANG_S, "rss_limit_mb": 0,
-        "max_len": max(LONGEST, *map(len, seeds)), "print_final_stats": 1, "artifact_prefix": f"{own}/",
-        "dict": own / "words",
+        "max_len": max(MAX_INPUT_BYTES, *map(len, seeds)), "print_final_stats": 1,
+        "artifact_prefix": f"{target_folder}/", "dict": target_folder / "words",
     }  # fmt: skip
-    arguments = [name, *(f"-{option}={value}" for option, value in options.items()), str(own / "corpus")]
-    change = CONTAINERS.get(target.container)
-    mutator = {"custom_mutator": lambda *given: _mutated(change, *given)} if change else {}
-    atheris.Setup(arguments, lambda data: check_call(target, data, own / "scratch"), **mutator)
-    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY_BYTES,) * 2)
-    warnings.simplefilter("error")  # a file must not make a conversion print warnings either
+    arguments = [name, *(f"-{option}={value}" for option, value in options.items()), str(target_folder / "corpus")]
+    mutate = CONTAINERS.get(target.container)
+    mutator = {"custom_mutator": lambda *mutation: _mutated(mutate, *mutation)} if mutate else {}
+    atheris.Setup(arguments, lambda data: check_call(target, data, target_folder / "scratch"), **mutator)
+    initial_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (initial_bytes + MEMORY_BYTES,) * 2)
+    warnings.simplefilter("error")  # a warning is a fault too
     atheris.Fuzz()
 
 
 def check_call(target: Target, data: bytes, folder: Path) -> None:
-    """Run the parser; what is raised here is a fault."""
+    """Run the parser once. An exception of this function is a fault."""
     begin = time.process_time()
     try:
         target.run(data, folder)
     except (BadInput, MissingResource) as error:
         if "MemoryError" in str(error):
             raise
-    if time.process_time() - begin > SLOWEST_S:
+    if time.process_time() - begin > MAX_CALL_S:
         raise TimeoutError(f"{time.process_time() - begin:.2f} s")
 
 
@@ -133,7 +129,7 @@ Change = Callable[[random.Random, bytes, int], bytes]
 def _mutated(change: Change, data: bytes, longest: int, seed: int) -> bytes:
     rng = random.Random(seed)
     if rng.random() < 0.6:
-        # What cannot be taken apart may raise or warn in many ways.
+        # An input that is not a valid container may raise or warn in many ways.
         with contextlib.suppress(Exception), warnings.catch_warnings(action="ignore"):
             return change(rng, bytes(data), longest)[:longest]
     return atheris.Mutate(data, longest)
@@ -143,28 +139,28 @@ def change_zip(rng: random.Random, data: bytes, longest: int) -> bytes:
     """Change, remove, repeat or rename one member."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         items = [(info.filename, archive.read(info), info.compress_type) for info in archive.infolist()]
-    at = rng.randrange(len(items))
-    name, content, kind = items.pop(at)
+    index = rng.randrange(len(items))
+    name, content, compression = items.pop(index)
     names = [name] * 5 + ["x.npy", "../up.npy", "/abs.npy", name + "/", "a" * 300]
-    changed = (rng.choice(names), atheris.Mutate(content, longest), kind)
-    items[at:at] = rng.choice(([], [(name, content, kind)] * 2, [changed], [changed], [changed]))
+    changed = (rng.choice(names), atheris.Mutate(content, longest), compression)
+    items[index:index] = rng.choice(([], [(name, content, compression)] * 2, [changed], [changed], [changed]))
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
-        for name, content, kind in items:
-            archive.NameToInfo.clear()  # or a repeated name would warn
-            archive.writestr(zipfile.ZipInfo(name), content, kind)  # a ZipInfo has a fixed time
+        for name, content, compression in items:
+            archive.NameToInfo.clear()  # zipfile warns about a repeated name
+            archive.writestr(zipfile.ZipInfo(name), content, compression)  # a ZipInfo has a fixed time
     return stream.getvalue()
 
 
 def change_pickle(rng: random.Random, data: bytes, longest: int) -> bytes:
-    """Remove, repeat, exchange or replace whole opcodes with their arguments. Frames go: they state lengths."""
+    """Remove, repeat, exchange or replace whole opcodes; FRAME opcodes are dropped, because they contain lengths."""
     starts = [(opcode.name, position) for opcode, _, position in pickletools.genops(data)]
     stops = [position for _, position in starts[1:]] + [starts[-1][1] + 1]
     parts = [data[start:stop] for (name, start), stop in zip(starts, stops, strict=True) if name != "FRAME"]
     for _ in range(rng.choice((1, 1, 2, 4))):
-        at, other = rng.randrange(len(parts)), rng.randrange(len(parts))
-        new = ([], [parts[at]] * 2, [parts[other]], [rng.choice(OPCODES)], [atheris.Mutate(parts[at], longest)])
-        parts[at : at + 1] = rng.choice(new)
+        index, other = rng.randrange(len(parts)), rng.randrange(len(parts))
+        new = ([], [parts[index]] * 2, [parts[other]], [rng.choice(OPCODES)], [atheris.Mutate(parts[index], longest)])
+        parts[index : index + 1] = rng.choice(new)
     return b"".join(parts) + data[stops[-1] :]
 
 

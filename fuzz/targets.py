@@ -1,4 +1,4 @@
-"""Every parser of files from outside, with small valid files as seeds."""
+"""The fuzzing target of each parser of external files, with small valid files as seeds."""
 
 import contextlib
 import gzip
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from fuzz.engine import LONGEST, Target
+from fuzz.engine import MAX_INPUT_BYTES, Target
 from hoidata.clips.clip import SourceFile
 from hoidata.datasets.arctic import files as arctic
 from hoidata.datasets.base import RawTree
@@ -42,7 +42,7 @@ from pipelines.stages import base
 from pipelines.stages.adapters import ConvertSettings
 from tests.builders.objects import hinged_box
 
-ABSENT = b"absent"  # stands for a file that is not there
+ABSENT = b"absent"  # this content means: the file does not exist
 BVH = (
     b"HIERARCHY\nROOT Hand\n{\nOFFSET 0 0 0\nCHANNELS 6 Xposition Yposition Zposition Yrotation Xrotation Zrotation\n"
     b"JOINT Finger\n{\nOFFSET 1 0.5 0\nCHANNELS 3 Yrotation Xrotation Zrotation\nEnd Site\n{\nOFFSET 1 0 0\n}\n}\n}\n"
@@ -62,13 +62,13 @@ TOML = b'[roots]\ngrab = "/data/grab"\nh2o = "x"\n\n[other]\na = [1, 2.5, true, 
 PARAMS = b"profile: own\nconvert: {margin_frames: 3}\nsplit: {h2o: text2hoi}\n"
 
 
-def made(*files: bytes) -> Callable[[], list[bytes]]:
+def seed_files(*files: bytes) -> Callable[[], list[bytes]]:
     return lambda: [*files, ABSENT]
 
 
 @cache
 def _raw(dataset: str) -> dict[str, bytes]:
-    """Raw files of two recordings, as the tests of an adapter write them."""
+    """Raw files of two recordings, written by the adapter's test builder."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         import_module(f"tests.builders.{dataset}").write_two(root)
@@ -76,7 +76,7 @@ def _raw(dataset: str) -> dict[str, bytes]:
 
 
 def raw(dataset: str, *patterns: str, lines: int | None = None) -> Callable[[], list[bytes]]:
-    """The smallest raw file that fits each pattern; of a long text its first lines."""
+    """Seeds: the smallest raw file that matches each pattern; ``lines``: only its first lines."""
 
     def seeds() -> list[bytes]:
         fitting = [[data for name, data in _raw(dataset).items() if fnmatch(name, pattern)] for pattern in patterns]
@@ -87,7 +87,7 @@ def raw(dataset: str, *patterns: str, lines: int | None = None) -> Callable[[], 
 
 
 def pickled(value: object, protocol: int = 2) -> bytes:
-    """With NumPy's names before version 2, as released files have them, where no length stands before a name."""
+    """Pickle with the module names of NumPy 1, as in released files; protocols over 3 keep those of NumPy 2."""
     data = pickle.dumps(value, protocol)
     return data if protocol > 3 else data.replace(b"numpy._core", b"numpy.core")
 
@@ -105,12 +105,12 @@ def boxed(value: object) -> np.ndarray:
 
 
 def parse(function: Callable, *names: Any) -> Callable[[bytes, Path], Any]:
-    """A parser of bytes, which is also told the file's name."""
+    """A parser of bytes and the file's name."""
     return lambda data, _: function(data, *names)
 
 
 def on_disk(name: str, function: Callable[[Path], Any]) -> Callable[[bytes, Path], Any]:
-    """A parser of a file of this name."""
+    """A parser of a file with this name."""
 
     def run(data: bytes, folder: Path) -> Any:
         path = folder / name
@@ -137,28 +137,32 @@ def _pickles() -> dict[str, Target]:
     )
     arrays_ = [pickled(value, protocol) for value in values for protocol in (0, 2, 5)]
     hand = {"poseCoeff": np.zeros(48, "f4"), "beta": np.zeros(10, "f4"), "trans": np.zeros(3, "f4")}
-    turn = {"pose_coeffs": np.eye(4, dtype="f4")[[0] * 16][None], "tsl": np.zeros((1, 3)), "betas": np.zeros((1, 10))}
-    both = {f"{side}__{name}": array for side in ("lh", "rh") for name, array in turn.items()}
+    mano_parameters = {
+        "pose_coeffs": np.eye(4, dtype="f4")[[0] * 16][None],
+        "tsl": np.zeros((1, 3)),
+        "betas": np.zeros((1, 10)),
+    }
+    both = {f"{side}__{name}": array for side in ("lh", "rh") for name, array in mano_parameters.items()}
     annotation = {"mocap_frame_id_list": [0, 1, 4], "obj_list": ["a", "b"], "raw_mano": {0: both}}
     annotation["obj_transf"] = {"a": {0: np.eye(4), 4: np.eye(4)}}
     load_hand = on_disk("MANO_RIGHT.pkl", lambda path: mano._load_side(path.parent, "right"))
     load_tensors = parse(torch_pickle.load_torch_pickle, "hand.pkl")
     tensors = raw("taco", "*hand_shape.pkl", "*right_hand.pkl")
     return {
-        "pickle-arrays": Target(made(*arrays_), parse(_restricted), [restricted_pickle, pickle_check], "pickle"),
+        "pickle-arrays": Target(seed_files(*arrays_), parse(_restricted), [restricted_pickle, pickle_check], "pickle"),
         "pickle-mano": Target(_chumpy_pickles, parse(_mano_values), [mano], "pickle"),
         "pickle-torch": Target(tensors, load_tensors, [torch_pickle], "pickle"),
         "mano-file": Target(_mano_file, load_hand, [mano, model], "pickle"),
-        "hoi4d-hand": Target(made(pickled(hand)), parse(hoi4d.hand_frame, "0.pickle"), [hoi4d], "pickle"),
+        "hoi4d-hand": Target(seed_files(pickled(hand)), parse(hoi4d.hand_frame, "0.pickle"), [hoi4d], "pickle"),
         "oakink2-annotation": Target(
-            made(pickled(annotation, 4)), parse(oakink2.read_annotation, "a.pkl"), [oakink2], "pickle"
+            seed_files(pickled(annotation, 4)), parse(oakink2.read_annotation, "a.pkl"), [oakink2], "pickle"
         ),
     }
 
 
 def _restricted(data: bytes) -> Any:
     source = io.BytesIO(data) if len(data) % 2 else data
-    return restricted_pickle.restricted_load(source, restricted_pickle.ARRAYS, max_bytes=LONGEST - 256)
+    return restricted_pickle.restricted_load(source, restricted_pickle.ARRAYS, max_bytes=MAX_INPUT_BYTES - 256)
 
 
 def _mano_values(data: bytes) -> Any:
@@ -167,7 +171,7 @@ def _mano_values(data: bytes) -> Any:
 
 
 def _chumpy_pickles() -> list[bytes]:
-    """A chumpy array, a selection of one and a sparse matrix, as Python 2 wrote them, in a dictionary each."""
+    """Dictionaries with a chumpy array, a selection of one, and a sparse matrix, as pickled by Python 2."""
 
     def instance(module: bytes, state: bytes) -> bytes:
         return b"c" + module + b"\n)\x81" + state + b"b"
@@ -184,7 +188,7 @@ def _chumpy_pickles() -> list[bytes]:
 
 
 def _mano_file() -> list[bytes]:
-    """A whole right hand in MANO's layout; its bulk in one-byte numbers, so that one reading is quick."""
+    """A right hand in MANO's layout; large arrays are int8, so that parsing is fast."""
     hand = load_embedded_hands().right
     content = {
         **{"shapedirs": np.zeros((778, 3, 10), np.int8), "posedirs": np.zeros((778, 3, 135), np.int8)},
@@ -200,11 +204,11 @@ def _numpy_files() -> dict[str, Target]:
     contact = boxed({"object": np.zeros((2, 4), np.int8), "body": np.zeros((2, 4100), np.int8)})
     grab = {"obj_name": np.array("cup"), "n_frames": np.array(2), "lhand": hand, "contact": contact}
     small = {"a": np.arange(4.0), "b": np.array("x"), "c": np.zeros((0, 2))}
-    objects = made(*(archive(save, **grab) for save in (np.savez, np.savez_compressed)))
-    numbers = made(*(archive(save, **small) for save in (np.savez, np.savez_compressed)))
-    turns = np.tile([1.0, 0, 0, 0], (4, 1))
-    still = {"time_s": np.arange(4) / 30, "object_position": np.zeros((4, 3)), "object_quaternion": turns}
-    tracked = made(archive(np.savez, **still, left_position=np.ones((4, 3)), left_quaternion=turns))
+    objects = seed_files(*(archive(save, **grab) for save in (np.savez, np.savez_compressed)))
+    numbers = seed_files(*(archive(save, **small) for save in (np.savez, np.savez_compressed)))
+    quaternions = np.tile([1.0, 0, 0, 0], (4, 1))
+    object_arrays = {"time_s": np.arange(4) / 30, "object_position": np.zeros((4, 3)), "object_quaternion": quaternions}
+    tracked = seed_files(archive(np.savez, **object_arrays, left_position=np.ones((4, 3)), left_quaternion=quaternions))
     plain = [archive(np.save, arr=array) for array in (np.arange(6.0).reshape(2, 3), np.array("text"))]
 
     def read_objects(path: Path) -> Any:
@@ -212,7 +216,7 @@ def _numpy_files() -> dict[str, Target]:
 
     def pieces(path: Path) -> None:
         for array in array_pieces.locate_arrays(path, "contact").values():
-            # An array of rows without columns may have any number of pieces.
+            # Four pieces only: an array with rows of no columns may have any number.
             _ = [piece.sum() for _, (_, piece) in zip(range(4), array.pieces(), strict=False)]
 
     def map_all(path: Path) -> None:
@@ -223,8 +227,8 @@ def _numpy_files() -> dict[str, Target]:
 
     read_any = on_disk("a.npy", numpy_files.load_npy_object)
     return {
-        "npy": Target(made(*plain), on_disk("a.npy", numpy_files.load_npy), [npy_header]),
-        "npy-object": Target(made(archive(np.save, arr=hand), *plain), read_any, [npy_header, numpy_files]),
+        "npy": Target(seed_files(*plain), on_disk("a.npy", numpy_files.load_npy), [npy_header]),
+        "npy-object": Target(seed_files(archive(np.save, arr=hand), *plain), read_any, [npy_header, numpy_files]),
         "npz-object": Target(objects, on_disk("a.npz", read_objects), [numpy_files], "zip"),
         "npz-pieces": Target(objects, on_disk("a.npz", pieces), [array_pieces], "zip"),
         "npz-read": Target(numbers, on_disk("a.npz", arrays.read_npz), [arrays], "zip"),
@@ -249,16 +253,16 @@ def _meshes_and_tables() -> dict[str, Target]:
         return on_disk(f"a.{suffix}", mesh.load_mesh if suffix in ("obj", "ply") else user_mesh.read_mesh_file)
 
     return {
-        "obj": Target(made(OBJ), meshes("obj"), [mesh]),
-        "ply-ascii": Target(made(PLY), meshes("ply"), [mesh, ply]),
-        "ply-binary": Target(made(binary_ply), meshes("ply"), [mesh, ply]),
-        "glb": Target(made(box.export(file_type="glb")), meshes("glb"), [user_mesh, glb]),
-        "stl": Target(made(ascii_stl, box.export(file_type="stl")), meshes("stl"), [user_mesh, stl]),
-        "trajectories-csv": Target(made(table), parse(trajectory_files.parse_csv, "a.csv"), [trajectory_files]),
+        "obj": Target(seed_files(OBJ), meshes("obj"), [mesh]),
+        "ply-ascii": Target(seed_files(PLY), meshes("ply"), [mesh, ply]),
+        "ply-binary": Target(seed_files(binary_ply), meshes("ply"), [mesh, ply]),
+        "glb": Target(seed_files(box.export(file_type="glb")), meshes("glb"), [user_mesh, glb]),
+        "stl": Target(seed_files(ascii_stl, box.export(file_type="stl")), meshes("stl"), [user_mesh, stl]),
+        "trajectories-csv": Target(seed_files(table), parse(trajectory_files.parse_csv, "a.csv"), [trajectory_files]),
         "trajectories-manipnet": Target(
-            made(manipnet_rows), parse(trajectory_files.parse_manipnet, "a.txt"), [trajectory_files]
+            seed_files(manipnet_rows), parse(trajectory_files.parse_manipnet, "a.txt"), [trajectory_files]
         ),
-        "object-keyframes": Target(made(KEYFRAMES, listed), parse(keyframed), [keyframes]),
+        "object-keyframes": Target(seed_files(KEYFRAMES, listed), parse(keyframed), [keyframes]),
     }
 
 
@@ -275,13 +279,15 @@ def _datasets() -> dict[str, Target]:
         return own_hand.parse_bvh(data.decode("utf-8", "replace"), "a.bvh")
 
     return {
-        "bvh": Target(made(BVH), parse(bvh_text), [own_hand]),
+        "bvh": Target(seed_files(BVH), parse(bvh_text), [own_hand]),
         "gzip-text": Target(
-            made(gzip.compress(BVH, mtime=0)), parse(own_hand.unpack_text, "a.bvh.gz", 4096), [own_hand]
+            seed_files(gzip.compress(BVH, mtime=0)), parse(own_hand.unpack_text, "a.bvh.gz", 4096), [own_hand]
         ),
-        "h2o-rows": Target(made(b"1 2.5 -3e-2\n4", b"1.0  2 3\r\n"), parse(h2o_rows), [h2o]),
-        "h2o-segments": Target(made(SEGMENTS), parse(h2o.parse_segments, "action_train.txt"), [h2o]),
-        "arctic-descriptions": Target(made(described), parse(arctic.parse_descriptions, "description.txt"), [arctic]),
+        "h2o-rows": Target(seed_files(b"1 2.5 -3e-2\n4", b"1.0  2 3\r\n"), parse(h2o_rows), [h2o]),
+        "h2o-segments": Target(seed_files(SEGMENTS), parse(h2o.parse_segments, "action_train.txt"), [h2o]),
+        "arctic-descriptions": Target(
+            seed_files(described), parse(arctic.parse_descriptions, "description.txt"), [arctic]
+        ),
         "hoi4d-camera": Target(raw("hoi4d", "*output.log", lines=10), parse(hoi4d.camera_poses, "output.log"), [hoi4d]),
         "hot3d-hands": Target(
             raw("hot3d", "*mano*.jsonl", lines=2), parse(hot3d.hand_poses, "a.jsonl", "mano"), [hot3d]
@@ -310,7 +316,7 @@ def _json_files() -> dict[str, Target]:
     oakink2_seeds = raw("oakink2", "*program_info/*.json", "*obj_desc.json", "*part_tree.json")
 
     def values(*contents: object) -> Callable[[], list[bytes]]:
-        return made(*(json.dumps(content).encode() for content in contents))
+        return seed_files(*(json.dumps(content).encode() for content in contents))
 
     def own_root(path: Path) -> Any:
         os.environ.pop(base.root_variable("grab"), None)
@@ -336,13 +342,13 @@ def _json_files() -> dict[str, Target]:
         "hoi4d-json": Target(hoi4d_seeds, parse(_hoi4d_json), [hoi4d]),
         "oakink2-json": Target(oakink2_seeds, parse(_oakink2_json), [oakink2]),
         "hot3d-json": Target(hot3d_seeds, parse(_hot3d_json), [hot3d, sources]),
-        "hoidata-toml": Target(made(TOML), on_disk("hoidata.toml", own_root), [base]),
-        "params-yaml": Target(made(PARAMS), on_disk("params.yaml", settings), [base, params]),
+        "hoidata-toml": Target(seed_files(TOML), on_disk("hoidata.toml", own_root), [base]),
+        "params-yaml": Target(seed_files(PARAMS), on_disk("params.yaml", settings), [base, params]),
     }
 
 
 def _hoi4d_json(data: bytes) -> object:
-    """Whichever of the three kinds of file it looks like; and as a tree of parts."""
+    """Parse as the kind of file that the bytes resemble; also as a tree of parts."""
     if b"dataList" in data or b"objects" in data:
         return hoi4d.object_poses(data, "0.json")
     if b"event" in data or not data.strip():
@@ -353,20 +359,20 @@ def _hoi4d_json(data: bytes) -> object:
 
 
 def _oakink2_json(data: bytes) -> None:
-    """As each of the three kinds of file."""
+    """Parse as each of the three kinds of file."""
     for read in (oakink2.read_program, oakink2.read_names, oakink2.read_roots):
         with contextlib.suppress(BadInput):
             parsed = read(data, "a.json")
-            _ = [(own.span, own.hand, own.name) for own in parsed] if isinstance(parsed, list) else parsed
+            _ = [(item.span, item.hand, item.name) for item in parsed] if isinstance(parsed, list) else parsed
 
 
 def _hot3d_json(data: bytes) -> object:
-    """Whichever of the four kinds of file it looks like; the joints of a profile are computed, too."""
+    """Parse as the kind of file that the bytes resemble; compute the joints of a profile too."""
     if b"sequence_id" in data:
         return sources.definition(data, "clip_definitions.json", 7)
     if b"headset" in data:
         return hot3d.headset(data, "metadata.json")
     if b"hand_model" not in data:
         return hot3d.object_names(data, "instance.json")
-    still = hot3d.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
-    return sources.joints_m(sources.parse_profile(data, "profile.json"), still, "right")
+    pose = hot3d.Poses(np.zeros(1, int), np.eye(3)[None], np.zeros((1, 3)), {"joint_angles": np.ones((1, 22))})
+    return sources.joints_m(sources.parse_profile(data, "profile.json"), pose, "right")

@@ -1,4 +1,4 @@
-"""Seeds are valid files, the fuzzer finds what it is there for, and a short run finds nothing."""
+"""Seeds are valid files, faults are detected, and a short run finds no fault."""
 
 import subprocess
 import sys
@@ -34,7 +34,7 @@ def test_every_parser_accepts_a_seed_and_no_seed_is_a_fault(tmp_path):
 
 
 def fragile(data: bytes, _: Path) -> None:
-    """One way to fail, or to be slow, for each content."""
+    """A parser that fails in one way for each content."""
     if data == b"KeyError":
         raise KeyError
     if data == b"warning":

@@ -14,7 +14,21 @@ from hoidata.errors import BadInput
 Config = TypeVar("Config")
 NONE = type(None)
 # Old names of keys in params.yaml and their present names: a file with an old one is refused, the new one is named.
-RENAMED_KEYS: dict[str, str] = {}
+RENAMED_KEYS: dict[str, str] = {
+    # BimArt
+    "window": "window_frames",
+    "map_of": "contact_map_target",
+    "most_m": "max_distance_m",
+    "floor": "min_std_fraction",
+    "windows": "windows_per_clip",
+    "rule": "guidance_rule",
+    "guide": "contact_guidance",
+    "guide_share": "contact_guidance_fraction",
+    # ManipNet
+    "keep": "keep_probability",
+    "rows": "steps_per_clip",
+    "astray": "perturbed_fraction",
+}
 
 
 class Section(dict[str, Any]):

@@ -26,9 +26,9 @@ FAMILIES = {
     "manipnet": "models.manipnet.family:FINGERS",
     "bimart": "models.bimart.family:BIMART",
     "bimart-unrefined": "models.bimart.family:UNREFINED",
-    "nearest-window": "models.bimart.lookups:NEAREST_WINDOW",
-    "nearest-window-refined": "models.bimart.lookups:NEAREST_REFINED",
-    "mean-pose-at-object": "models.bimart.lookups:OBJECT_MEAN_POSE",
+    "nearest-window": "models.bimart.retrieval:NEAREST_WINDOW",
+    "nearest-window-refined": "models.bimart.retrieval:NEAREST_REFINED",
+    "mean-pose-at-object": "models.bimart.retrieval:OBJECT_MEAN_POSE",
     # Rows that show what a figure sees: each must lose somewhere.
     "one-call": "models.text2hoi.controls:ONE_CALL",
     "other-contact": "models.text2hoi.controls:OTHER_CONTACT",
@@ -61,8 +61,8 @@ NETWORKS = {
     "diffusion": "models.text2hoi.diffusion_training:DIFFUSION",
     "refiner": "models.text2hoi.refiner_training:REFINER",
     "manipnet": "models.manipnet.training:MANIPNET",
-    "bimart-contact": "models.bimart.learning:CONTACT",
-    "bimart-motion": "models.bimart.learning:MOTION",
+    "bimart-contact": "models.bimart.training:CONTACT",
+    "bimart-motion": "models.bimart.training:MOTION",
 }
 
 

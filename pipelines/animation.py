@@ -223,7 +223,7 @@ def _from_file(path: Path, wish: AnimateWish, profile: str, datasets: tuple[str,
     given = given_control(found, model, own)
     notes += [*given.notes, *_left_notes(found, given, wish.sides)]
     control = at_30_fps(given.control)
-    made, fingers = np.zeros((2, len(control.thing.time_s)), bool), dict[Side, np.ndarray]()
+    made, fingers = np.zeros((2, len(control.object_motion.time_s)), bool), dict[Side, np.ndarray]()
     for side in found.wrists:
         fingers[side] = np.tile(own[side].rest_rotmats, (made.shape[1], 1, 1, 1))
         if side in given.active and side in wish.sides:
@@ -237,7 +237,7 @@ def _from_file(path: Path, wish: AnimateWish, profile: str, datasets: tuple[str,
 def _left_notes(found: TrajectoryFile, given: Given, sides: tuple[Side, ...]) -> list[str]:
     """Says which hands at the object were not asked for. Raises BadInput where none of those asked for is there."""
     if not set(given.active) & set(sides):
-        there = f"{found.where} has {' and '.join(found.wrists)}, near the object {' and '.join(given.active)}"
+        there = f"{found.source} has {' and '.join(found.wrists)}, near the object {' and '.join(given.active)}"
         raise BadInput(
             "--fingers", "a hand that is in the file and near the object", sides[0], f"name another: {there}"
         )

@@ -1,9 +1,9 @@
-"""The denoiser of both diffusion models: a Transformer encoder over frames, told of the object (Secs. 3.2 and 3.3).
+"""Both denoisers of BimArt: Transformer encoders over frames, conditioned on the object's motion (Secs. 3.2 and 3.3).
 
-Token 0 is the step; every other holds one frame (or a few) of what is noised, to which the encodings of that frame's
-object, and of its contact map, are added. It predicts what is clean, normalised as in the windows it was trained on.
+Token 0 is the diffusion step. Each further token is one frame (or a few) of the noised values, plus the encodings of
+that frame's object and contact map. The network predicts the clean values, normalised.
 
-``Layout`` cuts a path into windows and puts them together again; ``windows_of`` says what a network is told of them.
+``Layout`` cuts a motion into windows and joins them again. ``build_windows`` makes the condition of windows.
 """
 
 from collections.abc import Sequence
@@ -26,79 +26,76 @@ from models.common.transformer import Encoder, TransformerConfig, attention_mask
 
 @dataclass(frozen=True)
 class DenoiserConfig:
-    """The defaults are the paper's. encoder: widths of the hidden layers of both encoders, of object and map.
-
-    latents: of object and contact have half a token's width each ("concatenate", paper), or one encoder sees both
-    ("joint"), which can tell where on the object a value of the map belongs.
-    told: which hands take part is told, and the others neither enter nor are made. diffusion_steps: of the 1,000 those
-    that are trained; 50 are walked one by one, 1,000 by any sampler. position_dropout: of tokens with their positions.
-    floor: no number counts as varying less than this share of the mean spread of its kind. knot_frames: what is made
-    is a smooth curve with a knot so often (0: any numbers). signal_scale: spread of clean numbers beside the noise's 1:
-    the smaller, the later a motion is decided on (Chen 2023).
-    """
+    """Architecture of one denoiser; the defaults are the paper's."""
 
     features: FeatureConfig = field(default_factory=FeatureConfig)
     transformer: TransformerConfig = field(default_factory=TransformerConfig)
-    encoder: tuple[int, ...] = (1024, 1024)
+    encoder: tuple[int, ...] = (1024, 1024)  # hidden widths of the object encoder and of the contact encoder
+    # "concatenate" (paper): object and contact latents have half a token's width each. "joint": one encoder takes both,
+    # so it can relate a contact distance to its object point.
     latents: Literal["concatenate", "joint"] = "concatenate"
-    told: bool = False
-    diffusion_steps: int = 50
-    position_dropout: float = 0.1
-    floor: float = 0.0
-    knot_frames: int = 0
-    signal_scale: float = 1.0
+    condition_on_hands: bool = False  # on which hands are active; inactive hands are masked in input and output
+    diffusion_steps: int = 50  # trained steps of the 1,000: 50 are sampled one by one, 1,000 by any sampler
+    position_dropout: float = 0.1  # of tokens with their positional encoding
+    min_std_fraction: float = 0.0  # normalisation: least standard deviation, relative to that of its group
+    knot_frames: int = 0  # the output is a spline with a control point every so many frames; 0: any values
+    signal_scale: float = 1.0  # standard deviation of clean values; smaller decides the motion later (Chen 2023)
 
 
 @dataclass(frozen=True)
 class Windows:
-    """B windows of F frames. offset (B, F, 3N), state (B, F, S), scale (B,), contact_m (B, F, 2N) left then right.
+    """The condition of B windows of F frames. All but ``contact_m`` come from the object's motion."""
 
-    there (B, N): places the object has. hands (B, 2): sides that are made. frames (B, F): frames there are. All but
-    contact_m are what a motion is asked for; that is None for the contact model.
-    """
-
-    offset: Tensor
-    state: Tensor
-    scale: Tensor
-    there: Tensor
-    hands: Tensor
-    frames: Tensor
-    contact_m: Tensor | None = None
+    basis_offset: Tensor  # (B, F, 3N) O
+    state: Tensor  # (B, F, S) G
+    object_scale: Tensor  # (B,)
+    point_exists: Tensor  # (B, N) bool, object points of parts that the object has
+    active_hands: Tensor  # (B, 2) bool, left and right
+    frame_mask: Tensor  # (B, F) bool, False for padding
+    contact_m: Tensor | None = None  # (B, F, 2N) left then right; None for the contact model
 
     def __len__(self) -> int:
-        return len(self.scale)
+        return len(self.object_scale)
 
     def to(self, device: torch.device | str) -> Self:
-        found = {name: send(value, device) for name, value in vars(self).items() if isinstance(value, Tensor)}
-        return replace(self, **found)
+        tensors = {name: send(value, device) for name, value in vars(self).items() if isinstance(value, Tensor)}
+        return replace(self, **tensors)
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """Windows as the Transformer takes them. conditional, unconditional: (B, token, width) with contact map, without.
+class EncodedWindows:
+    """Windows encoded once for all diffusion steps."""
 
-    attention_mask: (B, token + 1). mask: (B, F, D) which numbers there are. lengths: frames of each window.
-    """
+    conditional: Tensor  # (B, token, width), with the contact map
+    unconditional: Tensor  # (B, token, width), with the null embedding instead
+    attention_mask: Tensor  # (B, token + 1) bool
+    channel_mask: Tensor  # (B, F, D) bool, values that exist
+    lengths: list[int]  # frames of each window
 
-    conditional: Tensor
-    unconditional: Tensor
-    attention_mask: Tensor
-    mask: Tensor
-    lengths: list[int]
-
-    def twice(self) -> "Prepared":
-        """All windows two times, with the contact map (as ``conditional``) and without."""
+    def doubled(self) -> "EncodedWindows":
+        """All windows twice, first with and then without the contact map, both as ``conditional``."""
         both = torch.cat((self.conditional, self.unconditional))
-        masks = [torch.cat((own, own)) for own in (self.attention_mask, self.mask)]
-        return Prepared(both, both, masks[0], masks[1], 2 * self.lengths)
+        masks = [torch.cat((mask, mask)) for mask in (self.attention_mask, self.channel_mask)]
+        return EncodedWindows(
+            conditional=both,
+            unconditional=both,
+            attention_mask=masks[0],
+            channel_mask=masks[1],
+            lengths=2 * self.lengths,
+        )
 
 
 class Denoiser(nn.Module):
-    """``clean = network(x, steps, windows)``. size: numbers per frame; with_contact: it is told contact maps."""
+    """``clean = network(x, steps, windows)``.
 
-    input_mean: Tensor
+    Args:
+        size: D, numbers per frame.
+        with_contact: whether contact maps are part of the condition.
+    """
+
+    input_mean: Tensor  # of O, G and scale
     input_scale: Tensor
-    mean: Tensor
+    mean: Tensor  # of the denoised values
     scale: Tensor
     contact_mean: Tensor
     contact_scale: Tensor
@@ -109,19 +106,20 @@ class Denoiser(nn.Module):
     def __init__(self, config: DenoiserConfig, size: int, with_contact: bool) -> None:
         super().__init__()
         self.config, self.with_contact = config, with_contact
-        features, width, rows = config.features, config.transformer.width, config.transformer.frames_per_token
-        self.x_in, self.x_out = nn.Linear(rows * size, width), nn.Linear(width, rows * size)
+        features, width = config.features, config.transformer.width
+        frames_per_token = config.transformer.frames_per_token
+        self.x_in, self.x_out = nn.Linear(frames_per_token * size, width), nn.Linear(width, frames_per_token * size)
         self.step_in = nn.Sequential(nn.Linear(width, width), nn.SiLU(), nn.Linear(width, width))
         latent = width // 2 if config.latents == "concatenate" and with_contact else width
         self.is_joint = config.latents == "joint" and with_contact
-        seen = features.scene_size + self.is_joint * features.contact_size
-        self.object_in = _layers(seen, config.encoder, latent)
-        self.hands_in = nn.Linear(2, width, bias=False) if config.told else None
-        self.tokens_in = nn.Linear(rows * width, width) if rows > 1 else nn.Identity()
+        object_inputs = features.scene_size + self.is_joint * features.contact_size
+        self.object_in = _layers(object_inputs, config.encoder, latent)
+        self.hands_in = nn.Linear(2, width, bias=False) if config.condition_on_hands else None
+        self.tokens_in = nn.Linear(frames_per_token * width, width) if frames_per_token > 1 else nn.Identity()
         if with_contact:
-            told = features.contact_size if self.is_joint else latent
+            null_size = features.contact_size if self.is_joint else latent
             self.contact_in = nn.Identity() if self.is_joint else _layers(features.contact_size, config.encoder, latent)
-            self.null = nn.Parameter(0.02 * torch.randn(1, told))
+            self.null = nn.Parameter(0.02 * torch.randn(1, null_size))
         self.encoder, self.drop = Encoder(config.transformer), nn.Dropout(config.position_dropout)
         for name, count in (("input", features.scene_size), ("", size), ("contact", features.contact_size)):
             self.register_buffer(f"{name}_mean".strip("_"), torch.zeros(count))
@@ -131,72 +129,93 @@ class Denoiser(nn.Module):
         self.register_buffer("keypoint_ids", torch.zeros(features.keypoints, dtype=torch.long))
 
     def channel_mask(self, windows: Windows) -> Tensor:
-        """(B, F, D) bool: numbers of hands and parts that are there, in frames that are."""
+        """(B, F, D) bool: values of existing parts, active hands and frames that are not padding."""
         raise NotImplementedError
 
     def forward(self, x: Tensor, steps: Tensor, windows: Windows, drop: Tensor | None = None) -> Tensor:
-        """Clean numbers (B, F, D) of noised ones at timesteps (B,); drop: (B,) bool, told no contact map."""
-        known = self.prepare(windows)
-        tokens = known.conditional
-        if drop is not None:
-            tokens = torch.where(drop[:, None, None], known.unconditional, tokens)
-        return self.denoise(x, steps, known, tokens)
+        """Predict the clean values.
 
-    def prepare(self, windows: Windows) -> Prepared:
-        """The part of ``forward`` that is the same at every step."""
-        rows, seen = self.config.transformer.frames_per_token, self._scene(windows)
-        frames = windows.frames[..., None]
-        hands = 0.0 if self.hands_in is None else self.hands_in(windows.hands.float())[:, None]
+        Args:
+            x: (B, F, D) noised, normalised values.
+            steps: (B,) diffusion steps, 0 to 999.
+            windows: the condition.
+            drop: (B,) bool, windows whose contact map is dropped.
+
+        Returns:
+            (B, F, D) normalised.
+        """
+        encoded = self.prepare(windows)
+        tokens = encoded.conditional
+        if drop is not None:
+            tokens = torch.where(drop[:, None, None], encoded.unconditional, tokens)
+        return self.denoise(x, steps, encoded, tokens)
+
+    def prepare(self, windows: Windows) -> EncodedWindows:
+        """Encode the condition: the part of ``forward`` that is the same at every diffusion step."""
+        frames_per_token, scene = self.config.transformer.frames_per_token, self._scene(windows)
+        frame_mask = windows.frame_mask[..., None]
+        hands = 0.0 if self.hands_in is None else self.hands_in(windows.active_hands.float())[:, None]
         conditional, unconditional = (
-            self.tokens_in(to_tokens(self._encoded(seen, windows, known) * frames, rows)) + hands
-            for known in (True, False)
+            self.tokens_in(to_tokens(self._encode(scene, windows, with_map) * frame_mask, frames_per_token)) + hands
+            for with_map in (True, False)
         )
-        mask = attention_mask_of(windows.frames, rows)
-        attention_mask = torch.cat((mask.new_ones(len(mask), 1), mask), 1)
-        lengths = windows.frames.sum(1).tolist() if self.config.knot_frames else []
-        return Prepared(conditional, unconditional, attention_mask, self.channel_mask(windows), lengths)
+        token_mask = attention_mask_of(windows.frame_mask, frames_per_token)
+        # A column for token 0, the diffusion step.
+        attention_mask = torch.cat((token_mask.new_ones(len(token_mask), 1), token_mask), 1)
+        return EncodedWindows(
+            conditional=conditional,
+            unconditional=unconditional,
+            attention_mask=attention_mask,
+            channel_mask=self.channel_mask(windows),
+            lengths=windows.frame_mask.sum(1).tolist() if self.config.knot_frames else [],
+        )
 
     def _scene(self, windows: Windows) -> Tensor:
-        """(B, F, 3N + S + 1) normalised O, G and scale; zeros for a part that is not there."""
-        there = windows.there.repeat_interleave(3, 1)[:, None].expand_as(windows.offset)
-        scale = windows.scale[:, None, None].expand(-1, windows.offset.shape[1], 1)
-        seen = (torch.cat((windows.offset, windows.state, scale), -1) - self.input_mean) / self.input_scale
-        known = torch.cat((there, there.new_ones(*there.shape[:2], seen.shape[-1] - there.shape[-1])), -1)
-        return seen * known
+        """(B, F, 3N + S + 1) normalised O, G and scale; zeros for a part that the object does not have."""
+        exists = windows.point_exists.repeat_interleave(3, 1)[:, None].expand_as(windows.basis_offset)
+        scale = windows.object_scale[:, None, None].expand(-1, windows.basis_offset.shape[1], 1)
+        scene = torch.cat((windows.basis_offset, windows.state, scale), -1)
+        scene = (scene - self.input_mean) / self.input_scale
+        # G and the scale always exist.
+        mask = torch.cat((exists, exists.new_ones(*exists.shape[:2], scene.shape[-1] - exists.shape[-1])), -1)
+        return scene * mask
 
-    def _encoded(self, seen: Tensor, windows: Windows, known: bool) -> Tensor:
-        """(B, F, width) what a frame's token is told of its object, and of its contact map where that is known."""
+    def _encode(self, scene: Tensor, windows: Windows, with_map: bool) -> Tensor:
+        """(B, F, width) encoding of each frame's object, and of its contact map if ``with_map``."""
         if not self.with_contact:
-            return self.object_in(seen)
-        contact = self.null.expand(*seen.shape[:2], -1)
-        if known:
+            return self.object_in(scene)
+        contact = self.null.expand(*scene.shape[:2], -1)
+        if with_map:
             assert windows.contact_m is not None
             normalised = (windows.contact_m - self.contact_mean) / self.contact_scale
             contact = self.contact_in(normalised * contact_channels(windows))
         if self.is_joint:
-            return self.object_in(torch.cat((seen, contact), -1))
-        return torch.cat((self.object_in(seen), contact), -1)
+            return self.object_in(torch.cat((scene, contact), -1))
+        return torch.cat((self.object_in(scene), contact), -1)
 
-    def denoise(self, x: Tensor, steps: Tensor, known: Prepared, tokens: Tensor) -> Tensor:
-        """``forward`` with what is prepared; tokens: its conditional or unconditional ones."""
-        config, rows, width = self.config, self.config.transformer.frames_per_token, self.config.transformer.width
-        number = (steps + 1) * config.diffusion_steps / TRAIN_STEPS - 1
-        time = self.step_in(sinusoid(number, width))[:, None]
-        x = x * self._size(steps) * known.mask
-        frames = torch.cat((time, self.x_in(to_tokens(x, rows)) + tokens), 1)
+    def denoise(self, x: Tensor, steps: Tensor, encoded: EncodedWindows, tokens: Tensor) -> Tensor:
+        """``forward`` for encoded windows; tokens: their conditional or unconditional ones."""
+        config, frames_per_token = self.config, self.config.transformer.frames_per_token
+        width = config.transformer.width
+        # The embedding counts trained steps, which are spread over the 1,000.
+        trained_step = (steps + 1) * config.diffusion_steps / TRAIN_STEPS - 1
+        time = self.step_in(sinusoid(trained_step, width))[:, None]
+        x = x * self._noised_scale(steps) * encoded.channel_mask
+        frames = torch.cat((time, self.x_in(to_tokens(x, frames_per_token)) + tokens), 1)
         frames = self.drop(frames + sinusoid(torch.arange(frames.shape[1], device=x.device), width))
-        found = to_frames(self.x_out(self.encoder(frames, known.attention_mask)[:, 1:]), x.shape[1], rows)
+        hidden = self.encoder(frames, encoded.attention_mask)[:, 1:]
+        clean = to_frames(self.x_out(hidden), x.shape[1], frames_per_token)
         if config.knot_frames:
-            found = projected(found, known.lengths, config.knot_frames)
-        return found * known.mask * config.signal_scale
+            clean = projected(clean, encoded.lengths, config.knot_frames)
+        return clean * encoded.channel_mask * config.signal_scale
 
-    def _size(self, steps: Tensor) -> Tensor:
-        """(B, 1, 1) factors that make noised numbers of any ``signal_scale`` as wide as 1; 1 where that is 1."""
-        share = self.signal[steps][:, None, None]
-        return (share * self.config.signal_scale**2 + 1 - share).rsqrt()
+    def _noised_scale(self, steps: Tensor) -> Tensor:
+        """(B, 1, 1) factors that bring noised values to standard deviation 1 (EDM's c_in)."""
+        signal_fraction = self.signal[steps][:, None, None]
+        return (signal_fraction * self.config.signal_scale**2 + 1 - signal_fraction).rsqrt()
 
     def encode(self, values: Tensor) -> Tensor:
-        """Metres (..., D) to normalised numbers."""
+        """Normalise values (..., D) in metres."""
         return (values - self.mean) / self.scale * self.config.signal_scale
 
     def decode(self, x: Tensor) -> Tensor:
@@ -205,7 +224,7 @@ class Denoiser(nn.Module):
 
 
 class ContactModel(Denoiser):
-    """Makes contact maps (B, F, 2N): of the left hand, then of the right (Sec. 3.2)."""
+    """Denoises contact maps (B, F, 2N): of the left hand, then of the right (Sec. 3.2)."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__(config, config.features.contact_size, with_contact=False)
@@ -215,19 +234,20 @@ class ContactModel(Denoiser):
 
 
 class MotionModel(Denoiser):
-    """Makes keypoints and vectors to the object (B, F, motion_size) for contact maps (Sec. 3.3)."""
+    """Denoises keypoints and vectors to the object (B, F, motion_size), conditioned on contact maps (Sec. 3.3)."""
 
     def __init__(self, config: DenoiserConfig) -> None:
         super().__init__(config, config.features.motion_size, with_contact=True)
 
     def channel_mask(self, windows: Windows) -> Tensor:
-        return self.config.features.of_hands(windows.hands.bool())[:, None] & windows.frames[..., None]
+        hands = self.config.features.spread_over_motion(windows.active_hands.bool())
+        return hands[:, None] & windows.frame_mask[..., None]
 
 
 def contact_channels(windows: Windows) -> Tensor:
-    """(B, F, 2N) bool: values of a map that are there, of hands that take part."""
-    own = windows.hands.bool()[..., None] & windows.there[:, None]
-    return own.flatten(1)[:, None] & windows.frames[..., None]
+    """(B, F, 2N) bool: contact distances of existing object points to active hands."""
+    by_hand = windows.active_hands.bool()[..., None] & windows.point_exists[:, None]
+    return by_hand.flatten(1)[:, None] & windows.frame_mask[..., None]
 
 
 def _layers(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential:
@@ -238,7 +258,7 @@ def _layers(inputs: int, hidden: tuple[int, ...], outputs: int) -> nn.Sequential
 
 @dataclass(frozen=True)
 class Layout:
-    """Where windows of ``length`` frames lie on a path of ``frames``; each half on the next one, or apart."""
+    """Start frames of windows of ``length`` frames on a motion of ``frames``; neighbours overlap by half or not."""
 
     frames: int
     length: int
@@ -246,63 +266,65 @@ class Layout:
 
     @cached_property
     def starts(self) -> list[int]:
-        """First frames; only the last of windows that lie apart may reach beyond the path."""
+        """First frame of each window. Only the last window without overlap may reach beyond the motion's end."""
         if not self.overlapping:
             return list(range(0, self.frames, self.length))
         last = max(self.frames - self.length, 0)
         return [*range(0, last, max(self.length // 2, 1)), last]
 
-    def cut(self, path: Tensor) -> Tensor:
-        """(B, frame, ...) to windows (B n, length, ...), zeros beyond the end."""
-        spare = max(self.starts[-1] + self.length - self.frames, 0)
-        padded = functional.pad(path.flatten(2), (0, 0, 0, spare)).unflatten(2, path.shape[2:])
+    def cut(self, motion: Tensor) -> Tensor:
+        """Cut (B, frame, ...) into windows (B n, length, ...), zeros beyond the end."""
+        padding = max(self.starts[-1] + self.length - self.frames, 0)
+        padded = functional.pad(motion.flatten(2), (0, 0, 0, padding)).unflatten(2, motion.shape[2:])
         return torch.stack([padded[:, start : start + self.length] for start in self.starts], 1).flatten(0, 1)
 
     def joined(self, windows: Tensor) -> Tensor:
-        """The path (B, frame, D) of windows (B n, length, D): the mean where they overlap, less towards their ends."""
-        own = windows.unflatten(0, (-1, len(self.starts)))
-        total = own.new_zeros(len(own), self.starts[-1] + self.length, own.shape[-1])
+        """Join windows (B n, length, D) to (B, frame, D): a mean with triangular weights where they overlap."""
+        by_motion = windows.unflatten(0, (-1, len(self.starts)))
+        total = by_motion.new_zeros(len(by_motion), self.starts[-1] + self.length, by_motion.shape[-1])
         weight = total.new_zeros(total.shape[1], 1)
-        place = torch.arange(self.length, device=own.device, dtype=own.dtype)
-        ramp = torch.minimum(place + 1, self.length - place)[:, None]
+        step = torch.arange(self.length, device=by_motion.device, dtype=by_motion.dtype)
+        ramp = torch.minimum(step + 1, self.length - step)[:, None]
         for number, start in enumerate(self.starts):
-            total[:, start : start + self.length] += ramp * own[:, number]
+            total[:, start : start + self.length] += ramp * by_motion[:, number]
             weight[start : start + self.length] += ramp
         return (total / weight.clamp_min(1e-9))[:, : self.frames]
 
 
-def layout_of(frames: int, window: int, overlapping: bool) -> Layout:
-    """Windows on a path; a path shorter than a window is one, as long as it is."""
-    return Layout(frames, min(window, frames), overlapping)
+def layout_of(frames: int, window_frames: int, overlapping: bool) -> Layout:
+    """Windows on a motion; a motion shorter than a window is one window of its length."""
+    return Layout(frames, min(window_frames, frames), overlapping)
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Frames start to stop of a scene, with the hands (2,) that take part."""
+class SceneWindow:
+    """Frames ``start`` to ``stop - 1`` of a scene."""
 
     scene: Scene
     start: int
     stop: int
-    hands: np.ndarray
+    active_hands: np.ndarray  # (2,) bool
 
 
-def windows_of(asked: Sequence[Asked], length: int, config: DenoiserConfig) -> Windows:
-    """What a network is told of windows, padded to ``length``."""
+def build_windows(scene_windows: Sequence[SceneWindow], length: int, config: DenoiserConfig) -> Windows:
+    """The condition of windows, padded to ``length`` frames, without contact maps."""
 
     def padded(rows: np.ndarray) -> np.ndarray:
         return np.concatenate((rows, np.zeros((length - len(rows), *rows.shape[1:]), rows.dtype)))
 
-    stops = [min(one.stop, len(one.scene)) for one in asked]
-    states = [one.scene.state(config.features.state, one.start, stop) for one, stop in zip(asked, stops, strict=True)]
-    offsets = [
-        one.scene.offset[one.start : stop].reshape(stop - one.start, -1) for one, stop in zip(asked, stops, strict=True)
-    ]
-    arrays = (
-        np.stack([padded(rows.astype(np.float32)) for rows in offsets]),
-        np.stack([padded(rows.astype(np.float32)) for rows in states]),
-        np.array([one.scene.scale for one in asked], np.float32),
-        np.stack([one.scene.there for one in asked]),
-        np.stack([one.hands if config.told else np.ones(2, bool) for one in asked]),
-        np.arange(length) < (np.array(stops) - [one.start for one in asked])[:, None],
+    states, offsets, n_frames = [], [], []
+    for window in scene_windows:
+        start, stop = window.start, min(window.stop, len(window.scene))
+        states.append(window.scene.state(config.features.state, start, stop))
+        offsets.append(window.scene.basis_offset[start:stop].reshape(stop - start, -1))
+        n_frames.append(stop - start)
+    hands = [window.active_hands if config.condition_on_hands else np.ones(2, bool) for window in scene_windows]
+    scales = np.array([window.scene.object_scale for window in scene_windows], np.float32)
+    return Windows(
+        basis_offset=torch.from_numpy(np.stack([padded(rows.astype(np.float32)) for rows in offsets])),
+        state=torch.from_numpy(np.stack([padded(rows.astype(np.float32)) for rows in states])),
+        object_scale=torch.from_numpy(scales),
+        point_exists=torch.from_numpy(np.stack([window.scene.point_exists for window in scene_windows])),
+        active_hands=torch.from_numpy(np.stack(hands)),
+        frame_mask=torch.from_numpy(np.arange(length) < np.array(n_frames)[:, None]),
     )
-    return Windows(*(torch.from_numpy(array) for array in arrays))

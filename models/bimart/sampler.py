@@ -1,7 +1,7 @@
-"""BimArt's answer: contact maps for a motion of an object, and hands for both, all windows of a path at once.
+"""Sampling of BimArt: contact maps for an object's motion, then keypoints and vectors to the object for both.
 
-Each motion is drawn from its own seed, whatever else is asked for with it. A motion may be pulled to its contact map
-while it is made (Sec. 3.3, eq. 5-7).
+All windows of a motion are denoised together. Each sample has a seed and does not depend on the rest of the batch.
+Guidance moves the keypoints towards the contact map during sampling (Sec. 3.3, Eqs. 5-7).
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,35 +16,33 @@ from hoidata.devices import send
 from hoidata.errors import BadInput
 from hoidata.settings import build_config
 from models.bimart.network import (
-    Asked,
     ContactModel,
     Denoiser,
     DenoiserConfig,
+    EncodedWindows,
     Layout,
     MotionModel,
-    Prepared,
+    SceneWindow,
     Windows,
+    build_windows,
     layout_of,
-    windows_of,
 )
 from models.bimart.scene import FeatureConfig, Scene, split_motion
 from models.common.checkpoints import Checkpoint
 from models.common.sampling import SamplerConfig, sample
 
-AT_ONCE = 1 << 22  # pairs of a place and a keypoint looked at together
-GUIDED_WITHIN_M = 0.02  # places the map says are farther than this from the hand matter less and less
+MAX_PAIRS = 1 << 22  # of object points and keypoints in one distance matrix
+GUIDANCE_RANGE_M = 0.02  # weights of object points decay with their target distance, by 1/e in this
+MAX_ACTIVE_M = 0.2  # a hand farther than this from the object is not active in a frame
 
 
 @dataclass(frozen=True)
-class Map:
-    """What a motion is held to. places_m (B, F, N, 3) of the object; contact_m (B, F, 2N): how far each hand is to be.
+class ContactTarget:
+    """The contact map that guidance moves keypoints to."""
 
-    known (B, F, 2N): values that count.
-    """
-
-    places_m: Tensor
-    contact_m: Tensor
-    known: Tensor
+    object_point_m: Tensor  # (B, F, N, 3)
+    contact_m: Tensor  # (B, F, 2N) target distances
+    mask: Tensor  # (B, F, 2N) bool, distances that count
 
 
 Guide = Literal["off", "paper", "metres"]
@@ -52,137 +50,154 @@ Guide = Literal["off", "paper", "metres"]
 
 @dataclass(frozen=True)
 class Discrepancy:
-    """error_m (B, F, 2, N): made map minus wanted. nearest (B, F, 2, N): the keypoint; away (B, F, 2, N, 3): to it."""
+    """How the contact map of keypoints differs from its target."""
 
-    error_m: Tensor
-    nearest: Tensor
-    away: Tensor
+    error_m: Tensor  # (B, F, 2, N) distance minus target distance; 0 where masked
+    nearest: Tensor  # (B, F, 2, N) index of the nearest keypoint
+    direction: Tensor  # (B, F, 2, N, 3) unit vector from the object point to that keypoint
 
 
-def discrepancy(keypoints_m: Tensor, wanted: Map) -> Discrepancy:
-    """Eq. 5: the map that keypoints (B, F, 2, J, 3) make, beside the wanted one."""
+def discrepancy(keypoints_m: Tensor, target: ContactTarget) -> Discrepancy:
+    """Compare the contact map of keypoints (B, F, 2, J, 3) with its target (Eq. 5)."""
     batch, frames, _, count, _ = keypoints_m.shape
-    places = wanted.places_m[:, :, None].expand(-1, -1, 2, -1, -1).flatten(0, 2)
+    points = target.object_point_m[:, :, None].expand(-1, -1, 2, -1, -1).flatten(0, 2)
     keypoints = keypoints_m.flatten(0, 2)
-    step = max(1, AT_ONCE // (places.shape[1] * count))
+    chunk = max(1, MAX_PAIRS // (points.shape[1] * count))
     nearest = torch.cat(
-        [torch.cdist(a, b).argmin(-1) for a, b in zip(places.split(step), keypoints.split(step), strict=True)]
+        [torch.cdist(a, b).argmin(-1) for a, b in zip(points.split(chunk), keypoints.split(chunk), strict=True)]
     )
-    way = keypoints.gather(1, nearest[..., None].expand(-1, -1, 3)) - places
-    distance = way.norm(dim=-1)
-    away = way / distance[..., None].clamp_min(1e-9)
-    shape = batch, frames, 2, places.shape[1]
-    error = distance.reshape(shape) - wanted.contact_m.unflatten(-1, (2, -1))
-    return Discrepancy(error * wanted.known.unflatten(-1, (2, -1)), nearest.reshape(shape), away.reshape(*shape, 3))
+    vector = keypoints.gather(1, nearest[..., None].expand(-1, -1, 3)) - points
+    distance = vector.norm(dim=-1)
+    direction = vector / distance[..., None].clamp_min(1e-9)
+    shape = batch, frames, 2, points.shape[1]
+    error = distance.reshape(shape) - target.contact_m.unflatten(-1, (2, -1))
+    return Discrepancy(error * target.mask.unflatten(-1, (2, -1)), nearest.reshape(shape), direction.reshape(*shape, 3))
 
 
-def paper_step(keypoints_m: Tensor, wanted: Map, scale: Tensor, window: int) -> Tensor:
-    """(B, F, 2, J, 3) the step of eq. 6 in normalised numbers: the gradient of the mean square, made of length 1.
+def paper_step(keypoints_m: Tensor, target: ContactTarget, scale: Tensor, window_frames: int) -> Tensor:
+    """The guidance step of Eq. 6: the negative gradient of the mean squared error, scaled to length 1 per window.
 
-    scale: (2, J, 3) metres of a normalised number. A path longer than a window takes the step every window would.
+    Args:
+        keypoints_m: (B, F, 2, J, 3).
+        target: the contact map.
+        scale: (2, J, 3) metres per normalised unit.
+        window_frames: frames of a window; a longer motion gets a longer step.
+
+    Returns:
+        (B, F, 2, J, 3) in normalised units.
     """
-    found = discrepancy(keypoints_m, wanted)
-    count = wanted.known.unflatten(-1, (2, -1)).sum((1, 3), keepdim=True).clamp_min(1)
-    gradient = (
-        _on_keypoints(2 * found.error_m[..., None] * found.away / count[..., None], found.nearest, keypoints_m) * scale
-    )
+    current = discrepancy(keypoints_m, target)
+    count = target.mask.unflatten(-1, (2, -1)).sum((1, 3), keepdim=True).clamp_min(1)
+    by_point = 2 * current.error_m[..., None] * current.direction / count[..., None]
+    gradient = _sum_at_keypoints(by_point, current.nearest, keypoints_m) * scale
     length = gradient.flatten(1).norm(dim=1).clamp_min(1e-12)
-    windows = max(keypoints_m.shape[1] / window, 1.0) ** 0.5
+    windows = max(keypoints_m.shape[1] / window_frames, 1.0) ** 0.5
     return -gradient * (windows / length)[:, None, None, None, None]
 
 
-def metre_step(keypoints_m: Tensor, wanted: Map) -> Tensor:
-    """(B, F, 2, J, 3) metres: each keypoint goes the mean way that the places it is nearest to ask of it.
+def metre_step(keypoints_m: Tensor, target: ContactTarget) -> Tensor:
+    """A guidance step in metres: Gauss-Newton with the diagonal of the Hessian.
 
-    A step of Gauss-Newton with the diagonal alone; places the map says are far from the hand count little.
+    Each keypoint moves by the weighted mean of the corrections of the object points it is nearest to. Object points
+    whose target distance is large have little weight.
+
+    Args:
+        keypoints_m: (B, F, 2, J, 3).
+        target: the contact map.
+
+    Returns:
+        (B, F, 2, J, 3) metres.
     """
-    found = discrepancy(keypoints_m, wanted)
-    near = torch.exp(-wanted.contact_m / GUIDED_WITHIN_M).unflatten(-1, (2, -1)) * wanted.known.unflatten(-1, (2, -1))
-    ask = _on_keypoints(near[..., None] * found.error_m[..., None] * found.away, found.nearest, keypoints_m)
-    total = _on_keypoints(near[..., None].expand_as(found.away), found.nearest, keypoints_m)
-    return -ask / (total + 0.5)
+    current = discrepancy(keypoints_m, target)
+    mask = target.mask.unflatten(-1, (2, -1))
+    weight = torch.exp(-target.contact_m / GUIDANCE_RANGE_M).unflatten(-1, (2, -1)) * mask
+    correction = weight[..., None] * current.error_m[..., None] * current.direction
+    correction = _sum_at_keypoints(correction, current.nearest, keypoints_m)
+    total = _sum_at_keypoints(weight[..., None].expand_as(current.direction), current.nearest, keypoints_m)
+    return -correction / (total + 0.5)  # 0.5 damps keypoints with little weight
 
 
-def _on_keypoints(values: Tensor, nearest: Tensor, like: Tensor) -> Tensor:
-    """Sums over places (B, F, 2, N, 3) at the keypoints they are nearest to (B, F, 2, J, 3)."""
-    return torch.zeros_like(like).scatter_add_(3, nearest[..., None].expand_as(values), values)
+def _sum_at_keypoints(values: Tensor, nearest: Tensor, keypoints: Tensor) -> Tensor:
+    """Sum values (B, F, 2, N, 3) of object points at their nearest keypoints: (B, F, 2, J, 3)."""
+    return torch.zeros_like(keypoints).scatter_add_(3, nearest[..., None].expand_as(values), values)
 
 
-def combined(told: Tensor, untold: Tensor, weight: float, rule: Literal["usual", "paper"]) -> Tensor:
-    """Classifier-free guidance: (1 + w) c - w u, or eq. 7 as printed, (1 + w) c - u."""
-    return (1 + weight) * told - (weight if rule == "usual" else 1.0) * untold
-
-
-IDLE_M = 0.2  # a hand that is farther than this from the object takes no part
+def combined(conditional: Tensor, unconditional: Tensor, weight: float, rule: Literal["usual", "paper"]) -> Tensor:
+    """Classifier-free guidance: (1 + w) c - w u; "paper" is Eq. 7 as printed, (1 + w) c - u."""
+    return (1 + weight) * conditional - (weight if rule == "usual" else 1.0) * unconditional
 
 
 @dataclass(frozen=True)
-class WalkConfig(SamplerConfig):
-    """The same with this family's defaults. guidance: lambda_f of classifier-free guidance; 0 is none."""
+class BimArtSamplerConfig(SamplerConfig):
+    """``SamplerConfig`` with the defaults of BimArt."""
 
     steps: int = 10
-    guidance: float = 0.0
+    guidance: float = 0.0  # lambda_f of classifier-free guidance; 0: none
 
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """How both networks are walked. sampler: the steps, and classifier-free guidance.
+    """How both networks are sampled."""
 
-    rule: of that guidance. guide: contact-map guidance, in the last
-    ``guide_share`` of the steps. overlapping: windows of a path share their frames at every step; else they are made
-    apart and put side by side.
-    """
-
-    sampler: WalkConfig = field(default_factory=WalkConfig)
-    rule: Literal["usual", "paper"] = "usual"
-    guide: Guide = "metres"
-    guide_share: float = 1 / 3
+    sampler: BimArtSamplerConfig = field(default_factory=BimArtSamplerConfig)
+    guidance_rule: Literal["usual", "paper"] = "usual"  # of classifier-free guidance, see ``combined``
+    contact_guidance: Guide = "metres"
+    contact_guidance_fraction: float = 1 / 3  # contact guidance acts in this last fraction of the sampler's steps
+    # True: windows overlap and are joined at each step. False (paper): windows are sampled independently.
     overlapping: bool = True
 
 
 OURS = SamplingConfig()
-PAPER = SamplingConfig(WalkConfig("ddpm", 50, 0.5), rule="paper", guide="paper", guide_share=1.0, overlapping=False)
+PAPER = SamplingConfig(
+    sampler=BimArtSamplerConfig("ddpm", 50, 0.5),
+    guidance_rule="paper",
+    contact_guidance="paper",
+    contact_guidance_fraction=1.0,
+    overlapping=False,
+)
 PRESETS = {"ours": OURS, "paper": PAPER}
 
 
-def sampling_of(preset: str, told: Mapping[str, Any], where: str) -> SamplingConfig:
-    """The sampling of a preset with what is told laid over it. Raises BadInput as ``build_config`` does."""
-    config = build_config(SamplingConfig, told, where)
-    walk = told.get("sampler", {})
-    sampler = replace(PRESETS[preset].sampler, **{name: getattr(config.sampler, name) for name in walk})
-    own = {name: getattr(config, name) for name in told if name != "sampler"}
-    return replace(PRESETS[preset], sampler=sampler, **own)
+def sampling_of(preset: str, changes: Mapping[str, Any], source: str) -> SamplingConfig:
+    """The sampling of a preset with some settings changed; source: their section, for errors.
+
+    Raises:
+        BadInput: for an unknown key or a value of another type.
+    """
+    config = build_config(SamplingConfig, changes, source)
+    sampler_changes = {name: getattr(config.sampler, name) for name in changes.get("sampler", {})}
+    sampler = replace(PRESETS[preset].sampler, **sampler_changes)
+    others = {name: getattr(config, name) for name in changes if name != "sampler"}
+    return replace(PRESETS[preset], sampler=sampler, **others)
 
 
 def preset_of(config: DenoiserConfig) -> str:
-    """The preset that a network's settings are of."""
-    return "ours" if config.told else "paper"
+    """The preset that a network was trained with."""
+    return "ours" if config.condition_on_hands else "paper"
 
 
 @dataclass(frozen=True)
-class Path:
-    """What hands are made for. hands: (2,) bool, that take part. seed: of everything drawn."""
+class SamplingTask:
+    """One motion to sample."""
 
     scene: Scene
-    hands: np.ndarray
+    active_hands: np.ndarray  # (2,) bool
     seed: int
 
 
 @dataclass(frozen=True)
-class Made:
-    """Canonical frame, metres. contact_m: (frame, 2 x places) wanted distances. keypoints_m and to_object_m, vectors
-    from them to the object: (side, frame, keypoint, 3). active: (side, frame) near the object.
-    """
+class SampledMotion:
+    """A sampled contact map and the hands for it, canonical frame, metres."""
 
-    contact_m: np.ndarray
-    keypoints_m: np.ndarray
-    to_object_m: np.ndarray
-    active: np.ndarray
+    contact_m: np.ndarray  # (frame, 2N) target distances
+    keypoints_m: np.ndarray  # (side, frame, keypoint, 3)
+    to_object_m: np.ndarray  # (side, frame, keypoint, 3) vectors from keypoints to the object
+    active: np.ndarray  # (side, frame) bool, near the object
 
 
 @dataclass(frozen=True)
 class BimArt:
-    """Both trained networks, ready to answer."""
+    """Both trained networks with their sampling."""
 
     contact: ContactModel
     motion: MotionModel
@@ -191,119 +206,134 @@ class BimArt:
 
     @classmethod
     def of(cls, contact: Checkpoint, motion: Checkpoint, config: SamplingConfig, device: torch.device) -> "BimArt":
-        """Raises BadInput where the two networks do not see alike."""
-        first, second = contact.network, motion.network
-        assert isinstance(first, ContactModel)
-        assert isinstance(second, MotionModel)
-        own, wanted = (_seen(one.config.features) for one in (second, first))
-        if own != wanted:
-            raise BadInput("bimart-motion", f"features of its contact model, {wanted}", f"{own}", "train both alike")
-        return cls(first, second, config, device)
+        """Combine two checkpoints.
+
+        Raises:
+            BadInput: if the two networks have different features.
+        """
+        contact_model, motion_model = contact.network, motion.network
+        assert isinstance(contact_model, ContactModel)
+        assert isinstance(motion_model, MotionModel)
+        expected, got = (_shared_features(model.config.features) for model in (contact_model, motion_model))
+        if got != expected:
+            raise BadInput("bimart-motion", f"features of its contact model, {expected}", f"{got}", "train both alike")
+        return cls(contact_model, motion_model, config, device)
 
     @torch.no_grad()
-    def make(self, paths: Sequence[Path], contact_m: Tensor | None = None) -> list[Made]:
-        """Hands for paths of one length. contact_m: (B, frame, 2N) maps in the place of those that would be drawn."""
-        generators = [torch.Generator().manual_seed(path.seed) for path in paths]
-        drawn = self._maps(paths, generators)  # even where maps are given: a motion's noise comes after a map's
-        contact = drawn if contact_m is None else contact_m.to(drawn)
-        motion = self.motion.decode(self._walk(self.motion, paths, generators, contact))
-        rows = zip(paths, contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
-        return [self._made(*own) for own in rows]
+    def sample_motions(self, tasks: Sequence[SamplingTask], contact_m: Tensor | None = None) -> list[SampledMotion]:
+        """Sample hands for tasks of one length; contact_m (B, frame, 2N) replaces the sampled contact maps."""
+        generators = [torch.Generator().manual_seed(task.seed) for task in tasks]
+        # Contact maps are sampled even if they are given, because the motion's noise follows theirs.
+        sampled_maps = self._sample_maps(tasks, generators)
+        contact = sampled_maps if contact_m is None else contact_m.to(sampled_maps)
+        motion = self.motion.decode(self._sample(self.motion, tasks, generators, contact))
+        arrays = zip(tasks, contact.cpu().numpy(), motion.cpu().numpy(), strict=True)
+        return [self._sampled_motion(*item) for item in arrays]
 
     @torch.no_grad()
-    def maps(self, paths: Sequence[Path]) -> np.ndarray:
-        """(B, frame, 2N) metres: the maps that hands would be made for."""
-        return self._maps(paths, [torch.Generator().manual_seed(path.seed) for path in paths]).cpu().numpy()
+    def sample_maps(self, tasks: Sequence[SamplingTask]) -> np.ndarray:
+        """(B, frame, 2N) metres: the contact maps that ``sample_motions`` samples for these tasks."""
+        return self._sample_maps(tasks, [torch.Generator().manual_seed(task.seed) for task in tasks]).cpu().numpy()
 
-    def _maps(self, paths: Sequence[Path], generators: list[torch.Generator]) -> Tensor:
-        drawn = self.contact.decode(self._walk(self.contact, paths, generators, None))
-        return drawn.clamp(0, self.motion.config.features.most_m or None) * self._known(paths)
+    def _sample_maps(self, tasks: Sequence[SamplingTask], generators: list[torch.Generator]) -> Tensor:
+        contact_m = self.contact.decode(self._sample(self.contact, tasks, generators, None))
+        return contact_m.clamp(0, self.motion.config.features.max_distance_m or None) * self._contact_mask(tasks)
 
-    def _known(self, paths: Sequence[Path]) -> Tensor:
-        """(B, frame, 2N) bool: values of maps that are there, of hands that take part."""
-        own = np.stack([(self._hands(path)[:, None] & path.scene.there).ravel() for path in paths])
-        return torch.from_numpy(own).to(self.device)[:, None].expand(-1, len(paths[0].scene), -1)
+    def _contact_mask(self, tasks: Sequence[SamplingTask]) -> Tensor:
+        """(B, frame, 2N) bool: contact distances of existing object points to active hands."""
+        masks = np.stack([(self._active_hands(task)[:, None] & task.scene.point_exists).ravel() for task in tasks])
+        return torch.from_numpy(masks).to(self.device)[:, None].expand(-1, len(tasks[0].scene), -1)
 
-    def _hands(self, path: Path) -> np.ndarray:
-        return path.hands if self.motion.config.told else np.ones(2, bool)
+    def _active_hands(self, task: SamplingTask) -> np.ndarray:
+        return task.active_hands if self.motion.config.condition_on_hands else np.ones(2, bool)
 
-    def _walk(
+    def _sample(
         self,
         network: Denoiser,
-        paths: Sequence[Path],
+        tasks: Sequence[SamplingTask],
         generators: list[torch.Generator],
         contact_m: Tensor | None,
     ) -> Tensor:
-        """(B, frame, D) normalised numbers of a network, from noise."""
-        frames, size = len(paths[0].scene), len(network.mean)
-        layout = layout_of(frames, network.config.features.window, self.config.overlapping)
-        known = network.prepare(self._windows(network, paths, layout, contact_m))
-        noise = send(torch.stack([torch.randn(frames, size, generator=own) for own in generators]), self.device)
+        """(B, frame, D) normalised values of a network, from noise."""
+        frames, size = len(tasks[0].scene), len(network.mean)
+        layout = layout_of(frames, network.config.features.window_frames, self.config.overlapping)
+        encoded = network.prepare(self._windows(network, tasks, layout, contact_m))
+        noise = torch.stack([torch.randn(frames, size, generator=generator) for generator in generators])
+        noise = send(noise, self.device)
         if contact_m is None:
-            denoise = _plain(network, known, layout)
+            denoise = _plain_denoiser(network, encoded, layout)
         else:
-            wanted = None if self.config.guide == "off" else self._map(paths, contact_m)
-            denoise = self._guided(network, known, layout, wanted)
+            target = None if self.config.contact_guidance == "off" else self._contact_target(tasks, contact_m)
+            denoise = self._guided_denoiser(network, encoded, layout, target)
         return sample(denoise, noise, self.config.sampler, generators)
 
-    def _windows(self, network: Denoiser, paths: Sequence[Path], layout: Layout, contact_m: Tensor | None) -> Windows:
-        asked = [
-            Asked(path.scene, start, start + layout.length, path.hands) for path in paths for start in layout.starts
+    def _windows(
+        self, network: Denoiser, tasks: Sequence[SamplingTask], layout: Layout, contact_m: Tensor | None
+    ) -> Windows:
+        scene_windows = [
+            SceneWindow(task.scene, start, start + layout.length, task.active_hands)
+            for task in tasks
+            for start in layout.starts
         ]
-        windows = windows_of(asked, layout.length, network.config).to(self.device)
+        windows = build_windows(scene_windows, layout.length, network.config).to(self.device)
         return windows if contact_m is None else replace(windows, contact_m=layout.cut(contact_m))
 
-    def _map(self, paths: Sequence[Path], contact_m: Tensor) -> Map:
-        places = torch.from_numpy(np.stack([path.scene.place_m for path in paths])).to(self.device)
-        known, most = self._known(paths), self.motion.config.features.most_m
-        return Map(places, contact_m, known & (contact_m < 0.99 * most) if most else known)
+    def _contact_target(self, tasks: Sequence[SamplingTask], contact_m: Tensor) -> ContactTarget:
+        points = torch.from_numpy(np.stack([task.scene.object_point_m for task in tasks])).to(self.device)
+        mask, max_m = self._contact_mask(tasks), self.motion.config.features.max_distance_m
+        # A distance at the clamp is a lower bound only.
+        return ContactTarget(points, contact_m, mask & (contact_m < 0.99 * max_m) if max_m else mask)
 
-    def _guided(
-        self, network: Denoiser, known: Prepared, layout: Layout, wanted: Map | None
+    def _guided_denoiser(
+        self, network: Denoiser, encoded: EncodedWindows, layout: Layout, target: ContactTarget | None
     ) -> Callable[[Tensor, Tensor], Tensor]:
-        """The motion model told of its map, pulled to it, and away from what it does untold."""
-        config, calls, both = self.config, 0, known.twice()
+        """The motion model with contact guidance and classifier-free guidance."""
+        config, calls, doubled = self.config, 0, encoded.doubled()
 
         def denoise(x: Tensor, steps: Tensor) -> Tensor:
             nonlocal calls
             calls += 1
-            cut, own = layout.cut(x), steps.repeat_interleave(len(layout.starts))
+            windows, window_steps = layout.cut(x), steps.repeat_interleave(len(layout.starts))
             if config.sampler.guidance == 0:
-                clean, untold = layout.joined(network.denoise(cut, own, known, known.conditional)), None
+                clean = layout.joined(network.denoise(windows, window_steps, encoded, encoded.conditional))
+                unconditional = None
             else:
-                found = network.denoise(torch.cat((cut, cut)), torch.cat((own, own)), both, both.conditional)
-                clean, untold = (layout.joined(part) for part in found.chunk(2))
-            if wanted is not None and calls > config.sampler.steps * (1 - config.guide_share):
-                clean = self._pulled(clean, wanted)
-            return clean if untold is None else combined(clean, untold, config.sampler.guidance, config.rule)
+                both_windows, both_steps = torch.cat((windows, windows)), torch.cat((window_steps, window_steps))
+                both = network.denoise(both_windows, both_steps, doubled, doubled.conditional)
+                clean, unconditional = (layout.joined(half) for half in both.chunk(2))
+            if target is not None and calls > config.sampler.steps * (1 - config.contact_guidance_fraction):
+                clean = self._guide_keypoints(clean, target)
+            if unconditional is None:
+                return clean
+            return combined(clean, unconditional, config.sampler.guidance, config.guidance_rule)
 
         return denoise
 
-    def _pulled(self, clean: Tensor, wanted: Map) -> Tensor:
-        """(B, frame, D) with its positions moved by a step of contact-map guidance; the ways to the object stay."""
+    def _guide_keypoints(self, clean: Tensor, target: ContactTarget) -> Tensor:
+        """(B, frame, D) with keypoints moved by one step of contact guidance; vectors to the object stay."""
         network, half = self.motion, 6 * self.motion.config.features.keypoints
         scale = (network.scale[:half] / network.config.signal_scale).reshape(2, -1, 3)
         keypoints = network.decode(clean)[..., :half].unflatten(-1, (2, -1, 3))
-        if self.config.guide == "paper":
-            step = paper_step(keypoints, wanted, scale, network.config.features.window)
+        if self.config.contact_guidance == "paper":
+            step = paper_step(keypoints, target, scale, network.config.features.window_frames)
         else:
-            step = metre_step(keypoints, wanted) / scale
+            step = metre_step(keypoints, target) / scale
         return torch.cat((clean[..., :half] + step.flatten(2), clean[..., half:]), -1)
 
-    def _made(self, path: Path, contact_m: np.ndarray, motion: np.ndarray) -> Made:
+    def _sampled_motion(self, task: SamplingTask, contact_m: np.ndarray, motion: np.ndarray) -> SampledMotion:
         keypoints, to_object = split_motion(motion)
-        near = np.linalg.norm(to_object, axis=-1).min(axis=-1) < IDLE_M
-        return Made(contact_m, keypoints, to_object, near & self._hands(path)[:, None])
+        near = np.linalg.norm(to_object, axis=-1).min(axis=-1) < MAX_ACTIVE_M
+        return SampledMotion(contact_m, keypoints, to_object, near & self._active_hands(task)[:, None])
 
 
-def _seen(features: FeatureConfig) -> FeatureConfig:
-    """What both networks of a pair must agree in."""
-    return replace(features, state="local", window=0)
+def _shared_features(features: FeatureConfig) -> FeatureConfig:
+    """The features that both networks of a pair must have in common; the others are set to fixed values."""
+    return replace(features, state="local", window_frames=0)
 
 
-def _plain(network: Denoiser, known: Prepared, layout: Layout) -> Callable[[Tensor, Tensor], Tensor]:
+def _plain_denoiser(network: Denoiser, encoded: EncodedWindows, layout: Layout) -> Callable[[Tensor, Tensor], Tensor]:
     def denoise(x: Tensor, steps: Tensor) -> Tensor:
-        own = steps.repeat_interleave(len(layout.starts))
-        return layout.joined(network.denoise(layout.cut(x), own, known, known.conditional))
+        window_steps = steps.repeat_interleave(len(layout.starts))
+        return layout.joined(network.denoise(layout.cut(x), window_steps, encoded, encoded.conditional))
 
     return denoise

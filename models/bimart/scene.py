@@ -1,7 +1,7 @@
-"""What BimArt is told of an object's motion (O, G and scale of Sec. 3.1), and what it learns of hands at it (C and X).
+"""BimArt's features: the object's motion as condition (O, G and scale, Sec. 3.1), and hands at it as targets (C and X).
 
-Everything is in the object's canonical frame (``hoidata.sensors.part_bps``). Sides are ordered left, right; parts top
-(the moving part, 1), base (0).
+Everything is in the object's canonical frame (``hoidata.sensors.part_bps``). Sides are ordered left, right. Parts are
+ordered top (the moving part, 1), base (0).
 """
 
 from dataclasses import dataclass, field
@@ -35,92 +35,97 @@ STATE_SIZES = {"pose": 6, "local": 9}
 
 @dataclass(frozen=True)
 class FeatureConfig:
-    """What networks see and make; both networks of a pair must agree in all but ``state``.
-
-    keypoints: of each hand. window: frames. state: G is the object's "pose" (axis-angle; position from that in the
-    window's first frame), as published; or "local": gravity, velocity and rotation in the object's own frame, which no
-    yaw, position or window changes. map_of: contact maps are distances to the whole skin (778 vertices) or to the
-    keypoints, over which guidance compares them. most_m: distances end there; 0: they do not.
-    """
+    """Inputs and outputs of the networks. Both networks of a pair must agree in all but ``state``."""
 
     basis: BasisSettings = field(default_factory=BasisSettings)
-    keypoints: int = 100
-    window: int = 64
+    keypoints: int = 100  # of each hand
+    window_frames: int = 64
+    # G. "pose" (paper): axis-angle, and position relative to the window's first frame. "local": gravity, velocity and
+    # angular velocity in the object frame; yaw, position and window do not change them.
     state: Literal["pose", "local"] = "pose"
-    map_of: Literal["skin", "keypoints"] = "skin"
-    most_m: float = 0.0
+    # Contact maps are distances to all 778 vertices of the hand, or to its keypoints, which guidance uses.
+    contact_map_target: Literal["skin", "keypoints"] = "skin"
+    max_distance_m: float = 0.0  # contact maps are clamped to it; 0: not clamped
 
     @property
-    def places(self) -> int:
-        """Places of an object that a map of one hand has a value for."""
+    def object_points(self) -> int:
+        """Number N of object points: a contact map has one distance per point and hand."""
         return self.basis.places
 
     @property
     def scene_size(self) -> int:
-        """Numbers per frame that the object encoder is given: O, G and the scale."""
-        return 3 * self.places + STATE_SIZES[self.state] + 1
+        """Numbers per frame of the object encoder's input: O, G and the scale."""
+        return 3 * self.object_points + STATE_SIZES[self.state] + 1
 
     @property
     def contact_size(self) -> int:
-        """Numbers per frame of a contact map: distances at places from the left hand, then from the right."""
-        return 2 * self.places
+        """Numbers per frame of a contact map: distances from the left hand, then from the right."""
+        return 2 * self.object_points
 
     @property
     def motion_size(self) -> int:
-        """Numbers per frame: keypoints left, right, then vectors to the object left, right (X = [H | D])."""
+        """Numbers per frame of X = [H | D]: keypoints left, right, then vectors to the object left, right."""
         return 12 * self.keypoints
 
-    def of_hands(self, hands: torch.Tensor) -> torch.Tensor:
-        """(..., motion_size) what is true (..., 2) of the left and the right hand, for every number of a motion."""
+    def spread_over_motion(self, hands: torch.Tensor) -> torch.Tensor:
+        """Repeat values (..., 2) of the left and right hand for every number of a motion: (..., motion_size)."""
         return torch.cat(2 * [hands.repeat_interleave(3 * self.keypoints, -1)], -1)
 
 
 @dataclass(frozen=True)
 class Scene:
-    """An object's motion. offset, place_m, there: as in ``Seen``. scale: s_o. hinge_rad: (frame,).
+    """The motion of an object with its part-based basis point set (BPS)."""
 
-    model_from_canonical: of every frame. object_from_canonical: of all. bps: the object's static structures.
-    """
-
-    offset: np.ndarray
-    place_m: np.ndarray
-    there: np.ndarray
-    scale: float
-    hinge_rad: np.ndarray
-    model_from_canonical: RigidTransform
-    object_from_canonical: RigidTransform
+    basis_offset: np.ndarray  # (frame, N, 3) scaled vectors from the basis points to the object (O, eq. 2)
+    object_point_m: np.ndarray  # (frame, N, 3) the object point nearest to each basis point, canonical frame
+    point_exists: np.ndarray  # (N,) bool, False for points of a part that the object does not have
+    object_scale: float  # s_o of eq. 1, per metre
+    hinge_rad: np.ndarray  # (frame,)
+    model_from_canonical: RigidTransform  # (frame,)
+    object_from_canonical: RigidTransform  # the same in all frames
     bps: PartBps
 
     def __len__(self) -> int:
         return len(self.hinge_rad)
 
     @classmethod
-    def of(cls, model: ObjectModel, thing: np.ndarray, basis: BasisSettings) -> "Scene":
-        """From features (frame, 10) of the model frame (``hoidata.clips.features``)."""
-        thing = thing.astype(np.float64)
-        bps, object_from_canonical = _structures(_Known(model), basis)
-        hinge = thing[:, OBJECT_HINGE] if model.is_articulated else np.zeros(len(thing))
-        body = RigidTransform(rot6d_to_rotmat(thing[:, OBJECT_ROTATION_6D]), thing[:, OBJECT_POSITION])
-        seen = bps.look(hinge)
-        known = seen.offset, seen.place_m, seen.there, bps.scale, hinge
-        return cls(*known, body @ object_from_canonical, object_from_canonical, bps)
+    def of(cls, model: ObjectModel, object_features: np.ndarray, basis: BasisSettings) -> "Scene":
+        """Build from features (frame, 10) in the model frame (``hoidata.clips.features``)."""
+        object_features = object_features.astype(np.float64)
+        bps, object_from_canonical = _basis_structures(_ModelIdentity(model), basis)
+        hinge_rad = object_features[:, OBJECT_HINGE] if model.is_articulated else np.zeros(len(object_features))
+        rotation = rot6d_to_rotmat(object_features[:, OBJECT_ROTATION_6D])
+        model_from_object = RigidTransform(rotation, object_features[:, OBJECT_POSITION])
+        nearest = bps.look(hinge_rad)
+        return cls(
+            basis_offset=nearest.offset,
+            object_point_m=nearest.place_m,
+            point_exists=nearest.there,
+            object_scale=bps.scale,
+            hinge_rad=hinge_rad,
+            model_from_canonical=model_from_object @ object_from_canonical,
+            object_from_canonical=object_from_canonical,
+            bps=bps,
+        )
 
     def state(self, kind: str, start: int, stop: int) -> np.ndarray:
-        """(frame, 6 or 9) G of a window of frames."""
+        """G (frame, 6 or 9) of frames ``start`` to ``stop - 1``; kind: ``FeatureConfig.state``."""
         rotation, position = self.model_from_canonical.rotation, self.model_from_canonical.translation
         if kind == "pose":
-            moved = position[start:stop] - position[start]
-            return np.concatenate((rotmat_to_rotvec(rotation[start:stop]), moved), axis=1)
+            displacement = position[start:stop] - position[start]
+            return np.concatenate((rotmat_to_rotvec(rotation[start:stop]), displacement), axis=1)
+        # Central differences; one-sided in the first and last frame.
         rows = np.clip(np.arange(start - 1, stop + 1), 0, len(self) - 1)
-        turns, places, seconds = rotation[rows], position[rows], (rows[2:] - rows[:-2]).clip(1)[:, None] / FPS
-        own = turns[1:-1].swapaxes(1, 2)
-        velocity = np.einsum("fij,fj->fi", own, (places[2:] - places[:-2]) / seconds)
-        turning = rotmat_to_rotvec(turns[:-2].swapaxes(1, 2) @ turns[2:]) / seconds
-        return np.concatenate((own @ DOWN, velocity, turning), axis=1)
+        rotations, positions = rotation[rows], position[rows]
+        elapsed_s = (rows[2:] - rows[:-2]).clip(1)[:, None] / FPS
+        canonical_from_model = rotations[1:-1].swapaxes(1, 2)
+        velocity = np.einsum("fij,fj->fi", canonical_from_model, (positions[2:] - positions[:-2]) / elapsed_s)
+        angular_velocity = rotmat_to_rotvec(rotations[:-2].swapaxes(1, 2) @ rotations[2:]) / elapsed_s
+        return np.concatenate((canonical_from_model @ DOWN, velocity, angular_velocity), axis=1)
 
 
-class _Known:
-    """A model as a key: the same object in memory."""
+class _ModelIdentity:
+    """A cache key: equal for the same object in memory, because arrays have no hash."""
 
     def __init__(self, model: ObjectModel) -> None:
         self.model = model
@@ -129,65 +134,68 @@ class _Known:
         return id(self.model)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Known) and other.model is self.model
+        return isinstance(other, _ModelIdentity) and other.model is self.model
 
 
 @lru_cache(maxsize=64)
-def _structures(known: _Known, basis: BasisSettings) -> tuple[PartBps, RigidTransform]:
-    canonical, object_from_canonical = canonical_object(known.model, basis.frame)
+def _basis_structures(key: _ModelIdentity, basis: BasisSettings) -> tuple[PartBps, RigidTransform]:
+    canonical, object_from_canonical = canonical_object(key.model, basis.frame)
     return PartBps(canonical, basis), object_from_canonical
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """A recorded clip as networks learn it. contact_m: (side, frame, place) float16 distances.
-
-    keypoints_m and to_object_m, the vectors from them to the object: (side, frame, keypoint, 3) float32, canonical
-    frame. present: (side, frame) tracked; active_hands: (side,).
-    """
+class RecordedClip:
+    """Training targets of a recorded clip, canonical frame."""
 
     scene: Scene
-    contact_m: np.ndarray
-    keypoints_m: np.ndarray
-    to_object_m: np.ndarray
-    present: np.ndarray
-    active_hands: np.ndarray
+    contact_m: np.ndarray  # (side, frame, N) float16 distances from object points to the hand
+    keypoints_m: np.ndarray  # (side, frame, keypoint, 3) float32
+    to_object_m: np.ndarray  # (side, frame, keypoint, 3) float32 vectors from keypoints to the object's surface
+    present: np.ndarray  # (side, frame) bool, tracked
+    active_hands: np.ndarray  # (side,) bool
 
     @property
     def motion(self) -> np.ndarray:
         """(frame, motion_size) X: keypoints left, right, then vectors to the object left, right."""
-        own = [part.swapaxes(0, 1).reshape(part.shape[1], -1) for part in (self.keypoints_m, self.to_object_m)]
-        return np.concatenate(own, axis=1)
+        by_frame = [array.swapaxes(0, 1).reshape(array.shape[1], -1) for array in (self.keypoints_m, self.to_object_m)]
+        return np.concatenate(by_frame, axis=1)
 
 
-def recorded_clip(sample: ClipSample, pair: HandPair, config: FeatureConfig) -> Recorded:
-    """A whole clip's maps, keypoints and vectors to the object."""
+def recorded_clip(sample: ClipSample, pair: HandPair, config: FeatureConfig) -> RecordedClip:
+    """Contact maps, keypoints and vectors to the object of a whole clip."""
     scene = Scene.of(sample.object_model, sample.object, config.basis)
     canonical_from_model = scene.model_from_canonical.inverse()
-    ids = hand_keypoints(pair.right, config.keypoints)
+    keypoint_ids = hand_keypoints(pair.right, config.keypoints)
     contact, keypoints, to_object = [], [], []
-    for row in range(2):
-        skin = canonical_from_model @ hand_vertices_m(pair, row, sample).astype(np.float64)
-        own = skin[:, ids]
-        found = distance_map(scene.place_m, skin if config.map_of == "skin" else own)
-        contact.append(np.minimum(found, config.most_m or np.inf).astype(np.float16))
-        keypoints.append(own.astype(np.float32))
-        to_object.append((scene.bps.nearest_m(own, scene.hinge_rad) - own).astype(np.float32))
-    arrays = np.stack(contact), np.stack(keypoints), np.stack(to_object)
-    return Recorded(scene, *arrays, sample.valid, sample.active_hands)
+    for side in range(2):
+        skin_m = canonical_from_model @ hand_vertices_m(pair, side, sample).astype(np.float64)
+        keypoints_m = skin_m[:, keypoint_ids]
+        target_m = skin_m if config.contact_map_target == "skin" else keypoints_m
+        distance_m = distance_map(scene.object_point_m, target_m)
+        contact.append(np.minimum(distance_m, config.max_distance_m or np.inf).astype(np.float16))
+        keypoints.append(keypoints_m.astype(np.float32))
+        to_object.append((scene.bps.nearest_m(keypoints_m, scene.hinge_rad) - keypoints_m).astype(np.float32))
+    return RecordedClip(
+        scene=scene,
+        contact_m=np.stack(contact),
+        keypoints_m=np.stack(keypoints),
+        to_object_m=np.stack(to_object),
+        present=sample.valid,
+        active_hands=sample.active_hands,
+    )
 
 
 @torch.no_grad()
-def hand_vertices_m(pair: HandPair, row: int, sample: ClipSample) -> np.ndarray:
-    """(frame, 778, 3) float32 skin of one side, model frame."""
-    hands = torch.from_numpy(sample.hands[row])
-    turns = rot6d_to_rotmat(hands[:, HAND_ROTATIONS_6D].reshape(-1, N_ROTATIONS, 6))
-    template = None if sample.template_m is None else torch.from_numpy(sample.template_m[row])
-    layer = kinematics_of(pair[SIDES[row]])
-    return layer(hands[:, WRIST], turns, torch.from_numpy(sample.betas[row])[None], template)[0].numpy()
+def hand_vertices_m(pair: HandPair, side: int, sample: ClipSample) -> np.ndarray:
+    """(frame, 778, 3) float32 vertices of one hand, model frame; side: 0 left, 1 right."""
+    hands = torch.from_numpy(sample.hands[side])
+    rotmats = rot6d_to_rotmat(hands[:, HAND_ROTATIONS_6D].reshape(-1, N_ROTATIONS, 6))
+    template = None if sample.template_m is None else torch.from_numpy(sample.template_m[side])
+    layer = kinematics_of(pair[SIDES[side]])
+    return layer(hands[:, WRIST], rotmats, torch.from_numpy(sample.betas[side])[None], template)[0].numpy()
 
 
 def split_motion(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The inverse of ``Recorded.motion``: keypoints and vectors to the object, both (side, frame, keypoint, 3)."""
+    """Split X into keypoints and vectors to the object, both (side, frame, keypoint, 3)."""
     keypoints, to_object = motion.reshape(len(motion), 2, 2, -1, 3).transpose(1, 2, 0, 3, 4)
     return keypoints, to_object

@@ -1,7 +1,4 @@
-"""What ManipNet is given: the motion of both wrists and of an object, at any rate, asked at any time.
-
-Of a clip or a request the same is at its 30 frames per second, with the fingers the network is to give.
-"""
+"""ManipNet's control signal: the motions of both wrists and of the object, at any frame rate, with interpolation."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -29,35 +26,36 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.model import ObjectModel
 from hoidata.sensors.mano_hand import mano_hand
 
-_ON_FRAME = 1e-6  # of a frame: times this near to a frame are that frame's
+_FRAME_TOLERANCE = 1e-6  # of a frame's duration: a time this close to a frame takes its pose without interpolation
 
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """One rigid body, world frame. time_s: (frame,) rising. rotmats: (frame, 3, 3); position_m: (frame, 3)."""
+    """The motion of one rigid body, world frame."""
 
-    time_s: np.ndarray
-    rotmats: np.ndarray
-    position_m: np.ndarray
+    time_s: np.ndarray  # (frame,) increasing
+    rotmats: np.ndarray  # (frame, 3, 3) world_from_body
+    position_m: np.ndarray  # (frame, 3)
 
     def at(self, time_s: np.ndarray) -> RigidTransform:
-        """``world_from_body`` at times of any shape: turned by slerp, moved straight, held beyond the ends.
+        """Interpolate ``world_from_body`` at times of any shape; constant before the first and after the last frame.
 
-        What it says of a time depends on the two frames beside it alone, to the last bit: a stream forgets the others.
+        Rotations are interpolated by slerp, positions linearly. A result depends on its two neighbouring frames only,
+        to the last bit, because a stream discards older frames.
         """
         time = np.clip(time_s, self.time_s[0], self.time_s[-1])
         before = np.searchsorted(self.time_s[1:-1], time, side="right")
         after = np.minimum(before + 1, len(self.time_s) - 1)
         since, until = time - self.time_s[before], self.time_s[after] - time
-        on_frame = np.minimum(since, until) <= _ON_FRAME * (since + until)
+        on_frame = np.minimum(since, until) <= _FRAME_TOLERANCE * (since + until)
         frame = np.where(since <= until, before, after)
-        turn, place = self.rotmats[frame], self.position_m[frame]
+        rotation, position_m = self.rotmats[frame], self.position_m[frame]
         if not on_frame.all():
-            between = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
+            interpolated = self._slerp(time.ravel()).as_matrix().reshape(*time.shape, 3, 3)
             columns = [np.interp(time, self.time_s, column) for column in self.position_m.T]
-            turn = np.where(on_frame[..., None, None], turn, between)
-            place = np.where(on_frame[..., None], place, np.stack(columns, axis=-1))
-        return RigidTransform(turn, place)
+            rotation = np.where(on_frame[..., None, None], rotation, interpolated)
+            position_m = np.where(on_frame[..., None], position_m, np.stack(columns, axis=-1))
+        return RigidTransform(rotation, position_m)
 
     @cached_property
     def _slerp(self) -> Slerp:
@@ -66,77 +64,89 @@ class Motion:
 
 @dataclass(frozen=True, eq=False)
 class Control:
-    """Wrists and object of one recording. wrists: world_from_wrist by side. thing: world_from_object.
+    """The motions of both wrists and of one object."""
 
-    model: the object's mesh. hinge_rad: (frame,) at ``thing.time_s`` for a hinged object, else None.
-    """
-
-    wrists: dict[Side, Motion]
-    thing: Motion
+    wrists: dict[Side, Motion]  # world_from_wrist
+    object_motion: Motion  # world_from_object
     model: ObjectModel
-    hinge_rad: np.ndarray | None = None
+    hinge_rad: np.ndarray | None = None  # (frame,) at ``object_motion.time_s``; None for a rigid object
 
     @cached_property
     def box_middle_m(self) -> np.ndarray:
-        """(3,) the middle of the object's bounding box, object frame, hinge at 0."""
+        """(3,) centre of the object's bounding box, object frame, hinge at 0."""
         return (self.model.vertices_m.min(axis=0) + self.model.vertices_m.max(axis=0)) / 2
 
     def hinge_at(self, time_s: np.ndarray) -> np.ndarray | None:
-        """Angles at times of any shape, radians."""
+        """Hinge angles at times of any shape, radians; None for a rigid object."""
         if self.hinge_rad is None:
             return None
-        return np.interp(time_s, self.thing.time_s, self.hinge_rad)
+        return np.interp(time_s, self.object_motion.time_s, self.hinge_rad)
 
 
-UNSEEN_M = 1.0  # how far away a wrist is taken to be that is never tracked
+UNTRACKED_DISTANCE_M = 1.0  # from the object to a wrist that is never tracked: out of range of all sensors
 
 
-def between(start: np.ndarray, stop: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """Rotations (frame, joint, 3, 3) a share (frame,) of the way from the first to the second."""
-    way = rotmat_to_rotvec(start.swapaxes(-1, -2) @ stop)
-    return start @ rotvec_to_rotmat(share[:, None, None] * way)
+def interpolate_rotations(start: np.ndarray, stop: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """Interpolate rotations (frame, joint, 3, 3) by slerp; fraction (frame,): 0 is ``start``, 1 is ``stop``."""
+    rotvec = rotmat_to_rotvec(start.swapaxes(-1, -2) @ stop)
+    return start @ rotvec_to_rotmat(fraction[:, None, None] * rotvec)
 
 
-def control_of(given: Trajectories, model: ObjectModel) -> Control:
-    """Wrists and object at 30 fps, time 0 in the first frame; a wrist that is lost stays where it was seen nearest."""
-    time_s = np.arange(len(given.object)) / FPS
-    thing = given.object.astype(np.float64)
-    hinge = thing[:, OBJECT_HINGE] if model.is_articulated else None
-    wrists: dict[Side, Motion] = {side: _wrist(given, row, time_s) for row, side in enumerate(SIDES)}
-    body = Motion(time_s, rot6d_to_rotmat(thing[:, OBJECT_ROTATION_6D]), thing[:, OBJECT_POSITION])
+def control_of(trajectories: Trajectories, model: ObjectModel) -> Control:
+    """Wrists and object at 30 fps from time 0; an untracked wrist has its pose of the nearest tracked frame."""
+    time_s = np.arange(len(trajectories.object)) / FPS
+    object_features = trajectories.object.astype(np.float64)
+    hinge = object_features[:, OBJECT_HINGE] if model.is_articulated else None
+    wrists: dict[Side, Motion] = {
+        side: _wrist(trajectories, side_index, time_s) for side_index, side in enumerate(SIDES)
+    }
+    body = Motion(time_s, rot6d_to_rotmat(object_features[:, OBJECT_ROTATION_6D]), object_features[:, OBJECT_POSITION])
     return Control(wrists, body, model, hinge)
 
 
-def _wrist(given: Trajectories, row: int, time_s: np.ndarray) -> Motion:
-    seen = np.flatnonzero(given.valid[row])
-    if not len(seen):
-        away = given.object[:, OBJECT_POSITION] + np.array([UNSEEN_M, 0.0, 0.0])
-        return Motion(time_s, np.tile(np.eye(3), (len(time_s), 1, 1)), away.astype(np.float64))
-    nearest = seen[abs(np.arange(len(time_s))[:, None] - seen).argmin(axis=1)]
-    wrist = given.wrists[row, nearest].astype(np.float64)
+def _wrist(trajectories: Trajectories, side_index: int, time_s: np.ndarray) -> Motion:
+    frames = nearest_tracked_frames(trajectories.valid[side_index])
+    if frames is None:
+        return untracked_wrist(time_s, trajectories.object[:, OBJECT_POSITION])
+    wrist = trajectories.wrists[side_index, frames].astype(np.float64)
     return Motion(time_s, rot6d_to_rotmat(wrist[:, GLOBAL_ORIENT_6D]), wrist[:, WRIST])
 
 
+def nearest_tracked_frames(valid: np.ndarray) -> np.ndarray | None:
+    """(frame,) index of the nearest tracked frame; None if no frame is tracked."""
+    tracked = np.flatnonzero(valid)
+    return tracked[abs(np.arange(len(valid))[:, None] - tracked).argmin(axis=1)] if len(tracked) else None
+
+
+def untracked_wrist(time_s: np.ndarray, object_m: np.ndarray) -> Motion:
+    """A wrist out of range of all sensors, from object positions (frame, 3)."""
+    position_m = object_m + np.array([UNTRACKED_DISTANCE_M, 0.0, 0.0])
+    return Motion(time_s, np.tile(np.eye(3), (len(time_s), 1, 1)), position_m.astype(np.float64))
+
+
 def trajectories_of(sample: ClipSample) -> Trajectories:
-    """What a recording of the clip without its fingers would know."""
+    """The trajectories of a clip's wrists and object, without fingers."""
     return Trajectories(sample.hands[..., : GLOBAL_ORIENT_6D.stop], sample.valid, sample.object)
 
 
 def finger_rotmats_of(hand_features: np.ndarray) -> np.ndarray:
-    """(frame, 15, 3, 3) of features (frame, 99)."""
-    turns = hand_features[:, HAND_POSE_6D].astype(np.float64).reshape(-1, N_ROTATIONS - 1, 6)
-    return rot6d_to_rotmat(turns)
+    """Finger rotations (frame, 15, 3, 3) of features (frame, 99)."""
+    rot6d = hand_features[:, HAND_POSE_6D].astype(np.float64).reshape(-1, N_ROTATIONS - 1, 6)
+    return rot6d_to_rotmat(rot6d)
 
 
 def hands_of(pair: HandPair, betas: np.ndarray, template_m: np.ndarray | None) -> Mapping[Side, TrackedHand]:
-    """Both hands of a person: betas (2, 10), personal rest meshes (2, 778, 3) or None."""
-    templates = [None, None] if template_m is None else [own.tobytes() for own in template_m]
-    return {side: _tracked(pair, side, betas[row].tobytes(), templates[row]) for row, side in enumerate(SIDES)}
+    """Both hands of a person; betas: (2, 10); template_m: personal rest meshes (2, 778, 3) or None."""
+    templates = [None, None] if template_m is None else [template.tobytes() for template in template_m]
+    return {
+        side: _tracked(pair, side, betas[side_index].tobytes(), templates[side_index])
+        for side_index, side in enumerate(SIDES)
+    }
 
 
 @lru_cache(maxsize=64)
 def _tracked(pair: HandPair, side: Side, betas: bytes, template: bytes | None) -> TrackedHand:
-    """Kept, since a person's hand is in many clips and takes a while to make."""
+    """Cached, because a person's hand is in many clips and takes long to build."""
     shape = np.frombuffer(betas, np.float32).astype(np.float64)
     rest = None if template is None else np.frombuffer(template, np.float32).reshape(-1, 3).astype(np.float64)
     return mano_hand(pair, side, shape, rest)

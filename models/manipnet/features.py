@@ -1,7 +1,7 @@
-"""What the network reads and writes: pose, trajectory and sensors of one hand, all in canonical axes of its wrist.
+"""Inputs and outputs of ManipNet's network: pose, trajectory and sensors of one hand, in canonical axes of its wrist.
 
 Sizes for ManipNet's 17-joint hand: pose 192, trajectory 336, sensors 1,822 (2,350 in all); output 192 + 22 = 214.
-Metres and right-handed axes. Groups of columns have names, to scale by unit.
+Metres and right-handed axes.
 """
 
 from dataclasses import dataclass
@@ -23,56 +23,64 @@ SAMPLE_NUMBERS = 16
 
 @dataclass(frozen=True)
 class FeatureSettings:
-    """step_s: from one pose to the next. past_s, future_s, spacing_s: samples of the trajectory around now.
+    """How inputs and outputs are sampled and scaled."""
 
-    range_m: distances of the output, less the radius of the capsule that begins at the joint, are clamped to 0 and this
-    and divided by it.
-    """
-
-    step_s: float = 1 / 60
-    past_s: float = 0.5
-    future_s: float = 0.5
-    spacing_s: float = 0.05
-    range_m: float = 0.03
+    step_s: float = 1 / 60  # from one pose to the next
+    past_s: float = 0.5  # trajectory samples reach from this long ago
+    future_s: float = 0.5  # to this far ahead
+    spacing_s: float = 0.05  # between trajectory samples
+    range_m: float = 0.03  # output distances from the skin are clamped to [0, range_m] and divided by it
     sensors: SensorSettings = OURS
 
     @property
     def samples_s(self) -> np.ndarray:
-        """(sample,) times around now, 0 among them."""
+        """(sample,) times relative to the present, including 0."""
         past, future = (round(length / self.spacing_s) for length in (self.past_s, self.future_s))
         return np.arange(-past, future + 1) * self.spacing_s
 
 
 class HandInputs(NamedTuple):
-    """pose: (frame, 192); trajectory: (frame, 336); sensors: (frame, 1822); of other hands their own sizes."""
+    """All inputs of one hand; sizes are those of ManipNet's hand."""
 
-    pose: np.ndarray
-    trajectory: np.ndarray
-    sensors: np.ndarray
+    pose: np.ndarray  # (frame, 192)
+    trajectory: np.ndarray  # (frame, 336)
+    sensors: np.ndarray  # (frame, 1822)
 
 
 def pose_features(hand: TrackedHand, state: HandState) -> np.ndarray:
-    """(frame, 9 joint + 15 + 6 palm capsule): 192. Canonical axes, metres, in the order
+    """Pose of a hand as the network reads it.
 
-    joint positions, tips in the hand's order, palm capsule starts, their ends, then per joint its z axis and y axis.
-    state: the hand in its wrist's frame.
+    Args:
+        hand: the hand's skeleton and capsules.
+        state: (frame,) the hand in its wrist's frame.
+
+    Returns:
+        (frame, 9 joints + 15 + 6 palm capsules), metres, canonical axes: joint positions, tips, starts and ends of the
+        palm's capsules, then z axis and y axis of each joint.
     """
     canonical, palm = hand.wrist_from_canonical, hand.palm_capsules
-    places = [state.joint_m, state.tip_m, state.capsule_start_m[:, palm], state.capsule_end_m[:, palm]]
+    positions_m = [state.joint_m, state.tip_m, state.capsule_start_m[:, palm], state.capsule_end_m[:, palm]]
     axes = canonical.T @ state.joint_rotmats @ canonical
-    vectors = np.concatenate([np.concatenate(places, axis=1) @ canonical, _axis_rows(axes)], axis=1)
+    vectors = np.concatenate([np.concatenate(positions_m, axis=1) @ canonical, _axis_rows(axes)], axis=1)
     return vectors.reshape(len(vectors), -1)
 
 
 def _axis_rows(rotmats: np.ndarray) -> np.ndarray:
-    """(frame, 2 joint, 3): z axis, then y axis of each (frame, joint, 3, 3)."""
+    """(frame, 2 joints, 3): z axis, then y axis of each rotation (frame, joint, 3, 3)."""
     return rotmats[..., [2, 1]].swapaxes(-1, -2).reshape(len(rotmats), -1, 3)
 
 
 def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray) -> np.ndarray:
-    """(frame, joint, 3, 3) wrist_from_joint, from the axes in pose features or network output (frame, 192 or more).
+    """Joint rotations from pose features or network output.
 
-    Axes are made orthonormal: z as given, y as near as it can be. ``hand.finger_rotmats`` makes them local.
+    The predicted axes are orthonormalised by Gram-Schmidt, z first.
+
+    Args:
+        hand: the hand's skeleton.
+        pose: (frame, 192 or more).
+
+    Returns:
+        (frame, joint, 3, 3) wrist_from_joint; ``hand.finger_rotmats`` converts them to local rotations.
     """
     first = 3 * (hand.n_points + 2 * len(hand.palm_capsules))
     axes = np.reshape(pose[:, first : first + 6 * hand.n_joints], (len(pose), hand.n_joints, 2, 3))
@@ -86,47 +94,59 @@ def joint_rotmats_of(hand: TrackedHand, pose: np.ndarray) -> np.ndarray:
 def trajectory_features(
     control: Control, side: Side, hand: TrackedHand, time_s: np.ndarray, settings: FeatureSettings
 ) -> np.ndarray:
-    """(frame, 21 x 16): per sample distance of the other wrist; own wrist position, z axis, y axis; the object's
-    position and angular velocity (rad/s). Metres, canonical axes of the own wrist at ``time_s (frame,)``.
+    """Past and future trajectory of wrists and object around ``time_s (frame,)``.
+
+    Returns:
+        (frame, 21 x 16), metres, canonical axes of this hand's wrist at ``time_s``. Per sample: distance of the other
+        wrist; this wrist's position, z axis and y axis; the object's position and angular velocity (rad/s).
     """
-    own, other = control.wrists[side], control.wrists[SIDES[1 - SIDES.index(side)]]
+    own_wrist, other_wrist = control.wrists[side], control.wrists[SIDES[1 - SIDES.index(side)]]
     canonical = hand.wrist_from_canonical
-    start, stop = own.time_s[0], own.time_s[-1]
+    start, stop = own_wrist.time_s[0], own_wrist.time_s[-1]
     samples = np.clip(time_s[:, None] + settings.samples_s, start, stop)
-    now, wrist, thing = own.at(time_s), own.at(samples), control.thing.at(samples)
-    wrist_from_world = now.inverse()
-    away = np.linalg.norm(other.at(samples).translation - now.translation[:, None], axis=-1, keepdims=True)
-    axes = canonical.T @ (now.rotation[:, None].swapaxes(-1, -2) @ wrist.rotation) @ canonical
-    middle = (thing @ control.box_middle_m[None])[:, :, 0]
-    turning = _angular_velocity(control.thing, own, samples, now, settings)
-    turning = np.linalg.det(canonical) * turning @ canonical  # a mirror turns axial vectors round
-    places = [(wrist_from_world @ points) @ canonical for points in (wrist.translation, middle)]
-    rows = np.concatenate([away, places[0], axes[..., 2], axes[..., 1], places[1], turning], axis=-1)
-    return rows.reshape(len(time_s), -1)
+    wrist_now, wrist_samples, object_samples = (
+        own_wrist.at(time_s),
+        own_wrist.at(samples),
+        control.object_motion.at(samples),
+    )
+    wrist_from_world = wrist_now.inverse()
+    to_other_m = other_wrist.at(samples).translation - wrist_now.translation[:, None]
+    other_distance_m = np.linalg.norm(to_other_m, axis=-1, keepdims=True)
+    # A change of basis on both sides: the axes themselves are canonical too.
+    axes = canonical.T @ (wrist_now.rotation[:, None].swapaxes(-1, -2) @ wrist_samples.rotation) @ canonical
+    middle = (object_samples @ control.box_middle_m[None])[:, :, 0]
+    angular_velocity = _angular_velocity(control.object_motion, own_wrist, samples, wrist_now, settings)
+    # An axial vector changes sign in a mirrored frame.
+    angular_velocity = np.linalg.det(canonical) * angular_velocity @ canonical
+    positions_m = [(wrist_from_world @ points) @ canonical for points in (wrist_samples.translation, middle)]
+    features = other_distance_m, positions_m[0], axes[..., 2], axes[..., 1], positions_m[1], angular_velocity
+    by_sample = np.concatenate(features, axis=-1)
+    return by_sample.reshape(len(time_s), -1)
 
 
 def _angular_velocity(
-    thing: Motion, own: Motion, samples_s: np.ndarray, now: RigidTransform, settings: FeatureSettings
+    object_motion: Motion, wrist: Motion, samples_s: np.ndarray, wrist_now: RigidTransform, settings: FeatureSettings
 ) -> np.ndarray:
-    """(frame, sample, 3) rad/s of the object relative to the wrist, from one step before."""
-    before_s = np.maximum(samples_s - settings.step_s, own.time_s[0])
-    here, before = (
-        own.at(times).rotation.swapaxes(-1, -2) @ thing.at(times).rotation for times in (samples_s, before_s)
+    """(frame, sample, 3) angular velocity of the object relative to the wrist, rad/s, by backward differences."""
+    before_s = np.maximum(samples_s - settings.step_s, wrist.time_s[0])
+    rotation, before = (
+        wrist.at(times).rotation.swapaxes(-1, -2) @ object_motion.at(times).rotation for times in (samples_s, before_s)
     )
-    turn = rotmat_to_rotvec(here @ before.swapaxes(-1, -2)) / settings.step_s
-    now_from_then = now.rotation[:, None].swapaxes(-1, -2) @ own.at(samples_s).rotation
-    return (now_from_then @ turn[..., None])[..., 0]
+    angular_velocity = rotmat_to_rotvec(rotation @ before.swapaxes(-1, -2)) / settings.step_s
+    # From the wrist's axes at the sample to those at the present.
+    now_from_then = wrist_now.rotation[:, None].swapaxes(-1, -2) @ wrist.at(samples_s).rotation
+    return (now_from_then @ angular_velocity[..., None])[..., 0]
 
 
 def object_from_wrist(
     control: Control, side: Side, time_s: np.ndarray, settings: FeatureSettings
 ) -> tuple[RigidTransform, np.ndarray | None]:
-    """(frame, time) transforms and hinge angles for ``sense``, at ``time_s (frame,)`` and the future times after it."""
+    """(frame, time) transforms and hinge angles for ``sense``, at ``time_s (frame,)`` and the sensors' future times."""
     times = time_s[:, None] + np.array(settings.sensors.times_s)
-    wrist, thing = control.wrists[side].at(times), control.thing.at(times)
-    turn = thing.rotation.swapaxes(-1, -2)
-    way = (turn @ (wrist.translation - thing.translation)[..., None])[..., 0]
-    return RigidTransform(turn @ wrist.rotation, way), control.hinge_at(times)
+    wrist, body = control.wrists[side].at(times), control.object_motion.at(times)
+    object_from_world = body.rotation.swapaxes(-1, -2)
+    translation = (object_from_world @ (wrist.translation - body.translation)[..., None])[..., 0]
+    return RigidTransform(object_from_world @ wrist.rotation, translation), control.hinge_at(times)
 
 
 def hand_inputs(
@@ -138,31 +158,31 @@ def hand_inputs(
     surface: SurfaceIndex,
     settings: FeatureSettings,
 ) -> HandInputs:
-    """All inputs of one hand at ``time_s (frame,)``. state: (frame,) in its wrist's frame; hand: that side's."""
-    seen, hinge_rad = object_from_wrist(control, side, time_s, settings)
-    sensed = sense(hand, state, seen, hinge_rad, surface, settings.sensors)
+    """All inputs of one hand at ``time_s (frame,)``; state: (frame,) the hand in its wrist's frame."""
+    placed, hinge_rad = object_from_wrist(control, side, time_s, settings)
+    sensed = sense(hand, state, placed, hinge_rad, surface, settings.sensors)
     trajectory = trajectory_features(control, side, hand, time_s, settings)
     return HandInputs(pose_features(hand, state), trajectory, sensed.flat())
 
 
 def output_distances(hand: TrackedHand, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
-    """(frame, 22) in 0 to 1, of signed distances (frame, 22) of joints and tips (``Sensed.distance_m[:, 0]``)."""
+    """Scale signed distances (frame, 22) of joints and tips (``Sensed.distance_m[:, 0]``) from the skin to [0, 1]."""
     return np.clip((distance_m - hand.point_radius_m) / settings.range_m, 0.0, 1.0)
 
 
 def outputs(hand: TrackedHand, state: HandState, distance_m: np.ndarray, settings: FeatureSettings) -> np.ndarray:
-    """(frame, 214): pose features and distances of the next frame, in its own wrist's frame: what is learnt."""
+    """Training targets (frame, 214): pose features and distances of the next frame, in the wrist's frame."""
     return np.concatenate([pose_features(hand, state), output_distances(hand, distance_m, settings)], axis=1)
 
 
-METRES, AXES, CELL, RAD_S, SHARE = 0.001, 0.01, 0.05, 0.05, 0.02  # the least spread a number is scaled by
+METRES, AXES, CELL, RAD_S, FRACTION = 0.001, 0.01, 0.05, 0.05, 0.02  # least standard deviation by unit
 
 
 def sizes(hand: TrackedHand, settings: FeatureSettings) -> dict[str, int]:
-    """Numbers of each group in their order: pose, trajectory, ambient, proximity, distance, normal."""
+    """Size of each input group, in order: pose, trajectory, ambient, proximity, distance, normal."""
     times = len(settings.sensors.times_s)
     return {
-        "pose": 3 * _positions(hand) + 6 * hand.n_joints,
+        "pose": 3 * _position_count(hand) + 6 * hand.n_joints,
         "trajectory": SAMPLE_NUMBERS * len(settings.samples_s),
         "ambient": CELLS**3,
         "proximity": times * hand.n_sensors,
@@ -171,10 +191,10 @@ def sizes(hand: TrackedHand, settings: FeatureSettings) -> dict[str, int]:
     }
 
 
-def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:
-    """(input,) and (output,): the least spread a number is scaled by, by what it is."""
+def std_floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np.ndarray]:
+    """Least standard deviations for normalisation: (input,) and (output,), by unit."""
     count = sizes(hand, settings)
-    pose = np.repeat([METRES, AXES], [3 * _positions(hand), 6 * hand.n_joints])
+    pose = np.repeat([METRES, AXES], [3 * _position_count(hand), 6 * hand.n_joints])
     sample = np.repeat([METRES, AXES, METRES, RAD_S], [4, 6, 3, 3])
     inputs = [
         pose,
@@ -183,9 +203,9 @@ def floors(hand: TrackedHand, settings: FeatureSettings) -> tuple[np.ndarray, np
         np.full(count["proximity"] + count["distance"], METRES),
         np.full(count["normal"], CELL),
     ]
-    return np.concatenate(inputs), np.concatenate([pose, np.full(hand.n_points, SHARE)])
+    return np.concatenate(inputs), np.concatenate([pose, np.full(hand.n_points, FRACTION)])
 
 
-def _positions(hand: TrackedHand) -> int:
-    """How many positions a pose has: joints, tips, both ends of the palm's capsules."""
+def _position_count(hand: TrackedHand) -> int:
+    """Number of positions in a pose: joints, tips, both ends of the palm's capsules."""
     return hand.n_joints + N_TIPS + 2 * len(hand.palm_capsules)

@@ -1,7 +1,7 @@
-"""Joints of a hand to targets: damped least squares within limits, each finger by itself.
+"""Inverse kinematics of fingers: damped least squares (Levenberg-Marquardt) within joint limits.
 
-ManipNet solves by cyclic coordinate descent (Sec. 6.3); the targets are its, the solver is ours. The wrist is fixed, so
-no finger knows of another: a step is five small systems of equations.
+ManipNet uses cyclic coordinate descent for the same targets (Sec. 6.3). The wrist is fixed, so the fingers are
+independent: a step solves five small linear systems.
 """
 
 from dataclasses import dataclass
@@ -14,46 +14,43 @@ from hoidata.geometry.rotations import mirror_rotvec_x, rotmat_to_rotvec, rotvec
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 
 STEPS = 6
-# A turn by one radian costs as much as an error of 5.5 mm: what leads nowhere is not turned.
+# Damping: a rotation by one radian costs as much as a position error of 5.5 mm.
 DAMPING_M2 = 3e-5
 
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """How far the finger joints may turn, as the axis-angle from the neutral pose about each joint's own axes.
+    """Joint limits, as axis-angle from the neutral pose in each joint's local axes."""
 
-    rest: (joint - 1, 3, 3) the neutral pose. low_rad, high_rad: (joint - 1, 3); equal: no turn about that axis.
-    """
-
-    rest: np.ndarray
-    low_rad: np.ndarray
-    high_rad: np.ndarray
+    rest: np.ndarray  # (joint - 1, 3, 3) the neutral pose
+    low_rad: np.ndarray  # (joint - 1, 3); equal to ``high_rad``: the axis is fixed
+    high_rad: np.ndarray  # (joint - 1, 3)
 
     @classmethod
     def of(cls, hand: TrackedHand, low_rad: np.ndarray, high_rad: np.ndarray) -> "Limits":
-        """Of one hand; its hinges keep their own limits, the other joints get these of a right hand, (joint - 1, 3)."""
+        """Limits of one hand from those of a right hand, (joint - 1, 3); hinge joints have the hand model's limits."""
         if hand.side == "left":
-            flipped = mirror_rotvec_x(np.stack([low_rad, high_rad]))
-            low_rad, high_rad = flipped.min(axis=0), flipped.max(axis=0)
+            mirrored = mirror_rotvec_x(np.stack([low_rad, high_rad]))
+            low_rad, high_rad = mirrored.min(axis=0), mirrored.max(axis=0)
         is_hinge = np.abs(hand.hinge_axis[1:]).sum(axis=1, keepdims=True) > 0
-        ends = hand.hinge_axis[1:, None] * hand.limit_rad[1:, :, None]
-        low_rad = np.where(is_hinge, ends.min(axis=1), low_rad)
-        return cls(hand.rest_rotmats, low_rad, np.where(is_hinge, ends.max(axis=1), high_rad))
+        hinge_limits_rad = hand.hinge_axis[1:, None] * hand.limit_rad[1:, :, None]
+        low_rad = np.where(is_hinge, hinge_limits_rad.min(axis=1), low_rad)
+        return cls(hand.rest_rotmats, low_rad, np.where(is_hinge, hinge_limits_rad.max(axis=1), high_rad))
 
     def within(self, finger_rotmats: np.ndarray) -> np.ndarray:
-        """Finger rotations (..., joint - 1, 3, 3), those beyond a limit put back to it."""
-        turn = rotmat_to_rotvec(self.rest.swapaxes(-1, -2) @ finger_rotmats)
-        return self.rest @ rotvec_to_rotmat(np.clip(turn, self.low_rad, self.high_rad))
+        """Clamp finger rotations (..., joint - 1, 3, 3) to the limits."""
+        rotvec = rotmat_to_rotvec(self.rest.swapaxes(-1, -2) @ finger_rotmats)
+        return self.rest @ rotvec_to_rotmat(np.clip(rotvec, self.low_rad, self.high_rad))
 
 
-def turns_from_rest(hand: TrackedHand, finger_rotmats: np.ndarray) -> np.ndarray:
-    """(..., joint - 1, 3) axis-angles from the neutral pose, those of a left hand as its mirror image's."""
-    turn = rotmat_to_rotvec(hand.rest_rotmats.swapaxes(-1, -2) @ finger_rotmats)
-    return mirror_rotvec_x(turn) if hand.side == "left" else turn
+def rotvecs_from_rest(hand: TrackedHand, finger_rotmats: np.ndarray) -> np.ndarray:
+    """(..., joint - 1, 3) axis-angle from the neutral pose; that of a left hand is mirrored."""
+    rotvec = rotmat_to_rotvec(hand.rest_rotmats.swapaxes(-1, -2) @ finger_rotmats)
+    return mirror_rotvec_x(rotvec) if hand.side == "left" else rotvec
 
 
 def target_points(hand: TrackedHand) -> np.ndarray:
-    """(15,) the points that post-processing moves: the last two joints of every finger, and its tip."""
+    """(15,) points that post-processing moves: the last two joints and the tip of each finger."""
     parents = hand.parents[hand.tip_joint]
     return np.concatenate([np.sort(np.r_[parents, hand.tip_joint]), hand.n_joints + np.arange(len(parents))])
 
@@ -61,10 +58,18 @@ def target_points(hand: TrackedHand) -> np.ndarray:
 def reach(
     hand: TrackedHand, limits: Limits, state: HandState, target_m: np.ndarray, weight: np.ndarray, steps: int = STEPS
 ) -> np.ndarray:
-    """(1, joint - 1, 3, 3) finger rotations of ``state`` turned so that points come near their targets.
+    """Rotate finger joints so that points reach their targets.
 
-    state: one frame, in the wrist's frame. target_m: (point, 3) in it, joints then tips. weight: (point,) of the
-    squared error; 0: anywhere.
+    Args:
+        hand: the hand's skeleton.
+        limits: of its joints.
+        state: one frame, wrist frame.
+        target_m: (point, 3) wrist frame, joints then tips.
+        weight: (point,) of the squared error; 0: no target.
+        steps: damped Gauss-Newton steps.
+
+    Returns:
+        (1, joint - 1, 3, 3) finger rotations.
     """
     last = hand.tip_joint
     from_last = state.joint_rotmats[0, last].swapaxes(-1, -2)
@@ -76,54 +81,56 @@ def reach(
 
 @lru_cache(maxsize=64)
 def _chains(hand: TrackedHand) -> np.ndarray:
-    """(5, longest) joints of each finger from the knuckle on; -1 fills up."""
-    found = []
+    """(5, longest) joints of each finger from the knuckle on, padded with -1."""
+    chains = []
     for joint in hand.tip_joint:
         chain = [int(joint)]
         while hand.parents[chain[0]] > 0:
             chain.insert(0, int(hand.parents[chain[0]]))
-        found.append(chain)
-    longest = max(map(len, found))
-    return np.array([chain + [-1] * (longest - len(chain)) for chain in found])
+        chains.append(chain)
+    longest = max(map(len, chains))
+    return np.array([chain + [-1] * (longest - len(chain)) for chain in chains])
 
 
-# Compiled with numba, float64, one thread: it runs for every hand in every frame.
+# Compiled with numba, float64, one thread: it runs for each hand in each frame.
 
 
 @njit(cache=True)
 def _reach(fingers, chains, offsets, tips, rest, low, high, target, weight, steps):  # pragma: no cover (compiled)
-    """Finger rotations (joint - 1, 3, 3) after ``steps`` damped steps; arguments as in ``reach``."""
+    """Finger rotations (joint - 1, 3, 3) after ``steps`` damped Gauss-Newton steps; arguments as of ``reach``."""
     fingers, longest = fingers.copy(), chains.shape[1]
     n_joints = len(fingers) + 1
-    place, turn = np.empty((longest + 1, 3)), np.empty((longest, 3, 3))
-    matrix, vector, rows = np.empty((3 * longest, 3 * longest)), np.empty(3 * longest), np.empty((3, 3 * longest))
+    positions, rotations = np.empty((longest + 1, 3)), np.empty((longest, 3, 3))
+    matrix, vector, jacobian = np.empty((3 * longest, 3 * longest)), np.empty(3 * longest), np.empty((3, 3 * longest))
     for finger in range(len(chains)):
         chain, size = chains[finger], 0
         while size < longest and chain[size] > 0:
             size += 1
         for _ in range(steps):
-            _place(fingers, chain, size, offsets, tips[finger], place, turn)
+            _forward(fingers, chain, size, offsets, tips[finger], positions, rotations)
+            # Normal equations of this finger, (J^T W J + damping) x = J^T W error.
             matrix[:], vector[:] = 0.0, 0.0
             for index in range(3 * size):
                 matrix[index, index] = DAMPING_M2
             for point in range(1, size + 1):
-                number = chain[point] if point < size else n_joints + finger
+                number = chain[point] if point < size else n_joints + finger  # joints, then the tip
                 if weight[number] > 0:
-                    _set_levers(rows, point, place, turn, low, high, chain)
-                    _add_point(matrix, vector, rows, 3 * point, weight[number], target[number], place[point])
+                    _set_jacobian(jacobian, point, positions, rotations, low, high, chain)
+                    _add_point(matrix, vector, jacobian, 3 * point, weight[number], target[number], positions[point])
             _solve(matrix, vector, 3 * size)
             for index in range(size):
                 joint = chain[index] - 1
-                turned = _times(fingers[joint], _exp(vector[3 * index : 3 * index + 3]))
-                from_rest = _log(_times(rest[joint].T, turned))
+                # Rotate in the joint's local axes, then clamp the rotation from the neutral pose.
+                rotated = _product(fingers[joint], _exp(vector[3 * index : 3 * index + 3]))
+                from_rest = _log(_product(rest[joint].T, rotated))
                 for axis in range(3):
                     from_rest[axis] = min(max(from_rest[axis], low[joint, axis]), high[joint, axis])
-                fingers[joint] = _times(rest[joint], _exp(from_rest))
+                fingers[joint] = _product(rest[joint], _exp(from_rest))
     return fingers
 
 
 @njit(cache=True)
-def _times(a, b):  # pragma: no cover (compiled)
+def _product(a, b):  # pragma: no cover (compiled)
     """Product of two (3, 3) matrices."""
     out = np.empty((3, 3))
     for i in range(3):
@@ -133,46 +140,51 @@ def _times(a, b):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _place(fingers, chain, size, offsets, tip, place, turn):  # pragma: no cover (compiled)
-    """Of one finger: positions, the tip last, and rotations in the wrist's frame, into ``place`` and ``turn``."""
+def _forward(fingers, chain, size, offsets, tip, positions, rotations):  # pragma: no cover (compiled)
+    """Forward kinematics of one finger, wrist frame: writes ``positions``, the tip last, and ``rotations``."""
     for index in range(size + 1):
         for axis in range(3):
             if index == 0:
-                place[0, axis] = offsets[chain[0], axis]
+                positions[0, axis] = offsets[chain[0], axis]
             else:
-                way, above = offsets[chain[index]] if index < size else tip, turn[index - 1, axis]
-                place[index, axis] = place[index - 1, axis] + above[0] * way[0] + above[1] * way[1] + above[2] * way[2]
+                offset, axis_row = offsets[chain[index]] if index < size else tip, rotations[index - 1, axis]
+                positions[index, axis] = (
+                    positions[index - 1, axis]
+                    + axis_row[0] * offset[0]
+                    + axis_row[1] * offset[1]
+                    + axis_row[2] * offset[2]
+                )
         if index < size:
-            own = fingers[chain[index] - 1]
-            turn[index] = own if index == 0 else _times(turn[index - 1], own)
+            local = fingers[chain[index] - 1]
+            rotations[index] = local if index == 0 else _product(rotations[index - 1], local)
 
 
 @njit(cache=True)
-def _set_levers(rows, point, place, turn, low, high, chain):  # pragma: no cover (compiled)
-    """How a point moves with small turns of the joints before it about their axes, as far as these are free."""
+def _set_jacobian(jacobian, point, positions, rotations, low, high, chain):  # pragma: no cover (compiled)
+    """Jacobian of a point's position for small rotations of the joints before it; 0 for fixed axes."""
     for joint in range(point):
-        x, y, z = place[point] - place[joint]
+        x, y, z = positions[point] - positions[joint]  # each column is the axis x the lever arm
         for axis in range(3):
-            column, own = 3 * joint + axis, turn[joint, :, axis]
+            column, axis_vector = 3 * joint + axis, rotations[joint, :, axis]
             free = 1.0 if high[chain[joint] - 1, axis] > low[chain[joint] - 1, axis] else 0.0
-            rows[0, column] = free * (own[1] * z - own[2] * y)
-            rows[1, column] = free * (own[2] * x - own[0] * z)
-            rows[2, column] = free * (own[0] * y - own[1] * x)
+            jacobian[0, column] = free * (axis_vector[1] * z - axis_vector[2] * y)
+            jacobian[1, column] = free * (axis_vector[2] * x - axis_vector[0] * z)
+            jacobian[2, column] = free * (axis_vector[0] * y - axis_vector[1] * x)
 
 
 @njit(cache=True)
-def _add_point(matrix, vector, rows, size, weight, target, place):  # pragma: no cover (compiled)
-    """Add a point's share to the normal equations."""
+def _add_point(matrix, vector, jacobian, size, weight, target, position):  # pragma: no cover (compiled)
+    """Add the term of a point to the normal equations."""
     for i in range(size):
         for axis in range(3):
-            vector[i] += weight * rows[axis, i] * (target[axis] - place[axis])
+            vector[i] += weight * jacobian[axis, i] * (target[axis] - position[axis])
             for j in range(size):
-                matrix[i, j] += weight * rows[axis, i] * rows[axis, j]
+                matrix[i, j] += weight * jacobian[axis, i] * jacobian[axis, j]
 
 
 @njit(cache=True)
 def _solve(matrix, vector, size):  # pragma: no cover (compiled)
-    """Solve in place by elimination; the matrix is symmetric and positive, so no rows need change places."""
+    """Solve in place by elimination without pivoting; the matrix is symmetric positive definite."""
     for i in range(size):
         for j in range(i + 1, size):
             factor = matrix[j, i] / matrix[i, i]
@@ -186,11 +198,12 @@ def _solve(matrix, vector, size):  # pragma: no cover (compiled)
 
 
 @njit(cache=True)
-def _exp(turn):  # pragma: no cover (compiled)
+def _exp(rotvec):  # pragma: no cover (compiled)
     """Axis-angle to rotation (Rodrigues' formula)."""
-    x, y, z = turn
+    x, y, z = rotvec
     square = x * x + y * y + z * z
     angle = np.sqrt(square)
+    # Limits of sin(a) / a and (1 - cos(a)) / a^2 at 0.
     sine = np.sin(angle) / angle if angle > 1e-8 else 1.0
     versine = (1 - np.cos(angle)) / square if angle > 1e-4 else 0.5
     out = np.empty((3, 3))
@@ -207,7 +220,7 @@ def _exp(turn):  # pragma: no cover (compiled)
 
 @njit(cache=True)
 def _log(matrix):  # pragma: no cover (compiled)
-    """Rotation to axis-angle by the largest number of its quaternion, so that half turns are as exact as others."""
+    """Rotation to axis-angle by the largest component of its quaternion, which is exact near 180 degrees too."""
     trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
     i = 0
     for axis in range(1, 3):

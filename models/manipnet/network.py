@@ -4,7 +4,7 @@
     twice:  h = W a + b + a;  r = relu(h);  g = V r + c + r + a;  a = relu(g) before the next block
     output = D g + d
 
-Numbers go in and come out as they are: normalisation is part of the network, so a checkpoint knows its own.
+Inputs and outputs are not normalised by the caller: normalisation is part of the network and of its checkpoint.
 """
 
 from dataclasses import dataclass, field
@@ -17,23 +17,17 @@ from models.manipnet.features import FeatureSettings
 
 @dataclass(frozen=True)
 class NetworkConfig:
-    """pose, trajectory, sensors, output: how many numbers there are of each; joints of the hand.
+    """Architecture; the defaults are the paper's."""
 
-    features: how they are measured, and the time from one pose to the next.
-
-    encoder: width of each of the three encoders, the paper's 512. keep: share of the numbers that dropout keeps at the
-    input of every linear layer.
-    """
-
-    pose: int = 192
+    pose: int = 192  # numbers of each input and of the output
     trajectory: int = 336
     sensors: int = 1822
     output: int = 214
-    joints: int = 17
+    joints: int = 17  # of the hand
     features: FeatureSettings = field(default_factory=FeatureSettings)
-    encoder: int = 512
+    encoder: int = 512  # width of each of the three encoders
     blocks: int = 2
-    keep: float = 0.7
+    keep_probability: float = 0.7  # of dropout, at the input of each linear layer
 
     @property
     def inputs(self) -> tuple[int, int, int]:
@@ -43,10 +37,10 @@ class NetworkConfig:
 class DenseBlock(nn.Module):
     """One residual dense block on activations (..., width): Sec. 6.2, the two equations."""
 
-    def __init__(self, width: int, keep: float) -> None:
+    def __init__(self, width: int, keep_probability: float) -> None:
         super().__init__()
         self.first, self.second = nn.Linear(width, width), nn.Linear(width, width)
-        self.dropout = nn.Dropout(1 - keep)
+        self.dropout = nn.Dropout(1 - keep_probability)
 
     def forward(self, a: Tensor) -> Tensor:
         r = torch.relu(self.first(self.dropout(a)) + a)
@@ -54,17 +48,13 @@ class DenseBlock(nn.Module):
 
 
 class ManipNet(nn.Module):
-    """Inputs (..., pose + trajectory + sensors) to outputs (..., output), both as measured.
-
-    Buffers of the normalisation: input_mean, input_scale, output_mean, output_scale. low_rad, high_rad: (joint - 1, 3)
-    how far finger joints turned in training (``inverse_kinematics.Limits``).
-    """
+    """Inputs (..., pose + trajectory + sensors) to outputs (..., output), without normalisation on both sides."""
 
     input_mean: Tensor
     input_scale: Tensor
     output_mean: Tensor
     output_scale: Tensor
-    low_rad: Tensor
+    low_rad: Tensor  # (joint - 1, 3) joint limits from the training poses, see ``inverse_kinematics.Limits``
     high_rad: Tensor
 
     def __init__(self, config: NetworkConfig) -> None:
@@ -72,9 +62,9 @@ class ManipNet(nn.Module):
         self.config = config
         width = 3 * config.encoder
         self.encoders = nn.ModuleList([nn.Linear(size, config.encoder) for size in config.inputs])
-        self.blocks = nn.ModuleList([DenseBlock(width, config.keep) for _ in range(config.blocks)])
+        self.blocks = nn.ModuleList([DenseBlock(width, config.keep_probability) for _ in range(config.blocks)])
         self.decoder = nn.Linear(width, config.output)
-        self.dropout = nn.Dropout(1 - config.keep)
+        self.dropout = nn.Dropout(1 - config.keep_probability)
         for layer in self.modules():
             if isinstance(layer, nn.Linear):
                 nn.init.xavier_uniform_(layer.weight)
@@ -89,7 +79,7 @@ class ManipNet(nn.Module):
         return self.normalised(inputs) * self.output_scale + self.output_mean
 
     def normalised(self, inputs: Tensor) -> Tensor:
-        """The outputs in units of their spread, on which the loss is."""
+        """Normalised outputs, which the loss compares."""
         z = self.dropout((inputs - self.input_mean) / self.input_scale)
         parts = z.split(self.config.inputs, -1)
         a = torch.cat([encoder(part) for encoder, part in zip(self.encoders, parts, strict=True)], -1)
@@ -98,10 +88,10 @@ class ManipNet(nn.Module):
         return self.decoder(self.dropout(a))
 
     def learn_normalisation(self, inputs: Tensor, outputs: Tensor, floors: tuple[Tensor, Tensor]) -> None:
-        """Mean and spread of training rows; floors: the least spread of each input and output.
+        """Set the normalisation from training inputs and outputs; floors: least standard deviation of each number.
 
-        Without a floor a number that hardly varies in training is blown up by whatever is new about a test.
+        Without a floor, a number that hardly varies in training has very large normalised values at test time.
         """
-        for name, rows, floor in zip(("input", "output"), (inputs, outputs), floors, strict=True):
-            getattr(self, f"{name}_mean").copy_(rows.mean(0))
-            getattr(self, f"{name}_scale").copy_(torch.maximum(rows.std(0, correction=0), floor))
+        for name, values, floor in zip(("input", "output"), (inputs, outputs), floors, strict=True):
+            getattr(self, f"{name}_mean").copy_(values.mean(0))
+            getattr(self, f"{name}_scale").copy_(torch.maximum(values.std(0, correction=0), floor))

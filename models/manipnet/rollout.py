@@ -1,12 +1,11 @@
-"""Running ManipNet: each hand frame by frame, its pose the next frame's input (Sec. 6.4).
+"""Autoregressive rollout of ManipNet: the pose of each frame is an input of the next (Sec. 6.4).
 
-No hand sees the fingers of the other, so every hand is followed by itself: :class:`Follower` takes one step,
-``roll_out`` whole clips of many hands at once, ``stream.Stream`` frames as they come. Rotations are predicted and
-joints placed by forward kinematics: bones keep their length, which the release's do not.
+Each hand is rolled out separately, because its input has no fingers of the other: :class:`HandRollout` takes one step,
+``roll_out`` runs whole clips of many hands, ``stream.Stream`` runs frames as they arrive. The network predicts
+rotations, and forward kinematics places the joints, so bones keep their length (unlike in the release).
 
-Post-processing moves the joints to targets: those of the paper's Algorithm 1, or ours. Points are in the wrist's frame,
-metres. Distances here are of points themselves: a predicted distance that stops at the skin has the radius added before
-it comes here.
+Post-processing moves joints to target points: those of the paper's Algorithm 1, or ours. Points are in the wrist's
+frame, metres. Distances are those of joint centres: skin distance plus radius.
 """
 
 from collections.abc import Sequence
@@ -21,7 +20,7 @@ from hoidata.geometry.transform import RigidTransform
 from hoidata.hands.tracked_hand import HandState, TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sense
-from models.manipnet.control import Control, between
+from models.manipnet.control import Control, interpolate_rotations
 from models.manipnet.features import (
     FeatureSettings,
     joint_rotmats_of,
@@ -33,255 +32,277 @@ from models.manipnet.inverse_kinematics import Limits, reach, target_points
 from models.manipnet.network import ManipNet
 
 Rule = Literal["off", "paper", "ours"]
-ACTIVE_SHARE = 0.8  # of the range of predicted distances: the paper's 2.8 of 3.5 cm, the demo's 2.4 of 3 cm
-NEAR_M = 0.06  # the demo looks at no point farther away; nor do we, or a wrong distance pulls at a hand in the air
-# Ours, chosen on the validation tenths of the real recordings, whose touching points are 4 to 8 mm deep in 5 %.
-DEEPEST_M = 0.008  # a finger gives way by so much and no more
-PRESS_M = 0.007  # and is brought so much nearer than it is said to be
-FADE_SHARE = 0.3  # of the range below the active share: the nearer it is said to be, the more it counts
-HOLD = 0.5  # weight of the network's own pose, where it says nothing of the object
+# A point is active below this fraction of the distance range: the paper's 2.8 of 3.5 cm, the demo's 2.4 of 3 cm.
+ACTIVE_FRACTION = 0.8
+NEAR_M = 0.06  # as in the demo; without it, a wrong predicted distance pulls at a hand far from the object
+# Our rule, chosen on the validation tenths of the real recordings. Their touching points are 4 to 8 mm deep in 5 %.
+MAX_INDENTATION_M = 0.008  # how far a finger may be indented by the object
+PRESS_M = 0.007  # target distance is the predicted one minus this
+FADE_FRACTION = 0.3  # confidence rises from 0 to 1 over this fraction of the range below ACTIVE_FRACTION
+MIN_WEIGHT = 0.5  # weight of the predicted pose for points without a contact prediction
 
 
 @dataclass(frozen=True)
 class Nearest:
-    """What the object is like at points (..., point): signed distance, nearest surface point, outward gradient."""
+    """The object's surface nearest to some points."""
 
-    distance_m: np.ndarray
-    closest_m: np.ndarray
-    normal: np.ndarray
+    distance_m: np.ndarray  # (..., point) signed, negative inside
+    closest_m: np.ndarray  # (..., point, 3) on the surface
+    normal: np.ndarray  # (..., point, 3) outward
 
 
 @dataclass(frozen=True)
 class Targets:
-    """point_m: (..., point, 3). weight: (..., point), 0 where there is nothing to reach."""
+    """Target positions for inverse kinematics."""
 
-    point_m: np.ndarray
-    weight: np.ndarray
+    point_m: np.ndarray  # (..., point, 3)
+    weight: np.ndarray  # (..., point); 0: no target
 
 
 def paper_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
-                  found: Nearest) -> Targets:  # fmt: skip
-    """Algorithm 1: near points to a mixture of predicted and true distance, the others to where they are.
+                  nearest: Nearest) -> Targets:  # fmt: skip
+    """Algorithm 1: move active points to a mixture of predicted and true distance.
 
-    points_m: (..., point, 3) as the network has them. predicted: (..., point) its distances, 0 to 1 of range_m from the
-    skin, which is radius_m (point,) from the point.
+    Args:
+        points_m: (..., point, 3) of the predicted pose.
+        predicted: (..., point) distances from the skin, as fractions of ``range_m``.
+        radius_m: (point,) from the point to the skin.
+        range_m: see ``FeatureSettings``.
+        nearest: the object's surface at ``points_m``.
+
+    Returns:
+        Targets of all points; inactive points stay.
     """
     distance_m = predicted * range_m + radius_m
-    inside = found.distance_m < 0
-    mixed = np.where(inside, 0.8 * distance_m + 0.2 * found.distance_m, 0.2 * distance_m + 0.8 * found.distance_m)
-    wanted = found.closest_m + mixed[..., None] * found.normal
-    return Targets(np.where(_active(predicted, found)[..., None], wanted, points_m), np.ones(predicted.shape))
+    inside = nearest.distance_m < 0
+    mixed_m = np.where(inside, 0.8 * distance_m + 0.2 * nearest.distance_m, 0.2 * distance_m + 0.8 * nearest.distance_m)
+    target_m = nearest.closest_m + mixed_m[..., None] * nearest.normal
+    return Targets(np.where(_is_active(predicted, nearest)[..., None], target_m, points_m), np.ones(predicted.shape))
 
 
 def our_targets(points_m: np.ndarray, predicted: np.ndarray, radius_m: np.ndarray, range_m: float,
-                near: np.ndarray, cover_m: np.ndarray, seen: Nearest) -> Targets:  # fmt: skip
-    """Fingers go where the network has them and press what it says is near; none enters the object or is drawn off it.
+                is_near: np.ndarray, thickness_m: np.ndarray, nearest: Nearest) -> Targets:  # fmt: skip
+    """Our rule: keep the predicted pose, press points that are predicted to touch, and limit penetration.
 
-    The rules above stop at the surface, where a contact carries nothing; a distance that is a mean of many takes off
-    the object what touches it; and from a pose that is deep in a thin thing the nearest way out may be the far side.
-    So the surface is what the hand sees from the pose that it comes from: ``seen``, of its points there, and what lies
-    below the plane of the nearest place is inside. Arguments else as in ``paper_targets``. near: (point,) bool, the
-    network's points are at the object or in it. cover_m: (point,) how thick the finger is there.
+    Algorithm 1 has three problems. It stops at the surface, where a contact has no pressure. A predicted distance is a
+    mean over many poses, so it lifts touching points off the object. In a thin object, the nearest surface may be on
+    the far side. So our rule presses, and moves points outward only if they enter the object. It takes the surface
+    plane at the pose that the solver starts from (``nearest``): a point below that plane is inside.
+
+    Args:
+        points_m: (point, 3) of the predicted pose.
+        predicted: (point,) distances from the skin, as fractions of ``range_m``.
+        radius_m: (point,) from the point to the skin.
+        range_m: see ``FeatureSettings``.
+        is_near: (point,) bool, whether the predicted points are at the object or in it.
+        thickness_m: (point,) radius of the finger at the point.
+        nearest: the object's surface at the points of the solver's present pose.
     """
-    wanted_m = predicted * range_m + radius_m - PRESS_M
-    least_m = cover_m - DEEPEST_M
-    height_m = ((points_m - seen.closest_m) * seen.normal).sum(axis=-1)
-    up_m = np.maximum(np.minimum(wanted_m, height_m), least_m) - height_m
-    is_seen = seen.distance_m < NEAR_M
-    sure = np.clip((ACTIVE_SHARE - predicted) / FADE_SHARE, 0, 1) * is_seen
-    enters = (height_m < least_m) & is_seen & near
-    share = np.where(enters, 1.0, sure)
-    target = points_m + (share * up_m)[..., None] * seen.normal
-    return Targets(target, np.where(enters, 1.0, np.maximum(sure, HOLD)))
+    target_height_m = predicted * range_m + radius_m - PRESS_M
+    min_height_m = thickness_m - MAX_INDENTATION_M
+    # Signed distance of the predicted points from the surface planes.
+    height_m = ((points_m - nearest.closest_m) * nearest.normal).sum(axis=-1)
+    # Inwards to the target height, never outwards, except up to the indentation limit.
+    move_m = np.maximum(np.minimum(target_height_m, height_m), min_height_m) - height_m
+    in_range = nearest.distance_m < NEAR_M
+    confidence = np.clip((ACTIVE_FRACTION - predicted) / FADE_FRACTION, 0, 1) * in_range
+    enters = (height_m < min_height_m) & in_range & is_near
+    weight = np.where(enters, 1.0, confidence)
+    target = points_m + (weight * move_m)[..., None] * nearest.normal
+    return Targets(target, np.where(enters, 1.0, np.maximum(confidence, MIN_WEIGHT)))
 
 
-def _active(predicted: np.ndarray, found: Nearest) -> np.ndarray:
-    return (predicted < ACTIVE_SHARE) & (found.distance_m < NEAR_M)
+def _is_active(predicted: np.ndarray, nearest: Nearest) -> np.ndarray:
+    return (predicted < ACTIVE_FRACTION) & (nearest.distance_m < NEAR_M)
 
 
-# Of our rule: so many passes move joints out that they, or their capsule, are deeper in the object than allowed.
-PASSES, ALLOWED_M = 4, 0.006
-# A capsule is held by its joint, so that the one after it goes twice as far as its middle is to go.
-OUT_SHARE = 2.0
-AT_OBJECT_M = 0.01  # a point of the network's this far from the finger's skin is kept out of the object
-ROUNDS = 2  # of ours: what a hand sees changes with its pose
-LEAD = 0.2  # of the way from the answer before to the network's pose, whose twist points do not tell
+# Our rule: after solving, these passes move joints and capsules out that are deeper in the object than the limit.
+EXIT_PASSES, MAX_DEPTH_M = 4, 0.006
+# A capsule rotates about its joint, so its far end moves twice as far as its middle.
+CAPSULE_FACTOR = 2.0
+AT_OBJECT_M = 0.01  # penetration is limited for predicted points whose skin is closer to the object than this
+SOLVER_ROUNDS = 2  # of surface planes at the present pose and inverse kinematics
+# The solver starts this fraction of the way from the previous answer to the prediction: it takes the twist of joints
+# from there, which point targets do not determine.
+BLEND_FRACTION = 0.2
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """A trained network and how it is run. rule: of post-processing."""
+    """A trained network with its post-processing."""
 
     network: ManipNet
-    rule: Rule = "ours"
+    rule: Rule = "ours"  # of post-processing
 
     @property
     def settings(self) -> FeatureSettings:
         return self.network.config.features
 
     def limits(self, hand: TrackedHand) -> Limits:
-        """How far the joints of a hand may turn: as far as in training, and as far as its hinges do."""
+        """Joint limits of a hand: those of the training poses, and of its hinge joints."""
         low, high = (array.double().numpy() for array in (self.network.low_rad, self.network.high_rad))
         return Limits.of(hand, low, high)
 
     @torch.no_grad()
-    def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """Outputs (hand, 214) of inputs (hand, 2350)."""
-        return self.network(torch.from_numpy(rows.astype(np.float32))).double().numpy()
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        """Outputs (hand, 214) for inputs (hand, 2350)."""
+        return self.network(torch.from_numpy(inputs.astype(np.float32))).double().numpy()
 
 
 @dataclass(frozen=True, eq=False)
-class Situation:
-    """What is given of one hand in one frame. trajectory: (336,) features. object_from_wrist: (time,) now and later.
+class FrameContext:
+    """The control signal of one hand in one frame."""
 
-    hinge_rad: (time,) of a hinged object, else None.
-    """
-
-    trajectory: np.ndarray
-    object_from_wrist: RigidTransform
-    hinge_rad: np.ndarray | None
+    trajectory: np.ndarray  # (336,) features
+    object_from_wrist: RigidTransform  # (time,) at the present and the sensors' future times
+    hinge_rad: np.ndarray | None  # (time,); None for a rigid object
 
 
-def situation(control: Control, side: Side, hand: TrackedHand, time_s: float, settings: FeatureSettings) -> Situation:
-    """What is given at one time. Not for many at once: last bits would depend on how many, and a stream has one."""
-    now = np.array([time_s])
-    placed, hinge = object_from_wrist(control, side, now, settings)
-    trajectory = trajectory_features(control, side, hand, now, settings)
-    return Situation(trajectory[0], placed[0], None if hinge is None else hinge[0])
+def frame_context(
+    control: Control, side: Side, hand: TrackedHand, time_s: float, settings: FeatureSettings
+) -> FrameContext:
+    """The control signal at one time. One call per time, because the last bits depend on the batch size."""
+    times_s = np.array([time_s])
+    transforms, hinge = object_from_wrist(control, side, times_s, settings)
+    trajectory = trajectory_features(control, side, hand, times_s, settings)
+    return FrameContext(trajectory[0], transforms[0], None if hinge is None else hinge[0])
 
 
 @dataclass
-class Follower:
-    """One hand on its way. finger_rotmats: (1, joint - 1, 3, 3) that the network goes on from, the start pose first.
-
-    answer: (1, joint - 1, 3, 3) the post-processed ones.
-    """
+class HandRollout:
+    """The rollout of one hand."""
 
     predictor: Predictor
     hand: TrackedHand
     surface: SurfaceIndex
-    finger_rotmats: np.ndarray
-    answer: np.ndarray = field(init=False)
+    finger_rotmats: np.ndarray  # (1, joint - 1, 3, 3) pose for the next input; at first the start pose
+    answer: np.ndarray = field(init=False)  # (1, joint - 1, 3, 3) post-processed pose
     limits: Limits = field(init=False)
-    cover_m: np.ndarray = field(init=False)
-    state: HandState = field(init=False)
+    thickness_m: np.ndarray = field(init=False)  # (point,) radius of the finger at each point
+    state: HandState = field(init=False)  # of ``finger_rotmats``
 
     def __post_init__(self) -> None:
         self.limits = self.predictor.limits(self.hand)
         radius = self.hand.point_radius_m
-        self.cover_m = np.r_[radius[: self.hand.n_joints], radius[self.hand.tip_joint]]
-        self._take(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
+        self.thickness_m = np.r_[radius[: self.hand.n_joints], radius[self.hand.tip_joint]]
+        self._set_pose(np.asarray(self.finger_rotmats, dtype=np.float64).reshape(1, -1, 3, 3))
 
-    def inputs(self, now: Situation) -> np.ndarray:
-        """(2350,) what the network sees."""
-        hinge = None if now.hinge_rad is None else now.hinge_rad[None]
-        at = now.object_from_wrist
-        placed = RigidTransform(at.rotation[None], at.translation[None])
+    def inputs(self, frame: FrameContext) -> np.ndarray:
+        """(2350,) the network's input for a frame."""
+        hinge = None if frame.hinge_rad is None else frame.hinge_rad[None]
+        transform = frame.object_from_wrist
+        placed = RigidTransform(transform.rotation[None], transform.translation[None])
         sensed = sense(self.hand, self.state, placed, hinge, self.surface, self.predictor.settings.sensors)
-        return np.concatenate([pose_features(self.hand, self.state)[0], now.trajectory, sensed.flat()[0]])
+        return np.concatenate([pose_features(self.hand, self.state)[0], frame.trajectory, sensed.flat()[0]])
 
-    def advance(self, output: np.ndarray, then: Situation) -> None:
-        """Take the pose of an output (214,) for the next frame, post-processed.
+    def advance(self, output: np.ndarray, next_frame: FrameContext) -> None:
+        """Go to the next frame with an output (214,) of the network, post-processed.
 
-        With our rule the network goes on from its own pose: a corrected one is none that it learnt from, and the next
-        is the worse for it.
+        With our rule the next input is the pose before post-processing: corrected poses are out of distribution, and
+        the next prediction is worse.
         """
-        rule, before = self.predictor.rule, self.answer
+        rule, previous_answer = self.predictor.rule, self.answer
         fingers = self.hand.finger_rotmats(joint_rotmats_of(self.hand, output[None]))
-        self._take(self.limits.within(fingers))
+        self._set_pose(self.limits.within(fingers))
         if rule != "off":
-            state = self._corrected(output, then, before)
+            state = self._corrected(output, next_frame, previous_answer)
             self.answer = self.hand.finger_rotmats(state.joint_rotmats)
             if rule != "ours":
                 self.finger_rotmats, self.state = self.answer, state
 
-    def _take(self, finger_rotmats: np.ndarray) -> None:
+    def _set_pose(self, finger_rotmats: np.ndarray) -> None:
         self.finger_rotmats = self.answer = finger_rotmats
         self.state = self.hand.state(finger_rotmats)
 
-    def _corrected(self, output: np.ndarray, then: Situation, before: np.ndarray) -> HandState:
-        """The hand that an output means, post-processed; before: the answer of the frame before."""
-        hand, settings, points = self.hand, self.predictor.settings, self.state.point_m[0]
+    def _corrected(self, output: np.ndarray, next_frame: FrameContext, previous_answer: np.ndarray) -> HandState:
+        """The predicted hand, post-processed; previous_answer: that of the previous frame."""
+        hand, settings, points_m = self.hand, self.predictor.settings, self.state.point_m[0]
         predicted = np.clip(output[-hand.n_points :], 0, 1)
-        found, given = self._nearest(points, then), (points, predicted, hand.point_radius_m, settings.range_m)
+        nearest = self._nearest(points_m, next_frame)
+        shared = points_m, predicted, hand.point_radius_m, settings.range_m
         if self.predictor.rule == "paper":
-            return self._reached(self.state, paper_targets(*given, found))
-        near = found.distance_m < self.cover_m + AT_OBJECT_M
-        state = self.hand.state(between(before, self.finger_rotmats, np.full(1, LEAD)))
-        for _ in range(ROUNDS):
-            seen = self._nearest(state.point_m[0], then)
-            state = self._reached(state, our_targets(*given, near, self.cover_m, seen))
-        for _ in range(PASSES):
-            targets = self._out_of_object(state, then)
+            return self._solve(self.state, paper_targets(*shared, nearest))
+        is_near = nearest.distance_m < self.thickness_m + AT_OBJECT_M
+        state = self.hand.state(interpolate_rotations(previous_answer, self.finger_rotmats, np.full(1, BLEND_FRACTION)))
+        for _ in range(SOLVER_ROUNDS):  # the planes depend on the pose
+            from_state = self._nearest(state.point_m[0], next_frame)
+            state = self._solve(state, our_targets(*shared, is_near, self.thickness_m, from_state))
+        for _ in range(EXIT_PASSES):
+            targets = self._out_of_object(state, next_frame)
             if not targets.weight.any():
                 break
-            state = self._reached(state, targets)
+            state = self._solve(state, targets)
         return state
 
-    def _reached(self, state: HandState, targets: Targets) -> HandState:
-        """The hand turned towards its targets."""
+    def _solve(self, state: HandState, targets: Targets) -> HandState:
+        """Solve inverse kinematics from a state."""
         weight = np.zeros(self.hand.n_points)
-        moved = target_points(self.hand)
-        weight[moved] = targets.weight[moved]
+        movable = target_points(self.hand)
+        weight[movable] = targets.weight[movable]
         if not weight.any():
             return state
         return self.hand.state(reach(self.hand, self.limits, state, targets.point_m, weight))
 
-    def _out_of_object(self, state: HandState, then: Situation) -> Targets:
-        """A further pass: what of the hand is too deep in the object moves out by a share of what is too much."""
+    def _out_of_object(self, state: HandState, next_frame: FrameContext) -> Targets:
+        """Targets of an exit pass: joints and capsules that are too deep in the object move out by the excess depth."""
         hand = self.hand
-        target, weight, n_points = state.point_m[0].copy(), np.zeros(hand.n_points), hand.n_points
-        middle = (state.capsule_start_m[0] + state.capsule_end_m[0]) / 2
-        found = self._nearest(np.concatenate([target, middle]), then)
-        depth = np.maximum(self.cover_m - found.distance_m[:n_points] - ALLOWED_M, 0)
-        target += depth[:, None] * found.normal[:n_points]
-        weight[depth > 0] = 1
-        depth = np.maximum(hand.capsules.radius_m - found.distance_m[n_points:] - ALLOWED_M, 0)
-        depth *= hand.capsules.joint > 0
-        for capsule in np.flatnonzero(depth):
-            # A capsule hangs between its joint and the one after it: the latter moves it.
-            after = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
-            tip = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
-            moved = np.concatenate([after, tip])
-            target[moved] += OUT_SHARE * depth[capsule] * found.normal[n_points + capsule]
-            weight[moved] = 1
-        return Targets(target, weight)
+        target_m, weight, n_points = state.point_m[0].copy(), np.zeros(hand.n_points), hand.n_points
+        middle_m = (state.capsule_start_m[0] + state.capsule_end_m[0]) / 2
+        nearest = self._nearest(np.concatenate([target_m, middle_m]), next_frame)
+        excess_m = np.maximum(self.thickness_m - nearest.distance_m[:n_points] - MAX_DEPTH_M, 0)
+        target_m += excess_m[:, None] * nearest.normal[:n_points]
+        weight[excess_m > 0] = 1
+        excess_m = np.maximum(hand.capsules.radius_m - nearest.distance_m[n_points:] - MAX_DEPTH_M, 0)
+        excess_m *= hand.capsules.joint > 0  # capsules of the wrist cannot move
+        for capsule in np.flatnonzero(excess_m):
+            # A capsule lies between its joint and the next one: moving the next joint moves the capsule.
+            next_joints = np.flatnonzero(hand.parents == hand.capsules.joint[capsule])
+            tips = hand.n_joints + np.flatnonzero(hand.tip_joint == hand.capsules.joint[capsule])
+            points = np.concatenate([next_joints, tips])
+            target_m[points] += CAPSULE_FACTOR * excess_m[capsule] * nearest.normal[n_points + capsule]
+            weight[points] = 1
+        return Targets(target_m, weight)
 
-    def _nearest(self, points_m: np.ndarray, then: Situation) -> Nearest:
-        """What the object is like at points (point, 3) of the wrist's frame."""
-        placed = then.object_from_wrist[0]
-        hinge = None if then.hinge_rad is None else then.hinge_rad[:1]
-        found = self.surface.nearest((placed @ points_m)[None], hinge)
-        back = placed.inverse()
-        return Nearest(found.distance_m[0], back @ found.closest_m[0], back.turn(found.normal[0]))
+    def _nearest(self, points_m: np.ndarray, frame: FrameContext) -> Nearest:
+        """The object's surface at points (point, 3), wrist frame."""
+        object_from_wrist = frame.object_from_wrist[0]
+        hinge_rad = None if frame.hinge_rad is None else frame.hinge_rad[:1]
+        nearest = self.surface.nearest((object_from_wrist @ points_m)[None], hinge_rad)
+        wrist_from_object = object_from_wrist.inverse()
+        return Nearest(
+            nearest.distance_m[0], wrist_from_object @ nearest.closest_m[0], wrist_from_object.turn(nearest.normal[0])
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
-    """A hand to follow through a clip. start: (joint - 1, 3, 3) finger rotations at the first of ``time_s``."""
+class RolloutTask:
+    """One hand to roll out."""
 
     hand: TrackedHand
     side: Side
     control: Control
-    time_s: np.ndarray
-    start: np.ndarray
+    time_s: np.ndarray  # (frame,) one step apart
+    start: np.ndarray  # (joint - 1, 3, 3) finger rotations in the first frame
 
 
-def roll_out(predictor: Predictor, tasks: Sequence[Task]) -> list[np.ndarray]:
-    """Finger rotations (frame, joint - 1, 3, 3) of each task, the start pose first; times are a step apart.
+def roll_out(predictor: Predictor, tasks: Sequence[RolloutTask]) -> list[np.ndarray]:
+    """Roll out several hands.
 
-    The hands of a frame share one call of the network, whose last bits depend on how many they are.
+    The hands of a frame share one call of the network. Its last bits depend on the number of hands.
+
+    Returns:
+        Finger rotations (frame, joint - 1, 3, 3) of each task, with the start pose first.
     """
-    given = [
-        [situation(task.control, task.side, task.hand, time_s, predictor.settings) for time_s in task.time_s]
+    contexts = [
+        [frame_context(task.control, task.side, task.hand, time_s, predictor.settings) for time_s in task.time_s]
         for task in tasks
     ]
-    followers = [Follower(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
-    made = [[follower.answer[0]] for follower in followers]
-    for frame in range(1, max(map(len, given), default=0)):
-        running = [number for number, frames in enumerate(given) if frame < len(frames)]
-        rows = np.stack([followers[number].inputs(given[number][frame - 1]) for number in running])
-        for number, output in zip(running, predictor(rows), strict=True):
-            followers[number].advance(output, given[number][frame])
-            made[number].append(followers[number].answer[0])
-    return [np.stack(poses) for poses in made]
+    rollouts = [HandRollout(predictor, task.hand, surface_index(task.control.model), task.start) for task in tasks]
+    poses_by_task = [[rollout.answer[0]] for rollout in rollouts]
+    for frame in range(1, max(map(len, contexts), default=0)):
+        running = [number for number, frames in enumerate(contexts) if frame < len(frames)]
+        inputs = np.stack([rollouts[number].inputs(contexts[number][frame - 1]) for number in running])
+        for number, output in zip(running, predictor(inputs), strict=True):
+            rollouts[number].advance(output, contexts[number][frame])
+            poses_by_task[number].append(rollouts[number].answer[0])
+    return [np.stack(poses) for poses in poses_by_task]

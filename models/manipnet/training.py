@@ -1,6 +1,6 @@
-"""Training of ManipNet on annotated clips: the shared loop draws clips, from each of which steps are drawn.
+"""Training of ManipNet on annotated clips: the shared loop samples clips, and this objective samples their steps.
 
-A step is the recorded pose of a frame and that of the next (Sec. 6.4), of hands of any source.
+A step is the recorded pose of a frame and that of the next (Sec. 6.4).
 """
 
 from collections.abc import Sequence
@@ -21,26 +21,30 @@ from hoidata.hands.tracked_hand import TrackedHand
 from hoidata.objects.surface_index import SurfaceIndex, surface_index
 from hoidata.sensors import sensor_size
 from models.common.family import Losses, Network, Setup
-from models.manipnet.control import Control, between, control_of, finger_rotmats_of, hands_of, trajectories_of
-from models.manipnet.features import FeatureSettings, floors, hand_inputs, outputs, sizes
-from models.manipnet.inverse_kinematics import turns_from_rest
-from models.manipnet.lookups import as_right
+from models.manipnet.control import (
+    Control,
+    control_of,
+    finger_rotmats_of,
+    hands_of,
+    interpolate_rotations,
+    trajectories_of,
+)
+from models.manipnet.features import FeatureSettings, hand_inputs, outputs, sizes, std_floors
+from models.manipnet.inverse_kinematics import rotvecs_from_rest
 from models.manipnet.network import ManipNet, NetworkConfig
+from models.manipnet.retrieval import mirrored_to_right
 
-LEARNT = ("inputs", "outputs")
-MARGIN_RAD = 0.1  # joints may turn by so much more than in any training clip
+NETWORK_ARRAYS = ("inputs", "outputs")
+MARGIN_RAD = 0.1  # joint limits are those of the training poses, extended by this
 
 
 class Examples(NamedTuple):
-    """Steps of a hand, from one frame to the next. frame: (step,) it starts in. inputs: (step, 2350), float32.
+    """Training steps of one hand, each from a frame to the next."""
 
-    outputs: (step, 214), float32. turns_rad: (step, joint - 1, 3) from the neutral pose, as a right hand's.
-    """
-
-    frame: np.ndarray
-    inputs: np.ndarray
-    outputs: np.ndarray
-    turns_rad: np.ndarray
+    frame: np.ndarray  # (step,) the first frame
+    inputs: np.ndarray  # (step, 2350) float32
+    outputs: np.ndarray  # (step, 214) float32
+    rotvecs_rad: np.ndarray  # (step, joint - 1, 3) axis-angle from the neutral pose, as a right hand's
 
 
 def hand_examples(
@@ -52,33 +56,46 @@ def hand_examples(
     usable: np.ndarray,
     surface: SurfaceIndex,
     settings: FeatureSettings,
-    given: np.ndarray | None = None,
+    start_rotmats: np.ndarray | None = None,
 ) -> Examples:
-    """The steps of a recorded hand whose two frames are usable (frame,); its times (frame,) are a step apart.
+    """Training steps of a recorded hand.
 
-    given: (frame, joint - 1, 3, 3) other poses to start the steps from, which lead to the recorded ones all the same:
-    the paper trains from recorded poses alone, and a network may then keep any pose it is given.
+    Args:
+        control: wrists and object.
+        side: of the hand.
+        hand: its skeleton and capsules.
+        finger_rotmats: (frame, joint - 1, 3, 3) recorded.
+        time_s: (frame,) one step apart.
+        usable: (frame,) bool; a step needs two usable frames.
+        surface: of the object.
+        settings: of the features.
+        start_rotmats: (frame, joint - 1, 3, 3) perturbed poses to start from; the targets are the recorded ones.
+            The paper trains from recorded poses only. Such a network may keep any pose it is given.
     """
     first = np.flatnonzero(usable[:-1] & usable[1:])
-    start = finger_rotmats[first] if given is None else given[first]
-    seen = hand_inputs(control, side, hand, hand.state(start), time_s[first], surface, settings)
-    placed = control.thing.at(time_s[first + 1]).inverse() @ control.wrists[side].at(time_s[first + 1])
+    start = finger_rotmats[first] if start_rotmats is None else start_rotmats[first]
+    inputs = hand_inputs(control, side, hand, hand.state(start), time_s[first], surface, settings)
+    object_from_wrist = control.object_motion.at(time_s[first + 1]).inverse() @ control.wrists[side].at(
+        time_s[first + 1]
+    )
     hinge = control.hinge_at(time_s[first + 1])
-    after = hand.state(finger_rotmats[first + 1])
-    distance_m = surface.nearest(placed @ after.point_m, hinge).distance_m
-    made = outputs(hand, after, distance_m, settings)
-    rows = np.concatenate(seen, axis=1, dtype=np.float32)
-    return Examples(first, rows, made.astype(np.float32), turns_from_rest(hand, finger_rotmats[first]))
+    next_state = hand.state(finger_rotmats[first + 1])
+    distance_m = surface.nearest(object_from_wrist @ next_state.point_m, hinge).distance_m
+    targets = outputs(hand, next_state, distance_m, settings)
+    input_rows = np.concatenate(inputs, axis=1, dtype=np.float32)
+    return Examples(first, input_rows, targets.astype(np.float32), rotvecs_from_rest(hand, finger_rotmats[first]))
 
 
-def other_poses(fingers: np.ndarray, pool: np.ndarray, seed: int) -> np.ndarray:
-    """(frame, joint - 1, 3, 3) for each pose one that lies between it and another of the pool, anywhere on the way."""
-    draws = np.random.default_rng(seed)
-    return between(fingers, pool[draws.integers(len(pool), size=len(fingers))], draws.uniform(0, 1, len(fingers)))
+def perturbed_poses(fingers: np.ndarray, pool: np.ndarray, seed: int) -> np.ndarray:
+    """Perturb poses (frame, joint - 1, 3, 3): move each by a random fraction towards a random pose of the pool."""
+    rng = np.random.default_rng(seed)
+    return interpolate_rotations(
+        fingers, pool[rng.integers(len(pool), size=len(fingers))], rng.uniform(0, 1, len(fingers))
+    )
 
 
-def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
-    """The configuration with the numbers that this hand has."""
+def sized_config(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
+    """The configuration with the input and output sizes of a hand."""
     count = sizes(hand, config.features)
     return replace(
         config,
@@ -90,71 +107,76 @@ def sized(config: NetworkConfig, hand: TrackedHand) -> NetworkConfig:
     )
 
 
-def prepared(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
-    """A network that knows its normalisation and the limits of the joints from training examples."""
-    network = ManipNet(sized(config, hand))
-    inputs, made = (torch.from_numpy(np.concatenate([getattr(one, name) for one in examples])) for name in LEARNT)
-    least = [torch.from_numpy(values).float() for values in floors(hand, config.features)]
-    network.learn_normalisation(inputs, made, (least[0], least[1]))
-    turns = torch.from_numpy(np.concatenate([one.turns_rad for one in examples]))
+def build_network(config: NetworkConfig, hand: TrackedHand, examples: Sequence[Examples]) -> ManipNet:
+    """A network with normalisation and joint limits from training examples, and random weights."""
+    network = ManipNet(sized_config(config, hand))
+    inputs, targets = (
+        torch.from_numpy(np.concatenate([getattr(example, name) for example in examples])) for name in NETWORK_ARRAYS
+    )
+    std_floor = [torch.from_numpy(values).float() for values in std_floors(hand, config.features)]
+    network.learn_normalisation(inputs, targets, (std_floor[0], std_floor[1]))
+    turns = torch.from_numpy(np.concatenate([example.rotvecs_rad for example in examples]))
     network.low_rad.copy_(turns.amin(0) - MARGIN_RAD)
     network.high_rad.copy_(turns.amax(0) + MARGIN_RAD)
     return network
 
 
-def step_loss(network: ManipNet, inputs: Tensor, made: Tensor) -> Tensor:
+def step_loss(network: ManipNet, inputs: Tensor, targets: Tensor) -> Tensor:
     """Mean squared error of normalised outputs."""
-    return (network.normalised(inputs) - (made - network.output_mean) / network.output_scale).square().mean()
+    return (network.normalised(inputs) - (targets - network.output_mean) / network.output_scale).square().mean()
 
 
 @dataclass(frozen=True)
 class LossConfig:
-    """rows: steps drawn from each clip of a batch. astray: share of them from poses that were not recorded, from which
-    they lead back; 0: as the paper trains.
-    """
+    """Sampling of training steps."""
 
-    rows: int = 16
-    astray: float = 0.5
+    steps_per_clip: int = 16  # of each clip of a batch
+    perturbed_fraction: float = 0.5  # of steps that start from a perturbed pose; 0: as in the paper
 
 
 def clip_examples(
     sample: ClipSample, pair: HandPair, settings: FeatureSettings, pool: np.ndarray | None = None
 ) -> list[Examples]:
-    """The steps of every active hand of a whole clip; with a pool (pose, 15, 3, 3) as a right hand's, from poses that
-    are partly others.
+    """Training steps of the active hands of a whole clip.
+
+    Args:
+        sample: the clip.
+        pair: the hand model.
+        settings: of the features.
+        pool: (pose, 15, 3, 3) as a right hand's; steps start from poses perturbed towards it. None: recorded poses.
     """
     hands = hands_of(pair, sample.betas, sample.template_m)
     control, surface = control_of(trajectories_of(sample), sample.object_model), surface_index(sample.object_model)
-    time_s, made = np.arange(sample.length) / FPS, []
-    for row, side in enumerate(SIDES):
-        if not seen_twice(sample)[row]:
+    time_s, examples = np.arange(sample.length) / FPS, []
+    for side_index, side in enumerate(SIDES):
+        if not has_steps(sample)[side_index]:
             continue
-        hand, fingers = hands[side], finger_rotmats_of(sample.hands[row])
+        hand, fingers = hands[side], finger_rotmats_of(sample.hands[side_index])
         seed = int.from_bytes(sha256(f"{sample.clip_id} {side}".encode()).digest()[:7])
-        given = None if pool is None else other_poses(fingers, as_right(hand, pool), seed)
-        own = (control, side, hand, fingers, time_s, sample.valid[row], surface, settings, given)
-        made.append(hand_examples(*own))
-    return made
+        start_rotmats = None if pool is None else perturbed_poses(fingers, mirrored_to_right(hand, pool), seed)
+        arguments = (control, side, hand, fingers, time_s, sample.valid[side_index], surface, settings, start_rotmats)
+        examples.append(hand_examples(*arguments))
+    return examples
 
 
-def seen_twice(sample: ClipSample) -> np.ndarray:
-    """(2,) bool: the hand takes part and is tracked in two frames in a row."""
+def has_steps(sample: ClipSample) -> np.ndarray:
+    """(2,) bool: the hand is active and tracked in two consecutive frames."""
     return sample.active_hands & (sample.valid[:, :-1] & sample.valid[:, 1:]).any(axis=1)
 
 
 def pose_pool(samples: Sequence[ClipSample], pair: HandPair) -> np.ndarray:
-    """(pose, 15, 3, 3) finger rotations of all tracked active hands, as a right hand's, and the neutral pose."""
+    """(pose, 15, 3, 3) the neutral pose and the finger rotations of all tracked active hands, as a right hand's."""
     poses = [hands_of(pair, samples[0].betas, samples[0].template_m)["right"].rest_rotmats[None]]
     for sample in samples:
         hands = hands_of(pair, sample.betas, sample.template_m)
-        for row in np.flatnonzero(sample.active_hands):
-            own = finger_rotmats_of(sample.hands[row, sample.valid[row]])
-            poses.append(as_right(hands[SIDES[row]], own))
+        for side_index in np.flatnonzero(sample.active_hands):
+            fingers = finger_rotmats_of(sample.hands[side_index, sample.valid[side_index]])
+            poses.append(mirrored_to_right(hands[SIDES[side_index]], fingers))
     return np.concatenate(poses)
 
 
 class FingersObjective:
-    """Squared error of the next pose and distances, from recorded poses and from poses beside them."""
+    """Squared error of the next pose and distances, from recorded and from perturbed poses."""
 
     frames = entries = 0
 
@@ -162,50 +184,66 @@ class FingersObjective:
         pair, self.loss, self.device = setup.corpus.annotated.store.hand_pair(), setup.loss, setup.device
         settings = replace(setup.network.features, step_s=1 / FPS)
         train = setup.corpus.train
-        whole = [train.whole(clip_id) for clip_id in train.ids]
-        pools = (None, pose_pool(whole, pair)) if self.loss.astray else (None,)
-        # By clip, for each hand: its steps from recorded poses, and those from others.
+        clips = [train.whole(clip_id) for clip_id in train.ids]
+        pools = (None, pose_pool(clips, pair)) if self.loss.perturbed_fraction else (None,)
+        # By clip, for each hand: its steps from recorded poses, and those from perturbed poses.
         self.examples = {
             sample.clip_id: list(zip(*(clip_examples(sample, pair, settings, pool) for pool in pools), strict=True))
-            for sample in whole
+            for sample in clips
         }
-        hand = hands_of(pair, whole[0].betas, whole[0].template_m)["right"]
-        known = [one for clip in self.examples.values() for kinds in clip for one in kinds]
-        self.network = prepared(replace(setup.network, features=settings), hand, known).to(setup.device)
-        held = [one for sample in setup.corpus.held_out for one in clip_examples(sample, pair, settings)]
-        if setup.corpus.held_out and not held:
-            expected = "a hand that is seen in two frames in a row"
+        hand = hands_of(pair, clips[0].betas, clips[0].template_m)["right"]
+        examples = [example for clip in self.examples.values() for kinds in clip for example in kinds]
+        self.network = build_network(replace(setup.network, features=settings), hand, examples).to(setup.device)
+        validation = [example for sample in setup.corpus.held_out for example in clip_examples(sample, pair, settings)]
+        if setup.corpus.held_out and not validation:
+            expected = "a hand that is tracked in two consecutive frames"
             raise BadInput("validation", expected, "none in its clips", "put other clips into the validation part")
-        self.held_out = [np.concatenate([getattr(one, name) for one in held]) for name in LEARNT] if held else None
+        self.held_out: list[np.ndarray] | None = None  # inputs and outputs of the validation steps
+        if validation:
+            self.held_out = [
+                np.concatenate([getattr(example, name) for example in validation]) for name in NETWORK_ARRAYS
+            ]
 
     def losses(self, batch: ClipBatch, generator: torch.Generator) -> Losses:
-        drawn = [pair for sample in batch.samples for pair in self._drawn(sample, generator)]
-        if not drawn:  # clips in which no hand is seen twice in a row
+        steps = [pair for sample in batch.samples for pair in self._sampled_steps(sample, generator)]
+        if not steps:  # no hand of the batch is tracked in two consecutive frames
             return {"total": self.network.decoder.bias.sum() * 0}
-        inputs, made = (send(torch.from_numpy(np.stack(rows)), self.device) for rows in zip(*drawn, strict=True))
-        return {"total": step_loss(self.network, inputs, made)}
+        inputs, targets = (send(torch.from_numpy(np.stack(rows)), self.device) for rows in zip(*steps, strict=True))
+        return {"total": step_loss(self.network, inputs, targets)}
 
-    def _drawn(self, sample: ClipSample, generator: torch.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
-        """So many steps of the frames of a cropped clip, any hand."""
+    def _sampled_steps(self, sample: ClipSample, generator: torch.Generator) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Inputs and outputs of random steps in the frames of a cropped clip, of any hand."""
         first, stop = sample.start, sample.start + sample.length - 1
         steps = [
-            (kinds, row)
+            (kinds, number_in_example)
             for kinds in self.examples[sample.clip_id]
-            for row in np.flatnonzero((kinds[0].frame >= first) & (kinds[0].frame < stop))
+            for number_in_example in np.flatnonzero((kinds[0].frame >= first) & (kinds[0].frame < stop))
         ]
         if not steps:
             return []
-        chosen = torch.randint(len(steps), (self.loss.rows,), generator=generator).tolist()
-        astray = (torch.rand(self.loss.rows, generator=generator) < self.loss.astray).long().tolist()
-        found = [(steps[number][0][kind], steps[number][1]) for number, kind in zip(chosen, astray, strict=True)]
-        return [(one.inputs[row], one.outputs[row]) for one, row in found]
+        chosen = torch.randint(len(steps), (self.loss.steps_per_clip,), generator=generator).tolist()
+        random = torch.rand(self.loss.steps_per_clip, generator=generator)
+        is_perturbed = (random < self.loss.perturbed_fraction).long().tolist()
+        sampled = [
+            (steps[number][0][kind], steps[number][1]) for number, kind in zip(chosen, is_perturbed, strict=True)
+        ]
+        return [
+            (example.inputs[number_in_example], example.outputs[number_in_example])
+            for example, number_in_example in sampled
+        ]
 
     @torch.no_grad()
     def validation(self, network: nn.Module) -> Tensor:
         assert isinstance(network, ManipNet)
         assert self.held_out is not None
-        inputs, made = (send(torch.from_numpy(rows), self.device) for rows in self.held_out)
-        return step_loss(network, inputs, made)
+        inputs, targets = (send(torch.from_numpy(rows), self.device) for rows in self.held_out)
+        return step_loss(network, inputs, targets)
 
 
-MANIPNET = Network("manipnet", NetworkConfig, ManipNet, lambda setup: (FingersObjective(setup), None), loss=LossConfig)
+MANIPNET = Network(
+    name="manipnet",
+    config=NetworkConfig,
+    build=ManipNet,
+    objective=lambda setup: (FingersObjective(setup), None),
+    loss=LossConfig,
+)

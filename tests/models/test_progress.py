@@ -29,7 +29,7 @@ from tests.models.toy import BUDGET, PARAMS
 
 STEPS, SAVED_EVERY = 8, 2
 # Beside the toy's, of which other tests train each.
-SETTINGS = PARAMS | {"manipnet": {"network": {"encoder": 8}, "training": BUDGET, "loss": {"rows": 4}}}
+SETTINGS = PARAMS | {"manipnet": {"network": {"encoder": 8}, "training": BUDGET, "loss": {"steps_per_clip": 4}}}
 
 
 def train(name: str, root: Path, out: Path, *, progress: Path | None = None, die_at: int = 0, **training) -> None:

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow  # a network is trained, and sensors are compiled
 TINY = {
     "network": {"encoder": 8},
     "training": {"steps": 1, "batch": 2, "learning_rate": 0.001, "validate_every": 1},
-    "loss": {"rows": 4},
+    "loss": {"steps_per_clip": 4},
 }
 TRAINED, HELD_OUT, LOST = "toy/s1/0", "toy/s2/1", "toy/s3/2"
 FRAMES, BOX_M = 40, (0.06, 0.06, 0.1)

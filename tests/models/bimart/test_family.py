@@ -1,4 +1,4 @@
-"""Promises of BimArt from training to clips: it goes on where it was, knows what it needs, sees no recorded hand."""
+"""BimArt from training to clips: training resumes, checkpoints are complete, no recorded hand is read."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +16,11 @@ from hoidata.sensors.keypoints import hand_keypoints
 from hoidata.sensors.part_bps import BasisSettings, distance_map
 from hoidata.store.annotated import AnnotatedStore
 from models.bimart.family import BIMART, OTHER_OBJECT, OTHER_PATH, UNREFINED, ZERO_MAP, HandsForPaths
-from models.bimart.learning import CONTACT, MOTION, LossConfig, learn_statistics, targets_of, window_losses
-from models.bimart.lookups import NEAREST_REFINED, NEAREST_WINDOW, OBJECT_MEAN_POSE
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel
-from models.bimart.sampler import BimArt
-from models.bimart.sampler import Path as ObjectPath
+from models.bimart.retrieval import NEAREST_REFINED, NEAREST_WINDOW, OBJECT_MEAN_POSE
+from models.bimart.sampler import BimArt, SamplingTask
 from models.bimart.scene import FeatureConfig, Scene, recorded_clip
+from models.bimart.training import CONTACT, MOTION, LossConfig, learn_statistics, targets_of, window_losses
 from models.common.checkpoints import load_checkpoint
 from models.common.family import LeftOut, Network, Setup, Sources
 from models.common.predicting import PredictionConfig, requests_for
@@ -34,10 +33,16 @@ pytestmark = pytest.mark.slow
 HANDS = load_embedded_hands()
 PARAMS: dict[str, Any] = {
     "network": {
-        "features": {"basis": {"count": 8}, "keypoints": 20, "window": 16, "state": "local", "most_m": 0.2},
+        "features": {
+            "basis": {"count": 8},
+            "keypoints": 20,
+            "window_frames": 16,
+            "state": "local",
+            "max_distance_m": 0.2,
+        },
         "transformer": {"width": 16, "layers": 1, "heads": 2, "feed_forward": 16, "norm_first": True},
         "encoder": [16],
-        "told": True,
+        "condition_on_hands": True,
         "diffusion_steps": 1000,
     },
     "training": {"steps": 4, "batch": 2, "learning_rate": 0.001, "validate_every": 2, "save_every": 1},
@@ -56,37 +61,38 @@ def checkpoints(annotated_root: Path, tmp_path_factory: pytest.TempPathFactory) 
 
 @pytest.fixture(scope="module")
 def sources(annotated: AnnotatedStore, checkpoints: Path) -> Sources:
-    return Sources(annotated, checkpoints, HANDS, torch.device("cpu"), SETTINGS)
+    device = torch.device("cpu")
+    return Sources(annotated=annotated, checkpoints=checkpoints, hands=HANDS, device=device, settings=SETTINGS)
 
 
-def interrupted(network: Network, at: int) -> Network:
-    """The network with an objective that stops everything at its ``at``-th step."""
+def interrupted(network: Network, step: int) -> Network:
+    """The network with an objective that interrupts training at a step."""
 
     def objective(setup: Setup):
-        made, normaliser = network.objective(setup)
-        count, losses = iter(range(1, at + 1)), made.losses
+        with_losses, normaliser = network.objective(setup)
+        count, losses = iter(range(1, step + 1)), with_losses.losses
 
         def counted(batch, generator):
-            if next(count) == at:
+            if next(count) == step:
                 raise KeyboardInterrupt
             return losses(batch, generator)
 
-        setattr(made, "losses", counted)  # noqa: B010 (pyright knows losses as a method)
-        return made, normaliser
+        setattr(with_losses, "losses", counted)  # noqa: B010 (pyright knows losses as a method)
+        return with_losses, normaliser
 
     return replace(network, objective=objective)
 
 
-def test_an_interrupted_training_goes_on_to_the_same_bytes(
+def test_an_interrupted_training_resumes_to_the_same_bytes(
     annotated_root: Path, checkpoints: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
         train_network(interrupted(MOTION, 3), annotated_root, tmp_path / "m", PARAMS, progress=tmp_path / "state")
-    made = train_network(MOTION, annotated_root, tmp_path / "m", PARAMS, progress=tmp_path / "state")
-    assert made.read_bytes() == (checkpoints / "bimart-motion" / "model.safetensors").read_bytes()
+    path = train_network(MOTION, annotated_root, tmp_path / "m", PARAMS, progress=tmp_path / "state")
+    assert path.read_bytes() == (checkpoints / "bimart-motion" / "model.safetensors").read_bytes()
 
 
-def test_a_checkpoint_knows_its_keypoints_basis_points_and_statistics(
+def test_a_checkpoint_stores_keypoints_basis_points_and_statistics(
     annotated: AnnotatedStore, checkpoints: Path
 ) -> None:
     network = load_checkpoint(checkpoints / "bimart-motion", MOTION).network
@@ -94,16 +100,16 @@ def test_a_checkpoint_knows_its_keypoints_basis_points_and_statistics(
     features = network.config.features
     np.testing.assert_array_equal(network.keypoint_ids, hand_keypoints(HANDS.right, 20))
     np.testing.assert_array_equal(network.basis_points, features.basis.points())
-    rows = []
+    by_window = []
     for sample in HoiDataset(annotated, "train"):
         clip = recorded_clip(sample, HANDS, features)
         for start in range(0, max(sample.length - 16, 0) + 1, 2):
-            own = clip.motion[start : start + 16].reshape(-1, 2, 2, 60)[:, :, 0]
-            rows.append(own[clip.present[0, start : start + 16]] if clip.active_hands[0] else own[:0])
-    left = np.concatenate(rows).astype(np.float64)
-    own = network.mean.numpy().reshape(2, 2, 60)[:, 0], network.scale.numpy().reshape(2, 2, 60)[:, 0]
-    np.testing.assert_allclose(own[0], left.mean(axis=0), atol=1e-6)
-    np.testing.assert_allclose(own[1], left.std(axis=0), atol=1e-6)
+            window = clip.motion[start : start + 16].reshape(-1, 2, 2, 60)[:, :, 0]
+            by_window.append(window[clip.present[0, start : start + 16]] if clip.active_hands[0] else window[:0])
+    left = np.concatenate(by_window).astype(np.float64)
+    mean, std = (values.numpy().reshape(2, 2, 60)[:, 0] for values in (network.mean, network.scale))
+    np.testing.assert_allclose(mean, left.mean(axis=0), atol=1e-6)
+    np.testing.assert_allclose(std, left.std(axis=0), atol=1e-6)
 
 
 def test_targets_are_the_clips_hands_in_the_objects_frame(samples: list[ClipSample], checkpoints: Path) -> None:
@@ -114,12 +120,12 @@ def test_targets_are_the_clips_hands_in_the_objects_frame(samples: list[ClipSamp
         target = targets_of(network, [(clip, 3)])
         scene = clip.scene
         np.testing.assert_allclose(clip.motion[:, :60], clip.keypoints_m[0].reshape(-1, 60))
-        near = scene.bps.nearest_m(clip.keypoints_m[1].astype(np.float64), scene.hinge_rad)
-        np.testing.assert_allclose(clip.to_object_m[1], near - clip.keypoints_m[1], atol=1e-6)
-        places = target.clean[0].reshape(16, 2, -1).numpy()
-        skin = distance_map(scene.place_m[3:19], clip.keypoints_m[0, 3:19])
-        assert (places[:, 0] <= np.minimum(skin, 0.2) + 1e-3).all()  # the skin has more points than the keypoints
-        assert target.known.reshape(16, 2, -1).any(dim=(0, 2)).tolist() == sample.active_hands.tolist()
+        nearest_m = scene.bps.nearest_m(clip.keypoints_m[1].astype(np.float64), scene.hinge_rad)
+        np.testing.assert_allclose(clip.to_object_m[1], nearest_m - clip.keypoints_m[1], atol=1e-6)
+        maps = target.clean[0].reshape(16, 2, -1).numpy()
+        skin = distance_map(scene.object_point_m[3:19], clip.keypoints_m[0, 3:19])
+        assert (maps[:, 0] <= np.minimum(skin, 0.2) + 1e-3).all()  # the skin has more points than the keypoints
+        assert target.clean_mask.reshape(16, 2, -1).any(dim=(0, 2)).tolist() == sample.active_hands.tolist()
 
 
 def same(one: Clip, other: Clip) -> bool:
@@ -127,14 +133,14 @@ def same(one: Clip, other: Clip) -> bool:
     return all(np.array_equal(getattr(one.hands[s], n), getattr(other.hands[s], n)) for s in SIDES for n in names)
 
 
-def test_it_answers_with_hands_for_the_objects_motion_and_looks_at_no_recorded_hand(
+def test_samples_follow_the_objects_motion_and_do_not_depend_on_recorded_hands(
     sources: Sources, samples: list[ClipSample]
 ) -> None:
-    family, draws = UNREFINED.load(sources), np.random.default_rng(0)
+    family, rng = UNREFINED.load(sources), np.random.default_rng(0)
     for sample in samples:
-        spoilt = replace(sample, hands=draws.normal(size=sample.hands.shape).astype(np.float32))
-        asked = [requests_for(one, PredictionConfig(samples=2)) for one in (sample, spoilt)]
-        (first, second), (again, _) = (family.sample(own) for own in asked)
+        corrupted = replace(sample, hands=rng.normal(size=sample.hands.shape).astype(np.float32))
+        requests = [requests_for(one, PredictionConfig(samples=2)) for one in (sample, corrupted)]
+        (first, second), (again, _) = (family.sample(one_requests) for one_requests in requests)
         assert isinstance(first, Clip)
         assert isinstance(second, Clip)
         assert isinstance(again, Clip)
@@ -146,11 +152,11 @@ def test_it_answers_with_hands_for_the_objects_motion_and_looks_at_no_recorded_h
         assert [bool(first.hands[side].valid.all()) for side in SIDES] == sample.active_hands.tolist()
 
 
-def test_a_request_without_the_objects_motion_is_left_out_with_the_reason(
+def test_a_request_without_object_motion_is_skipped_with_the_reason(
     sources: Sources, samples: list[ClipSample]
 ) -> None:
-    asked = requests_for(samples[1], PredictionConfig(samples=2))
-    answers = UNREFINED.load(sources).sample([replace(asked[0], trajectories=None), asked[1]])
+    requests = requests_for(samples[1], PredictionConfig(samples=2))
+    answers = UNREFINED.load(sources).sample([replace(requests[0], trajectories=None), requests[1]])
     assert isinstance(answers[0], LeftOut)
     assert "motion of an object" in answers[0].reason
     assert isinstance(answers[1], Clip)
@@ -160,17 +166,17 @@ def test_a_request_without_the_objects_motion_is_left_out_with_the_reason(
 def test_refinement_and_controls_change_the_hands_and_never_the_object(
     sources: Sources, samples: list[ClipSample]
 ) -> None:
-    asked = requests_for(samples[1], PredictionConfig(samples=1))
-    plain = UNREFINED.load(sources).sample(asked)[0]
+    requests = requests_for(samples[1], PredictionConfig(samples=1))
+    plain = UNREFINED.load(sources).sample(requests)[0]
     assert isinstance(plain, Clip)
     for family in (BIMART, ZERO_MAP, OTHER_OBJECT, OTHER_PATH):
-        made = family.load(sources).sample(asked)[0]
-        assert isinstance(made, Clip)
-        assert not same(plain, made)
-        np.testing.assert_array_equal(made.object.translation_m, plain.object.translation_m)
+        changed = family.load(sources).sample(requests)[0]
+        assert isinstance(changed, Clip)
+        assert not same(plain, changed)
+        np.testing.assert_array_equal(changed.object.translation_m, plain.object.translation_m)
 
 
-def test_networks_that_do_not_see_alike_are_refused(sources: Sources, annotated_root: Path, tmp_path: Path) -> None:
+def test_networks_with_different_features_are_refused(sources: Sources, annotated_root: Path, tmp_path: Path) -> None:
     features = {**PARAMS["network"]["features"], "keypoints": 21}
     params = {**PARAMS, "network": {**PARAMS["network"], "features": features}}
     train_network(
@@ -181,63 +187,85 @@ def test_networks_that_do_not_see_alike_are_refused(sources: Sources, annotated_
         HandsForPaths.load(replace(sources, checkpoints=tmp_path))
 
 
-def test_figures_from_inside_name_both_networks_and_the_best_of_ten_is_no_worse_than_the_mean(sources: Sources) -> None:
-    found = BIMART.diagnose(sources)
-    assert set(found) == {"bimart-contact", "bimart-motion"}
-    assert all(np.isfinite(value) and value > 0 for own in found.values() for value in own.values())
-    assert found["bimart-contact"]["best_of_10_mm"] <= found["bimart-contact"]["map_error_mm"]
+def test_diagnosed_metrics_are_positive_and_the_best_of_ten_maps_is_no_worse_than_the_mean(sources: Sources) -> None:
+    metrics = BIMART.diagnose(sources)
+    assert set(metrics) == {"bimart-contact", "bimart-motion"}
+    assert all(np.isfinite(value) and value > 0 for by_name in metrics.values() for value in by_name.values())
+    assert metrics["bimart-contact"]["best_of_10_mm"] <= metrics["bimart-contact"]["map_error_mm"]
 
 
-def test_lookups_place_training_hands_at_the_object(sources: Sources, annotated: AnnotatedStore) -> None:
+def test_retrieval_baselines_place_training_hands_at_the_object(sources: Sources, annotated: AnnotatedStore) -> None:
     train = HoiDataset(annotated, "train")
     sample = next(one for one in train if one.hand_type == "both")
-    asked = requests_for(sample, PredictionConfig(samples=1))
-    found = NEAREST_WINDOW.load(sources).sample(asked)[0]
-    mean = OBJECT_MEAN_POSE.load(sources).sample(asked)[0]
-    refined = NEAREST_REFINED.load(sources).sample(asked)[0]
-    assert isinstance(found, Clip)
+    requests = requests_for(sample, PredictionConfig(samples=1))
+    nearest = NEAREST_WINDOW.load(sources).sample(requests)[0]
+    mean = OBJECT_MEAN_POSE.load(sources).sample(requests)[0]
+    refined = NEAREST_REFINED.load(sources).sample(requests)[0]
+    assert isinstance(nearest, Clip)
     assert isinstance(mean, Clip)
     assert isinstance(refined, Clip)
     recorded = annotated.clip(sample.clip_id)
     for side in SIDES:  # a training clip is nearest to itself
-        np.testing.assert_allclose(found.hands[side].wrist_m, recorded.hands[side].wrist_m, atol=1e-4)
+        np.testing.assert_allclose(nearest.hands[side].wrist_m, recorded.hands[side].wrist_m, atol=1e-4)
         assert np.abs(mean.hands[side].wrist_m - recorded.hands[side].wrist_m).max() > 1e-3
-        # Refinement corrects depth and shaking of recorded hands; it does not take them elsewhere.
+        # Refinement corrects depth and jitter of recorded hands, by a few millimetres.
         assert np.abs(refined.hands[side].wrist_m - recorded.hands[side].wrist_m).max() < 0.03
 
 
 @pytest.mark.parametrize("family", [NEAREST_WINDOW, NEAREST_REFINED])
-def test_no_window_is_copied_in_which_a_hand_is_not_tracked(family, sources: Sources, annotated, monkeypatch) -> None:
+def test_windows_with_an_untracked_hand_are_not_copied(family, sources: Sources, annotated, monkeypatch) -> None:
     train = list(HoiDataset(annotated, "train"))
-    gaps = [replace(one, valid=one.valid & (np.arange(one.length) != 3)) for one in train]
-    monkeypatch.setattr("models.bimart.lookups.training_clips", lambda _: gaps)
-    (found,) = family.load(sources).sample(requests_for(train[0], PredictionConfig(samples=1)))
-    assert isinstance(found, LeftOut)
+    untracked = [replace(one, valid=one.valid & (np.arange(one.length) != 3)) for one in train]
+    monkeypatch.setattr("models.bimart.retrieval.training_clips", lambda _: untracked)
+    (answer,) = family.load(sources).sample(requests_for(train[0], PredictionConfig(samples=1)))
+    assert isinstance(answer, LeftOut)
 
 
 @pytest.mark.slow
-def test_two_windows_are_learnt_by_heart_to_5_mm(samples: list[ClipSample]) -> None:
+def test_two_windows_are_overfitted_to_5_mm(samples: list[ClipSample]) -> None:
     torch.manual_seed(0)
-    features = FeatureConfig(BasisSettings(32, nearest="surface"), 20, 24, "local", most_m=0.2, map_of="keypoints")
-    transformer = TransformerConfig(96, 2, 4, 192, 0.0, norm_first=True)
-    config = DenoiserConfig(features, transformer, (128,), "joint", True, 1000, 0.0, 0.05, 4, 0.2)
-    clips, network, loss = [recorded_clip(own, HANDS, features) for own in samples], MotionModel(config), LossConfig()
+    features = FeatureConfig(
+        basis=BasisSettings(32, nearest="surface"),
+        keypoints=20,
+        window_frames=24,
+        state="local",
+        contact_map_target="keypoints",
+        max_distance_m=0.2,
+    )
+    transformer = TransformerConfig(width=96, layers=2, heads=4, feed_forward=192, dropout=0.0, norm_first=True)
+    config = DenoiserConfig(
+        features=features,
+        transformer=transformer,
+        encoder=(128,),
+        latents="joint",
+        condition_on_hands=True,
+        diffusion_steps=1000,
+        position_dropout=0.0,
+        min_std_fraction=0.05,
+        knot_frames=4,
+        signal_scale=0.2,
+    )
+    clips, network, loss = (
+        [recorded_clip(sample, HANDS, features) for sample in samples],
+        MotionModel(config),
+        LossConfig(),
+    )
     learn_statistics(network, [(clip, 0) for clip in clips])
     target = targets_of(network, [(clip, 0) for clip in clips] * 8)
     optimiser, generator = torch.optim.AdamW(network.parameters(), lr=2e-3), torch.Generator().manual_seed(0)
     losses = []
     for step in range(STEPS):
         optimiser.param_groups[0]["lr"] = 2e-3 * (1 - step / STEPS)
-        found = window_losses(network, target, loss, generator)["total"]
+        loss_value = window_losses(network, target, loss, generator)["total"]
         optimiser.zero_grad()
-        found.backward()
+        loss_value.backward()
         optimiser.step()
-        losses.append(float(found.detach()))
+        losses.append(float(loss_value.detach()))
     model = BimArt(ContactModel(config).eval(), network.eval(), FAST, torch.device("cpu"))
     for clip, sample in zip(clips, samples, strict=True):
         scene = Scene.of(sample.object_model, sample.object[:24], features.basis)
         maps = clip.contact_m[:, :24].transpose(1, 0, 2).reshape(1, 24, -1).astype(np.float32)
-        made = model.make([ObjectPath(scene, clip.active_hands, 0)], torch.from_numpy(maps))[0]
-        wrong = np.linalg.norm(made.keypoints_m - clip.keypoints_m[:, :24], axis=-1)[clip.active_hands]
-        print(f"{1000 * wrong.mean():.2f} mm, loss {losses[0]:.3f} to {np.mean(losses[-20:]):.4f}")
-        assert wrong.mean() < 0.005
+        motion = model.sample_motions([SamplingTask(scene, clip.active_hands, 0)], torch.from_numpy(maps))[0]
+        error_m = np.linalg.norm(motion.keypoints_m - clip.keypoints_m[:, :24], axis=-1)[clip.active_hands]
+        print(f"{1000 * error_m.mean():.2f} mm, loss {losses[0]:.3f} to {np.mean(losses[-20:]):.4f}")
+        assert error_m.mean() < 0.005

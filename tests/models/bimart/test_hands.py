@@ -1,4 +1,4 @@
-"""Hands for a motion that was never recorded: repeatable, of the object as it was given, as files and a page."""
+"""Hands for an object motion without a recording: repeatable, with the given object, as files and a page."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -28,19 +28,25 @@ from tests.builders.objects import hinged_box
 pytestmark = pytest.mark.slow
 
 PAIR = load_embedded_hands()
-FEATURES = FeatureConfig(BasisSettings(16), keypoints=24, window=16, state="local", most_m=0.2)
-TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)
+FEATURES = FeatureConfig(BasisSettings(16), keypoints=24, window_frames=16, state="local", max_distance_m=0.2)
+TINY = DenoiserConfig(
+    FEATURES,
+    TransformerConfig(width=16, layers=1, heads=2, feed_forward=16, dropout=0.0),
+    (8,),
+    condition_on_hands=True,
+    position_dropout=0.0,
+)
 
 
 @pytest.fixture(scope="module")
 def sampler() -> HandsForPaths:
-    """Networks that have learnt nothing, whose hands are about the size of hands."""
+    """Untrained networks whose output has the size of hands."""
     torch.manual_seed(0)
     contact, motion = ContactModel(TINY), MotionModel(TINY)
     ids = hand_keypoints(PAIR.right, FEATURES.keypoints)
-    places = np.concatenate([PAIR[side].template_m[ids] + [0, 0, 0.03] for side in SIDES]).ravel()
+    points_m = np.concatenate([PAIR[side].template_m[ids] + [0, 0, 0.03] for side in SIDES]).ravel()
     with torch.no_grad():
-        motion.mean[: len(places)] = torch.from_numpy(places)
+        motion.mean[: len(points_m)] = torch.from_numpy(points_m)
         motion.scale.fill_(0.003)
         motion.keypoint_ids.copy_(torch.from_numpy(ids))
         contact.mean.fill_(0.02)
@@ -57,12 +63,12 @@ def path() -> ObjectPath:
 
 
 @pytest.fixture(scope="module")
-def made(sampler, path) -> list[MadeHands]:
+def motions(sampler, path) -> list[MadeHands]:
     return hands_for(sampler, path.track, MotionWish(seed=3, samples=2, words="box"))
 
 
-def test_the_object_moves_exactly_as_it_was_given_and_both_hands_have_every_frame(made, path):
-    for motion in made:
+def test_the_object_track_is_unchanged_and_both_hands_are_in_all_frames(motions, path):
+    for motion in motions:
         assert motion.clip.object is path.track
         assert motion.clip.object_words == "box"
         assert all(motion.clip.hands[side].valid.all() for side in SIDES)
@@ -70,16 +76,16 @@ def test_the_object_moves_exactly_as_it_was_given_and_both_hands_have_every_fram
 
 
 @pytest.mark.slow
-def test_a_motion_is_the_same_again_and_whatever_others_are_asked_for(sampler, path, made):
+def test_a_sample_is_repeatable_and_does_not_depend_on_the_number_of_samples(sampler, path, motions):
     alone = hands_for(sampler, path.track, MotionWish(seed=3))[0]
     for side in SIDES:
-        first, again, other = (motion.clip.hands[side] for motion in (made[0], alone, made[1]))
-        assert all(np.array_equal(getattr(first, name), getattr(again, name)) for name in first.PER_FRAME)
+        first, repeated, other = (motion.clip.hands[side] for motion in (motions[0], alone, motions[1]))
+        assert all(np.array_equal(getattr(first, name), getattr(repeated, name)) for name in first.PER_FRAME)
         assert not np.array_equal(first.wrist_m, other.wrist_m)
 
 
 @pytest.mark.slow
-def test_only_the_hand_that_was_asked_for_is_made(sampler, path):
+def test_only_the_requested_hand_is_sampled(sampler, path):
     left = hands_for(sampler, path.track, MotionWish(hand="left"))[0]
     assert left.clip.hands["left"].valid.all()
     assert not left.clip.hands["right"].valid.any()
@@ -88,32 +94,34 @@ def test_only_the_hand_that_was_asked_for_is_made(sampler, path):
     assert np.isinf(left.asked_m[1]).all()
 
 
-def test_how_the_contact_stands_is_measured_on_the_hands_themselves(made):
-    motion, index = made[0], surface_index(hinged_box())
-    thing = motion.clip.object
-    for row, side in enumerate(SIDES):
-        skin = track_vertices(motion.clip.hands[side], PAIR[side])
-        points = thing.points_in_world(motion.points.points_m, motion.points.part)
+def test_contact_measures_equal_those_of_the_hand_meshes(motions):
+    motion, index = motions[0], surface_index(hinged_box())
+    object_track = motion.clip.object
+    for side_index, side in enumerate(SIDES):
+        vertices_m = track_vertices(motion.clip.hands[side], PAIR[side])
+        points = object_track.points_in_world(motion.points.points_m, motion.points.part)
         frame = 20
-        assert motion.reached_m[row, frame] == pytest.approx(KDTree(skin[frame]).query(points[frame])[0], abs=1e-5)
-        seen = thing.world_from_object.inverse() @ skin.astype(np.float64)
-        distance = index.distance_m(seen, thing.hinge_rad).min(axis=1)
+        assert motion.reached_m[side_index, frame] == pytest.approx(
+            KDTree(vertices_m[frame]).query(points[frame])[0], abs=1e-5
+        )
+        vertices_object_m = object_track.world_from_object.inverse() @ vertices_m.astype(np.float64)
+        distance = index.distance_m(vertices_object_m, object_track.hinge_rad).min(axis=1)
         assert np.array_equal(motion.standing.touching[side], distance < 0.005)
     assert np.isfinite(motion.asked_m).sum() > 20
     assert motion.standing.deepest_m.max() < motion.standing_before.deepest_m.max()
 
 
-def test_too_short_a_motion_is_an_answer(sampler, path):
+def test_too_short_a_motion_is_bad_input(sampler, path):
     with pytest.raises(BadInput, match="give a longer motion"):
         hands_for(sampler, path.track.take(slice(0, 5)))
 
 
 @pytest.mark.slow
-def test_files_and_page_are_written_repeat_and_explain_every_array(made, path, tmp_path):
+def test_files_and_page_are_repeatable_and_each_array_is_documented(motions, path, tmp_path):
     def written(folder: str) -> list[Path]:
         digests = {"checkpoints/bimart-motion/model.safetensors": "ab" * 32}
         return write_hands(
-            tmp_path / folder, made, PAIR, path.steps, digests, [("object's motion", "a <script>")], ["so"]
+            tmp_path / folder, motions, PAIR, path.steps, digests, [("object's motion", "a <script>")], ["so"]
         )
 
     first, again = written("a"), written("b")

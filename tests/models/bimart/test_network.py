@@ -1,4 +1,4 @@
-"""Promises of BimArt's denoisers: sizes layer by layer, what is not there changes nothing, statistics, switches."""
+"""BimArt's denoisers: parameter counts, masked inputs have no effect, statistics, settings."""
 
 from dataclasses import fields, replace
 from typing import cast
@@ -8,13 +8,19 @@ import pytest
 import torch
 
 from hoidata.sensors.part_bps import BasisSettings
-from models.bimart.learning import Moments
 from models.bimart.network import ContactModel, Denoiser, DenoiserConfig, MotionModel, Windows, contact_channels
-from models.bimart.scene import FeatureConfig, Recorded, Scene, split_motion
+from models.bimart.scene import FeatureConfig, RecordedClip, Scene, split_motion
+from models.bimart.training import Moments
 from models.common.transformer import TransformerConfig
 
-FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window=8, state="local")
-TINY = DenoiserConfig(FEATURES, TransformerConfig(16, 1, 2, 16, 0.0), (8,), told=True, position_dropout=0.0)
+FEATURES = FeatureConfig(BasisSettings(3), keypoints=4, window_frames=8, state="local")
+TINY = DenoiserConfig(
+    FEATURES,
+    TransformerConfig(width=16, layers=1, heads=2, feed_forward=16, dropout=0.0),
+    (8,),
+    condition_on_hands=True,
+    position_dropout=0.0,
+)
 
 
 def linear(inputs: int, outputs: int) -> int:
@@ -26,12 +32,12 @@ def linear(inputs: int, outputs: int) -> int:
 )
 def test_parameters_at_paper_size_are_counted_layer_by_layer(kind, numbers: int, total: int) -> None:
     network = kind(DenoiserConfig())
-    latent = 256 if kind is MotionModel else 512  # half a token each of object and contact
+    latent = 256 if kind is MotionModel else 512  # object and contact share a token
     width, forward, scene = 512, 1024, 2 * 512 * 3 + 6 + 1
     block = (
         linear(width, 3 * width) + linear(width, width) + linear(width, forward) + linear(forward, width) + 4 * width
     )
-    wanted = {
+    expected = {
         "x_in": linear(numbers, width),
         "x_out": linear(width, numbers),
         "step_in": 2 * linear(width, width),
@@ -39,26 +45,35 @@ def test_parameters_at_paper_size_are_counted_layer_by_layer(kind, numbers: int,
         "encoder": 8 * block,
     }
     if kind is MotionModel:
-        wanted["contact_in"] = linear(2048, 1024) + linear(1024, 1024) + linear(1024, latent)
-        wanted["null"] = latent
-    found: dict[str, int] = {}
+        expected["contact_in"] = linear(2048, 1024) + linear(1024, 1024) + linear(1024, latent)
+        expected["null"] = latent
+    counts: dict[str, int] = {}
     for name, parameter in network.named_parameters():
-        own = name.split(".")[0]
-        found[own] = found.get(own, 0) + parameter.numel()
-    assert found == wanted
-    assert sum(found.values()) == total
+        module = name.split(".")[0]
+        counts[module] = counts.get(module, 0) + parameter.numel()
+    assert counts == expected
+    assert sum(counts.values()) == total
 
 
-def drawn(lengths: list[int], frames: int, seed: int = 0, config: DenoiserConfig = TINY) -> Windows:
+def random_windows(lengths: list[int], frames: int, seed: int = 0, config: DenoiserConfig = TINY) -> Windows:
     """Random windows of these lengths, padded to ``frames``; the second has no moving part and no left hand."""
-    draws, batch, places = torch.Generator().manual_seed(seed), len(lengths), config.features.places
-    there, hands = torch.ones(batch, places, dtype=torch.bool), torch.ones(batch, 2, dtype=torch.bool)
-    there[1:, : places // 2] = False
+    generator, batch, n_points = torch.Generator().manual_seed(seed), len(lengths), config.features.object_points
+    exists, hands = torch.ones(batch, n_points, dtype=torch.bool), torch.ones(batch, 2, dtype=torch.bool)
+    exists[1:, : n_points // 2] = False
     hands[1:, 0] = False
-    shape = (3 * places, config.features.scene_size - 3 * places - 1)
-    offset, state, contact = (torch.randn(batch, frames, n, generator=draws) for n in (*shape, 2 * places))
-    known = torch.arange(frames) < torch.tensor(lengths)[:, None]
-    return Windows(offset, state, torch.rand(batch, generator=draws), there, hands, known, contact)
+    shape = (3 * n_points, config.features.scene_size - 3 * n_points - 1)
+    offset, state, contact = (torch.randn(batch, frames, n, generator=generator) for n in (*shape, 2 * n_points))
+    frame_mask = torch.arange(frames) < torch.tensor(lengths)[:, None]
+    scale = torch.rand(batch, generator=generator)
+    return Windows(
+        basis_offset=offset,
+        state=state,
+        object_scale=scale,
+        point_exists=exists,
+        active_hands=hands,
+        frame_mask=frame_mask,
+        contact_m=contact,
+    )
 
 
 @pytest.fixture(params=[ContactModel, MotionModel])
@@ -67,60 +82,62 @@ def network(request: pytest.FixtureRequest) -> Denoiser:
     return request.param(TINY).eval()
 
 
-def made(network: Denoiser, windows: Windows, x: torch.Tensor) -> torch.Tensor:
+def predicted(network: Denoiser, windows: Windows, x: torch.Tensor) -> torch.Tensor:
     return network(x, torch.full((len(windows),), 399), windows).detach()
 
 
-def test_padding_and_what_stands_in_it_change_nothing(network: Denoiser) -> None:
-    windows, x = drawn([8, 5], 8), torch.randn(2, 8, len(network.mean))
-    whole = made(network, windows, x)
-    spoilt = {name: getattr(windows, name).clone() for name in ("offset", "state", "contact_m")}
-    for value in (*spoilt.values(), changed := x.clone()):
+def test_padding_has_no_effect(network: Denoiser) -> None:
+    windows, x = random_windows([8, 5], 8), torch.randn(2, 8, len(network.mean))
+    whole = predicted(network, windows, x)
+    corrupted = {name: getattr(windows, name).clone() for name in ("basis_offset", "state", "contact_m")}
+    for value in (*corrupted.values(), changed := x.clone()):
         value[1, 5:] = 1e3
-    torch.testing.assert_close(made(network, replace(windows, **spoilt), changed), whole)
+    torch.testing.assert_close(predicted(network, replace(windows, **corrupted), changed), whole)
     short = {item.name: getattr(windows, item.name)[1:] for item in fields(windows)}
-    short |= {name: short[name][:, :5] for name in ("offset", "state", "contact_m", "frames")}
-    torch.testing.assert_close(made(network, Windows(**short), x[1:, :5]), whole[1:, :5])
+    short |= {name: short[name][:, :5] for name in ("basis_offset", "state", "contact_m", "frame_mask")}
+    torch.testing.assert_close(predicted(network, Windows(**short), x[1:, :5]), whole[1:, :5])
     assert not whole[1, 5:].any()
 
 
-def test_a_hand_and_a_part_that_are_not_there_neither_enter_nor_are_made(network: Denoiser) -> None:
-    windows, x = drawn([8, 8], 8), torch.randn(2, 8, len(network.mean))
-    mask, whole = network.channel_mask(windows), made(network, windows, x)
+def test_an_inactive_hand_and_a_missing_part_have_no_effect_and_no_output(network: Denoiser) -> None:
+    windows, x = random_windows([8, 8], 8), torch.randn(2, 8, len(network.mean))
+    mask, whole = network.channel_mask(windows), predicted(network, windows, x)
     assert not whole[~mask].any()
-    spoilt = torch.where(mask, x, 1e3)
+    corrupted = torch.where(mask, x, 1e3)
     assert windows.contact_m is not None
     contact = torch.where(contact_channels(windows), windows.contact_m, 1e3)
-    offset = torch.where(windows.there.repeat_interleave(3, 1)[:, None], windows.offset, 1e3)
-    torch.testing.assert_close(made(network, replace(windows, contact_m=contact, offset=offset), spoilt), whole)
+    offset = torch.where(windows.point_exists.repeat_interleave(3, 1)[:, None], windows.basis_offset, 1e3)
+    torch.testing.assert_close(
+        predicted(network, replace(windows, contact_m=contact, basis_offset=offset), corrupted), whole
+    )
     assert mask[0].all()
     assert 0 < mask[1].float().mean() < 0.6
 
 
-def test_a_batch_of_windows_is_each_by_itself(network: Denoiser) -> None:
-    windows, x = drawn([8, 6], 8), torch.randn(2, 8, len(network.mean))
+def test_windows_of_a_batch_are_independent(network: Denoiser) -> None:
+    windows, x = random_windows([8, 6], 8), torch.randn(2, 8, len(network.mean))
     alone = {item.name: getattr(windows, item.name)[:1] for item in fields(windows)}
-    torch.testing.assert_close(made(network, Windows(**alone), x[:1]), made(network, windows, x)[:1])
+    torch.testing.assert_close(predicted(network, Windows(**alone), x[:1]), predicted(network, windows, x)[:1])
 
 
-def test_the_map_is_not_seen_where_it_is_dropped_and_the_contact_model_never_sees_one(network: Denoiser) -> None:
-    windows, x, steps = drawn([8, 8], 8), torch.randn(2, 8, len(network.mean)), torch.full((2,), 399)
+def test_a_dropped_contact_map_has_no_effect_and_the_contact_model_has_no_map(network: Denoiser) -> None:
+    windows, x, steps = random_windows([8, 8], 8), torch.randn(2, 8, len(network.mean)), torch.full((2,), 399)
     assert windows.contact_m is not None
     other = replace(windows, contact_m=windows.contact_m * 2)
-    both = [network(x, steps, own, torch.tensor([True, False])) for own in (windows, other)]
-    torch.testing.assert_close(both[0][0], both[1][0])
-    assert torch.equal(both[0][1], both[1][1]) == isinstance(network, ContactModel)
+    outputs = [network(x, steps, condition, torch.tensor([True, False])) for condition in (windows, other)]
+    torch.testing.assert_close(outputs[0][0], outputs[1][0])
+    assert torch.equal(outputs[0][1], outputs[1][1]) == isinstance(network, ContactModel)
 
 
 @pytest.mark.parametrize("change", [{"latents": "concatenate"}, {"latents": "joint"}, {"knot_frames": 4}])
-def test_every_kind_of_encoding_keeps_these_promises(change: dict) -> None:
+def test_the_same_holds_for_every_kind_of_encoding(change: dict) -> None:
     network = MotionModel(replace(TINY, **change)).eval()
-    test_padding_and_what_stands_in_it_change_nothing(network)
-    test_a_hand_and_a_part_that_are_not_there_neither_enter_nor_are_made(network)
-    test_the_map_is_not_seen_where_it_is_dropped_and_the_contact_model_never_sees_one(network)
+    test_padding_has_no_effect(network)
+    test_an_inactive_hand_and_a_missing_part_have_no_effect_and_no_output(network)
+    test_a_dropped_contact_map_has_no_effect_and_the_contact_model_has_no_map(network)
 
 
-def test_encoding_takes_the_statistics_and_the_scale_of_the_signal_and_goes_back() -> None:
+def test_encode_uses_the_statistics_and_the_signal_scale_and_decode_is_its_inverse() -> None:
     network = ContactModel(replace(TINY, signal_scale=0.2))
     network.mean.copy_(torch.arange(12.0))
     network.scale.copy_(torch.arange(1.0, 13))
@@ -129,28 +146,35 @@ def test_encoding_takes_the_statistics_and_the_scale_of_the_signal_and_goes_back
     torch.testing.assert_close(network.decode(network.encode(values)), values)
 
 
-def test_moments_are_of_what_is_known_alone() -> None:
-    draws = np.random.default_rng(0)
-    values, known = draws.normal(2, 3, (40, 3)), draws.random((40, 3)) < 0.7
-    known[:, 2] = False
+def test_moments_are_those_of_the_known_values() -> None:
+    rng = np.random.default_rng(0)
+    values, mask = rng.normal(2, 3, (40, 3)), rng.random((40, 3)) < 0.7
+    mask[:, 2] = False
     moments = Moments(3)
     for rows in (slice(0, 25), slice(25, None)):
-        moments.add(torch.from_numpy(values[None, rows]), torch.from_numpy(known[None, rows]))
-    mean, spread = (found.numpy() for found in moments.found())
+        moments.add(torch.from_numpy(values[None, rows]), torch.from_numpy(mask[None, rows]))
+    mean, std = (tensor.numpy() for tensor in moments.mean_and_std())
     for column in range(2):
-        own = values[known[:, column], column]
-        np.testing.assert_allclose((mean[column], spread[column]), (own.mean(), own.std()), rtol=1e-9)
-    assert (mean[2], spread[2]) == (0, 1)
+        values_known = values[mask[:, column], column]
+        np.testing.assert_allclose((mean[column], std[column]), (values_known.mean(), values_known.std()), rtol=1e-9)
+    assert (mean[2], std[2]) == (0, 1)
 
 
 def test_a_motion_is_keypoints_left_and_right_then_vectors_to_the_object_left_and_right() -> None:
-    draws, features = np.random.default_rng(0), FeatureConfig(keypoints=4)
-    points, vectors = draws.normal(size=(2, 2, 3, 4, 3))
-    rows = Recorded(cast(Scene, None), vectors, points, vectors, vectors, vectors).motion
-    wanted = [points[0, 1].ravel(), points[1, 1].ravel(), vectors[0, 1].ravel(), vectors[1, 1].ravel()]
-    np.testing.assert_array_equal(rows[1], np.concatenate(wanted))
+    rng, features = np.random.default_rng(0), FeatureConfig(keypoints=4)
+    points, vectors = rng.normal(size=(2, 2, 3, 4, 3))
+    rows = RecordedClip(
+        scene=cast(Scene, None),
+        contact_m=vectors,
+        keypoints_m=points,
+        to_object_m=vectors,
+        present=vectors,
+        active_hands=vectors,
+    ).motion
+    expected = [points[0, 1].ravel(), points[1, 1].ravel(), vectors[0, 1].ravel(), vectors[1, 1].ravel()]
+    np.testing.assert_array_equal(rows[1], np.concatenate(expected))
     assert rows.shape == (3, features.motion_size)
-    for own, back in zip((points, vectors), split_motion(rows), strict=True):
-        np.testing.assert_array_equal(back, own)
-    left = features.of_hands(torch.tensor([True, False])).numpy()
-    np.testing.assert_array_equal(rows[1][left], np.concatenate((wanted[0], wanted[2])))
+    for array, restored in zip((points, vectors), split_motion(rows), strict=True):
+        np.testing.assert_array_equal(restored, array)
+    left = features.spread_over_motion(torch.tensor([True, False])).numpy()
+    np.testing.assert_array_equal(rows[1][left], np.concatenate((expected[0], expected[2])))

@@ -1,4 +1,4 @@
-"""Promises of animated frames of a clip in which the tracking lost a hand: what a track says there is never used."""
+"""Animated frames of a clip with an untracked hand: the track's values in untracked frames are never used."""
 
 import numpy as np
 import pytest
@@ -10,45 +10,45 @@ from tests.builders.clips import build_clip, random_hand, with_hand
 FRAMES = 40
 
 
-def lost(seen: np.ndarray) -> HandTrack:
-    """A hand that was lost in the other frames, whose arrays are zero there."""
+def partly_tracked_hand(tracked: np.ndarray) -> HandTrack:
+    """A hand that is untracked in the other frames, where its arrays are zero."""
     hand = random_hand(FRAMES, seed=1)
     for array in (hand.wrist_m, hand.global_orient, hand.hand_pose):
-        array[~seen] = 0
-    hand.valid[:] = seen
+        array[~tracked] = 0
+    hand.valid[:] = tracked
     return hand
 
 
-def test_the_poses_beside_frames_are_the_nearest_ones_that_were_seen() -> None:
-    seen = np.ones(FRAMES, bool)
-    seen[8:12], seen[20:23] = False, False
-    track = lost(seen)
+def test_the_poses_around_a_gap_are_the_nearest_tracked_ones() -> None:
+    tracked = np.ones(FRAMES, bool)
+    tracked[8:12], tracked[20:23] = False, False
+    track = partly_tracked_hand(tracked)
     gap = gap_of(track, slice(12, 20))
     whole = gap_of(track, slice(0, FRAMES))
     assert (gap.first, gap.stop) == (8, 23)
     assert gap.before is not None
     assert gap.after is not None
-    known = gap_of(random_hand(FRAMES, seed=1), slice(8, 23))
-    np.testing.assert_array_equal([gap.before, gap.after], [known.before, known.after])
+    expected = gap_of(random_hand(FRAMES, seed=1), slice(8, 23))
+    np.testing.assert_array_equal([gap.before, gap.after], [expected.before, expected.after])
     assert (whole.first, whole.stop, whole.before, whole.after) == (0, FRAMES, None, None)
-    assert gap_of(lost(np.arange(FRAMES) >= 20), slice(5, 10)).before is None
+    assert gap_of(partly_tracked_hand(np.arange(FRAMES) >= 20), slice(5, 10)).before is None
 
 
-def test_a_lost_wrist_is_where_it_was_seen_nearest_and_a_seen_one_stays_to_the_bit() -> None:
-    seen = np.ones(FRAMES, bool)
-    seen[10:20] = False
-    clip = with_hand(build_clip(FRAMES), "right", **vars(lost(seen)))
+def test_an_untracked_wrist_has_its_nearest_tracked_pose_and_a_tracked_wrist_is_unchanged() -> None:
+    tracked = np.ones(FRAMES, bool)
+    tracked[10:20] = False
+    clip = with_hand(build_clip(FRAMES), "right", **vars(partly_tracked_hand(tracked)))
     track, frames = clip.hands["right"], slice(5, 25)
-    made = with_fingers(track, frames, np.tile(np.eye(3), (20, 15, 1, 1)), clip_control(clip).wrists["right"])
+    filled = with_fingers(track, frames, np.tile(np.eye(3), (20, 15, 1, 1)), clip_control(clip).wrists["right"])
     nearest = np.array([9] * 5 + [20] * 5)
-    np.testing.assert_allclose(made.wrist_m[10:20], track.wrist_m[nearest], atol=1e-6)
-    np.testing.assert_array_equal(made.wrist_m[seen], track.wrist_m[seen])
-    np.testing.assert_array_equal(made.global_orient[seen], track.global_orient[seen])
-    assert np.abs(made.global_orient[10:20]).min() > 0
-    assert made.valid.all()
+    np.testing.assert_allclose(filled.wrist_m[10:20], track.wrist_m[nearest], atol=1e-6)
+    np.testing.assert_array_equal(filled.wrist_m[tracked], track.wrist_m[tracked])
+    np.testing.assert_array_equal(filled.global_orient[tracked], track.global_orient[tracked])
+    assert np.abs(filled.global_orient[10:20]).min() > 0
+    assert filled.valid.all()
 
 
-def test_up_to_two_seconds_between_known_poses_is_a_short_gap() -> None:
+def test_a_gap_of_up_to_two_seconds_between_known_poses_is_short() -> None:
     track = random_hand(90)
     assert gap_of(track, slice(5, 65)).is_short
     assert not gap_of(track, slice(5, 66)).is_short

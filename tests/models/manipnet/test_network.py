@@ -1,4 +1,4 @@
-"""Promises of ManipNet's network: the paper's layers."""
+"""ManipNet's network has the paper's layers."""
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ SMALL = NetworkConfig(pose=6, trajectory=5, sensors=7, output=4, encoder=8)
 
 
 def numpy_block(block: DenseBlock, a: np.ndarray) -> np.ndarray:
-    """Sec. 6.2 as it is printed, for an input that has been through its ReLU."""
+    """Sec. 6.2 as printed, for an input after its ReLU."""
     state = {name: value.double().numpy() for name, value in block.state_dict().items()}
     h1 = a @ state["first.weight"].T + state["first.bias"] + a
     r = np.where(h1 > 0, h1, 0)
@@ -32,7 +32,7 @@ def test_the_block_is_the_printed_equation() -> None:
 
 def test_the_network_is_the_printed_one() -> None:
     torch.manual_seed(0)
-    network = ManipNet(NetworkConfig(6, 5, 7, 4, 8)).eval()
+    network = ManipNet(NetworkConfig(pose=6, trajectory=5, sensors=7, output=4, joints=8)).eval()
     network.learn_normalisation(
         torch.randn(50, 18) * 3 + 1, torch.randn(50, 4) * 2 - 1, (torch.zeros(18), torch.zeros(4))
     )
@@ -51,22 +51,24 @@ def test_the_network_is_the_printed_one() -> None:
     assert np.allclose(network(inputs).detach().numpy(), expected, atol=1e-5)
 
 
-def test_every_linear_layer_loses_inputs_in_training() -> None:
-    network, seen = ManipNet(SMALL).train(), []
+def test_dropout_acts_on_the_inputs_of_every_linear_layer() -> None:
+    network, zero_fractions = ManipNet(SMALL).train(), []
     for layer in network.modules():
         if isinstance(layer, torch.nn.Linear):
-            layer.register_forward_pre_hook(lambda layer, given: seen.append((given[0] == 0).float().mean()))
+            layer.register_forward_pre_hook(
+                lambda layer, inputs: zero_fractions.append((inputs[0] == 0).float().mean())
+            )
     network.normalised(torch.randn(4000, 18))
-    # Three encoders lose 30 %; behind a ReLU it is more.
-    assert len(seen) == 8
-    assert min(seen) > 0.28
-    assert max(seen[:3]) < 0.32
+    # Dropout removes 30 % of the encoders' inputs; after a ReLU there are more zeros.
+    assert len(zero_fractions) == 8
+    assert min(zero_fractions) > 0.28
+    assert max(zero_fractions[:3]) < 0.32
 
 
-def test_a_number_that_hardly_varies_is_scaled_by_the_floor() -> None:
+def test_an_input_that_hardly_varies_is_scaled_by_the_floor() -> None:
     network = ManipNet(SMALL)
-    rows = torch.randn(100, 18)
-    rows[:, 3] = 0.5 + 1e-4 * rows[:, 3]
-    network.learn_normalisation(rows, torch.randn(100, 4), (torch.full((18,), 0.05), torch.zeros(4)))
+    inputs = torch.randn(100, 18)
+    inputs[:, 3] = 0.5 + 1e-4 * inputs[:, 3]
+    network.learn_normalisation(inputs, torch.randn(100, 4), (torch.full((18,), 0.05), torch.zeros(4)))
     assert network.input_scale[3] == 0.05
     assert network.input_scale[4] > 0.5

@@ -1,4 +1,4 @@
-"""Promises of the readers of trajectories, and of what is said when they cannot be meant."""
+"""Readers of trajectory files, and the remedies for implausible ones."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +13,7 @@ from hoidata.errors import BadInput
 from hoidata.hands import load_embedded_hands
 from hoidata.objects.user_mesh import UNITS_M
 from hoidata.sensors.mano_hand import mano_hand
-from models.manipnet.animate import at_30_fps, given_control, interpolated, led
+from models.manipnet.animate import at_30_fps, blend_ends, given_control, interpolated
 from models.manipnet.control import Control, Motion
 from models.manipnet.plausible import reading
 from models.manipnet.trajectory_files import PARTS, Axes, parse_csv, parse_manipnet, read_trajectories
@@ -28,34 +28,40 @@ WORLD = Rotation.from_rotvec([-1.3, -0.6, 0.0])
 def table(
     scale: float = 1.0, order: str = "wxyz", step: float = 1 / 30, away_m: float = 0.0, world: Rotation = WORLD
 ) -> str:
-    """A right hand that moves with a box it holds, turned so that fingers and palm look to it."""
-    looks = HANDS["right"].wrist_from_canonical
+    """A CSV table of a right hand that grasps a moving box, with fingers and palm facing it."""
+    wrist_from_canonical = HANDS["right"].wrist_from_canonical
     # Canonical x (fingers) to -y of the world, canonical z (back of the hand) to +z; the palm above the box.
     world_from_canonical = np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]])
-    wrist = Rotation.from_matrix(world_from_canonical @ looks.T)
+    wrist = Rotation.from_matrix(world_from_canonical @ wrist_from_canonical.T)
     names = "time_s," + ",".join(f"{body}_{p}" for body in ("object", "right") for p in PARTS)
     lines = [names]
     for frame in range(FRAMES):
-        thing = np.array([0.01 * frame, 0, 0.5])
-        hand = thing + np.array([0.0, 0.08 + away_m, 0.07])
-        turn = [Rotation.from_rotvec([0, 0, 0.02 * frame]), wrist]
-        # The whole scene turned: quaternions that say the same in any order would be no test of it.
-        thing, hand, turn = world.apply(thing), world.apply(hand), [world * one for one in turn]
-        quaternions = [one.as_quat() if order == "xyzw" else one.as_quat()[[3, 0, 1, 2]] for one in turn]
-        numbers = [frame * step, *thing * scale, *quaternions[0], *hand * scale, *quaternions[1]]
+        object_m = np.array([0.01 * frame, 0, 0.5])
+        wrist_m = object_m + np.array([0.0, 0.08 + away_m, 0.07])
+        rotations = [Rotation.from_rotvec([0, 0, 0.02 * frame]), wrist]
+        # The scene is rotated, so that quaternions with permuted components differ.
+        object_m, wrist_m, rotations = (
+            world.apply(object_m),
+            world.apply(wrist_m),
+            [world * rotation for rotation in rotations],
+        )
+        quaternions = [
+            rotation.as_quat() if order == "xyzw" else rotation.as_quat()[[3, 0, 1, 2]] for rotation in rotations
+        ]
+        numbers = [frame * step, *object_m * scale, *quaternions[0], *wrist_m * scale, *quaternions[1]]
         lines.append(",".join(f"{number:.9g}" for number in numbers))
     return "\n".join(lines)
 
 
 def trajectory_tables() -> list[bytes]:
-    """A table that is good, then one of every kind that is refused."""
+    """A valid table, a valid one with a hinge, then one table for each reason of refusal."""
     names = ["time_s", *(f"{body}_{part}" for body in ("object", "right") for part in PARTS)]
-    row = "0,0,0,1,0,0,0,0.1,0,0,1,0,0,0"
-    good = [",".join(names), *(f"{number / 30:.4f},{row}" for number in range(4))]
+    pose_columns = "0,0,0,1,0,0,0,0.1,0,0,1,0,0,0"
+    good = [",".join(names), *(f"{number / 30:.4f},{pose_columns}" for number in range(4))]
     hinged = [good[0] + ",hinge_rad", *(line + ",0.5" for line in good[1:])]
-    late = [good[0], *(f"{step},{row}" for step in (0, 33, 66, 100))]
-    frames = [good[0], *(f"{step},{row}" for step in range(4))]
-    falling = [good[0], *(f"{step},{row}" for step in (0, 0.1, 0.05))]
+    late = [good[0], *(f"{step},{pose_columns}" for step in (0, 33, 66, 100))]
+    frames = [good[0], *(f"{step},{pose_columns}" for step in range(4))]
+    falling = [good[0], *(f"{step},{pose_columns}" for step in (0, 0.1, 0.05))]
     changed = [
         *("\n".join(good).replace(old, new) for old, new in ((",1,0,0,0,0.1", ",2,0,0,0,0.1"), ("0.0333", "x"))),
         *("\n".join(good).replace(old, new) for old, new in (("0.0333", "nan"), ("right_qz", "right_q"))),
@@ -70,7 +76,7 @@ def trajectory_tables() -> list[bytes]:
     ]
 
 
-def given(text: str, model=BOX, unit: str = "m", axes: Axes = "model"):
+def checked_control(text: str, model=BOX, unit: str = "m", axes: Axes = "model"):
     return given_control(replace(parse_csv(text.encode(), "mine.csv", unit), axes=axes), model, HANDS)
 
 
@@ -79,46 +85,46 @@ def with_last_time(time_s: str) -> str:
     return "\n".join([*lines, ",".join([time_s, *last.split(",")[1:]])])
 
 
-def test_a_table_is_read_as_it_is_written_in_any_order_of_columns() -> None:
-    found = parse_csv(table().encode(), "mine.csv")
-    np.testing.assert_allclose(found.time_s, np.arange(FRAMES) / 30, atol=1e-8)
-    np.testing.assert_allclose(found.thing.position_m[3], WORLD.apply([0.03, 0, 0.5]), atol=1e-8)
-    turn = (WORLD * Rotation.from_rotvec([0, 0, 0.06])).as_matrix()
-    np.testing.assert_allclose(found.thing.rotmats[3], turn, atol=1e-8)
+def test_a_table_is_read_with_its_columns_in_any_order() -> None:
+    trajectories = parse_csv(table().encode(), "mine.csv")
+    np.testing.assert_allclose(trajectories.time_s, np.arange(FRAMES) / 30, atol=1e-8)
+    np.testing.assert_allclose(trajectories.object_body.position_m[3], WORLD.apply([0.03, 0, 0.5]), atol=1e-8)
+    rotmat = (WORLD * Rotation.from_rotvec([0, 0, 0.06])).as_matrix()
+    np.testing.assert_allclose(trajectories.object_body.rotmats[3], rotmat, atol=1e-8)
     columns = np.array([line.split(",") for line in table().splitlines()])
     shuffled = "\n".join(",".join(row) for row in columns[:, np.random.default_rng(0).permutation(15)])
-    again = parse_csv(shuffled.encode(), "mine.csv")
-    np.testing.assert_array_equal(again.wrists["right"].rotmats, found.wrists["right"].rotmats)
-    assert given(table()).active == ["right"]
+    from_shuffled = parse_csv(shuffled.encode(), "mine.csv")
+    np.testing.assert_array_equal(from_shuffled.wrists["right"].rotmats, trajectories.wrists["right"].rotmats)
+    assert checked_control(table()).active == ["right"]
 
 
-def test_npz_and_csv_say_the_same_and_units_are_metres_afterwards(tmp_path: Path) -> None:
-    found = parse_csv(table().encode(), "mine.csv")
-    quaternion = Rotation.from_matrix(found.wrists["right"].rotmats).as_quat()[:, [3, 0, 1, 2]]
-    thing = Rotation.from_matrix(found.thing.rotmats).as_quat()[:, [3, 0, 1, 2]]
+def test_npz_and_csv_give_the_same_trajectories_in_metres(tmp_path: Path) -> None:
+    from_csv = parse_csv(table().encode(), "mine.csv")
+    quaternion = Rotation.from_matrix(from_csv.wrists["right"].rotmats).as_quat()[:, [3, 0, 1, 2]]
+    object_quaternion = Rotation.from_matrix(from_csv.object_body.rotmats).as_quat()[:, [3, 0, 1, 2]]
     np.savez(
         tmp_path / "mine.npz",
-        time_s=found.time_s,
-        object_position=1000 * found.thing.position_m,
-        object_quaternion=thing,
-        right_position=1000 * found.wrists["right"].position_m,
+        time_s=from_csv.time_s,
+        object_position=1000 * from_csv.object_body.position_m,
+        object_quaternion=object_quaternion,
+        right_position=1000 * from_csv.wrists["right"].position_m,
         right_quaternion=quaternion,
     )
-    again = read_trajectories(tmp_path / "mine.npz", "mm")
-    np.testing.assert_allclose(again.wrists["right"].position_m, found.wrists["right"].position_m, atol=1e-12)
-    np.testing.assert_allclose(again.thing.rotmats, found.thing.rotmats, atol=1e-9)
+    from_npz = read_trajectories(tmp_path / "mine.npz", "mm")
+    np.testing.assert_allclose(from_npz.wrists["right"].position_m, from_csv.wrists["right"].position_m, atol=1e-12)
+    np.testing.assert_allclose(from_npz.object_body.rotmats, from_csv.object_body.rotmats, atol=1e-9)
 
 
-def test_manipnets_text_is_seen_in_the_mirror_in_metres_at_the_box_centre() -> None:
-    turn = Rotation.from_rotvec([0.3, -0.2, 0.5])
-    row = ",".join(map(str, [*turn.as_quat(), 1.0, 2.0, 3.0]))
-    found = parse_manipnet("\n".join(["120", *[",".join([row, row, row])] * 4]).encode(), "demo.txt")
+def test_manipnets_text_is_mirrored_and_converted_to_metres_at_the_box_centre() -> None:
+    rotation = Rotation.from_rotvec([0.3, -0.2, 0.5])
+    row = ",".join(map(str, [*rotation.as_quat(), 1.0, 2.0, 3.0]))
+    trajectories = parse_manipnet("\n".join(["120", *[",".join([row, row, row])] * 4]).encode(), "demo.txt")
     flip = np.diag([-1.0, 1, 1])
-    np.testing.assert_allclose(found.thing.position_m[0], [-0.1, 0.2, 0.3])
-    np.testing.assert_allclose(found.wrists["left"].rotmats[0], flip @ turn.as_matrix() @ flip, atol=1e-12)
-    assert (found.axes, found.at_box, found.up) == ("canonical", True, (0.0, 1.0, 0.0))
-    assert (found.mesh_unit, parse_csv(table().encode(), "mine.csv").mesh_unit) == ("dm", "")
-    np.testing.assert_allclose(np.diff(found.time_s), 1 / 120)
+    np.testing.assert_allclose(trajectories.object_body.position_m[0], [-0.1, 0.2, 0.3])
+    np.testing.assert_allclose(trajectories.wrists["left"].rotmats[0], flip @ rotation.as_matrix() @ flip, atol=1e-12)
+    assert (trajectories.axes, trajectories.at_box, trajectories.up) == ("canonical", True, (0.0, 1.0, 0.0))
+    assert (trajectories.mesh_unit, parse_csv(table().encode(), "mine.csv").mesh_unit) == ("dm", "")
+    np.testing.assert_allclose(np.diff(trajectories.time_s), 1 / 120)
 
 
 @pytest.mark.parametrize(
@@ -136,38 +142,38 @@ def test_manipnets_text_is_seen_in_the_mirror_in_metres_at_the_box_centre() -> N
         (with_last_time("3600"), "3599.87 s after row 5; cut the file there"),
     ],
 )
-def test_what_cannot_be_meant_is_told_with_a_remedy(text: str, words: str) -> None:
+def test_an_implausible_table_is_refused_with_a_remedy(text: str, words: str) -> None:
     with pytest.raises(BadInput, match=words):
-        given(text)
+        checked_control(text)
 
 
-@pytest.mark.parametrize("told", ["m", "cm", "mm", "dm"])
-@pytest.mark.parametrize("meant", ["m", "cm", "mm"])
-def test_the_unit_that_was_meant_is_named_whichever_was_told(meant: str, told: str) -> None:
-    text = table(scale=1 / UNITS_M[meant])
-    if told == meant:
-        assert given(text, unit=told).active == ["right"]
+@pytest.mark.parametrize("given_unit", ["m", "cm", "mm", "dm"])
+@pytest.mark.parametrize("true_unit", ["m", "cm", "mm"])
+def test_the_correct_unit_is_named_for_each_wrong_one(true_unit: str, given_unit: str) -> None:
+    text = table(scale=1 / UNITS_M[true_unit])
+    if given_unit == true_unit:
+        assert checked_control(text, unit=given_unit).active == ["right"]
         return
     with pytest.raises(BadInput) as refused:
-        given(text, unit=told)
-    assert refused.value.remedy.endswith(f"--trajectory-unit {meant}")
+        checked_control(text, unit=given_unit)
+    assert refused.value.remedy.endswith(f"--trajectory-unit {true_unit}")
 
 
-def test_a_wrist_in_the_hollow_of_a_mug_cannot_be_meant() -> None:
+def test_a_wrist_in_the_hollow_of_a_mug_is_refused() -> None:
     rings = [trimesh.creation.annulus(0.045, 0.05, 0.1), trimesh.creation.cylinder(0.045, 0.005)]
     mug = model_of(trimesh.util.concatenate(rings), "mug")
     inside = reading(parse_csv(table(scale=0.01).encode(), "mine.csv"), mug, HANDS)
     assert inside.nearest_m["right"] < 0.12
     with pytest.raises(BadInput, match=r"a wrist at least 1.5 cm off mug"):
-        given(table(scale=0.01), mug)
+        checked_control(table(scale=0.01), mug)
 
 
-def test_the_other_axes_of_the_wrist_are_named_where_they_alone_would_do() -> None:
+def test_the_other_wrist_axes_are_named_if_only_they_are_plausible() -> None:
     with pytest.raises(BadInput, match="--wrist-axes model"):
-        given(table(), axes="canonical")
+        checked_control(table(), axes="canonical")
 
 
-def test_files_that_are_no_trajectories_are_told_by_their_ending(tmp_path: Path) -> None:
+def test_files_of_other_formats_are_refused_by_their_suffix(tmp_path: Path) -> None:
     for name, words in (("demo1.txt.gz", "gunzip --keep"), ("mine.cvs", r"\.csv, \.npz, \.txt")):
         (tmp_path / name).write_bytes(b"1")
         with pytest.raises(BadInput, match=words):
@@ -177,30 +183,30 @@ def test_files_that_are_no_trajectories_are_told_by_their_ending(tmp_path: Path)
         read_trajectories(tmp_path / "demo.txt", "cm")
 
 
-def test_too_many_frames_at_30_per_second_are_refused_before_they_are_made() -> None:
+def test_too_many_frames_at_30_per_second_are_refused() -> None:
     times = np.linspace(0, 1e9, 3)
     still = Motion(times, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
     with pytest.raises(BadInput, match="at most 200000 frames"):
         at_30_fps(Control(dict.fromkeys(SIDES, still), still, BOX))
 
 
-def test_w_last_is_refused_in_nearly_every_world_and_w_first_in_none() -> None:
+def test_quaternions_with_w_last_are_refused_in_nearly_every_world_and_w_first_in_none() -> None:
     refused = []
     for world in Rotation.from_quat(np.random.default_rng(0).normal(size=(20, 4))):
-        assert given(table(world=world)).active == ["right"]
+        assert checked_control(table(world=world)).active == ["right"]
         try:
-            given(table(order="xyzw", world=world))
+            checked_control(table(order="xyzw", world=world))
         except BadInput as error:
             refused.append("put w first" in error.remedy)
-    assert sum(refused) >= 19  # of many worlds 99 %: in some the hand that is not meant holds the object as well
+    assert sum(refused) >= 19  # 99 % of random worlds: in a few the wrong reading is a plausible grasp too
 
 
-def test_a_hinged_object_needs_angles_and_an_open_mesh_is_said_to_have_no_inside() -> None:
+def test_a_hinged_object_needs_angles_and_an_open_mesh_gives_a_note() -> None:
     with pytest.raises(BadInput, match="hinge_rad"):
-        given(table(), notebook(0.02))
+        checked_control(table(), notebook(0.02))
     sheet = box_model((0.06, 0.06, 0.1))
     faces = sheet.faces[:6]
-    noted = given(table(), type(sheet)("sheet", sheet.vertices_m, faces, sheet.part))
+    noted = checked_control(table(), type(sheet)("sheet", sheet.vertices_m, faces, sheet.part))
     assert any("no inside" in note for note in noted.notes)
 
 
@@ -209,19 +215,19 @@ def test_angles_of_a_hinge_need_a_mesh_with_one_unless_they_are_all_zero(angle) 
     head, *rows = table().splitlines()
     text = "\n".join([f"{head},hinge_rad", *(f"{row},{angle}" for row in rows)])
     if angle == "0":
-        assert given(text).active == ["right"]
+        assert checked_control(text).active == ["right"]
         return
-    with pytest.raises(BadInput, match=r"which is rigid; tell the hinge of a two-piece mesh \(--hinge"):
-        given(text)
+    with pytest.raises(BadInput, match=r"which is rigid; give the hinge of a two-piece mesh \(--hinge"):
+        checked_control(text)
 
 
-def test_an_object_that_swallows_the_hand_is_refused_and_a_palm_on_its_surface_is_not() -> None:
-    given(table(), box_model((0.06, 0.06, 0.12)))  # the palm a centimetre in it, as a crude mesh may have it
+def test_an_object_around_the_hand_is_refused_and_a_palm_on_its_surface_is_not() -> None:
+    checked_control(table(), box_model((0.06, 0.06, 0.12)))  # the palm is 1 cm inside, as with a coarse mesh
     with pytest.raises(BadInput, match=r"palm inside it in 100 %.*--unit"):
-        given(table(), box_model((0.6, 0.6, 1.0)))
+        checked_control(table(), box_model((0.6, 0.6, 1.0)))
 
 
-def test_every_damaged_table_is_refused_and_the_good_ones_are_not() -> None:
+def test_damaged_tables_are_refused_and_valid_tables_are_not() -> None:
     good, hinged, *bad = trajectory_tables()
     assert parse_csv(good, "a.csv").hinge_rad is None
     assert parse_csv(hinged, "a.csv").hinge_rad is not None
@@ -230,21 +236,21 @@ def test_every_damaged_table_is_refused_and_the_good_ones_are_not() -> None:
             parse_csv(data, "a.csv")
 
 
-def test_a_gap_is_led_from_and_to_where_the_recording_goes_on() -> None:
-    draws = np.random.default_rng(0)
-    made = Rotation.from_rotvec(draws.normal(0, 0.3, (20 * 15, 3))).as_matrix().reshape(20, 15, 3, 3)
-    start, goal = Rotation.from_rotvec(draws.normal(0, 0.3, (30, 3))).as_matrix().reshape(2, 15, 3, 3)
+def test_a_gap_is_blended_to_the_poses_before_and_after_it() -> None:
+    rng = np.random.default_rng(0)
+    predicted = Rotation.from_rotvec(rng.normal(0, 0.3, (20 * 15, 3))).as_matrix().reshape(20, 15, 3, 3)
+    start, goal = Rotation.from_rotvec(rng.normal(0, 0.3, (30, 3))).as_matrix().reshape(2, 15, 3, 3)
 
     def angles(one: np.ndarray, other: np.ndarray) -> np.ndarray:
         return Rotation.from_matrix(np.swapaxes(one, -1, -2).reshape(-1, 3, 3) @ other.reshape(-1, 3, 3)).magnitude()
 
-    both = led(made, start, goal, 8)
-    np.testing.assert_allclose(both[7:13], made[7:13], atol=1e-9)
-    assert angles(both[0], start).max() < 0.15 * angles(made[0], start).max()
-    assert angles(both[-1], goal).max() < 0.15 * angles(made[-1], goal).max()
-    np.testing.assert_allclose(led(made, None, goal, 8)[:13], made[:13], atol=1e-9)
-    np.testing.assert_array_equal(led(made, None, None, 8), made)
-    between = interpolated(made[0], goal, 3)
-    angle = Rotation.from_matrix(made[0, 4].T @ goal[4]).magnitude()
-    steps = [Rotation.from_matrix(made[0, 4].T @ pose[4]).magnitude() / angle for pose in between]
+    blended = blend_ends(predicted, start, goal, 8)
+    np.testing.assert_allclose(blended[7:13], predicted[7:13], atol=1e-9)
+    assert angles(blended[0], start).max() < 0.15 * angles(predicted[0], start).max()
+    assert angles(blended[-1], goal).max() < 0.15 * angles(predicted[-1], goal).max()
+    np.testing.assert_allclose(blend_ends(predicted, None, goal, 8)[:13], predicted[:13], atol=1e-9)
+    np.testing.assert_array_equal(blend_ends(predicted, None, None, 8), predicted)
+    between = interpolated(predicted[0], goal, 3)
+    angle = Rotation.from_matrix(predicted[0, 4].T @ goal[4]).magnitude()
+    steps = [Rotation.from_matrix(predicted[0, 4].T @ pose[4]).magnitude() / angle for pose in between]
     np.testing.assert_allclose(steps, [0.25, 0.5, 0.75], atol=1e-6)

@@ -1,4 +1,4 @@
-"""Inputs that fuzzing found, each of which once ended in something else than a clear error."""
+"""Regression tests of inputs found by fuzzing: each must raise a clear error."""
 
 import io
 import json
@@ -36,10 +36,10 @@ def shaped(shape: str, descr: str = "<f8") -> bytes:
     return npy(f"{{'descr': '{descr}', 'fortran_order': False, 'shape': {shape}}}\n")
 
 
-def patched(data: bytes, mark: bytes, at: int, new: bytes) -> bytes:
-    """Bytes overwritten at a place counted from the last mark (PK12: of the zip's directory)."""
-    place = data.rindex(mark) + at
-    return data[:place] + new + data[place + len(new) :]
+def patched(data: bytes, mark: bytes, offset: int, replacement: bytes) -> bytes:
+    """Overwrite bytes at an offset from the last mark (PK12: the zip's directory)."""
+    position = data.rindex(mark) + offset
+    return data[:position] + replacement + data[position + len(replacement) :]
 
 
 GOOD = archive(shaped("(4,)"))
@@ -65,7 +65,7 @@ def test_damaged_archives_are_bad_input(tmp_path: Path, kind: str, read: Callabl
     path = tmp_path / "a.npz"
     path.write_bytes(ARCHIVES[kind])
     if read is map_npz and kind.startswith(("encrypted", "strong")):
-        pytest.skip("a map looks at no flag of a member: its bytes are what they are")
+        pytest.skip("a memory map does not read the flags of a member")
     with pytest.raises(BadInput, match=r"a\.npz"):
         read(path)
 
